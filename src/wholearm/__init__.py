@@ -1,0 +1,1 @@
+"""Plans joint-torque trajectories for dynamic whole-arm manipulation in the plane."""

@@ -1,0 +1,294 @@
+"""The constrained equations of motion of object and fingers, forward and inverse.
+
+With the notation of `wholearm.model`, Eqs. (1)-(4) are together
+
+    M5 z'' + b(z') = g + S tau + G^T c_n,   A z'' + A' z' = 0,   G = A - U Xi A_t,
+
+where b = B z' + D sigma is joint friction, sigma the directions of the joints and S = [0; I]. Three
+routes through them:
+
+* forward, tau to (z'', c_n): c_n from K c_n = -A' z' - A M5^-1 (g + S tau - b), K = A M5^-1 G^T;
+* inverse, along a curve z(s) with speed s' and acceleration s'': the object's rows leave one free
+  number, the squeeze lambda, and the joints' rows then give tau;
+* the paper's, Eqs. (6)-(16): everything but theta_1 eliminated, Phi_1 theta_1'' + Phi_2 theta_1' +
+  Phi_3 = 0.
+
+Friction can make the reduced inertia vanish or turn negative (jamming). Its sign is that of
+det(A M5^-1 G^T) / det(A M5^-1 A^T), which is 1 without friction: `reduced_inertia`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from .contact import Expression
+from .errors import JammingError
+from .formation import Formation, Kinematics, split_by_first_joint
+from .model import Array
+
+
+class Directions(NamedTuple):
+    """Signs that friction depends on.
+
+    Attributes
+    ----------
+    Xi : ndarray, shape (n_c,)
+        Sliding directions of the contacts.
+    sigma : ndarray, shape (2,)
+        Directions of the joints.
+    """
+
+    Xi: Array
+    sigma: Array
+
+
+class PathForces(NamedTuple):
+    """Forces along a curve, affine in a = s'', b = s'^2, the squeeze and the speed.
+
+    c_n = C0 + Ca a + Cb b + Cl lambda and tau = T0 + Ta a + Tb b + Tl lambda + Tv sqrt(b), with
+    c_n in N, tau in N m, lambda in N, each array of shape (n, n_c) or (n, 2).
+    """
+
+    C0: Array
+    Ca: Array
+    Cb: Array
+    Cl: Array
+    T0: Array
+    Ta: Array
+    Tb: Array
+    Tl: Array
+    Tv: Array
+
+    def c_n(self, a: Array, b: Array, squeeze: Array) -> Array:
+        """Normal forces, shape (n, n_c) [N], for a, b and squeeze of shape (n,)."""
+        a, b, squeeze = a[:, None], b[:, None], squeeze[:, None]
+        return self.C0 + self.Ca * a + self.Cb * b + self.Cl * squeeze
+
+    def tau(self, a: Array, b: Array, squeeze: Array) -> Array:
+        """Joint torques, shape (n, 2) [N m], for a, b and squeeze of shape (n,)."""
+        a, b, squeeze = a[:, None], b[:, None], squeeze[:, None]
+        affine = self.T0 + self.Ta * a + self.Tb * b + self.Tl * squeeze
+        return affine + self.Tv * np.sqrt(np.maximum(b, 0.0))
+
+
+def build_forward(formation: Formation) -> Expression:
+    """CasADi function (z, z', tau, Xi, sigma) -> (z'', c_n, K) of a formation.
+
+    K = A M5^-1 G^T is singular where the formation jams.
+    """
+    scene, n_c = formation.scene, formation.n_contacts
+    z, v = ca.SX.sym("z", 5), ca.SX.sym("v", 5)
+    tau, Xi, sigma = ca.SX.sym("tau", 2), ca.SX.sym("Xi", n_c), ca.SX.sym("sigma", 2)
+    _, A, A_t, A_dot_v = formation.function(z, v)
+    inverse_mass = ca.DM(1 / scene.mass_diagonal)
+    G = A - ca.diag(ca.DM(formation.friction) * Xi) @ A_t
+    friction = ca.DM(scene.viscous) * v + ca.DM(scene.dry) * ca.vertcat(0, 0, 0, sigma)
+    applied = ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau) - friction
+    K = A @ (inverse_mass * G.T)
+    c_n = ca.solve(K, -A_dot_v - A @ (inverse_mass * applied))
+    acceleration = inverse_mass * (applied + G.T @ c_n)
+    names = ["z", "v", "tau", "Xi", "sigma"], ["acceleration", "c_n", "K"]
+    return ca.Function("forward", [z, v, tau, Xi, sigma], [acceleration, c_n, K], *names)
+
+
+def forward(
+    formation: Formation, z: Array, v: Array, tau: Array, directions: Directions
+) -> tuple[Array, Array]:
+    """Accelerations z'', shape (5,), and normal forces c_n, shape (n_c,), from joint torques.
+
+    Parameters
+    ----------
+    z, v : ndarray, shape (5,)
+        Configuration and velocity, consistent with the contacts.
+    tau : ndarray, shape (2,), [N m]
+    directions : Directions
+        Signs of friction, those of `v` (or of the impending motion at rest).
+
+    Raises
+    ------
+    JammingError
+        If friction makes the reduced inertia vanish or turn negative.
+    """
+    kinematics = formation.evaluate(z[None], v[None])
+    inertia = reduced_inertia(formation, kinematics, directions)[0]
+    if inertia <= 0:
+        raise JammingError(
+            f"{' '.join(formation.names)} jams: friction makes the reduced inertia "
+            f"{inertia:.3g} of its frictionless value"
+        )
+    acceleration, c_n, _ = build_forward(formation)(z, v, tau, *directions)
+    return acceleration.full()[:, 0], c_n.full()[:, 0]
+
+
+def reduced_inertia(formation: Formation, kinematics: Kinematics, directions: Directions) -> Array:
+    """Reduced inertia over that without friction, shape (n,): jamming at zero and below."""
+    inverse_mass = 1 / formation.scene.mass_diagonal
+    A = kinematics.A
+    G = _friction_jacobian(formation, kinematics, directions)
+    return np.asarray(
+        np.linalg.det((A * inverse_mass) @ G.transpose(0, 2, 1))
+        / np.linalg.det((A * inverse_mass) @ A.transpose(0, 2, 1))
+    )
+
+
+def inverse(
+    formation: Formation,
+    z: Array,
+    z_s: Array,
+    z_ss: Array,
+    directions: Directions,
+) -> PathForces:
+    """Forces that carry a formation along a curve, at n places.
+
+    The object's rows M q'' = g + (W_n - W_t U Xi) c_n leave c_n one free number: the squeeze
+    lambda, the component of c_n along the unit null vector of W_n - W_t U Xi that presses.
+
+    Parameters
+    ----------
+    z, z_s, z_ss : ndarray, shape (n, 5)
+        The curve: z' = z_s s' and z'' = z_s s'' + z_ss s'^2.
+    directions : Directions
+        Signs for motion along +s.
+    """
+    scene = formation.scene
+    kinematics = formation.evaluate(z, z_s)
+    G = _friction_jacobian(formation, kinematics, directions)
+    wrench = G[:, :, :3].transpose(0, 2, 1)
+    left, values, right = np.linalg.svd(wrench)
+    pseudo = (right[:, :3].transpose(0, 2, 1) / values[:, None, :]) @ left.transpose(0, 2, 1)
+    null = right[:, 3]
+    null = null * np.where(null.sum(axis=1) < 0, -1.0, 1.0)[:, None]
+    mass = scene.mass_diagonal
+    C0 = -(pseudo @ scene.applied_force[:3])
+    Ca = np.einsum("nij,nj->ni", pseudo, mass[:3] * z_s[:, :3])
+    Cb = np.einsum("nij,nj->ni", pseudo, mass[:3] * z_ss[:, :3])
+    joint = G[:, :, 3:]
+
+    def reaction(c_n: Array) -> Array:
+        return np.asarray(np.einsum("nij,ni->nj", joint, c_n))
+
+    dry = scene.dry[3:] * directions.sigma
+    return PathForces(
+        C0,
+        Ca,
+        Cb,
+        null,
+        T0=dry - reaction(C0),
+        Ta=mass[3:] * z_s[:, 3:] - reaction(Ca),
+        Tb=mass[3:] * z_ss[:, 3:] - reaction(Cb),
+        Tl=-reaction(null),
+        Tv=scene.viscous[3:] * z_s[:, 3:],
+    )
+
+
+@dataclass(frozen=True)
+class ReducedMotion:
+    """The paper's scalar equation Phi_1 theta_1'' + Phi_2 theta_1' + Phi_3 = 0 at one state.
+
+    Attributes
+    ----------
+    Phi_1 : float, [kg m^2]
+        Reduced inertia.
+    Phi_2 : float, [N m s]
+        Velocity terms over theta_1'.
+    Phi_3 : float, [N m]
+        Gravity, dry friction and torques.
+    acceleration : float, [rad/s^2]
+        theta_1''.
+    c_n : ndarray, shape (4,), [N]
+    """
+
+    Phi_1: float
+    Phi_2: float
+    Phi_3: float
+    acceleration: float
+    c_n: Array
+
+
+def reduce_to_first_joint(
+    formation: Formation,
+    z: Array,
+    theta_1_dot: float,
+    tau: Array,
+    directions: Directions,
+) -> ReducedMotion:
+    """Eliminate everything but theta_1 as the paper does (Eqs. 6-16), for four contacts.
+
+    Eqs. (6)-(9) give (q', theta_2') = -P_AI^+ P_AII theta_1'. The equations of q and theta_2 then
+    give c_n, and that of theta_1 becomes the scalar equation. The pseudoinverse keeps the formula
+    defined where P_AI is singular, but where that is because theta_1 is stationary the motion is
+    not a multiple of theta_1' and no such formula describes it; `forward` does.
+
+    Raises
+    ------
+    JammingError
+        If Phi_1 is zero or has the wrong sign.
+    """
+    scene = formation.scene
+    others = [0, 1, 2, 4]
+
+    def extend(A: Array, right: Array, first: float) -> Array:
+        P_AI, P_AII = split_by_first_joint(A)
+        full = np.empty(5)
+        full[others] = np.linalg.pinv(P_AI) @ (right - P_AII * first)
+        full[3] = first
+        return full
+
+    A = formation.evaluate(z[None], np.zeros((1, 5))).A[0]
+    slope = extend(A, np.zeros(4), 1.0)
+    kinematics = formation.evaluate(z[None], slope[None])
+    bend = extend(A, -kinematics.A_dot_v[0], 0.0)
+    G = _friction_jacobian(formation, kinematics, directions)[0]
+    mass = scene.mass_diagonal
+    dry = scene.dry * np.array([0.0, 0.0, 0.0, *directions.sigma])
+    resting = dry - scene.applied_force - np.array([0.0, 0.0, 0.0, *tau])
+    # Rows of each term of M5 z'' + b - g - S tau = G^T c_n; the others' rows solve for c_n.
+    eliminate = G[:, 3] @ np.linalg.inv(G[:, others].T)
+
+    def scalar(term: Array) -> float:
+        return float(term[3] - eliminate @ term[others])
+
+    moving = mass * bend * theta_1_dot + scene.viscous * slope
+    Phi_1, Phi_2, Phi_3 = scalar(mass * slope), scalar(moving), scalar(resting)
+    ratio = reduced_inertia(formation, kinematics, directions)[0]
+    if ratio <= 0:
+        raise JammingError(
+            f"{' '.join(formation.names)} jams: Phi_1 = {Phi_1:.3g} kg m^2, "
+            f"{ratio:.3g} of its frictionless value"
+        )
+    acceleration = -(Phi_2 * theta_1_dot + Phi_3) / Phi_1
+    total = mass * slope * acceleration + moving * theta_1_dot + resting
+    c_n = np.linalg.solve(G[:, others].T, total[others])
+    return ReducedMotion(Phi_1, Phi_2, Phi_3, acceleration, c_n)
+
+
+def energy(formation: Formation, z: Array, v: Array) -> Array:
+    """Kinetic and potential energy at n states, shape (n,) [J]."""
+    scene = formation.scene
+    kinetic = 0.5 * (v**2) @ scene.mass_diagonal
+    return np.asarray(kinetic + scene.polygon.mass * scene.gravity * z[:, 1])
+
+
+def _friction_jacobian(
+    formation: Formation, kinematics: Kinematics, directions: Directions
+) -> Array:
+    """G = A - U Xi A_t, shape (n, n_c, 5)."""
+    slip = formation.friction * directions.Xi
+    return kinematics.A - slip[:, None] * kinematics.A_t
+
+
+__all__ = [
+    "Directions",
+    "PathForces",
+    "ReducedMotion",
+    "build_forward",
+    "energy",
+    "forward",
+    "inverse",
+    "reduce_to_first_joint",
+    "reduced_inertia",
+]

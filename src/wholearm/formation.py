@@ -1,0 +1,234 @@
+"""Contact formations: a set of contacts as constraints A z' = 0, and where the set stops being valid.
+
+With the rows of each contact stacked, Eq. (4) reads A z' = 0 with A = [W_n^T, -J_n], the sliding
+velocities are v_t = A_t z' with A_t = [W_t^T, -J_t], and differentiating once more gives
+A z'' + A' z' = 0. For four contacts, Eqs. (6)-(9) split A by the columns of (q, theta_2) and theta_1,
+
+    P_AI (q', theta_2') + P_AII theta_1' = 0,  P_AI = [W_n^T, -j_2n],  P_AII = -j_1n.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from .contact import (
+    Contact,
+    Expression,
+    Limit,
+    build_clearance,
+    build_features,
+    build_gap,
+    build_geometry,
+    build_limits,
+    candidate_contacts,
+)
+from .errors import InputError
+from .model import Array, Scene
+
+TOUCHING = 1e-7
+"""Gap [m] below which closed fingers count as touching: above rounding, below any real clearance."""
+
+
+class Kinematics(NamedTuple):
+    """A formation at n configurations.
+
+    Attributes
+    ----------
+    C : ndarray, shape (n, n_c), [m]
+    A, A_t : ndarray, shape (n, n_c, 5)
+    A_dot_v : ndarray, shape (n, n_c)
+        A' v for the velocities v that were given, so that A z'' = -A' z'.
+    """
+
+    C: Array
+    A: Array
+    A_t: Array
+    A_dot_v: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Formation:
+    """A contact formation of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    contacts : tuple of Contact
+        In the order of every array over contacts.
+    """
+
+    scene: Scene
+    contacts: tuple[Contact, ...]
+
+    @property
+    def n_contacts(self) -> int:
+        """Number of contacts n_c."""
+        return len(self.contacts)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the contacts."""
+        return tuple(contact.name for contact in self.contacts)
+
+    @cached_property
+    def friction(self) -> Array:
+        """Diagonal of U, shape (n_c,)."""
+        return np.array([self.scene.friction.of(contact.finger) for contact in self.contacts])
+
+    @cached_property
+    def function(self) -> Expression:
+        """CasADi function (z, v) -> (C, A, A_t, A' v) of shapes (n_c), (n_c, 5), (n_c, 5), (n_c)."""
+        z, v = build_features(self.scene).z, ca.SX.sym("v", 5)
+        parts = [build_geometry(contact, self.scene) for contact in self.contacts]
+        gaps = ca.vertcat(*(part.gap for part in parts))
+        A = ca.vertcat(*(part.A for part in parts))
+        A_t = ca.vertcat(*(part.A_t for part in parts))
+        A_dot_v = ca.jtimes(A @ v, z, v)
+        return ca.Function("formation", [z, v], [gaps, ca.densify(A), ca.densify(A_t), A_dot_v])
+
+    @cached_property
+    def limits(self) -> tuple[Limit, ...]:
+        """Where this formation stops being valid, for every contact and every other feature."""
+        limits = [limit for c in self.contacts for limit in build_limits(c, self.scene)]
+        for finger in (None, 0, 1):
+            limits += self._clearances(finger)
+        return tuple(limits)
+
+    def _clearances(self, finger: int | None) -> list[Limit]:
+        held = [contact for contact in self.contacts if contact.finger == finger]
+        on_side = {contact.index for contact in held if contact.surface == "finger"}
+        count = self.scene.polygon.n_vertices
+        adjacent = on_side | {(index - 1) % count for index in on_side}
+        limits = []
+        for contact in candidate_contacts(self.scene, finger):
+            if contact in held:
+                continue
+            on_tip = contact.surface == "tip"
+            if on_side and on_tip and not (contact.feature == "e" and contact.index in adjacent):
+                continue
+            if held and not on_side and on_tip:
+                continue
+            limits.append(build_clearance(contact, self.scene, bool(on_side)))
+        return limits
+
+    @cached_property
+    def limit_function(self) -> Expression:
+        """CasADi function z -> values of `limits`, shape (n_limits,) [m]."""
+        values = ca.vertcat(*(limit.value for limit in self.limits))
+        return ca.Function("limits", [build_features(self.scene).z], [values])
+
+    def evaluate(self, z: Array, v: Array) -> Kinematics:
+        """Evaluate the formation at n configurations.
+
+        Parameters
+        ----------
+        z, v : ndarray, shape (n, 5)
+            Configurations, and the velocities for A' v.
+        """
+        count, n_c = len(z), self.n_contacts
+        C, A, A_t, A_dot_v = (part.full() for part in self.function(z.T, v.T))
+        return Kinematics(
+            C.T,
+            A.reshape(n_c, count, 5).transpose(1, 0, 2),
+            A_t.reshape(n_c, count, 5).transpose(1, 0, 2),
+            A_dot_v.T,
+        )
+
+    def evaluate_limits(self, z: Array) -> Array:
+        """Values of `limits` at n configurations, shape (n, n_limits) [m]."""
+        return np.asarray(self.limit_function(z.T).full().T)
+
+    def evaluate_gap(self, contact: Contact, z: Array) -> Array:
+        """C-function of any contact of the scene at n configurations, shape (n,) [m]."""
+        function = ca.Function(
+            "gap", [build_features(self.scene).z], [build_gap(contact, self.scene)]
+        )
+        return np.asarray(function(z.T).full()[0])
+
+
+def split_by_first_joint(A: Array) -> tuple[Array, Array]:
+    """Return P_AI, shape (..., 4, 4), and P_AII, shape (..., 4), of Eqs. (6)-(9)."""
+    return A[..., [0, 1, 2, 4]], A[..., 3]
+
+
+def place_flush(scene: Scene, edge: int, x: float) -> Array:
+    """Pose q with `edge` on the palm and the centroid at `x`, shape (3,) [m, m, rad]."""
+    phi = scene.polygon.flush_angle(edge)
+    height = -_rotate(phi, scene.polygon.vertices[edge])[1]
+    return np.array([x, height, phi])
+
+
+def close_finger(scene: Scene, q: Array, finger: int) -> float:
+    """Joint angle at which a finger, closing from outside, first touches the object at `q` [rad].
+
+    Raises
+    ------
+    InputError
+        If the finger reaches no part of the object, or its joint is inside or under the object.
+    """
+    link = scene.fingers[finger]
+    sign = 1.0 if finger == 0 else -1.0
+    base = np.asarray(link.base)
+    corners = q[:2] + np.array([_rotate(q[2], v) for v in scene.polygon.vertices]) - base
+    angles: list[float] = []
+    for corner in corners:
+        distance, bearing = math.hypot(*corner), math.atan2(corner[1], corner[0])
+        if distance <= link.radius:
+            raise InputError(
+                "", f"fingers.{finger + 1}.base", f"{base.tolist()} is inside the object"
+            )
+        run = math.sqrt(distance**2 - link.radius**2)
+        if run <= link.length:
+            angles.append(bearing - sign * math.asin(link.radius / distance))
+        else:
+            reach = (distance**2 + link.length**2 - link.radius**2) / (2 * distance * link.length)
+            if reach <= 1:
+                angles.append(bearing - sign * math.acos(reach))
+    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        along = (end - start) / math.hypot(*(end - start))
+        outward = np.array([along[1], -along[0]])
+        offset = (link.radius + outward @ start) / link.length
+        if abs(offset) <= 1:
+            heading = math.atan2(outward[1], outward[0])
+            for angle in (heading - math.acos(offset), heading + math.acos(offset)):
+                tip = link.length * np.array([math.cos(angle), math.sin(angle)])
+                if 0 <= along @ (tip - start) <= along @ (end - start):
+                    angles.append(angle)
+    if not angles:
+        raise InputError("", "start", f"finger {finger + 1} is too short to reach the object")
+    # A closing finger sweeps from pointing outwards and down, so angles count from there.
+    outside = -math.pi / 2
+    swept = [
+        (sign * (a - (outside if finger == 0 else math.pi - outside))) % math.tau for a in angles
+    ]
+    return (outside if finger == 0 else math.pi - outside) + sign * min(swept)
+
+
+def find_touching(scene: Scene, z: Array) -> tuple[Contact, ...]:
+    """Return the contacts whose gap is below `TOUCHING` at `z`, in the order palm, finger 1, 2."""
+    touching = []
+    for finger in (None, 0, 1):
+        candidates = candidate_contacts(scene, finger)
+        clearances = [build_clearance(c, scene, touching=False).value for c in candidates]
+        values = ca.Function("touching", [build_features(scene).z], [ca.vertcat(*clearances)])
+        for contact, value in zip(candidates, values(z).full()[:, 0], strict=True):
+            if abs(value) < TOUCHING:
+                touching.append(contact)
+    return tuple(touching)
+
+
+def describe(contacts: Sequence[Contact]) -> str:
+    """Names of the contacts in one line."""
+    return " ".join(sorted(contact.name for contact in contacts)) or "nothing"
+
+
+def _rotate(angle: float, vector: Array) -> Array:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])

@@ -1,0 +1,266 @@
+"""Problem files: TOML in, a validated `Problem` out.
+
+Every message names the file and the key, says what was given and what is allowed.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from .contact import Contact, parse_contact
+from .errors import InputError
+from .formation import Formation, close_finger, describe, find_touching, place_flush
+from .model import Array, Finger, Friction, Polygon, Scene, require_number
+
+_T = TypeVar("_T")
+
+_TOP = {"name", "epsilon", "gravity", "object", "fingers", "friction", "start", "phases"}
+_OBJECT = {"vertices", "mass", "inertia"}
+_FINGER = {
+    "base": True,
+    "length": True,
+    "radius": False,
+    "inertia": True,
+    "viscous": False,
+    "dry": False,
+    "torque_limit": True,
+    "speed_limit": False,
+}
+
+
+@dataclass(frozen=True)
+class Until:
+    """What ends a phase: a contact gained, or a coordinate of the pose reached.
+
+    Attributes
+    ----------
+    contact : Contact or None
+        The contact that is gained.
+    coordinate : {"", "x", "phi"}
+        The coordinate, when there is no contact.
+    value : float or None, [m] or [rad]
+    """
+
+    contact: Contact | None = None
+    coordinate: str = ""
+    value: float | None = None
+
+    def __str__(self) -> str:
+        if self.contact is not None:
+            return self.contact.name
+        assert self.value is not None
+        if self.coordinate == "x":
+            return f"x = {self.value:g} m"
+        return f"phi = {math.degrees(self.value):g} deg"
+
+
+@dataclass(frozen=True, eq=False)
+class Phase:
+    """A stretch of the motion on one contact formation, from rest to rest.
+
+    Attributes
+    ----------
+    index : int
+        From 0; messages and files count from 1.
+    formation : Formation
+    until : Until
+    """
+
+    index: int
+    formation: Formation
+    until: Until
+
+    @property
+    def number(self) -> int:
+        """The phase's number for people, from 1."""
+        return self.index + 1
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A manipulation to plan.
+
+    Attributes
+    ----------
+    name : str
+    scene : Scene
+    epsilon : float, [N]
+        Least normal force of every contact.
+    start : ndarray, shape (5,)
+        Configuration z at the start, with the fingers closed.
+    phases : tuple of Phase
+    source : str
+        The file this was read from.
+    """
+
+    name: str
+    scene: Scene
+    epsilon: float
+    start: Array
+    phases: tuple[Phase, ...]
+    source: str = ""
+
+    @property
+    def contacts(self) -> tuple[Contact, ...]:
+        """Every contact of the plan, in the order of first use."""
+        used = (contact for phase in self.phases for contact in phase.formation.contacts)
+        return tuple(dict.fromkeys(used))
+
+
+def read_problem(path: str) -> Problem:
+    """Read and validate a problem file; whether each phase can be reached is not checked here.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or anything in it is malformed.
+    """
+    try:
+        with open(path, "rb") as stream:
+            table = tomllib.load(stream)
+    except OSError as error:
+        raise InputError(str(path), "", f"cannot be read: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(str(path), "", f"is not TOML: {error}") from None
+    try:
+        return build_problem(table, str(path))
+    except InputError as error:
+        if error.source:
+            raise
+        raise InputError(str(path), error.key, error.problem) from None
+
+
+def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
+    """Validate a problem given as the nested tables of a problem file."""
+    _check_keys(table, "", _TOP, required=_TOP - {"name", "gravity"})
+    name = table.get("name", "unnamed")
+    if not isinstance(name, str):
+        raise InputError("", "name", f"{name!r} is not a string")
+    epsilon = require_number(table["epsilon"], "epsilon", nonnegative=True)
+    scene = _read_scene(table)
+    start = _read_start(scene, _table(table, "start"))
+    given = table["phases"]
+    if not isinstance(given, list) or not given:
+        raise InputError("", "phases", f"{given!r} is not a list of one or more [[phases]]")
+    phases = tuple(_read_phase(scene, i, entry) for i, entry in enumerate(given))
+    problem = Problem(name, scene, epsilon, start, phases, source)
+    _check_first_formation(problem)
+    return problem
+
+
+def _read_scene(table: Mapping[str, Any]) -> Scene:
+    body = _table(table, "object")
+    _check_keys(body, "object", _OBJECT, required=_OBJECT - {"inertia"})
+    polygon = Polygon(body["vertices"], body["mass"], body.get("inertia"))
+    fingers = _table(table, "fingers")
+    _check_keys(fingers, "fingers", {"1", "2"}, required={"1", "2"})
+    friction = _table(table, "friction")
+    parts = {"palm", "finger1", "finger2"}
+    _check_keys(friction, "friction", parts, required=parts)
+    return Scene(
+        polygon,
+        (_read_finger(fingers, "1"), _read_finger(fingers, "2")),
+        Friction(friction["palm"], friction["finger1"], friction["finger2"]),
+        table.get("gravity", 9.81),
+    )
+
+
+def _read_finger(fingers: Mapping[str, Any], key: str) -> Finger:
+    name = f"fingers.{key}"
+    entry = _table(fingers, key, name)
+    _check_keys(entry, name, set(_FINGER), required={k for k, needed in _FINGER.items() if needed})
+    defaults = {"radius": 0.0, "viscous": 0.0, "dry": 0.0}
+    return Finger(**(defaults | dict(entry)), name=name)
+
+
+def _read_start(scene: Scene, start: Mapping[str, Any]) -> Array:
+    _check_keys(start, "start", {"flush", "x"}, required={"flush", "x"})
+    edge, count = start["flush"], scene.polygon.n_vertices
+    if not isinstance(edge, int) or isinstance(edge, bool) or not 0 <= edge < count:
+        raise InputError(
+            "", "start.flush", f"{edge!r} is not an edge; allowed are 0 to {count - 1}"
+        )
+    q = place_flush(scene, edge, require_number(start["x"], "start.x"))
+    z = np.array([*q, close_finger(scene, q, 0), close_finger(scene, q, 1)])
+    z.setflags(write=False)
+    return z
+
+
+def _read_phase(scene: Scene, index: int, entry: object) -> Phase:
+    key = f"phases[{index + 1}]"
+    if not isinstance(entry, dict):
+        raise InputError("", key, f"{entry!r} is not a table")
+    _check_keys(entry, key, {"contacts", "until"}, required={"contacts", "until"})
+    names = entry["contacts"]
+    if not isinstance(names, list) or not names:
+        raise InputError("", f"{key}.contacts", f"{names!r} is not a list of contact names")
+    contacts = [_at(f"{key}.contacts", lambda n=n: parse_contact(n, scene)) for n in names]
+    twice = {contact.name for contact in contacts if contacts.count(contact) > 1}
+    if twice:
+        raise InputError("", f"{key}.contacts", f"{', '.join(sorted(twice))} is given twice")
+    until = _at(f"{key}.until", lambda: _read_until(scene, entry["until"]))
+    if until.contact in contacts:
+        raise InputError("", f"{key}.until", f"{until} is already in the phase's contacts")
+    return Phase(index, Formation(scene, tuple(contacts)), until)
+
+
+def _read_until(scene: Scene, given: object) -> Until:
+    if isinstance(given, str):
+        return Until(contact=parse_contact(given, scene))
+    allowed = "allowed are a contact name, { phi_deg = ... } or { x = ... }"
+    if not isinstance(given, dict) or len(given) != 1 or not set(given) <= {"phi_deg", "x"}:
+        raise InputError("", "", f"{given!r} does not end a phase; {allowed}")
+    ((key, value),) = given.items()
+    number = require_number(value, "")
+    if key == "x":
+        return Until(coordinate="x", value=number)
+    return Until(coordinate="phi", value=math.radians(number))
+
+
+def _check_first_formation(problem: Problem) -> None:
+    touching = find_touching(problem.scene, problem.start)
+    first = problem.phases[0].formation.contacts
+    if set(first) != set(touching):
+        raise InputError(
+            "",
+            "phases[1].contacts",
+            f"{describe(first)} given, but the closed fingers touch {describe(touching)}",
+        )
+
+
+def _at(key: str, read: Callable[[], _T]) -> _T:
+    """Run `read`, giving the key to an error that does not know its own."""
+    try:
+        return read()
+    except InputError as error:
+        raise InputError("", key, error.problem) from None
+
+
+def _table(parent: Mapping[str, Any], key: str, name: str = "") -> Mapping[str, Any]:
+    value = parent[key]
+    if not isinstance(value, dict):
+        raise InputError("", name or key, f"{value!r} is not a table")
+    return value
+
+
+def _check_keys(
+    table: Mapping[str, Any], where: str, allowed: set[str], required: set[str]
+) -> None:
+    prefix = f"{where}." if where else ""
+    for key in table:
+        if key not in allowed:
+            from difflib import get_close_matches
+
+            near = get_close_matches(key, allowed, 1, 0.5)
+            hint = f"did you mean {near[0]!r}? " if near else ""
+            raise InputError(
+                "", f"{prefix}{key}", f"unknown key; {hint}allowed are {', '.join(sorted(allowed))}"
+            )
+    for key in sorted(required - set(table)):
+        raise InputError("", f"{prefix}{key}", "is missing")

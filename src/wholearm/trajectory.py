@@ -1,0 +1,294 @@
+"""The result of planning: a motion with its forces, on disk and at any instant."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import InputError
+from .files import write_whole
+from .model import Array
+from .torque import TorqueProfile
+
+
+class Samples(NamedTuple):
+    """A motion at n instants, on one contact formation.
+
+    Attributes
+    ----------
+    z, z_dot, z_ddot : ndarray, shape (n, 5)
+        Degrees of freedom (q, theta) and their derivatives.
+    tau : ndarray, shape (n, 2), [N m]
+    c_n, c_t : ndarray, shape (n, n_c), [N]
+        In the order of the formation's contacts.
+    """
+
+    z: Array
+    z_dot: Array
+    z_ddot: Array
+    tau: Array
+    c_n: Array
+    c_t: Array
+
+
+class Motion(Protocol):
+    """One phase of a trajectory as a function of time."""
+
+    @property
+    def duration(self) -> float:
+        """How long the phase lasts [s]."""
+
+    @property
+    def contacts(self) -> tuple[str, ...]:
+        """Names of the phase's contacts."""
+
+    def evaluate(self, t: Array) -> Samples:
+        """Samples at times `t` from the start of the phase, shape (n,) [s]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """A planned motion: samples for files and plots, motions for any instant.
+
+    Attributes
+    ----------
+    t : ndarray, shape (n,), [s]
+        Even within each phase; a phase boundary is there twice, since torques and forces step.
+    q, theta : ndarray, shape (n, 3) and (n, 2), [m, m, rad] and [rad]
+    q_dot, theta_dot, q_ddot, theta_ddot : ndarray
+        First and second derivatives with respect to time.
+    tau : ndarray, shape (n, 2), [N m]
+    contacts : tuple of str, length m
+        Every contact of the plan.
+    c_n, c_t : ndarray, shape (n, m), [N]
+        NaN where a contact is not in the formation.
+    phase : ndarray of int, shape (n,)
+        Index of the phase, from 0.
+    torque : TorqueProfile
+        The torques at any instant, exact between samples, with every step at a break.
+    motions : tuple of Motion
+        One per phase. Those of a planned trajectory satisfy the equations of motion at any
+        instant; those of a loaded one interpolate the samples.
+    meta : dict
+        Status, objective, epsilon, durations, timings, iterations, versions and the problem.
+    """
+
+    t: Array
+    q: Array
+    theta: Array
+    q_dot: Array
+    theta_dot: Array
+    q_ddot: Array
+    theta_ddot: Array
+    tau: Array
+    contacts: tuple[str, ...]
+    c_n: Array
+    c_t: Array
+    phase: NDArray[np.int64]
+    torque: TorqueProfile
+    motions: tuple[Motion, ...]
+    meta: Mapping[str, Any]
+
+    @property
+    def duration(self) -> float:
+        """How long the motion lasts [s]."""
+        return float(self.t[-1])
+
+    @property
+    def phase_starts(self) -> Array:
+        """When each phase starts, and when the last one ends, shape (n_phases + 1,) [s]."""
+        first = np.flatnonzero(np.diff(self.phase, prepend=-1))
+        return np.append(self.t[first], self.t[-1])
+
+    @property
+    def z(self) -> Array:
+        """Degrees of freedom (q, theta), shape (n, 5)."""
+        return np.hstack([self.q, self.theta])
+
+    @property
+    def z_dot(self) -> Array:
+        """Velocities (q', theta'), shape (n, 5)."""
+        return np.hstack([self.q_dot, self.theta_dot])
+
+    @property
+    def z_ddot(self) -> Array:
+        """Accelerations (q'', theta''), shape (n, 5)."""
+        return np.hstack([self.q_ddot, self.theta_ddot])
+
+    def at(self, t: float) -> Samples:
+        """The motion at one instant, each field of shape (1, ...).
+
+        At a phase boundary the later phase answers. The contacts are those of that phase,
+        ``motions[k].contacts``.
+
+        Raises
+        ------
+        ValueError
+            If `t` is outside the trajectory.
+        """
+        starts = self.phase_starts
+        if not starts[0] <= t <= starts[-1]:
+            raise ValueError(f"t = {t} s is outside the trajectory, 0 to {starts[-1]} s")
+        index = min(int(np.searchsorted(starts, t, side="right")) - 1, len(self.motions) - 1)
+        return self.motions[index].evaluate(np.array([t - starts[index]]))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the trajectory to a ``.npz`` file.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be written.
+        """
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
+        arrays["contacts"] = np.array(self.contacts)
+        arrays["torque_breaks"] = self.torque.breaks
+        arrays["torque_coefficients"] = self.torque.coefficients
+        arrays["meta"] = np.array(json.dumps(dict(self.meta)))
+        write_whole(path, lambda stream: np.savez(stream, **arrays))
+
+
+_ARRAYS = {
+    "t": (), "q": (3,), "theta": (2,), "q_dot": (3,), "theta_dot": (2,), "q_ddot": (3,),
+    "theta_ddot": (2,), "tau": (2,), "c_n": (-1,), "c_t": (-1,), "phase": (),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class SampledMotion:
+    """A phase known by its samples: quintic in time for z, linear for tau and forces."""
+
+    t: Array
+    contacts: tuple[str, ...]
+    samples: Samples
+
+    @property
+    def duration(self) -> float:
+        """How long the phase lasts [s]."""
+        return float(self.t[-1] - self.t[0])
+
+    def evaluate(self, t: Array) -> Samples:
+        """Samples at times `t` from the start of the phase, shape (n,) [s]."""
+        grid, known = self.t - self.t[0], self.samples
+        k = np.clip(np.searchsorted(grid, t, side="right") - 1, 0, len(grid) - 2)
+        h = (grid[k + 1] - grid[k])[:, None]
+        x = (np.asarray(t)[:, None] - grid[k][:, None]) / h
+        z0, v0, a0 = known.z[k], h * known.z_dot[k], h**2 * known.z_ddot[k]
+        rise = known.z[k + 1] - z0 - v0 - a0 / 2
+        speed = h * known.z_dot[k + 1] - v0 - a0
+        bend = h**2 * known.z_ddot[k + 1] - a0
+        c3 = 10 * rise - 4 * speed + bend / 2
+        c4 = -15 * rise + 7 * speed - bend
+        c5 = 6 * rise - 3 * speed + bend / 2
+        z = z0 + x * (v0 + x * (a0 / 2 + x * (c3 + x * (c4 + x * c5))))
+        z_dot = (v0 + x * (a0 + x * (3 * c3 + x * (4 * c4 + x * 5 * c5)))) / h
+        z_ddot = (a0 + x * (6 * c3 + x * (12 * c4 + x * 20 * c5))) / h**2
+        forces = [(1 - x) * f[k] + x * f[k + 1] for f in (known.tau, known.c_n, known.c_t)]
+        return Samples(z, z_dot, z_ddot, *forces)
+
+
+def assemble(
+    motions: Sequence[Motion], torque: TorqueProfile, meta: Mapping[str, Any], samples: int
+) -> Trajectory:
+    """Sample motions that follow one another, `samples` rows to a phase."""
+    contacts = tuple(dict.fromkeys(name for motion in motions for name in motion.contacts))
+    rows, times, forces, start = [], [], [], 0.0
+    for motion in motions:
+        local = np.linspace(0.0, motion.duration, samples)
+        row = motion.evaluate(local)
+        wide = np.full((2, samples, len(contacts)), np.nan)
+        wide[:, :, [contacts.index(name) for name in motion.contacts]] = row.c_n, row.c_t
+        rows.append(row)
+        times.append(start + local)
+        forces.append(wide)
+        start += motion.duration
+    z, z_dot, z_ddot, tau = (np.concatenate([row[k] for row in rows]) for k in range(4))
+    c_n, c_t = np.concatenate(forces, axis=1)
+    return Trajectory(
+        t=np.concatenate(times),
+        q=z[:, :3],
+        theta=z[:, 3:],
+        q_dot=z_dot[:, :3],
+        theta_dot=z_dot[:, 3:],
+        q_ddot=z_ddot[:, :3],
+        theta_ddot=z_ddot[:, 3:],
+        tau=tau,
+        contacts=contacts,
+        c_n=c_n,
+        c_t=c_t,
+        phase=np.repeat(np.arange(len(motions)), samples),
+        torque=torque,
+        motions=tuple(motions),
+        meta=dict(meta),
+    )
+
+
+def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
+    """Read a trajectory file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or an array is missing or of the wrong shape.
+    """
+    source = str(path)
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            arrays = {name: data[name] for name in data.files}
+    except OSError as error:
+        raise InputError(source, "", f"cannot be read: {error.strerror or error}") from None
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(source, "", f"is not a trajectory file: {error}") from None
+    extra = {"contacts": (), "torque_breaks": (), "torque_coefficients": (2, -1), "meta": None}
+    for name, shape in (_ARRAYS | extra).items():
+        if name not in arrays:
+            raise InputError(source, name, "array is missing")
+        if shape is not None:
+            _check_shape(source, name, arrays, shape)
+    try:
+        meta = json.loads(str(arrays["meta"]))
+    except json.JSONDecodeError as error:
+        raise InputError(source, "meta", f"is not JSON: {error}") from None
+    contacts = tuple(str(name) for name in arrays["contacts"])
+    known = {name: arrays[name] for name in _ARRAYS}
+    torque = TorqueProfile(arrays["torque_breaks"], arrays["torque_coefficients"])
+    motions = tuple(_sampled_motion(known, contacts, index) for index in np.unique(arrays["phase"]))
+    return Trajectory(**known, contacts=contacts, torque=torque, motions=motions, meta=meta)
+
+
+def _check_shape(source: str, name: str, arrays: Mapping[str, Any], tail: tuple[int, ...]) -> None:
+    array = arrays[name]
+    rows = len(arrays["t"]) if name in _ARRAYS else len(array) if array.ndim else -1
+    widths = (len(arrays["contacts"]),) if name in ("c_n", "c_t") else tail
+    fits = array.ndim == 1 + len(widths) and array.shape[0] == rows
+    fits = fits and all(w in (-1, n) for w, n in zip(widths, array.shape[1:], strict=True))
+    if not fits:
+        needed = ", ".join(str(n) if n >= 0 else "any" for n in (rows, *widths))
+        raise InputError(source, name, f"shape {array.shape} given, ({needed}) needed")
+    if name not in ("c_n", "c_t", "contacts") and not np.isfinite(array).all():
+        raise InputError(source, name, "holds numbers that are not finite")
+
+
+def _sampled_motion(
+    arrays: Mapping[str, Any], contacts: tuple[str, ...], index: int
+) -> SampledMotion:
+    rows = arrays["phase"] == index
+    held = ~np.isnan(arrays["c_n"][rows]).all(axis=0)
+    parts = {name: array[rows] for name, array in arrays.items()}
+    samples = Samples(
+        np.hstack([parts["q"], parts["theta"]]),
+        np.hstack([parts["q_dot"], parts["theta_dot"]]),
+        np.hstack([parts["q_ddot"], parts["theta_ddot"]]),
+        parts["tau"],
+        parts["c_n"][:, held],
+        parts["c_t"][:, held],
+    )
+    names = tuple(name for name, here in zip(contacts, held, strict=True) if here)
+    return SampledMotion(parts["t"], names, samples)
