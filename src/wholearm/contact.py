@@ -182,7 +182,7 @@ def parse_contact(name: object, scene: Scene) -> Contact:
     )
     if match is None:
         raise InputError("", "", f"{name!r} is not a contact; {allowed}")
-    feature, index, surface, finger, tip = match.groups()
+    feature, index, _, finger, tip = match.groups()
     contact = Contact(
         feature,
         int(index),

@@ -46,7 +46,7 @@ class SolverError(WholearmError):
 
 
 class JammingError(WholearmError):
-    """Friction makes the reduced inertia vanish or turn negative, so forces do not set the motion."""
+    """Friction makes the reduced inertia vanish or turn negative: no forward dynamics."""
 
 
 class SimulationError(WholearmError):

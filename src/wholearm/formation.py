@@ -1,8 +1,9 @@
-"""Contact formations: a set of contacts as constraints A z' = 0, and where the set stops being valid.
+"""Contact formations: contacts as constraints A z' = 0, and where they stop being valid.
 
 With the rows of each contact stacked, Eq. (4) reads A z' = 0 with A = [W_n^T, -J_n], the sliding
 velocities are v_t = A_t z' with A_t = [W_t^T, -J_t], and differentiating once more gives
-A z'' + A' z' = 0. For four contacts, Eqs. (6)-(9) split A by the columns of (q, theta_2) and theta_1,
+A z'' + A' z' = 0. For four contacts, Eqs. (6)-(9) split A by the columns of (q, theta_2) and
+theta_1,
 
     P_AI (q', theta_2') + P_AII theta_1' = 0,  P_AI = [W_n^T, -j_2n],  P_AII = -j_1n.
 """
@@ -33,7 +34,7 @@ from .errors import InputError
 from .model import Array, Scene
 
 TOUCHING = 1e-7
-"""Gap [m] below which closed fingers count as touching: above rounding, below any real clearance."""
+"""Gap [m] below which features count as touching: above rounding, below any real clearance."""
 
 
 class Kinematics(NamedTuple):
@@ -84,7 +85,7 @@ class Formation:
 
     @cached_property
     def function(self) -> Expression:
-        """CasADi function (z, v) -> (C, A, A_t, A' v) of shapes (n_c), (n_c, 5), (n_c, 5), (n_c)."""
+        """CasADi function (z, v) -> (C, A, A_t, A' v), with n_c rows each."""
         z, v = build_features(self.scene).z, ca.SX.sym("v", 5)
         parts = [build_geometry(contact, self.scene) for contact in self.contacts]
         gaps = ca.vertcat(*(part.gap for part in parts))

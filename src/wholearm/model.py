@@ -150,7 +150,7 @@ class Polygon:
 
     @property
     def gyration_radius(self) -> float:
-        """Radius of gyration about the centroid [m]: the length that weighs angles against lengths."""
+        """Radius of gyration about the centroid [m], which weighs angles against lengths."""
         assert self.inertia is not None
         return math.sqrt(self.inertia / self.mass)
 

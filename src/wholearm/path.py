@@ -141,7 +141,7 @@ class Curve:
     @property
     def start(self) -> Array:
         """Configuration at s = 0, shape (5,)."""
-        return self.panels[0].z[0]
+        return np.asarray(self.panels[0].z[0])
 
     @cached_property
     def end(self) -> Array:
@@ -167,9 +167,11 @@ class Curve:
             flips = np.flatnonzero(np.diff(np.sign(rates[moving, column])))
             for flip in flips:
                 low, high = grid[moving[flip]], grid[moving[flip + 1]]
-                breaks.append(
-                    find_root(lambda s, k=column: self.sliding(np.array([s]))[0, k], low, high)
-                )
+
+                def rate(s: float, k: int = column) -> float:
+                    return float(self.sliding(np.array([s]))[0, k])
+
+                breaks.append(find_root(rate, low, high))
         margin = 1e-7 * self.length
         inner = [s for s in sorted(breaks) if margin < s < self.length - margin]
         ends = [0.0, *(s for i, s in enumerate(inner) if i == 0 or s > inner[i - 1] + margin)]
@@ -338,11 +340,11 @@ def _first_crossing(
         if row == 0 or values[row - 1, k] <= TOUCHING * 1e-3:
             roots[int(k)] = float(grid[max(row - 1, 0)])
         else:
-            roots[int(k)] = find_root(
-                lambda s, k=k: margins(panel.interpolate(np.array([s]))[0])[0, k],
-                grid[row - 1],
-                grid[row],
-            )
+
+            def margin(s: float, k: int = int(k)) -> float:
+                return float(margins(panel.interpolate(np.array([s]))[0])[0, k])
+
+            roots[int(k)] = find_root(margin, grid[row - 1], grid[row])
     first = min(roots.values())
     closed = np.abs(margins(panel.interpolate(np.array([first]))[0])[0]) < TOUCHING
     return first, sorted(
@@ -375,7 +377,7 @@ def _build_panel(
     if not size < 1e-10 * rho:
         return None
     z_u = np.linalg.solve(_border(kinematics.A, projection), np.eye(5)[:, 4:])[..., 0]
-    speed = np.sqrt((z_u**2 @ metric))
+    speed = np.sqrt(z_u**2 @ metric)
     scaled = np.column_stack([points * np.sqrt(metric) / rho, speed])
     tail = np.abs(analyse @ scaled)[-2:].max()
     if speed.max() > 1.5 or tail > RESOLVED:

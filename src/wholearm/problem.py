@@ -200,7 +200,7 @@ def _read_phase(scene: Scene, index: int, entry: object) -> Phase:
     names = entry["contacts"]
     if not isinstance(names, list) or not names:
         raise InputError("", f"{key}.contacts", f"{names!r} is not a list of contact names")
-    contacts = [_at(f"{key}.contacts", lambda n=n: parse_contact(n, scene)) for n in names]
+    contacts = _at(f"{key}.contacts", lambda: [parse_contact(n, scene) for n in names])
     twice = {contact.name for contact in contacts if contacts.count(contact) > 1}
     if twice:
         raise InputError("", f"{key}.contacts", f"{', '.join(sorted(twice))} is given twice")
