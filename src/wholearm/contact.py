@@ -36,7 +36,7 @@ from .model import Array, Scene
 Expression = Any
 """A CasADi SX expression (CasADi has no type stubs)."""
 
-_PATTERN = re.compile(r"(v|e)(\d+)-(palm|finger([12])|tip([12]))")
+_PATTERN = re.compile(r"(v|e)(0|[1-9][0-9]*)-(palm|finger([12])|tip([12]))")
 
 
 @dataclass(frozen=True, order=True)
@@ -306,43 +306,65 @@ def _build_row(
 
 
 def build_limits(contact: Contact, scene: Scene) -> list[Limit]:
-    """Return the limits of one contact's own range: between base and tip, between two vertices."""
-    if contact.finger is None:
+    """Return the limits of one contact's own range: between base and tip, between two vertices.
+
+    Where the range goes over into that of a neighbour, the neighbour is the contact gained.
+    """
+    finger = contact.finger
+    if finger is None:
         return []
     link = build_features(scene).links[contact.finger]
     lengths = build_features(scene).edge_lengths
     i, part, count = contact.index, contact.part, len(lengths)
+    before, after = (i - 1) % count, (i + 1) % count
+
+    def gains(feature: str, index: int, surface: str = "tip") -> Contact | None:
+        if (feature, surface) == ("v", "tip") and scene.fingers[finger].radius == 0:
+            return None
+        return Contact(feature, index, surface, finger)
+
     if contact.surface == "finger":
         run = link.vertex_run[i]
         off = f"v{i} runs off {part} at its"
         return [
             Limit(run, f"{off} base"),
-            Limit(scene.fingers[contact.finger].length - run, f"{off} tip"),
+            Limit(scene.fingers[finger].length - run, f"{off} tip", gains("v", i)),
         ]
     if contact.feature == "e":
         run = link.edge_run[i]
         off = f"{part} runs off edge {i} at v"
         return [
-            Limit(run, f"{off}{i}"),
-            Limit(lengths[i] - run, f"{off}{(i + 1) % count}"),
+            Limit(run, f"{off}{i}", gains("v", i)),
+            Limit(lengths[i] - run, f"{off}{after}", gains("v", after)),
         ]
-    before = (i - 1) % count
     return [
-        Limit(link.arc_run[i], f"v{i} leaves {part} for the side of the link"),
-        Limit(link.edge_run[before] - lengths[before], f"edge {before} turns onto {part}"),
-        Limit(-link.edge_run[i], f"edge {i} turns onto {part}"),
+        Limit(
+            link.arc_run[i],
+            f"v{i} leaves {part} for the side of the link",
+            gains("v", i, "finger"),
+        ),
+        Limit(
+            link.edge_run[before] - lengths[before],
+            f"edge {before} turns onto {part}",
+            gains("e", before),
+        ),
+        Limit(-link.edge_run[i], f"edge {i} turns onto {part}", gains("e", i)),
     ]
 
 
 def build_clearance(contact: Contact, scene: Scene, touching: bool) -> Limit:
     """Return the limit at which `contact`, not in the formation, is gained.
 
-    A feature beyond the ends of its partner cannot touch it, so its gap does not count there. The
-    exception is a link that already touches a vertex with its side (`touching`): by convexity the
+    A feature beyond the ends of its partner cannot touch it, so its gap does not count there, and
+    a tip that is farther outside another edge cannot touch this one. The exception is a link that already touches a vertex with its side (`touching`): by convexity the
     whole object then stays on that side of the link's line.
     """
-    gap = build_gap(contact, scene)
+    gap = own = build_gap(contact, scene)
     text = f"{contact.corner} touches {contact.part}"
+    if contact.feature == "e" and contact.finger is not None and not touching:
+        gaps = build_features(scene).links[contact.finger].edge_gap
+        for other in range(scene.polygon.n_vertices):
+            gap = ca.fmax(gap, gaps[other] - own)
     if contact.finger is not None and not (touching and contact.surface == "finger"):
         for limit in build_limits(contact, scene):
             gap = ca.fmax(gap, -limit.value)

@@ -141,6 +141,7 @@ def inverse(
     z_s: Array,
     z_ss: Array,
     directions: Directions,
+    kinematics: Kinematics | None = None,
 ) -> PathForces:
     """Forces that carry a formation along a curve, at n places.
 
@@ -152,20 +153,23 @@ def inverse(
     z, z_s, z_ss : ndarray, shape (n, 5)
         The curve: z' = z_s s' and z'' = z_s s'' + z_ss s'^2.
     directions : Directions
-        Signs for motion along +s.
+        Signs for motion along +s, one for all places or one row for each.
+    kinematics : Kinematics, optional
+        The formation at `z`, where it is known already.
     """
     scene = formation.scene
-    kinematics = formation.evaluate(z, z_s)
+    kinematics = kinematics or formation.evaluate(z, z_s)
     G = _friction_jacobian(formation, kinematics, directions)
     wrench = G[:, :, :3].transpose(0, 2, 1)
-    left, values, right = np.linalg.svd(wrench)
-    pseudo = (right[:, :3].transpose(0, 2, 1) / values[:, None, :]) @ left.transpose(0, 2, 1)
-    null = right[:, 3]
-    null = null * np.where(null.sum(axis=1) < 0, -1.0, 1.0)[:, None]
+    null = _null_vector(wrench)
     mass = scene.mass_diagonal
-    C0 = -(pseudo @ scene.applied_force[:3])
-    Ca = np.einsum("nij,nj->ni", pseudo, mass[:3] * z_s[:, :3])
-    Cb = np.einsum("nij,nj->ni", pseudo, mass[:3] * z_ss[:, :3])
+    # Bordering by the null vector makes each solution the shortest one.
+    right = np.zeros((len(z), 4, 3))
+    right[:, :3, 0] = -scene.applied_force[:3]
+    right[:, :3, 1] = mass[:3] * z_s[:, :3]
+    right[:, :3, 2] = mass[:3] * z_ss[:, :3]
+    solution = np.linalg.solve(np.concatenate([wrench, null[:, None, :]], axis=1), right)
+    C0, Ca, Cb = (solution[..., k] for k in range(3))
     joint = G[:, :, 3:]
 
     def reaction(c_n: Array) -> Array:
@@ -273,12 +277,20 @@ def energy(formation: Formation, z: Array, v: Array) -> Array:
     return np.asarray(kinetic + scene.polygon.mass * scene.gravity * z[:, 1])
 
 
+def _null_vector(wrench: Array) -> Array:
+    """Unit null vector of each (3, 4) matrix, by its minors, with the sign of larger sum."""
+    minors = [np.linalg.det(np.delete(wrench, k, axis=2)) for k in range(4)]
+    null = np.stack([minors[0], -minors[1], minors[2], -minors[3]], axis=1)
+    size = np.linalg.norm(null, axis=1) * np.where(null.sum(axis=1) < 0, -1.0, 1.0)
+    return np.asarray(null / size[:, None])
+
+
 def _friction_jacobian(
     formation: Formation, kinematics: Kinematics, directions: Directions
 ) -> Array:
     """G = A - U Xi A_t, shape (n, n_c, 5)."""
     slip = formation.friction * directions.Xi
-    return kinematics.A - slip[:, None] * kinematics.A_t
+    return kinematics.A - slip[..., :, None] * kinematics.A_t
 
 
 __all__ = [

@@ -107,6 +107,10 @@ class Formation:
         on_side = {contact.index for contact in held if contact.surface == "finger"}
         count = self.scene.polygon.n_vertices
         adjacent = on_side | {(index - 1) % count for index in on_side}
+        tips = [contact for contact in held if contact.surface == "tip"]
+        # A link whose tip touches an edge is outside the edge's line: only the end of the edge
+        # that is behind the tip can come to its side.
+        behind = {(c.index + (finger or 0)) % count for c in tips if c.feature == "e"}
         limits = []
         for contact in candidate_contacts(self.scene, finger):
             if contact in held:
@@ -114,7 +118,7 @@ class Formation:
             on_tip = contact.surface == "tip"
             if on_side and on_tip and not (contact.feature == "e" and contact.index in adjacent):
                 continue
-            if held and not on_side and on_tip:
+            if tips and not on_side and (on_tip or contact.index not in behind):
                 continue
             limits.append(build_clearance(contact, self.scene, bool(on_side)))
         return limits
@@ -172,19 +176,21 @@ def close_finger(scene: Scene, q: Array, finger: int) -> float:
     Raises
     ------
     InputError
-        If the finger reaches no part of the object, or its joint is inside or under the object.
+        If the finger reaches no part of the object, or its joint is in the object or too near.
     """
     link = scene.fingers[finger]
     sign = 1.0 if finger == 0 else -1.0
     base = np.asarray(link.base)
     corners = q[:2] + np.array([_rotate(q[2], v) for v in scene.polygon.vertices]) - base
+    if _distance_from_origin(corners) <= link.radius:
+        raise InputError(
+            "",
+            f"fingers.{finger + 1}.base",
+            f"{base.tolist()} is inside the object or nearer to it than the link's radius",
+        )
     angles: list[float] = []
     for corner in corners:
         distance, bearing = math.hypot(*corner), math.atan2(corner[1], corner[0])
-        if distance <= link.radius:
-            raise InputError(
-                "", f"fingers.{finger + 1}.base", f"{base.tolist()} is inside the object"
-            )
         run = math.sqrt(distance**2 - link.radius**2)
         if run <= link.length:
             angles.append(bearing - sign * math.asin(link.radius / distance))
@@ -228,6 +234,15 @@ def find_touching(scene: Scene, z: Array) -> tuple[Contact, ...]:
 def describe(contacts: Sequence[Contact]) -> str:
     """Names of the contacts in one line."""
     return " ".join(sorted(contact.name for contact in contacts)) or "nothing"
+
+
+def _distance_from_origin(corners: Array) -> float:
+    """Distance of a convex anticlockwise polygon from the origin, zero when it is inside."""
+    runs = np.roll(corners, -1, axis=0) - corners
+    if (corners[:, 0] * runs[:, 1] >= corners[:, 1] * runs[:, 0]).all():
+        return 0.0
+    part = np.clip(-(corners * runs).sum(axis=1) / (runs**2).sum(axis=1), 0.0, 1.0)
+    return float(np.hypot(*(corners + part[:, None] * runs).T).min())
 
 
 def _rotate(angle: float, vector: Array) -> Array:

@@ -45,10 +45,13 @@ def require_number(
 ) -> float:
     """Return `value` as a finite float, or raise `InputError` naming `key`."""
     allowed = "a positive number" if positive else "a number >= 0" if nonnegative else "a number"
-    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not number or not math.isfinite(float(value)):  # type: ignore[arg-type]
+    real = isinstance(value, int | float | np.integer | np.floating)
+    try:
+        result = float(value) if real and not isinstance(value, bool) else math.nan  # type: ignore[arg-type]
+    except OverflowError:
+        result = math.inf
+    if not math.isfinite(result):
         raise InputError("", key, f"{value!r} is not {allowed} (finite)")
-    result = float(value)  # type: ignore[arg-type]
     if (positive and result <= 0) or (nonnegative and result < 0):
         raise InputError("", key, f"{value!r} is not {allowed}")
     return result

@@ -22,7 +22,7 @@ import numpy as np
 
 from .contact import Contact
 from .errors import InputError
-from .formation import TOUCHING, Formation, describe, find_touching
+from .formation import TOUCHING, Formation, Kinematics, describe, find_touching
 from .model import Array, Scene
 from .problem import Phase, Problem, Until, read_problem
 
@@ -36,11 +36,15 @@ LONGEST = 60.0
 
 
 class CurvePoint(NamedTuple):
-    """A curve at n places: z, its unit tangent z_s and its curvature z_ss, each (n, 5)."""
+    """A curve at n places: z, its unit tangent z_s and its curvature z_ss, each (n, 5).
+
+    `kinematics` is the formation there.
+    """
 
     z: Array
     z_s: Array
     z_ss: Array
+    kinematics: Kinematics
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +131,7 @@ class Curve:
         kinematics = formation.evaluate(z, tangent)
         metric = metric_weights(formation.scene)
         z_s, z_ss = _solve_tangent(kinematics.A, kinematics.A_dot_v, tangent, metric)
-        return CurvePoint(z, z_s, z_ss)
+        return CurvePoint(z, z_s, z_ss, kinematics)
 
     def _interpolate(self, s: Array) -> tuple[Array, Array]:
         starts = np.array([panel.s[0] for panel in self.panels])
@@ -150,10 +154,10 @@ class Curve:
 
     def sliding(self, s: Array) -> Array:
         """Sliding rates A_t z_s of the contacts and rates of the joints, shape (n, n_c + 2)."""
-        z, z_s, _ = self.evaluate(s)
-        A_t = self.formation.evaluate(z, z_s).A_t
+        point = self.evaluate(s)
         rho = self.formation.scene.polygon.gyration_radius
-        return np.hstack([np.einsum("nij,nj->ni", A_t, z_s), rho * z_s[:, 3:]])
+        slip = np.einsum("nij,nj->ni", point.kinematics.A_t, point.z_s)
+        return np.hstack([slip, rho * point.z_s[:, 3:]])
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
@@ -223,15 +227,17 @@ def _require_touching(problem: Problem, phase: Phase, z: Array, before: Curve | 
         raise InputError(
             problem.source, key, f"{formation.n_contacts} contacts given; a phase takes 4"
         )
-    touching = find_touching(problem.scene, z)
-    missing = [c for c in formation.contacts if c not in touching]
-    extra = [c for c in touching if c not in formation.contacts] if before is None else []
-    if missing or extra:
+    gaps = formation.evaluate(z[None], np.zeros((1, 5))).C[0]
+    if np.abs(gaps).max() > TOUCHING:
+        missing = [
+            c.name for c, gap in zip(formation.contacts, gaps, strict=True) if abs(gap) > TOUCHING
+        ]
         when = "at the start" if before is None else f"at the end of phase {phase.index}"
-        wrong = [f"{c.name} does not touch" for c in missing]
-        wrong += [f"{c.name} touches too" for c in extra]
+        touching = describe(find_touching(problem.scene, z))
         raise InputError(
-            problem.source, key, f"{', '.join(wrong)} {when}; touching are {describe(touching)}"
+            problem.source,
+            key,
+            f"{', '.join(missing)} does not touch {when}; touching are {touching}",
         )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -97,6 +97,8 @@ class Problem:
     phases : tuple of Phase
     source : str
         The file this was read from.
+    table : mapping
+        The contents of that file, which trajectory files carry along.
     """
 
     name: str
@@ -105,6 +107,7 @@ class Problem:
     start: Array
     phases: tuple[Phase, ...]
     source: str = ""
+    table: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @property
     def contacts(self) -> tuple[Contact, ...]:
@@ -149,7 +152,7 @@ def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
     if not isinstance(given, list) or not given:
         raise InputError("", "phases", f"{given!r} is not a list of one or more [[phases]]")
     phases = tuple(_read_phase(scene, i, entry) for i, entry in enumerate(given))
-    problem = Problem(name, scene, epsilon, start, phases, source)
+    problem = Problem(name, scene, epsilon, start, phases, source, table)
     _check_first_formation(problem)
     return problem
 

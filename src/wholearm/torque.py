@@ -89,13 +89,14 @@ def read_torque_csv(path: str) -> TorqueProfile:
         times do not start at 0 and increase.
     """
     try:
-        with open(path, newline="", encoding="utf-8") as stream:
-            rows = [row for row in csv.reader(stream) if any(cell.strip() for cell in row)]
+        with open(path, newline="", encoding="utf-8-sig") as stream:
+            reader = csv.reader(stream)
+            numbered = [(reader.line_num, row) for row in reader if any(map(str.strip, row))]
     except OSError as error:
         raise InputError(str(path), "", f"cannot be read: {error.strerror}") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(str(path), "", f"is not CSV: {error}") from None
-    header = [cell.strip() for cell in rows[0]] if rows else []
+    header = [cell.strip() for cell in numbered[0][1]] if numbered else []
     for column in COLUMNS:
         if column not in header:
             given = ",".join(header) or "an empty file"
@@ -103,7 +104,7 @@ def read_torque_csv(path: str) -> TorqueProfile:
                 str(path), column, f"column is missing; {given} given, {','.join(COLUMNS)} needed"
             )
     where = [header.index(column) for column in COLUMNS]
-    values = np.array([_read_row(path, i, row, where) for i, row in enumerate(rows[1:], start=2)])
+    values = np.array([_read_row(path, line, row, where) for line, row in numbered[1:]])
     if len(values) < 2:
         raise InputError(str(path), "t", f"{len(values)} rows given; two or more are needed")
     t = values[:, 0]

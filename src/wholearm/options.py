@@ -1,0 +1,78 @@
+"""What to plan for, and how finely."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from .errors import InputError
+from .model import require_number
+
+
+class Objective(Enum):
+    """What a plan makes best."""
+
+    TIME = "time"
+    """Least duration."""
+    EFFORT = "effort"
+    """Least integral of tau^T tau, plus a weight on time."""
+    MARGIN = "margin"
+    """Largest least normal force within a given duration."""
+    ELASTIC = "elastic"
+    """Least shortfall of the limits; used to explain why there is no plan."""
+
+
+CHOICES = tuple(choice.value for choice in Objective if choice is not Objective.ELASTIC)
+"""Objectives that a user can ask for."""
+
+
+@dataclass(frozen=True)
+class PlanOptions:
+    """Options of the planner.
+
+    Attributes
+    ----------
+    objective : Objective or str
+        ``"time"``, ``"effort"`` or ``"margin"``.
+    intervals : int
+        Intervals of the grid of each phase, at least 10.
+    time_weight : float, [(N m)^2]
+        Weight of the duration against the effort.
+    duration : float, optional, [s]
+        What `margin` may take for all phases together; twice the least time when left out.
+    samples : int
+        Rows per phase of the trajectory file, at least 2.
+
+    Raises
+    ------
+    InputError
+        If an option is out of its range.
+    """
+
+    objective: Objective | str = Objective.TIME
+    intervals: int = 80
+    time_weight: float = 1.0
+    duration: float | None = None
+    samples: int = 201
+
+    def __post_init__(self) -> None:
+        given = self.objective
+        if given not in CHOICES and given not in [Objective(choice) for choice in CHOICES]:
+            raise InputError("", "objective", f"{given!r} given; allowed are {', '.join(CHOICES)}")
+        object.__setattr__(self, "objective", Objective(given))
+        for key, least in (("intervals", 10), ("samples", 2)):
+            value = getattr(self, key)
+            if not isinstance(value, int) or isinstance(value, bool) or value < least:
+                raise InputError("", key, f"{value!r} is not a whole number of {least} or more")
+        weight = require_number(self.time_weight, "time_weight", positive=True)
+        object.__setattr__(self, "time_weight", weight)
+        if self.duration is not None:
+            duration = require_number(self.duration, "duration", positive=True)
+            object.__setattr__(self, "duration", duration)
+            if self.objective is not Objective.MARGIN:
+                raise InputError("", "duration", "is for the objective margin only")
+
+    @property
+    def goal(self) -> Objective:
+        """The objective as an enumeration member."""
+        return Objective(self.objective)

@@ -1,0 +1,147 @@
+"""Planning a problem, phase by phase.
+
+Phases are joined at rest, so each is a problem of its own.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from . import __version__
+from .errors import InfeasibleError
+from .options import Objective, PlanOptions
+from .path import Curve, trace_phases
+from .pathplan import PathPlan, plan_path
+from .problem import Problem
+from .torque import TorqueProfile
+from .trajectory import Trajectory, assemble
+
+UNITS = {Objective.TIME: "s", Objective.EFFORT: "(N m)^2 s", Objective.MARGIN: "N"}
+
+
+def solve(
+    problem: Problem,
+    objective: str = "time",
+    *,
+    progress: Callable[[str], None] | None = None,
+    **options: Any,
+) -> Trajectory:
+    """Plan joint torques that carry the object through every phase of a problem.
+
+    Parameters
+    ----------
+    problem : Problem
+    objective : {"time", "effort", "margin"}
+        Least duration; least integral of tau^T tau plus `time_weight` times the duration; or the
+        largest least normal force within `duration`.
+    progress : callable, optional
+        Told in a few words what is being done.
+    **options
+        Other fields of `PlanOptions`: `intervals`, `time_weight`, `duration`, `samples`.
+
+    Returns
+    -------
+    Trajectory
+        Its motions satisfy the equations of motion at any instant.
+
+    Raises
+    ------
+    InputError
+        If an option is out of its range or the problem's phases cannot be traced.
+    InfeasibleError, JammingError, SolverError
+        If there is no plan; the message names the phase, the limit, the place and the time.
+    """
+    return solve_with(problem, PlanOptions(objective=objective, **options), progress)
+
+
+def solve_with(
+    problem: Problem, options: PlanOptions, progress: Callable[[str], None] | None = None
+) -> Trajectory:
+    """Plan with `options` given as one object; see `solve`."""
+    started = time.perf_counter()
+    report = progress or (lambda _: None)
+    report("tracing the phases")
+    curves = trace_phases(problem)
+    traced = time.perf_counter()
+    if options.goal is Objective.MARGIN:
+        fastest = PlanOptions(intervals=options.intervals)
+        least = _plan_phases(problem, curves, fastest, [None] * len(curves), report)
+        allowed = _share_duration(least, options.duration)
+    else:
+        least, allowed = [], [None] * len(curves)
+    plans = _plan_phases(problem, curves, options, allowed, report)
+    planned = time.perf_counter()
+    motions = [plan.motion for plan in plans]
+    values = [plan.value for plan in plans]
+    every = [*least, *plans]
+    nlps = {plan.build_time for plan in every}
+    meta = {
+        "status": "solved",
+        "name": problem.name,
+        "objective": options.goal.value,
+        "value": min(values) if options.goal is Objective.MARGIN else sum(values),
+        "value_unit": UNITS[options.goal],
+        "epsilon": problem.epsilon,
+        "phase_values": values,
+        "phase_durations": [motion.duration for motion in motions],
+        "intervals": options.intervals,
+        "time_weight": options.time_weight,
+        "timings": {
+            "trace": traced - started,
+            "build": sum(nlps),
+            "solve": sum(plan.solve_time for plan in every),
+            "plan": planned - started,
+        },
+        "iterations": [plan.iterations for plan in plans],
+        "solves": [plan.solves for plan in plans],
+        "versions": {
+            "wholearm": __version__,
+            "casadi": ca.__version__,
+            "numpy": np.__version__,
+            "python": ".".join(map(str, sys.version_info[:3])),
+        },
+        "problem": problem.table,
+    }
+    report("sampling")
+    return assemble(motions, _join(plans), meta, options.samples)
+
+
+def _plan_phases(
+    problem: Problem,
+    curves: Sequence[Curve],
+    options: PlanOptions,
+    allowed: Sequence[float | None],
+    report: Callable[[str], None],
+) -> list[PathPlan]:
+    plans = []
+    for phase, curve, duration in zip(problem.phases, curves, allowed, strict=True):
+        report(f"phase {phase.number} of {len(curves)}: {options.goal.value}")
+        plans.append(plan_path(curve, problem.epsilon, options, phase.number, duration))
+    return plans
+
+
+def _share_duration(least: Sequence[PathPlan], duration: float | None) -> list[float | None]:
+    """Longest duration of each phase [s]: the whole, shared in proportion to the least times."""
+    times = [plan.motion.duration for plan in least]
+    total = 2 * sum(times) if duration is None else duration
+    if total <= sum(times):
+        raise InfeasibleError(
+            f"duration = {total:g} s is not longer than the least time, {sum(times):.6g} s"
+        )
+    return [total / sum(times) * own for own in times]
+
+
+def _join(plans: Sequence[PathPlan]) -> TorqueProfile:
+    """Torques of all phases, one after the other."""
+    breaks, start = [np.zeros(1)], 0.0
+    for plan in plans:
+        breaks.append(start + plan.torque.breaks[1:])
+        start += plan.motion.duration
+    coefficients = np.concatenate([plan.torque.coefficients for plan in plans])
+    return TorqueProfile(np.concatenate(breaks), coefficients)
