@@ -39,7 +39,7 @@ Expression = Any
 _PATTERN = re.compile(r"(v|e)(0|[1-9][0-9]*)-(palm|finger([12])|tip([12]))")
 
 
-@dataclass(frozen=True, order=True)
+@dataclass(frozen=True)
 class Contact:
     """An elemental contact between a feature of the object and a part of the hand.
 
@@ -313,7 +313,7 @@ def build_limits(contact: Contact, scene: Scene) -> list[Limit]:
     finger = contact.finger
     if finger is None:
         return []
-    link = build_features(scene).links[contact.finger]
+    link = build_features(scene).links[finger]
     lengths = build_features(scene).edge_lengths
     i, part, count = contact.index, contact.part, len(lengths)
     before, after = (i - 1) % count, (i + 1) % count
@@ -356,8 +356,9 @@ def build_clearance(contact: Contact, scene: Scene, touching: bool) -> Limit:
     """Return the limit at which `contact`, not in the formation, is gained.
 
     A feature beyond the ends of its partner cannot touch it, so its gap does not count there, and
-    a tip that is farther outside another edge cannot touch this one. The exception is a link that already touches a vertex with its side (`touching`): by convexity the
-    whole object then stays on that side of the link's line.
+    a tip that is farther outside another edge cannot touch this one. The exception is a link that
+    already touches a vertex with its side (`touching`): by convexity the whole object then stays
+    on that side of the link's line.
     """
     gap = own = build_gap(contact, scene)
     text = f"{contact.corner} touches {contact.part}"

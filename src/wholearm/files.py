@@ -3,12 +3,28 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Callable
-from pathlib import Path
 from typing import BinaryIO
 
 from .errors import InputError
+
+
+def require_writable(path: str | os.PathLike[str]) -> None:
+    """Check, before long work, that a file can be written at `path`.
+
+    Raises
+    ------
+    InputError
+        If it is a folder, or its folder does not exist or cannot be written to.
+    """
+    target = os.fspath(path)
+    folder = os.path.dirname(os.path.realpath(target))
+    if os.path.isdir(target):
+        raise InputError(target, "", "cannot be written: is a folder")
+    if not os.path.isdir(folder):
+        raise InputError(target, "", f"cannot be written: {folder} is not a folder")
+    if not os.access(folder, os.W_OK) and not _is_special(target):
+        raise InputError(target, "", f"cannot be written: no permission in {folder}")
 
 
 def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object]) -> None:
@@ -17,7 +33,8 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object
     Parameters
     ----------
     path : path-like
-        Where the file is to appear; an existing file is replaced.
+        Where the file is to appear; an existing file is replaced, and what is not a file (a
+        device, a pipe) is written to.
     write : callable
         Receives the open binary file.
 
@@ -26,20 +43,28 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object
     InputError
         If the file cannot be written.
     """
-    target = Path(path)
+    target = os.fspath(path)
     try:
-        handle, name = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
+        if _is_special(target):
+            with open(target, "wb") as stream:
+                write(stream)
+        else:
+            _replace(os.path.realpath(target), write)
     except OSError as error:
-        raise InputError(str(target), "", f"cannot be written: {error.strerror}") from None
+        raise InputError(target, "", f"cannot be written: {error.strerror}") from None
+
+
+def _is_special(target: str) -> bool:
+    return os.path.exists(target) and not os.path.isfile(target) and not os.path.isdir(target)
+
+
+def _replace(target: str, write: Callable[[BinaryIO], object]) -> None:
+    folder, name = os.path.split(target)
+    part = os.path.join(folder, f".{name}.{os.getpid()}.part")
     try:
-        with os.fdopen(handle, "wb") as stream:
+        with open(part, "xb") as stream:
             write(stream)
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(name, 0o666 & ~umask)
-        os.replace(name, target)
-    except OSError as error:
-        raise InputError(str(target), "", f"cannot be written: {error.strerror}") from None
+        os.replace(part, target)
     finally:
-        if os.path.exists(name):
-            os.unlink(name)
+        if os.path.exists(part):
+            os.unlink(part)

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
+from .batch import Batch
 from .contact import (
     Contact,
     Expression,
@@ -91,8 +92,12 @@ class Formation:
         gaps = ca.vertcat(*(part.gap for part in parts))
         A = ca.vertcat(*(part.A for part in parts))
         A_t = ca.vertcat(*(part.A_t for part in parts))
-        A_dot_v = ca.jtimes(A @ v, z, v)
-        return ca.Function("formation", [z, v], [gaps, ca.densify(A), ca.densify(A_t), A_dot_v])
+        outputs = [gaps, A, A_t, ca.jtimes(A @ v, z, v)]
+        return ca.Function("formation", [z, v], [ca.densify(part) for part in outputs])
+
+    @cached_property
+    def _batch(self) -> Batch:
+        return Batch(self.function)
 
     @cached_property
     def limits(self) -> tuple[Limit, ...]:
@@ -106,17 +111,18 @@ class Formation:
         held = [contact for contact in self.contacts if contact.finger == finger]
         on_side = {contact.index for contact in held if contact.surface == "finger"}
         count = self.scene.polygon.n_vertices
-        adjacent = on_side | {(index - 1) % count for index in on_side}
-        tips = [contact for contact in held if contact.surface == "tip"]
-        # A link whose tip touches an edge is outside the edge's line: only the end of the edge
+        # A link that touches a vertex can only turn onto the edge that leads from it to the tip;
+        # one whose tip touches an edge is outside the edge's line, and only the end of the edge
         # that is behind the tip can come to its side.
+        ahead = {(index - (finger or 0)) % count for index in on_side}
+        tips = [contact for contact in held if contact.surface == "tip"]
         behind = {(c.index + (finger or 0)) % count for c in tips if c.feature == "e"}
         limits = []
         for contact in candidate_contacts(self.scene, finger):
             if contact in held:
                 continue
             on_tip = contact.surface == "tip"
-            if on_side and on_tip and not (contact.feature == "e" and contact.index in adjacent):
+            if on_side and on_tip and not (contact.feature == "e" and contact.index in ahead):
                 continue
             if tips and not on_side and (on_tip or contact.index not in behind):
                 continue
@@ -127,7 +133,11 @@ class Formation:
     def limit_function(self) -> Expression:
         """CasADi function z -> values of `limits`, shape (n_limits,) [m]."""
         values = ca.vertcat(*(limit.value for limit in self.limits))
-        return ca.Function("limits", [build_features(self.scene).z], [values])
+        return ca.Function("limits", [build_features(self.scene).z], [ca.densify(values)])
+
+    @cached_property
+    def _limit_batch(self) -> Batch:
+        return Batch(self.limit_function)
 
     def evaluate(self, z: Array, v: Array) -> Kinematics:
         """Evaluate the formation at n configurations.
@@ -137,18 +147,12 @@ class Formation:
         z, v : ndarray, shape (n, 5)
             Configurations, and the velocities for A' v.
         """
-        count, n_c = len(z), self.n_contacts
-        C, A, A_t, A_dot_v = (part.full() for part in self.function(z.T, v.T))
-        return Kinematics(
-            C.T,
-            A.reshape(n_c, count, 5).transpose(1, 0, 2),
-            A_t.reshape(n_c, count, 5).transpose(1, 0, 2),
-            A_dot_v.T,
-        )
+        C, A, A_t, A_dot_v = self._batch(z, v)
+        return Kinematics(C[..., 0], A, A_t, A_dot_v[..., 0])
 
     def evaluate_limits(self, z: Array) -> Array:
         """Values of `limits` at n configurations, shape (n, n_limits) [m]."""
-        return np.asarray(self.limit_function(z.T).full().T)
+        return self._limit_batch(z)[0][..., 0]
 
     def evaluate_gap(self, contact: Contact, z: Array) -> Array:
         """C-function of any contact of the scene at n configurations, shape (n,) [m]."""

@@ -137,9 +137,10 @@ class Curve:
         starts = np.array([panel.s[0] for panel in self.panels])
         owner = np.clip(np.searchsorted(starts, s, side="right") - 1, 0, None)
         z, tangent = np.empty((len(s), 5)), np.empty((len(s), 5))
-        for index in np.unique(owner):
+        for index, panel in enumerate(self.panels):
             mine = owner == index
-            z[mine], tangent[mine] = self.panels[index].interpolate(s[mine])
+            if mine.any():
+                z[mine], tangent[mine] = panel.interpolate(s[mine])
         return z, tangent
 
     @property
@@ -162,7 +163,8 @@ class Curve:
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
         """The curve split wherever a contact's sliding or a joint reverses."""
-        grid = np.unique(np.concatenate([_refine(panel.s, self.length) for panel in self.panels]))
+        grids = [_refine(panel.s, self.length) for panel in self.panels]
+        grid = np.concatenate([grid[index > 0 :] for index, grid in enumerate(grids)])
         rates = self.sliding(grid)
         rates[np.abs(rates) < 1e-9] = 0.0
         breaks = []

@@ -163,7 +163,7 @@ def draw_together(grid: Grid, solid: NDArray[np.int64], misses: Array) -> Grid:
     wanted = np.ones(len(grid.steps))
     wanted[solid] = np.clip(np.sqrt(misses), 1.0, 4.0)
     s = grid.s.copy()
-    for segment in np.unique(grid.segment):
+    for segment in range(int(grid.segment[-1]) + 1):
         mine = np.flatnonzero(grid.segment == segment)
         parts = np.concatenate([[0.0], np.cumsum(wanted[mine[:-1]])])
         s[mine] = np.interp(np.linspace(0.0, parts[-1], len(mine)), parts, grid.s[mine])

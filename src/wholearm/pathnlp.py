@@ -311,7 +311,7 @@ def move_multipliers(
     """Carry multipliers from one grid to another with the same segments."""
     nodes, intervals = np.arange(len(old.s)), nlp.intervals
     place = np.empty(len(nodes))
-    for segment in np.unique(old.segment):
+    for segment in range(int(old.segment[-1]) + 1):
         mine = old.segment == segment
         place[mine] = np.interp(new.s[mine], old.s[mine], nodes[mine])
 

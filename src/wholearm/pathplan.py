@@ -191,13 +191,16 @@ def guess(data: PhaseData) -> tuple[Profile, Scales]:
         low, high = squeeze_range(height)
         return bool((low <= high).all() and (height * shape <= b_max).all())
 
-    height = least = 1e-6 * data.curve.formation.scene.gravity * length + 1e-9
-    while possible(2 * height) and height < 1e6 * least:
-        height *= 2
-    fine = height
-    for _ in range(4):
-        fine *= 2**0.25 if possible(fine * 2**0.25) else 1.0
-    height = 0.7 * fine
+    # Bisection over heights from 2^-12 to 2^8 times that of a fall over this length.
+    low_power, high_power = -12.0, 8.0
+    fall = 2 * data.curve.formation.scene.gravity * length + 1e-9
+    for _ in range(7):
+        power = (low_power + high_power) / 2
+        if possible(fall * 2**power):
+            low_power = power
+        else:
+            high_power = power
+    height = 0.7 * fall * 2**low_power
     low, high = squeeze_range(height)
     middle = np.where(np.isfinite(low + high), (low + high) / 2, 0.0)
     duration = np.pi / 2 * length / np.sqrt(height)

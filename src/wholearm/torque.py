@@ -48,6 +48,23 @@ class TorqueProfile:
         powers = x[:, None] ** np.arange(self.coefficients.shape[2])
         return np.asarray(np.einsum("njd,nd->nj", self.coefficients[piece], powers))
 
+    def rows(self, times: Array) -> Array:
+        """Rows (t, tau_1, tau_2) at `times` and at every break, where two rows make a step.
+
+        Joined by straight lines they give the torques back up to the curvature between rows.
+        """
+        middle = (self.breaks[1:] + self.breaks[:-1]) / 2
+        rows = []
+        for k, (start, stop) in enumerate(zip(self.breaks[:-1], self.breaks[1:], strict=True)):
+            inner = times[(times > start) & (times < stop)]
+            t = np.concatenate([[start], inner, [stop]])
+            x = (t - middle[k]) / ((stop - start) / 2)
+            tau = x[:, None] ** np.arange(self.coefficients.shape[2]) @ self.coefficients[k].T
+            rows.append(np.column_stack([t, tau]))
+        table = np.concatenate(rows)
+        same = (np.abs(np.diff(table, axis=0)) <= [0.0, 1e-6, 1e-6]).all(axis=1)
+        return np.asarray(table[np.append(True, ~same)])
+
     @staticmethod
     def fit(breaks: Array, function: Callable[[Array], Array], degree: int) -> TorqueProfile:
         """Interpolate `function`, t -> (n, 2) [N m], at Chebyshev nodes of each piece.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .errors import InputError
 from .files import write_whole
 from .model import Array
-from .torque import TorqueProfile
+from .torque import COLUMNS, TorqueProfile
 
 
 class Samples(NamedTuple):
@@ -154,6 +154,19 @@ class Trajectory:
         arrays["meta"] = np.array(json.dumps(dict(self.meta)))
         write_whole(path, lambda stream: np.savez(stream, **arrays))
 
+    def save_torques(self, path: str | os.PathLike[str]) -> None:
+        """Write the torques as CSV, ``t,tau1,tau2``, a repeated time being a step.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be written.
+        """
+        rows = self.torque.rows(self.t)
+        lines = [",".join(COLUMNS), *(",".join(map(repr, row)) for row in rows.tolist())]
+        text = "\n".join(lines) + "\n"
+        write_whole(path, lambda stream: stream.write(text.encode()))
+
 
 _ARRAYS = {
     "t": (), "q": (3,), "theta": (2,), "q_dot": (3,), "theta_dot": (2,), "q_ddot": (3,),
@@ -240,22 +253,28 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     """
     source = str(path)
     try:
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}
+        with open(path, "rb") as stream:
+            data = np.load(stream, allow_pickle=False)
+            if not isinstance(data, np.lib.npyio.NpzFile):
+                raise InputError(source, "", "is not a trajectory file: one array, no archive")
+            arrays = {name: np.asarray(data[name]) for name in data.files}
     except OSError as error:
         raise InputError(source, "", f"cannot be read: {error.strerror or error}") from None
     except (ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(source, "", f"is not a trajectory file: {error}") from None
-    extra = {"contacts": (), "torque_breaks": (), "torque_coefficients": (2, -1), "meta": None}
-    for name, shape in (_ARRAYS | extra).items():
+    extra = {"contacts": (), "torque_breaks": (), "torque_coefficients": (2, -1)}
+    for name in (*_ARRAYS, *extra, "meta"):
         if name not in arrays:
             raise InputError(source, name, "array is missing")
-        if shape is not None:
-            _check_shape(source, name, arrays, shape)
+    for name, shape in (_ARRAYS | extra).items():
+        _check_shape(source, name, arrays, shape)
+    _check_order(source, arrays)
     try:
         meta = json.loads(str(arrays["meta"]))
     except json.JSONDecodeError as error:
         raise InputError(source, "meta", f"is not JSON: {error}") from None
+    if not isinstance(meta, dict):
+        raise InputError(source, "meta", "is not a JSON object")
     contacts = tuple(str(name) for name in arrays["contacts"])
     known = {name: arrays[name] for name in _ARRAYS}
     torque = TorqueProfile(arrays["torque_breaks"], arrays["torque_coefficients"])
@@ -265,15 +284,38 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
 
 def _check_shape(source: str, name: str, arrays: Mapping[str, Any], tail: tuple[int, ...]) -> None:
     array = arrays[name]
-    rows = len(arrays["t"]) if name in _ARRAYS else len(array) if array.ndim else -1
-    widths = (len(arrays["contacts"]),) if name in ("c_n", "c_t") else tail
+    rows = arrays["t"].size if name in _ARRAYS else array.shape[0] if array.ndim else 1
+    widths = (arrays["contacts"].size,) if name in ("c_n", "c_t") else tail
     fits = array.ndim == 1 + len(widths) and array.shape[0] == rows
     fits = fits and all(w in (-1, n) for w, n in zip(widths, array.shape[1:], strict=True))
     if not fits:
         needed = ", ".join(str(n) if n >= 0 else "any" for n in (rows, *widths))
         raise InputError(source, name, f"shape {array.shape} given, ({needed}) needed")
-    if name not in ("c_n", "c_t", "contacts") and not np.isfinite(array).all():
+    if name == "contacts":
+        if array.dtype.kind != "U":
+            raise InputError(source, name, "does not hold text")
+    elif array.dtype.kind not in ("iu" if name == "phase" else "iuf"):
+        raise InputError(source, name, f"holds {array.dtype}; numbers are needed")
+    elif np.isinf(array).any() or (name not in ("c_n", "c_t") and np.isnan(array).any()):
         raise InputError(source, name, "holds numbers that are not finite")
+
+
+def _check_order(source: str, arrays: Mapping[str, Any]) -> None:
+    """Check that phases follow one another, and that time increases within each."""
+    phase, t = arrays["phase"], arrays["t"]
+    known, counts = np.unique(phase, return_counts=True)
+    in_order = len(phase) and known[-1] == len(known) - 1 and (np.diff(phase) >= 0).all()
+    if not in_order or known[0] != 0 or (counts < 2).any():
+        raise InputError(source, "phase", "must count up from 0, with two or more rows to a phase")
+    steps = np.diff(t)
+    if t[0] != 0 or (steps < 0).any() or (steps[np.diff(phase) == 0] == 0).any():
+        raise InputError(source, "t", "must start at 0 and increase within each phase")
+    breaks = arrays["torque_breaks"]
+    if len(breaks) < 2 or (np.diff(breaks) <= 0).any():
+        raise InputError(source, "torque_breaks", "must be two or more, and increase")
+    if len(arrays["torque_coefficients"]) != len(breaks) - 1:
+        given, needed = len(arrays["torque_coefficients"]), len(breaks) - 1
+        raise InputError(source, "torque_coefficients", f"{given} pieces given, {needed} needed")
 
 
 def _sampled_motion(

@@ -1,0 +1,219 @@
+"""The command line: ``wholearm solve|verify|plot|bench``.
+
+Exit status 0 means done and all contacts held, 1 infeasible or a contact lost or a goal missed,
+2 bad input. Each command imports what it needs and nothing else.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NoReturn
+
+from .errors import InputError, WholearmError
+
+if TYPE_CHECKING:
+    from .torque import TorqueProfile
+    from .trajectory import Trajectory
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise InputError("", "", f"{message}; see {self.prog} --help")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command and return its exit status."""
+    try:
+        options = build_parser().parse_args(arguments)
+        status: int = options.run(options)
+        sys.stdout.flush()
+        return status
+    except WholearmError as error:
+        _clear_progress()
+        print(f"wholearm: {error}", file=sys.stderr)
+        return error.exit_status
+    except BrokenPipeError:
+        # The reader has gone; keep the interpreter from complaining again when it exits.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except KeyboardInterrupt:
+        _clear_progress()
+        print("wholearm: interrupted", file=sys.stderr)
+        return 130
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands."""
+    parser = _Parser(prog="wholearm", description="Plan and verify whole-arm manipulation.")
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+
+    solve = _command(commands, "solve", _solve, "plan joint torques for a problem file")
+    solve.add_argument("problem", help="problem file (TOML)")
+    solve.add_argument("-o", "--output", help="trajectory file to write (default: NAME.npz)")
+    solve.add_argument("--torques", metavar="FILE", help="also write the torques as CSV")
+    solve.add_argument("--objective", default="time", help="time, effort or margin (default: time)")
+    solve.add_argument("--intervals", type=int, help="intervals of each phase's grid")
+    solve.add_argument("--duration", type=float, help="longest duration [s], for margin")
+    solve.add_argument("--time-weight", type=float, help="weight of time [(N m)^2], for effort")
+    solve.add_argument("--samples", type=int, help="rows per phase of the trajectory file")
+    solve.add_argument("--json", action="store_true", help="print the summary as JSON")
+
+    verify = _command(commands, "verify", _verify, "replay torques open loop and check the motion")
+    verify.add_argument("problem", help="problem file (TOML)")
+    verify.add_argument("torques", help="trajectory file (.npz) or torques (.csv: t,tau1,tau2)")
+    verify.add_argument("--tolerance", type=float, default=1e-9, help="of the simulator (1e-9)")
+    verify.add_argument("--json", action="store_true", help="print the report as JSON")
+
+    plot = _command(commands, "plot", _plot, "draw force margins, torques and snapshots")
+    plot.add_argument("trajectory", help="trajectory file (.npz)")
+    plot.add_argument("-o", "--output", required=True, help="figure to write (.png, .pdf, .svg)")
+    plot.add_argument("--simulate", action="store_true", help="overlay the simulated forces")
+
+    bench = _command(commands, "bench", _bench, "measure run time against error")
+    bench.add_argument("problem", help="problem file (TOML)")
+    bench.add_argument("-o", "--output", default="results", help="folder for tables and figures")
+    return parser
+
+
+def _command(
+    commands: argparse._SubParsersAction[_Parser],
+    name: str,
+    run: Callable[[argparse.Namespace], int],
+    text: str,
+) -> argparse.ArgumentParser:
+    parser = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
+    parser.set_defaults(run=run)
+    return parser
+
+
+class _Version(argparse.Action):
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from . import __version__
+
+        print(f"wholearm {__version__}")
+        parser.exit()
+
+
+def _solve(options: argparse.Namespace) -> int:
+    from .files import require_writable
+    from .options import PlanOptions
+    from .path import load
+    from .plan import solve_with
+
+    output = options.output or _stem(options.problem) + ".npz"
+    given = {
+        key: getattr(options, key)
+        for key in ("objective", "intervals", "duration", "time_weight", "samples")
+        if getattr(options, key) is not None
+    }
+    plan_options = PlanOptions(**given)
+    for path in (output, options.torques):
+        if path is not None:
+            require_writable(path)
+    trajectory = solve_with(load(options.problem), plan_options, _progress())
+    trajectory.save(output)
+    if options.torques is not None:
+        trajectory.save_torques(options.torques)
+    _clear_progress()
+    if options.json:
+        print(json.dumps(dict(trajectory.meta), indent=2))
+    else:
+        print(_summarise(trajectory, output))
+    return 0
+
+
+def _stem(path: str) -> str:
+    return os.path.splitext(os.path.basename(path))[0]
+
+
+def _summarise(trajectory: Trajectory, output: str) -> str:
+    meta = trajectory.meta
+    lines = [
+        f"{'phase':>5}  {'duration [s]':>12}  {'least c_n [N]':>13}  {'largest |tau| [N m]':>19}"
+    ]
+    for index, duration in enumerate(meta["phase_durations"]):
+        rows = trajectory.phase == index
+        c_n = trajectory.c_n[rows]
+        least = c_n[c_n == c_n].min()
+        torque = abs(trajectory.tau[rows]).max()
+        lines.append(f"{index + 1:>5}  {duration:>12.6f}  {least:>13.6f}  {torque:>19.6f}")
+    value = f"{meta['objective']} = {meta['value']:.6f} {meta['value_unit']}"
+    return "\n".join([*lines, f"{value}, {trajectory.duration:.6f} s in all; wrote {output}"])
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from .model import require_number
+    from .path import load
+    from .verify import verify
+
+    tolerance = require_number(options.tolerance, "--tolerance", positive=True)
+    problem = load(options.problem)
+    report = verify(problem, _read_torques(options.torques), tolerance=tolerance)
+    _clear_progress()
+    print(json.dumps(report.to_dict(), indent=2) if options.json else report.to_text())
+    return report.exit_status
+
+
+def _read_torques(path: str) -> Trajectory | TorqueProfile:
+    from .torque import read_torque_csv
+    from .trajectory import load_trajectory
+
+    ending = os.path.splitext(path)[1].lower()
+    if ending == ".csv":
+        return read_torque_csv(path)
+    if ending == ".npz":
+        return load_trajectory(path)
+    raise InputError(path, "", f"ending {ending!r} given; allowed are .npz and .csv")
+
+
+def _plot(options: argparse.Namespace) -> int:
+    from . import plots
+    from .files import require_writable
+    from .trajectory import load_trajectory
+
+    plots.require_format(options.output)
+    require_writable(options.output)
+    trajectory = load_trajectory(options.trajectory)
+    simulation = None
+    if options.simulate:
+        from .problem import build_problem
+        from .simulate import simulate
+
+        problem = build_problem(trajectory.meta["problem"], options.trajectory)
+        simulation = simulate(problem, trajectory.torque, progress=_progress())
+    plots.save(plots.force_margins(trajectory, simulation=simulation), options.output)
+    _clear_progress()
+    print(f"wrote {options.output}")
+    return 0
+
+
+def _bench(options: argparse.Namespace) -> int:
+    from .bench import run_bench
+    from .path import load
+
+    written = run_bench(load(options.problem), options.output, progress=_progress())
+    _clear_progress()
+    for path in written:
+        print(f"wrote {path}")
+    return 0
+
+
+def _progress() -> Callable[[str], None] | None:
+    """A progress line on stderr when that is a terminal."""
+    if not sys.stderr.isatty():
+        return None
+
+    def show(text: str) -> None:
+        print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
+
+    return show
+
+
+def _clear_progress() -> None:
+    if sys.stderr.isatty():
+        print("\r\033[K", end="", file=sys.stderr, flush=True)
