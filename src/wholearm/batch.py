@@ -28,12 +28,15 @@ class Batch:
         self._arguments = [np.zeros((SIZE, function.size1_in(i))) for i in range(function.n_in())]
         shapes = [function.size_out(i) for i in range(function.n_out())]
         self._results = [np.zeros((SIZE, columns, rows)) for rows, columns in shapes]
-        # The buffer keeps raw pointers, so it has to live as long as the arrays.
-        self._buffer, self._trigger = mapped.buffer()
+        # Both buffers keep raw pointers into the same arrays, so they have to live as long.
+        self._many, self._run_many = mapped.buffer()
+        self._one, self._run_one = function.buffer()
         for i, argument in enumerate(self._arguments):
-            self._buffer.set_arg(i, memoryview(argument))
+            self._many.set_arg(i, argument.data)
+            self._one.set_arg(i, argument[0].data)
         for i, result in enumerate(self._results):
-            self._buffer.set_res(i, memoryview(result))
+            self._many.set_res(i, result.data)
+            self._one.set_res(i, result[0].data)
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate at n points.
@@ -54,7 +57,7 @@ class Batch:
             stop = min(start + SIZE, count)
             for store, argument in zip(self._arguments, arguments, strict=True):
                 store[: stop - start] = argument[start:stop]
-            self._trigger()
+            (self._run_one if stop - start == 1 else self._run_many)()
             for output, result in zip(outputs, self._results, strict=True):
                 output[start:stop] = result[: stop - start]
         return [output.transpose(0, 2, 1) for output in outputs]

@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .curve import Curve, describe_pose
 from .dynamics import PathForces, inverse, reduced_inertia
 from .errors import JammingError
 from .model import Array
-from .path import Curve, describe_pose
 from .pathmotion import Grid, PathMotion, Profile, directions_of
 from .torque import TorqueProfile
 
@@ -101,6 +101,15 @@ class PhaseData(NamedTuple):
         speeding = np.maximum(here.b / self.largest_b(self.looks) - 1, 0.0)
         shape = (len(self.solid), len(LOOKS))
         return short.reshape(*shape, -1).max(axis=1), speeding.reshape(shape).max(axis=1)
+
+    def slack_beside(self, profile: Profile, margin: float, short: Array) -> Array:
+        """The lesser slack of the two nodes of each solid interval, shape (n_solid, n_c + 4).
+
+        Zero where nothing is `short` in the interval.
+        """
+        slack = self.slack(self.nodes, profile, margin)
+        least = np.minimum(slack[self.solid], slack[self.solid + 1])
+        return np.where(short > 0, np.maximum(least, 0.0), 0.0)
 
     def beside(self, inside: Array) -> Array:
         """The larger value of the two solid intervals beside each node, shape (N + 1, ...)."""

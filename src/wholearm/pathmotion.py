@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .curve import Curve
 from .dynamics import Directions, inverse
 from .model import Array
-from .path import Curve
 from .trajectory import Samples
 
 

@@ -48,8 +48,9 @@ _IPOPT = {
     # The default relaxes every bound by 1e-8, so that limits would be missed with success.
     "bound_relax_factor": 0.0,
     "fast_step_computation": "yes",
-    # Without this the ordering, and so the iterates, can differ between machines.
+    # A fixed ordering: the automatic one can differ between machines, and is slow on long grids.
     "mumps_permuting_scaling": 0,
+    "mumps_pivot_order": 0,
     # Together these make a repeated solve take two or three iterations.
     "mu_strategy": "adaptive",
     "mu_oracle": "probing",
@@ -100,10 +101,14 @@ class Tightening(NamedTuple):
         limits = np.zeros((count, data.curve.formation.n_contacts + 4))
         return Tightening(limits, np.ones(count), duration)
 
-    def by(self, limits: Array, speed_share: Array, late: float) -> Tightening:
-        """Tighten further: limits by so much, b and the duration by a relative amount."""
+    def by(self, reach: Array, limits: Array, speed_share: Array, late: float) -> Tightening:
+        """Tighten further: limits by so much, b and the duration by a relative amount.
+
+        Limits are first raised to `reach`, as what is slack already would not feel the rest.
+        """
         duration = None if self.duration is None else self.duration * (1 - late)
-        return Tightening(self.limits + limits, self.speed_share * (1 - speed_share), duration)
+        raised = np.maximum(self.limits, reach) + limits
+        return Tightening(raised, self.speed_share * (1 - speed_share), duration)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,8 +206,10 @@ def build_path_nlp(n_contacts: int, intervals: int, objective: Objective) -> Pat
     )
     parameters = ca.vertcat(ends, h, weight, *(ca.vec(block) for block in coefficients))
     nlp = {"x": x, "p": parameters, "f": cost + calm, "g": constraints}
+    # Started from nowhere near its optimum, the elastic NLP needs the more robust strategy.
+    strategy = {"mu_strategy": "monotone"} if elastic else {}
     options = {
-        "ipopt": _IPOPT,
+        "ipopt": _IPOPT | strategy,
         "print_time": False,
         "record_time": True,
         "calc_lam_p": False,
@@ -281,9 +288,13 @@ def first_multipliers(
     }
 
 
-def pack(nlp: PathNLP, profile: Profile, scales: Scales, margin: float) -> Array:
-    """Unknowns of the NLP, in its units, from a profile."""
+def pack(
+    nlp: PathNLP, profile: Profile, scales: Scales, margin: float, short: Array | None = None
+) -> Array:
+    """Unknowns of the NLP, in its units, from a profile and (elastic) shortfalls [N, N m]."""
     table = np.zeros((len(profile.a), nlp.columns))
+    if short is not None:
+        table[:, 3:] = short / np.repeat([scales.force, 1.0], [nlp.n_contacts, 2])
     table[:, :3] = np.column_stack([profile.b, profile.a, profile.squeeze]) / scales.profile
     last = [margin / scales.force] if nlp.objective is Objective.MARGIN else []
     return np.concatenate([table[nlp.free], last])

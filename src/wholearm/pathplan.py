@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .curve import Curve, describe_pose
 from .errors import InfeasibleError, SolverError
 from .model import Array
 from .options import Objective, PlanOptions
-from .path import Curve, describe_pose
 from .pathdata import PhaseData, fit_torque, prepare
 from .pathmotion import PathMotion, Profile, draw_together, make_grid
 from .pathnlp import (
@@ -34,7 +34,7 @@ from .torque import TorqueProfile
 
 MISS = 5e-7
 """Largest miss of a force or torque limit between nodes [N or N m]; of b and T, relative."""
-ROUNDS = 15
+ROUNDS = 40
 """Most times that the NLP is solved for one phase."""
 _COARSE = 1.5e-4
 """Miss, over the typical force, above which the grid is drawn together."""
@@ -126,8 +126,9 @@ def plan_path(
                 multipliers=move_multipliers(nlp, solution.multipliers, old, grid),
             )
         else:
+            reach = data.beside(data.slack_beside(profile, margin, short))
             short, speeding = data.beside(short), data.beside(speeding)
-            tightening = tightening.by(_OVER * short, _OVER * speeding, _OVER * late)
+            tightening = tightening.by(reach, _OVER * short, _OVER * speeding, _OVER * late)
     else:
         raise SolverError(
             f"phase {phase}: after {ROUNDS} solves limits are still missed by {short.max():.2g} N "
@@ -202,9 +203,10 @@ def guess(data: PhaseData) -> tuple[Profile, Scales]:
             high_power = power
     height = 0.7 * fall * 2**low_power
     low, high = squeeze_range(height)
-    middle = np.where(np.isfinite(low + high), (low + high) / 2, 0.0)
+    middle = np.where(np.isfinite(low + high) & (low <= high), (low + high) / 2, 0.0)
     duration = np.pi / 2 * length / np.sqrt(height)
-    scales = Scales(length, 0.6 * duration, max(1.0, float(np.abs(middle).mean())))
+    force = max(1.0, data.epsilon, float(np.abs(middle).mean()))
+    scales = Scales(length, 0.6 * duration, force)
     return Profile(height * slope, height * shape, middle), scales
 
 
@@ -214,15 +216,13 @@ def explain(data: PhaseData, phase: int, status: str) -> InfeasibleError | Solve
     nlp = build_path_nlp(formation.n_contacts, len(data.grid.s) - 1, Objective.ELASTIC)
     profile, scales = guess(data)
     bounds = make_bounds(nlp, data, scales, Tightening.none(data, None))
-    start = pack(nlp, profile, scales, 0.0)
+    short = np.maximum(_shortfalls(data, profile), 0.0) + 0.1
+    start = pack(nlp, profile, scales, 0.0, short)
     result = nlp.solver(x0=start, p=parameters(nlp, data, scales, 1.0), **bounds)
     if not nlp.solver.stats()["success"]:
         return SolverError(f"phase {phase}: Ipopt stopped with {status}")
     profile, _ = unpack(nlp, data.grid, result["x"].full()[:, 0], scales)
-    slack = data.slack(data.nodes, profile)
-    n_c = formation.n_contacts
-    torque = np.minimum(slack[:, n_c : n_c + 2], slack[:, n_c + 2 :])
-    short = -np.hstack([slack[:, :n_c], torque])
+    short, n_c = _shortfalls(data, profile), formation.n_contacts
     if short.max() < 1e-4:
         return SolverError(
             f"phase {phase}: Ipopt stopped with {status} although limits can be kept"
@@ -241,3 +241,10 @@ def explain(data: PhaseData, phase: int, status: str) -> InfeasibleError | Solve
                 f"t = {times[worst]:.4f} s ({describe_pose(z[worst])})"
             )
     return InfeasibleError(f"phase {phase} is infeasible: {'; '.join(parts)}")
+
+
+def _shortfalls(data: PhaseData, profile: Profile) -> Array:
+    """By how much c_n and tau miss their limits at the nodes, shape (n, n_c + 2) [N, N m]."""
+    slack = data.slack(data.nodes, profile)
+    c_n, torque = slack[:, :-4], np.minimum(slack[:, -4:-2], slack[:, -2:])
+    return -np.hstack([c_n, torque])

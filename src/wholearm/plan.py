@@ -14,9 +14,10 @@ import casadi as ca
 import numpy as np
 
 from . import __version__
+from .curve import Curve
 from .errors import InfeasibleError
 from .options import Objective, PlanOptions
-from .path import Curve, trace_phases
+from .path import trace_phases
 from .pathplan import PathPlan, plan_path
 from .problem import Problem
 from .torque import TorqueProfile

@@ -48,20 +48,19 @@ class TorqueProfile:
         powers = x[:, None] ** np.arange(self.coefficients.shape[2])
         return np.asarray(np.einsum("njd,nd->nj", self.coefficients[piece], powers))
 
-    def rows(self, times: Array) -> Array:
-        """Rows (t, tau_1, tau_2) at `times` and at every break, where two rows make a step.
+    def rows(self, per_piece: int) -> Array:
+        """Rows (t, tau_1, tau_2), `per_piece` + 1 on each piece, two at a break where it steps.
 
         Joined by straight lines they give the torques back up to the curvature between rows.
         """
-        middle = (self.breaks[1:] + self.breaks[:-1]) / 2
-        rows = []
-        for k, (start, stop) in enumerate(zip(self.breaks[:-1], self.breaks[1:], strict=True)):
-            inner = times[(times > start) & (times < stop)]
-            t = np.concatenate([[start], inner, [stop]])
-            x = (t - middle[k]) / ((stop - start) / 2)
-            tau = x[:, None] ** np.arange(self.coefficients.shape[2]) @ self.coefficients[k].T
-            rows.append(np.column_stack([t, tau]))
-        table = np.concatenate(rows)
+        x = np.linspace(-1.0, 1.0, per_piece + 1)
+        tau = np.einsum(
+            "kjd,nd->knj", self.coefficients, x[:, None] ** np.arange(self.coefficients.shape[2])
+        )
+        middle, half = (self.breaks[1:] + self.breaks[:-1]) / 2, np.diff(self.breaks) / 2
+        t = middle[:, None] + half[:, None] * x
+        t[:, 0], t[:, -1] = self.breaks[:-1], self.breaks[1:]
+        table = np.concatenate([t[..., None], tau], axis=2).reshape(-1, 3)
         same = (np.abs(np.diff(table, axis=0)) <= [0.0, 1e-6, 1e-6]).all(axis=1)
         return np.asarray(table[np.append(True, ~same)])
 

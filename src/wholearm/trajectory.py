@@ -162,11 +162,14 @@ class Trajectory:
         InputError
             If the file cannot be written.
         """
-        rows = self.torque.rows(self.t)
+        rows = self.torque.rows(ROWS)
         lines = [",".join(COLUMNS), *(",".join(map(repr, row)) for row in rows.tolist())]
         text = "\n".join(lines) + "\n"
         write_whole(path, lambda stream: stream.write(text.encode()))
 
+
+ROWS = 20
+"""Rows of a torque CSV per piece: their straight lines then replay to about a micrometre."""
 
 _ARRAYS = {
     "t": (), "q": (3,), "theta": (2,), "q_dot": (3,), "theta_dot": (2,), "q_ddot": (3,),

@@ -1,0 +1,278 @@
+"""Run time against error: of the planner, of the simulator, and of plain baselines beside them."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from .baseline_opti import plan_with_opti
+from .baseline_simulation import simulate_with_scipy
+from .benchreport import Row, write_results
+from .curve import Curve
+from .errors import InputError
+from .events import Simulation
+from .model import Array
+from .options import Objective, PlanOptions
+from .path import load, trace_phases
+from .pathdata import prepare
+from .pathmotion import PathMotion, make_grid
+from .pathnlp import build_path_nlp
+from .pathplan import guess, plan_path
+from .plan import solve
+from .problem import Problem
+from .simulate import simulate
+from .torque import TorqueProfile
+
+INTERVALS = (10, 20, 40, 80, 160, 320, 640, 800)
+FINE = 1600
+TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
+FINEST = 1e-13
+SCIPY_METHODS = ("DOP853", "RK45")
+BASELINE_INTERVALS = 40
+REPEATS = 3
+
+
+def run_bench(
+    problem: Problem, folder: str, progress: Callable[[str], None] | None = None
+) -> list[str]:
+    """Measure everything and write a table (Markdown, CSV) and a figure (PNG).
+
+    Parameters
+    ----------
+    problem : Problem
+    folder : str
+        Made if it does not exist.
+    progress : callable, optional
+        Told what is being measured.
+
+    Returns
+    -------
+    list of str
+        The files written.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be made or written to.
+    """
+    try:
+        os.makedirs(folder, exist_ok=True)
+    except OSError as error:
+        raise InputError(folder, "", f"cannot be made: {error.strerror}") from None
+    report = progress or (lambda _: None)
+    studies: list[Callable[[Problem], list[Row]]] = [
+        measure_planner,
+        measure_simulator,
+        measure_baseline,
+        measure_parts,
+    ]
+    rows: list[Row] = []
+    for study in studies:
+        report(f"bench: {study.__name__.removeprefix('measure_')}")
+        rows += study(problem)
+    stem = os.path.splitext(os.path.basename(problem.source or problem.name))[0]
+    return write_results(problem.name, rows, os.path.join(folder, f"bench_{stem}"))
+
+
+def measure_planner(problem: Problem) -> list[Row]:
+    """Planner over the number of intervals, building included.
+
+    The error of the phase time is the largest relative one against a fine solution; that of the
+    simulated end is the largest difference of any z between plan and simulation at a phase's end.
+    """
+    curves = trace_phases(problem)
+    fine = _plan_times(problem, curves, FINE)
+    rows = []
+    for intervals in INTERVALS:
+        seconds = []
+        for _ in range(REPEATS):
+            build_path_nlp.cache_clear()
+            started = time.perf_counter()
+            times = _plan_times(problem, curves, intervals)
+            seconds.append(time.perf_counter() - started)
+        trajectory = solve(problem, intervals=intervals)
+        ends = trajectory.phase_starts[1:]
+        simulation = simulate(problem, trajectory.torque, tolerance=1e-11, times=ends)
+        missed = 0.0
+        for index, end in enumerate(ends):
+            planned = trajectory.motions[index].evaluate(
+                np.array([end]) - ends[index - 1] * (index > 0)
+            )
+            nearest = np.flatnonzero(simulation.phase == index)[-1]
+            missed = max(missed, float(np.abs(planned.z[0] - simulation.z[nearest]).max()))
+        error = float(np.abs(times / fine - 1).max())
+        median = statistics.median(seconds)
+        rows.append(Row("planner: phase time", "path NLP", str(intervals), median, error))
+        rows.append(Row("planner: simulated end", "path NLP", str(intervals), median, missed))
+    return rows
+
+
+def _plan_times(problem: Problem, curves: Sequence[Curve], intervals: int) -> Array:
+    options = PlanOptions(intervals=intervals)
+    plans = [
+        plan_path(curve, problem.epsilon, options, phase.number)
+        for phase, curve in zip(problem.phases, curves, strict=True)
+    ]
+    return np.array([plan.motion.duration for plan in plans])
+
+
+def measure_simulator(problem: Problem) -> list[Row]:
+    """Simulator over its tolerance, and SciPy's `solve_ivp` on plain NumPy callbacks.
+
+    Both replay smooth torques over all phases, SciPy stretch by stretch between reversals from
+    exact states. The error is the largest of any z or z' shortly before the end of a stretch.
+    """
+    motions = [_cosine_motion(curve, problem.epsilon) for curve in trace_phases(problem)]
+    torque, marks = _smooth_torque(motions)
+    looks = marks[:-1] + 0.95 * np.diff(marks)
+    times = np.sort(np.concatenate([marks, looks]))
+    exact = simulate(problem, torque, tolerance=FINEST, times=times)
+    wanted, starts = _states_at(exact, looks), _states_at(exact, marks[:-1])
+    rows = []
+    for tolerance in TOLERANCES:
+        seconds = []
+        for _ in range(REPEATS):
+            started = time.perf_counter()
+            run = simulate(problem, torque, tolerance=tolerance, times=looks)
+            seconds.append(time.perf_counter() - started)
+        error = float(np.abs(_states_at(run, looks) - wanted).max())
+        median = statistics.median(seconds)
+        rows.append(
+            Row("simulator", "wholearm", f"{tolerance:g}", median, error, f"{run.steps} steps")
+        )
+    stretches = [(i, part) for i, motion in enumerate(motions) for part in motion.curve.segments]
+    for method, tolerance in itertools.product(SCIPY_METHODS, TOLERANCES):
+        started = time.perf_counter()
+        error, calls = 0.0, 0
+        for k, (index, part) in enumerate(stretches):
+            plain = simulate_with_scipy(
+                problem,
+                index,
+                torque,
+                starts[k, :5],
+                starts[k, 5:],
+                part.Xi,
+                part.sigma,
+                (marks[k], looks[k]),
+                rtol=tolerance,
+                atol=tolerance,
+                method=method,
+            )
+            calls += plain.evaluations
+            end = np.append(plain.z[-1], plain.z_dot[-1])
+            error = max(error, float(np.abs(end - wanted[k]).max()))
+        elapsed = time.perf_counter() - started
+        note = f"{calls} evaluations"
+        rows.append(Row("simulator", f"SciPy {method}", f"{tolerance:g}", elapsed, error, note))
+    return rows
+
+
+def _cosine_motion(curve: Curve, epsilon: float) -> PathMotion:
+    """A slow smooth motion with its squeeze amid the range that limits allow."""
+    data = prepare(curve, epsilon, make_grid(curve, 3 + len(curve.segments)), 0)
+    profile, _ = guess(data)
+    slow = 0.3
+    calm = profile._replace(a=slow * profile.a, b=slow * profile.b)
+    return PathMotion(curve, data.grid, calm)
+
+
+def _smooth_torque(motions: Sequence[PathMotion]) -> tuple[TorqueProfile, Array]:
+    """Torques of motions one after the other in a few long pieces, and where segments meet [s]."""
+    breaks, blocks, marks, start = [np.zeros(1)], [], [0.0], 0.0
+    for motion in motions:
+        solid = np.append(motion.grid.steps > 0, True)
+        own = motion.times[solid]
+        profile = TorqueProfile.fit(own, lambda t, m=motion: m.evaluate(t).tau, 14)  # type: ignore[misc]
+        breaks.append(start + own[1:])
+        blocks.append(profile.coefficients)
+        last = np.flatnonzero(np.diff(motion.grid.segment, append=-1))
+        marks += (start + motion.times[last]).tolist()
+        start += motion.duration
+    return TorqueProfile(np.concatenate(breaks), np.concatenate(blocks)), np.array(marks)
+
+
+def _states_at(simulation: Simulation, times: Array) -> Array:
+    """States (z, z') of a simulation at instants it was asked for, shape (n, 10)."""
+    return np.array([np.concatenate(simulation.at(t)) for t in times])
+
+
+def measure_baseline(problem: Problem) -> list[Row]:
+    """Plain time-domain transcription of the same phases, and ours beside it."""
+    rows = []
+    options = PlanOptions()
+    total, theirs = 0.0, 0.0
+    for phase, curve in zip(problem.phases, trace_phases(problem), strict=True):
+        build_path_nlp.cache_clear()
+        started = time.perf_counter()
+        ours = plan_path(curve, problem.epsilon, options, phase.number)
+        elapsed = time.perf_counter() - started
+        plain = plan_with_opti(curve, problem.epsilon, BASELINE_INTERVALS)
+        fine = plan_path(curve, problem.epsilon, PlanOptions(intervals=FINE), phase.number)
+        least = fine.motion.duration
+        took = plain.build_time + plain.solve_time
+        number = f"phase {phase.number}"
+        excess = ours.motion.duration / least - 1
+        note = f"T = {ours.motion.duration:.6f} s, {ours.iterations} iterations"
+        rows.append(Row("least time", "path NLP", number, elapsed, excess, note))
+        note = f"T = {plain.duration:.6f} s, {plain.iterations} iterations, {plain.status}"
+        rows.append(Row("least time", "plain Opti", number, took, plain.duration / least - 1, note))
+        total += elapsed
+        theirs += took
+    rows.append(Row("least time", "path NLP", "all phases", total, None, "one build per phase"))
+    rows.append(
+        Row("least time", "plain Opti", "all phases", theirs, None, f"{theirs / total:.0f} x")
+    )
+    return rows
+
+
+def measure_parts(problem: Problem) -> list[Row]:
+    """What the parts of planning cost, and the whole process against importing its libraries."""
+    rows = []
+
+    def timed(name: str, run: Callable[[], Any], before: Callable[[], object] = int) -> Any:
+        seconds, result = [], None
+        for _ in range(REPEATS):
+            before()
+            started = time.perf_counter()
+            result = run()
+            seconds.append(time.perf_counter() - started)
+        rows.append(Row("parts", name, "", statistics.median(seconds), None))
+        return result
+
+    def forget() -> None:
+        build_path_nlp.cache_clear()
+        trace_phases.cache_clear()
+
+    if problem.source:
+        timed("read and trace", lambda: load(problem.source), forget)
+    timed("trace", lambda: trace_phases(problem), forget)
+    timed(
+        "build the NLP", lambda: build_path_nlp(4, PlanOptions().intervals, Objective.TIME), forget
+    )
+    trajectory = timed("plan and sample (NLP built)", lambda: solve(problem))
+    rows.append(Row("parts", "Ipopt alone", "", trajectory.meta["timings"]["solve"], None))
+    with tempfile.TemporaryDirectory() as folder:
+        path = os.path.join(folder, "plan.npz")
+        timed("write", lambda: trajectory.save(path))
+        timed("simulate", lambda: simulate(problem, trajectory.torque))
+        imports = [sys.executable, "-c", "import casadi, numpy"]
+        timed("process: import casadi, numpy", lambda: _run(imports))
+        if problem.source:
+            whole = [sys.executable, "-m", "wholearm", "solve", problem.source, "-o", path]
+            timed("process: wholearm solve", lambda: _run(whole))
+            ratio = rows[-1].seconds / rows[-2].seconds
+            rows[-1] = rows[-1]._replace(note=f"{ratio:.2f} x the imports alone")
+    return rows
+
+
+def _run(command: Sequence[str]) -> None:
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

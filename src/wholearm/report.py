@@ -1,0 +1,224 @@
+"""The report of a replay: numbers, text and plain values."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class ContactMargin:
+    """The least normal force of one contact in one phase.
+
+    Attributes
+    ----------
+    contact : str
+    least : float, [N]
+        NaN if the contact was never seen moving.
+    time : float, [s]
+        When.
+    margin : float, [N]
+        least - epsilon.
+    """
+
+    contact: str
+    least: float
+    time: float
+    margin: float
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """Largest difference between planned and simulated state: coordinates [m], angles [rad]."""
+
+    position: float
+    angle: float
+
+
+@dataclass(frozen=True)
+class PhaseReport:
+    """One phase of the replay.
+
+    Attributes
+    ----------
+    number : int
+        From 1.
+    until : str
+        What ends the phase.
+    start : float, [s]
+    contacts : tuple of ContactMargin
+    arrival : float or None, [s]
+        When its end was reached, None if it was not.
+    arrival_rate : float or None, [m/s or rad/s]
+        How fast the distance to the end was closing then.
+    end_deviation, deviation : Deviation or None
+        From the plan, at the end of the phase and at worst; None without a plan.
+    """
+
+    number: int
+    until: str
+    start: float
+    contacts: tuple[ContactMargin, ...]
+    arrival: float | None
+    arrival_rate: float | None
+    end_deviation: Deviation | None
+    deviation: Deviation | None
+
+
+@dataclass(frozen=True)
+class EnergyBalance:
+    """Energies of the whole replay [J]: work = kinetic + potential + losses + residual.
+
+    Attributes
+    ----------
+    work : float
+        Of the torques.
+    kinetic, potential : float
+        Changes.
+    viscous, dry, contact, impact : float
+        Losses: viscous and dry joint friction, sliding, contacts gained at a speed.
+    residual : float
+        What the equations leave unexplained.
+    relative : float
+        The residual over the sum of all magnitudes.
+    """
+
+    work: float
+    kinetic: float
+    potential: float
+    viscous: float
+    dry: float
+    contact: float
+    impact: float
+    residual: float
+    relative: float
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a replay of torques showed.
+
+    Attributes
+    ----------
+    name : str
+        The problem's.
+    epsilon : float, [N]
+    outcome : str
+        How the replay ended, in one sentence.
+    reached : bool
+        Whether the goal was reached.
+    missed_by : float, [m or rad]
+        Distance to the end of the last phase entered.
+    failures : tuple of str
+        Why the torques are not good, empty if they are.
+    warnings : tuple of str
+        What is not asked for but worth knowing.
+    phases : tuple of PhaseReport
+        Those entered.
+    energy : EnergyBalance
+    tolerance : float
+    steps : int
+        Of the simulation.
+    """
+
+    name: str
+    epsilon: float
+    outcome: str
+    reached: bool
+    missed_by: float
+    failures: tuple[str, ...]
+    warnings: tuple[str, ...]
+    phases: tuple[PhaseReport, ...]
+    energy: EnergyBalance
+    tolerance: float
+    steps: int
+
+    @property
+    def ok(self) -> bool:
+        """Whether every contact held and the goal was reached."""
+        return not self.failures
+
+    @property
+    def exit_status(self) -> int:
+        """Exit status of the command line: 0 or 1."""
+        return 0 if self.ok else 1
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain values for JSON, with None where there is no number."""
+        plain = _plain(asdict(self))
+        return {"ok": self.ok, "exit_status": self.exit_status, **plain}
+
+    def to_text(self) -> str:
+        """Everything as aligned tables."""
+        parts = [f"{self.name}: {'ok' if self.ok else 'FAILED'}", self.outcome]
+        parts += [f"failure: {text}" for text in self.failures if text != self.outcome]
+        parts += [f"warning: {text}" for text in self.warnings]
+        parts += ["", *_contact_table(self), "", *_phase_table(self), "", *_energy_table(self)]
+        return "\n".join(parts)
+
+
+def _plain(value: Any) -> Any:
+    """`value` with None for NaN and infinity and plain containers."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    return value
+
+
+def _contact_table(report: Report) -> list[str]:
+    rows = [
+        [str(p.number), c.contact, _show(c.least, ".4f"), _show(c.margin, "+.4f"),
+         _show(c.time, ".5f")]
+        for p in report.phases
+        for c in p.contacts
+    ]  # fmt: skip
+    return _table(["phase", "contact", "least c_n [N]", "margin [N]", "at t [s]"], rows, {1})
+
+
+def _phase_table(report: Report) -> list[str]:
+    header = ["phase", "until", "arrival [s]", "rate [m/s, rad/s]"]
+    planned = any(p.deviation is not None for p in report.phases)
+    header += ["end dev. [m]", "[rad]", "largest dev. [m]", "[rad]"] if planned else []
+    rows = []
+    for p in report.phases:
+        row = [str(p.number), p.until, _show(p.arrival, ".5f"), _show(p.arrival_rate, ".1e")]
+        for deviation in (p.end_deviation, p.deviation) if planned else ():
+            pair = (deviation.position, deviation.angle) if deviation else (None, None)
+            row += [_show(value, ".1e") for value in pair]
+        rows.append(row)
+    return _table(header, rows, {1})
+
+
+def _energy_table(report: Report) -> list[str]:
+    energy = report.energy
+    rows = [
+        ["work of the torques", energy.work],
+        ["change of kinetic energy", energy.kinetic],
+        ["change of potential energy", energy.potential],
+        ["viscous joint friction", energy.viscous],
+        ["dry joint friction", energy.dry],
+        ["sliding friction", energy.contact],
+        ["contacts gained", energy.impact],
+        ["residual", energy.residual],
+    ]
+    return _table(["energy", "[J]"], [[str(n), f"{v: .6e}"] for n, v in rows], {0})
+
+
+def _show(value: float | None, form: str) -> str:
+    return "-" if value is None or math.isnan(value) else format(value, form)
+
+
+def _table(header: list[str], rows: list[list[str]], left: set[int]) -> list[str]:
+    """Lines of a table with aligned columns; those in `left` are flush left."""
+    widths = [max(len(cell) for cell in column) for column in zip(header, *rows, strict=True)]
+    return [
+        "  ".join(
+            cell.ljust(width) if k in left else cell.rjust(width)
+            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in (header, *rows)
+    ]

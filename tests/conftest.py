@@ -1,0 +1,21 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from wholearm.curve import Curve
+from wholearm.path import load, trace_phases
+from wholearm.problem import Problem
+
+HEPTAGON = Path(__file__).parents[1] / "problems" / "heptagon_four_contacts.toml"
+
+
+@pytest.fixture(scope="session")
+def heptagon() -> Problem:
+    return load(str(HEPTAGON))
+
+
+@pytest.fixture(scope="session")
+def curves(heptagon: Problem) -> tuple[Curve, ...]:
+    return trace_phases(heptagon)

@@ -1,0 +1,330 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from plane import SQUARE, cross, make_formation, make_scene
+from wholearm.contact import build_features, build_geometry
+from wholearm.curve import Curve
+from wholearm.dynamics import (
+    Directions,
+    build_forward,
+    energy,
+    forward,
+    inverse,
+    reduce_to_first_joint,
+    reduced_inertia,
+)
+from wholearm.errors import JammingError
+from wholearm.formation import Formation, close_finger
+from wholearm.model import Array, Friction, Scene
+
+FRICTIONLESS = Friction(0.0, 0.0, 0.0)
+
+
+def states(curves: tuple[Curve, ...], count: int = 4) -> Iterator[tuple[Curve, float, Directions]]:
+    """Random places of every segment of every curve, with the signs of motion along +s."""
+    rng = np.random.default_rng(11)
+    for curve in curves:
+        for segment in curve.segments:
+            for part in rng.uniform(0.02, 0.98, count):
+                s = segment.start + part * (segment.stop - segment.start)
+                yield curve, s, Directions(segment.Xi, segment.sigma)
+
+
+def random_motion(rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Path acceleration, squared speed and squeeze, as arrays of one place."""
+    return rng.uniform(-2, 2, 1), rng.uniform(0.01, 0.2, 1), rng.uniform(1, 5, 1)
+
+
+def test_three_routes_agree(curves: tuple[Curve, ...]) -> None:
+    rng = np.random.default_rng(12)
+    for curve, s, directions in states(curves):
+        z, z_s, z_ss = curve.evaluate(np.array([s]))[:3]
+        a, b, squeeze = random_motion(rng)
+        forces = inverse(curve.formation, z, z_s, z_ss, directions)
+        tau, c_n = forces.tau(a, b, squeeze)[0], forces.c_n(a, b, squeeze)[0]
+        v = z_s[0] * np.sqrt(b)
+        z_ddot = z_s[0] * a + z_ss[0] * b
+
+        acceleration, normal = forward(curve.formation, z[0], v, tau, directions)
+        size = np.abs(z_ddot).max() + 1
+        np.testing.assert_allclose(acceleration, z_ddot, rtol=0, atol=1e-10 * size)
+        np.testing.assert_allclose(normal, c_n, rtol=0, atol=1e-10 * np.abs(c_n).max())
+
+        reduced = reduce_to_first_joint(curve.formation, z[0], v[3], tau, directions)
+        assert reduced.acceleration == pytest.approx(z_ddot[3], abs=1e-10 * size)
+        np.testing.assert_allclose(reduced.c_n, c_n, rtol=0, atol=1e-10 * np.abs(c_n).max())
+        scalar = reduced.Phi_1 * reduced.acceleration + reduced.Phi_2 * v[3] + reduced.Phi_3
+        assert abs(scalar) < 1e-12
+
+
+def contact_frames(formation: Formation, z: Array) -> tuple[Array, Array]:
+    """Contact points and normals, (n_c, 2) each; their own tests measure them."""
+    scene = formation.scene
+    parts = [build_geometry(contact, scene) for contact in formation.contacts]
+    columns = [ca.horzcat(*(getattr(p, name) for p in parts)) for name in ("point", "normal")]
+    points, normals = ca.Function("frames", [build_features(scene).z], columns)(z)
+    return points.full().T, normals.full().T
+
+
+def newton_euler_residual(
+    formation: Formation, z: Array, v: Array, z_ddot: Array, tau: Array, c_n: Array
+) -> Array:
+    """What is missing in each body's balance: 2 forces and 1 moment, and 2 joint moments."""
+    scene = formation.scene
+    points, normals = contact_frames(formation, z)
+    force = np.zeros_like(points)
+    for k, contact in enumerate(formation.contacts):
+        at, n = points[k], normals[k]
+        t = np.array([n[1], -n[0]])
+        object_speed = v[:2] + v[2] * np.array([-(at - z[:2])[1], (at - z[:2])[0]])
+        finger_speed = np.zeros(2)
+        if contact.finger is not None:
+            arm = at - np.asarray(scene.fingers[contact.finger].base)
+            finger_speed = v[3 + contact.finger] * np.array([-arm[1], arm[0]])
+        slip = (object_speed - finger_speed) @ t
+        force[k] = c_n[k] * (n - scene.friction.of(contact.finger) * np.sign(slip) * t)
+    body = scene.polygon
+    assert body.inertia is not None
+    weight = np.array([0.0, -body.mass * scene.gravity])
+    linear = force.sum(axis=0) + weight - body.mass * z_ddot[:2]
+    angular = cross(points - z[:2], force).sum() - body.inertia * z_ddot[2]
+    joints = []
+    for finger, link in enumerate(scene.fingers):
+        mine = [c.finger == finger for c in formation.contacts]
+        moment = cross(points[mine] - np.asarray(link.base), -force[mine]).sum()
+        drag = link.viscous * v[3 + finger] + link.dry * np.sign(v[3 + finger])
+        joints.append(tau[finger] + moment - drag - link.inertia * z_ddot[3 + finger])
+    return np.array([*linear, angular, *joints])
+
+
+def test_every_body_obeys_newton_and_euler(curves: tuple[Curve, ...]) -> None:
+    rng = np.random.default_rng(13)
+    for curve, s, directions in states(curves):
+        z, z_s, _ = (part[0] for part in curve.evaluate(np.array([s]))[:3])
+        v, tau = z_s * rng.uniform(0.1, 0.5), rng.uniform(-1, 1, 2)
+        z_ddot, c_n = forward(curve.formation, z, v, tau, directions)
+        residual = newton_euler_residual(curve.formation, z, v, z_ddot, tau, c_n)
+        assert np.abs(residual).max() < 1e-12 * (1 + np.abs(c_n).max())
+
+
+def test_moving_backwards_reverses_every_sign(curves: tuple[Curve, ...]) -> None:
+    for curve, s, directions in states(curves, 1):
+        z, z_s, _ = (part[0] for part in curve.evaluate(np.array([s]))[:3])
+        backwards = Directions(-directions.Xi, -directions.sigma)
+        z_ddot, c_n = forward(curve.formation, z, -0.3 * z_s, np.array([0.5, -0.5]), backwards)
+        residual = newton_euler_residual(
+            curve.formation, z, -0.3 * z_s, z_ddot, np.array([0.5, -0.5]), c_n
+        )
+        assert np.abs(residual).max() < 1e-12 * (1 + np.abs(c_n).max())
+
+
+def test_accelerations_keep_the_contacts(curves: tuple[Curve, ...]) -> None:
+    for curve, s, directions in states(curves, 2):
+        z, z_s, _ = (part[0] for part in curve.evaluate(np.array([s]))[:3])
+        v = 0.4 * z_s
+        z_ddot, _ = forward(curve.formation, z, v, np.array([1.0, -1.0]), directions)
+        h = 2e-5
+        path = [z + k * v + k**2 / 2 * z_ddot for k in (-h, 0.0, h)]
+        gaps = curve.formation.evaluate(np.array(path), np.zeros((3, 5))).C
+        # Rounding 1e-17 over h^2; the gap's fourth derivative times h^2.
+        np.testing.assert_allclose((gaps[0] - 2 * gaps[1] + gaps[2]) / h**2, 0.0, atol=1e-6)
+
+
+def test_power_balance(curves: tuple[Curve, ...]) -> None:
+    """d/dt energy = power of the torques - friction at joints and contacts."""
+    rng = np.random.default_rng(14)
+    for curve, s, directions in states(curves):
+        formation, scene = curve.formation, curve.formation.scene
+        z, z_s, _ = (part[0] for part in curve.evaluate(np.array([s]))[:3])
+        v, tau = z_s * rng.uniform(0.1, 0.5), rng.uniform(-1, 1, 2)
+        z_ddot, c_n = forward(formation, z, v, tau, directions)
+        h = 1e-5
+        before, after = (
+            energy(formation, (z + k * v + k**2 / 2 * z_ddot)[None], (v + k * z_ddot)[None])[0]
+            for k in (-h, h)
+        )
+        slip = formation.evaluate(z[None], v[None]).A_t[0] @ v
+        lost = np.abs(slip) @ (formation.friction * c_n)
+        lost += scene.viscous @ v**2 + scene.dry @ np.abs(v)
+        power = tau @ v[3:] - lost
+        assert (after - before) / (2 * h) == pytest.approx(power, abs=1e-8 * (1 + abs(power)))
+
+
+def test_friction_opposes_sliding(curves: tuple[Curve, ...]) -> None:
+    """The power of c_t = -U Xi c_n is negative for a pressed contact."""
+    for curve, s, directions in states(curves, 2):
+        z, z_s = curve.evaluate(np.array([s]))[:2]
+        slip = curve.formation.evaluate(z, z_s).A_t[0] @ z_s[0]
+        c_t = -curve.formation.friction * directions.Xi * 1.0
+        assert (c_t * slip < 0).all()
+
+
+def standing() -> tuple[Formation, Array]:
+    """A square on the palm between two links that lean inwards on its upper corners."""
+    scene = make_scene(SQUARE, base=0.08, depth=-0.01, friction=0.0)
+    q = np.array([0.0, 0.03, 0.0])
+    z = np.array([*q, close_finger(scene, q, 0), close_finger(scene, q, 1)])
+    return make_formation(scene, "v0-palm v1-palm v2-finger1 v3-finger2"), z
+
+
+def test_symmetric_squeeze_by_hand() -> None:
+    """Equal torques hold the square; each link's force has the lever arm base to corner."""
+    formation, z = standing()
+    scene = formation.scene
+    still = Directions(np.ones(4), np.zeros(2))
+    tau = np.array([0.3, -0.3])
+    z_ddot, c_n = forward(formation, z, np.zeros(5), tau, still)
+    np.testing.assert_allclose(z_ddot, 0.0, atol=1e-10)
+    arm = np.array([0.03, 0.06]) - np.asarray(scene.fingers[0].base)
+    run = np.sqrt(arm @ arm - 0.005**2)
+    press = 0.3 / run
+    # The right link's normal is its axis turned left, so its upward part is cos(theta_1).
+    up = press * np.cos(z[3])
+    weight = scene.polygon.mass * scene.gravity
+    np.testing.assert_allclose(c_n[2:], press, rtol=1e-12)
+    np.testing.assert_allclose(c_n[:2], (weight - 2 * up) / 2, rtol=1e-11)
+
+
+def test_without_friction_the_motion_follows_virtual_work(curves: tuple[Curve, ...]) -> None:
+    """M_eff s'' + M_eff' s'^2 / 2 = tau . theta_s + g . z_s - viscous: no constraint forces."""
+    rng = np.random.default_rng(15)
+    for curve in curves:
+        scene = replace(curve.formation.scene, friction=FRICTIONLESS)
+        formation = Formation(scene, curve.formation.contacts)
+        s, h = curve.length * rng.uniform(0.1, 0.9), 1e-6 * curve.length
+
+        def inertia(s: float, curve: Curve = curve, scene: Scene = scene) -> float:
+            return float(curve.evaluate(np.array([s])).z_s[0] ** 2 @ scene.mass_diagonal)
+
+        z, z_s, z_ss = (part[0] for part in curve.evaluate(np.array([s]))[:3])
+        speed, tau = 0.3, rng.uniform(-1, 1, 2)
+        v = speed * z_s
+        sigma = np.sign(v[3:])
+        z_ddot, _ = forward(formation, z, v, tau, Directions(np.ones(4), sigma))
+        drag = scene.viscous * v + scene.dry * np.sign(v)
+        work = tau @ z_s[3:] + (scene.applied_force - drag) @ z_s
+        slope = (inertia(s + h) - inertia(s - h)) / (2 * h)
+        s_ddot = (work - slope / 2 * speed**2) / inertia(s)
+        expected = z_s * s_ddot + z_ss * speed**2
+        # The slope is a difference: rounding 1e-16 over h.
+        np.testing.assert_allclose(z_ddot, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+
+
+def test_squeeze_moves_no_body(curves: tuple[Curve, ...]) -> None:
+    """The squeeze is a unit vector of c_n that presses and leaves the object alone."""
+    for curve, s, directions in states(curves, 2):
+        point = curve.evaluate(np.array([s]))
+        z, z_s, z_ss = point[:3]
+        forces = inverse(curve.formation, z, z_s, z_ss, directions)
+        assert np.linalg.norm(forces.Cl[0]) == pytest.approx(1.0, abs=1e-12)
+        assert forces.Cl[0].sum() > 0
+        a, b = np.array([0.5]), np.array([0.04])
+        v, z_ddot = z_s[0] * 0.2, z_s[0] * 0.5 + z_ss[0] * 0.04
+        for squeeze in (np.zeros(1), np.full(1, 3.0)):
+            tau, c_n = forces.tau(a, b, squeeze)[0], forces.c_n(a, b, squeeze)[0]
+            residual = newton_euler_residual(curve.formation, z[0], v, z_ddot, tau, c_n)
+            assert np.abs(residual).max() < 1e-12 * (1 + np.abs(c_n).max())
+
+
+def test_forces_are_the_same_one_by_one(curves: tuple[Curve, ...]) -> None:
+    """Many places at once, each with its own directions, on both sides of a reversal."""
+    curve = curves[0]
+    point = curve.evaluate(curve.length * np.array([0.1, 0.3, 0.9]))
+    parts = [curve.segments[k] for k in (0, 0, 1)]
+    many = Directions(np.array([p.Xi for p in parts]), np.array([p.sigma for p in parts]))
+    z, z_s, z_ss, kinematics = point
+    together = inverse(curve.formation, z, z_s, z_ss, many, kinematics)
+    for i, part in enumerate(parts):
+        one_place = slice(i, i + 1)
+        directions = Directions(part.Xi, part.sigma)
+        alone = inverse(curve.formation, z[one_place], z_s[one_place], z_ss[one_place], directions)
+        for row, one in zip(together, alone, strict=True):
+            np.testing.assert_allclose(row[i], one[0], rtol=1e-11, atol=1e-12)
+
+
+def test_reduced_inertia_is_one_without_friction(curves: tuple[Curve, ...]) -> None:
+    for curve in curves:
+        formation = Formation(
+            replace(curve.formation.scene, friction=FRICTIONLESS), curve.formation.contacts
+        )
+        z = curve.evaluate(np.linspace(0, curve.length, 5)).z
+        kinematics = formation.evaluate(z, z)
+        ratio = reduced_inertia(formation, kinematics, Directions(np.ones(4), np.ones(2)))
+        np.testing.assert_allclose(ratio, 1.0, rtol=1e-12)
+
+
+def test_reduced_inertia_has_the_sign_of_the_mass_along_the_motion(
+    curves: tuple[Curve, ...],
+) -> None:
+    """It vanishes where z_s^T M5 w does, w the vector that no contact force acts on."""
+    for curve, s, directions in states(curves, 2):
+        formation = curve.formation
+        point = curve.evaluate(np.array([s]))
+        ratio = reduced_inertia(formation, formation.evaluate(point.z, point.z), directions)[0]
+        kinematics = formation.evaluate(point.z, point.z_s)
+        slip = (formation.friction * directions.Xi)[:, None]
+        G = (kinematics.A - slip * kinematics.A_t)[0]
+
+        def null(matrix: Array) -> Array:
+            minors = [(-1) ** k * np.linalg.det(np.delete(matrix, k, axis=1)) for k in range(5)]
+            return np.array(minors)
+
+        mass, free, idle = formation.scene.mass_diagonal, null(kinematics.A[0]), null(G)
+        expected = (free * mass) @ idle / ((free * mass) @ free)
+        assert ratio == pytest.approx(expected, rel=1e-9)
+
+
+def jam(curves: tuple[Curve, ...]) -> tuple[Formation, Array, Array, Directions]:
+    """A formation of the plan, with as much friction as first makes it jam."""
+    for curve, s, directions in states(curves, 2):
+        z, z_s = (part[0] for part in curve.evaluate(np.array([s]))[:2])
+        for mu in np.arange(0.2, 3.0, 0.2):
+            scene = replace(curve.formation.scene, friction=Friction(mu, mu, mu))
+            formation = Formation(scene, curve.formation.contacts)
+            kinematics = formation.evaluate(z[None], z_s[None])
+            if reduced_inertia(formation, kinematics, directions)[0] <= 0:
+                return formation, z, z_s, directions
+    raise AssertionError("nothing jams up to a friction coefficient of 3")
+
+
+def test_jamming_is_said_and_not_computed(curves: tuple[Curve, ...]) -> None:
+    formation, z, z_s, directions = jam(curves)
+    tau = np.array([0.5, -0.5])
+    with pytest.raises(JammingError, match="jams: friction") as caught:
+        forward(formation, z, 0.1 * z_s, tau, directions)
+    assert " ".join(formation.names) in str(caught.value) and caught.value.exit_status == 1
+    with pytest.raises(JammingError, match="jams: Phi_1"):
+        reduce_to_first_joint(formation, z, float(0.1 * z_s[3]), tau, directions)
+
+
+def test_forward_takes_any_number_of_contacts(curves: tuple[Curve, ...]) -> None:
+    curve = curves[0]
+    for count in (1, 2, 3):
+        formation = Formation(curve.formation.scene, curve.formation.contacts[:count])
+        z = curve.start
+        A = formation.evaluate(z[None], z[None]).A[0]
+        v = 0.1 * np.linalg.svd(A)[2][-1]
+        slip = formation.evaluate(z[None], z[None]).A_t[0] @ v
+        directions = Directions(np.sign(slip), np.sign(v[3:]))
+        z_ddot, c_n = forward(formation, z, v, np.array([0.2, -0.1]), directions)
+        residual = newton_euler_residual(formation, z, v, z_ddot, np.array([0.2, -0.1]), c_n)
+        assert np.abs(residual).max() < 1e-12 * (1 + np.abs(c_n).max())
+
+
+def test_compiled_forward_returns_the_matrix_that_jams(curves: tuple[Curve, ...]) -> None:
+    curve = curves[4]
+    formation = curve.formation
+    z, z_s = (part[0] for part in curve.evaluate(np.array([0.01]))[:2])
+    Xi, sigma = curve.segments[-1].Xi, curve.segments[-1].sigma
+    K = build_forward(formation)(z, z_s, np.zeros(2), Xi, sigma)[2].full()
+    kinematics = formation.evaluate(z[None], z_s[None])
+    A, A_t = kinematics.A[0], kinematics.A_t[0]
+    G = A - (formation.friction * Xi)[:, None] * A_t
+    expected = A @ np.diag(1 / formation.scene.mass_diagonal) @ G.T
+    np.testing.assert_allclose(K, expected, rtol=1e-12)

@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import BinaryIO
+
+import pytest
+
+from wholearm.errors import InputError
+from wholearm.files import require_writable, write_whole
+
+
+def fail_halfway(stream: BinaryIO) -> None:
+    stream.write(b"half")
+    raise RuntimeError("stopped")
+
+
+def test_writes_the_whole_file_and_nothing_else(tmp_path: Path) -> None:
+    write_whole(tmp_path / "out.txt", lambda stream: stream.write(b"content"))
+    assert [path.name for path in tmp_path.iterdir()] == ["out.txt"]
+    assert (tmp_path / "out.txt").read_bytes() == b"content"
+
+
+def test_nothing_appears_when_the_writer_fails(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="stopped"):
+        write_whole(tmp_path / "out.txt", fail_halfway)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_old_file_survives_a_failed_writer(tmp_path: Path) -> None:
+    target = tmp_path / "out.txt"
+    target.write_bytes(b"old")
+    with pytest.raises(RuntimeError, match="stopped"):
+        write_whole(target, fail_halfway)
+    assert target.read_bytes() == b"old" and list(tmp_path.iterdir()) == [target]
+
+
+def test_old_file_is_whole_while_the_new_one_is_written(tmp_path: Path) -> None:
+    target = tmp_path / "out.txt"
+    target.write_bytes(b"old")
+
+    def write(stream: BinaryIO) -> None:
+        stream.write(b"new")
+        stream.flush()
+        assert target.read_bytes() == b"old"
+
+    write_whole(target, write)
+    assert target.read_bytes() == b"new"
+
+
+def test_a_full_disk_is_reported(tmp_path: Path) -> None:
+    def write(stream: BinaryIO) -> None:
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(InputError, match="cannot be written: No space left") as caught:
+        write_whole(tmp_path / "out.txt", write)
+    assert caught.value.source == str(tmp_path / "out.txt")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("mask, bits", [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664)])
+def test_permissions_follow_the_umask(tmp_path: Path, mask: int, bits: int) -> None:
+    before = os.umask(mask)
+    try:
+        write_whole(tmp_path / "out.txt", lambda stream: stream.write(b"x"))
+        assert os.umask(mask) == mask
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "out.txt").stat().st_mode) == bits
+
+
+@pytest.mark.parametrize("name", ["absent/out.txt", "", "file.txt/out.txt"])
+def test_place_that_cannot_be_written(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file.txt").write_bytes(b"")
+    with pytest.raises(InputError, match="cannot be written") as caught:
+        write_whole(tmp_path / name, lambda stream: stream.write(b"x"))
+    assert caught.value.source == str(tmp_path / name) and caught.value.exit_status == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["file.txt"]
+
+
+def test_a_link_keeps_pointing_to_its_file(tmp_path: Path) -> None:
+    (tmp_path / "real.txt").write_bytes(b"old")
+    (tmp_path / "link.txt").symlink_to("real.txt")
+    write_whole(tmp_path / "link.txt", lambda stream: stream.write(b"new"))
+    assert (tmp_path / "link.txt").is_symlink()
+    assert (tmp_path / "real.txt").read_bytes() == b"new"
+
+
+def test_a_pipe_is_written_to_and_not_replaced(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        write_whole(pipe, lambda stream: stream.write(b"through"))
+        assert os.read(reader, 100) == b"through"
+    finally:
+        os.close(reader)
+    assert stat.S_ISFIFO(pipe.stat().st_mode) and list(tmp_path.iterdir()) == [pipe]
+
+
+@pytest.mark.parametrize("name", ["absent/out.txt", "", "file.txt/out.txt"])
+def test_checked_before_the_work(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file.txt").write_bytes(b"")
+    with pytest.raises(InputError, match="cannot be written") as caught:
+        require_writable(tmp_path / name)
+    assert caught.value.source == str(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["new.txt", "file.txt"])
+def test_a_check_writes_nothing(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file.txt").write_bytes(b"old")
+    require_writable(tmp_path / name)
+    assert [path.name for path in tmp_path.iterdir()] == ["file.txt"]
+    assert (tmp_path / "file.txt").read_bytes() == b"old"

@@ -1,0 +1,345 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plane import (
+    SQUARE,
+    convex_polygon,
+    finger_gap,
+    make_formation,
+    make_scene,
+    place_corners,
+    place_tips,
+    rotate,
+)
+from wholearm.contact import parse_contact
+from wholearm.errors import InputError
+from wholearm.formation import (
+    close_finger,
+    describe,
+    find_touching,
+    place_flush,
+    split_by_first_joint,
+)
+from wholearm.model import Array, Friction, Scene
+from wholearm.problem import Problem
+
+# Distances of metres-sized coordinates in double precision.
+ROUNDING = 1e-14
+
+
+def sweep(finger: int, last: float, count: int = 1500) -> Array:
+    """Joint angles from pointing straight down, outside, up to `last`."""
+    first = -np.pi / 2 if finger == 0 else 3 * np.pi / 2
+    return np.linspace(first, last, count)
+
+
+def touching_kinds(scene: Scene, z: Array, finger: int) -> set[str]:
+    return {
+        f"{contact.feature}-{contact.surface}"
+        for contact in find_touching(scene, z)
+        if contact.finger == finger
+    }
+
+
+def random_pose(rng: np.random.Generator, scene: Scene) -> Array:
+    """A pose above the palm, between the joints or beyond them."""
+    phi = rng.uniform(-np.pi, np.pi)
+    lowest = rotate(phi, scene.polygon.vertices)[:, 1].min()
+    return np.array([rng.uniform(-0.09, 0.09), rng.uniform(0.0, 0.02) - lowest, phi])
+
+
+@pytest.mark.parametrize("radius", [0.0, 0.005, 0.02])
+@pytest.mark.parametrize("length", [0.06, 0.1, 0.2])
+def test_closing_stops_at_the_first_touch(radius: float, length: float) -> None:
+    """Swept from outside, the capsule is clear of the object up to the angle and touches there."""
+    rng = np.random.default_rng([int(1e3 * radius), int(1e3 * length)])
+    for trial in range(25):
+        points = convex_polygon(rng, int(rng.integers(3, 8)))
+        scene = make_scene(points, length=length, radius=radius, base=0.13, depth=-0.025)
+        q = random_pose(rng, scene)
+        finger = trial % 2
+        try:
+            angle = close_finger(scene, q, finger)
+        except InputError as error:
+            assert "too short" in error.problem
+            turn = 2 * np.pi if finger == 0 else -2 * np.pi
+            angles = sweep(finger, sweep(finger, 0.0)[0] + turn)
+            assert (finger_gap(scene, q, finger, angles) > 0).all()
+            continue
+        assert abs(finger_gap(scene, q, finger, angle)[0]) < ROUNDING
+        assert (finger_gap(scene, q, finger, sweep(finger, angle)[:-1]) > 0).all()
+
+
+@pytest.mark.parametrize("finger", [0, 1])
+def test_closing_starts_from_straight_down(finger: int) -> None:
+    """An object outside the hand and below the joint is met before the finger points outwards."""
+    scene = make_scene(SQUARE, base=0.05, depth=0.12, length=0.1)
+    q = np.array([0.12 if finger == 0 else -0.12, 0.03, 0.0])
+    angle = close_finger(scene, q, finger)
+    assert abs(finger_gap(scene, q, finger, angle)[0]) < ROUNDING
+    assert (finger_gap(scene, q, finger, sweep(finger, angle)[:-1]) > 0).all()
+    assert abs(angle - sweep(finger, angle)[0]) < np.pi / 4
+
+
+def test_every_way_of_touching_is_met() -> None:
+    """The poses of the test above include a side, a tip on an edge and a vertex on the arc."""
+    rng = np.random.default_rng(7)
+    met: set[str] = set()
+    for trial in range(120):
+        points = convex_polygon(rng, 5)
+        length = rng.uniform(0.08, 0.2)
+        scene = make_scene(points, length=length, radius=0.01, base=0.13, depth=-0.025)
+        q = random_pose(rng, scene)
+        try:
+            angles = [close_finger(scene, q, finger) for finger in (0, 1)]
+        except InputError:
+            continue
+        kinds = touching_kinds(scene, np.array([*q, *angles]), trial % 2)
+        met |= kinds
+    assert met == {"v-finger", "e-tip", "v-tip"}
+
+
+@pytest.mark.parametrize(
+    "height, angle_kind", [(0.05, "v-finger"), (0.1575, "e-tip"), (0.154, "v-tip")]
+)
+def test_touching_names_the_kind(height: float, angle_kind: str) -> None:
+    """A square beside the tip of an upright link: flush side, or above it."""
+    scene = make_scene(SQUARE, base=0.08, depth=0.0, length=0.12)
+    if angle_kind == "v-finger":
+        z = np.array([0.08 - 0.005 - 0.03, height, 0.0, np.pi / 2, np.pi / 2])
+        names = {"v1-finger1", "v2-finger1"}
+    elif angle_kind == "e-tip":
+        z = np.array([0.08 - 0.01, 0.12 + 0.005 + 0.03, 0.0, np.pi / 2, np.pi / 2])
+        names = {"e0-tip1"}
+    else:
+        away = 0.005 * np.array([-np.sqrt(0.5), np.sqrt(0.5)])
+        z = np.array([*(np.array([0.08, 0.12]) + away - [0.03, -0.03]), 0.0, *[np.pi / 2] * 2])
+        names = {"v1-tip1"}
+    assert {c.name for c in find_touching(scene, z) if c.finger == 0} == names
+
+
+def test_touching_a_flush_link_and_the_palm() -> None:
+    scene = make_scene(SQUARE, base=0.08, depth=0.0, length=0.12)
+    z = np.array([0.045, 0.03, 0.0, np.pi / 2, np.pi / 2])
+    names = [contact.name for contact in find_touching(scene, z)]
+    assert names == ["v0-palm", "v1-palm", "v1-finger1", "v2-finger1"]
+
+
+def test_a_corner_behind_the_joint_does_not_touch() -> None:
+    """It lies on the line of the link's side, before the joint."""
+    scene = make_scene(SQUARE, base=0.08, depth=0.05, length=0.12)
+    z = np.array([0.045, 0.03, 0.0, np.pi / 2, np.pi / 2])
+    names = {c.name for c in find_touching(scene, z) if c.finger == 0}
+    assert names == {"v2-finger1"}
+
+
+@pytest.mark.parametrize("base", [[0.0, 0.03], [0.0, -0.004], [0.029, 0.03], [0.034, 0.03]])
+def test_joint_inside_the_object(base: list[float]) -> None:
+    """Also where only the rounded end of the link reaches into it."""
+    scene = make_scene(SQUARE)
+    scene = replace(scene, fingers=(replace(scene.fingers[0], base=base), scene.fingers[1]))
+    with pytest.raises(InputError, match="inside the object") as caught:
+        close_finger(scene, np.array([0.0, 0.03, 0.0]), 0)
+    assert caught.value.key == "fingers.1.base"
+
+
+@pytest.mark.parametrize("finger", [0, 1])
+def test_finger_that_is_too_short(finger: int) -> None:
+    scene = make_scene(SQUARE, base=0.3, length=0.2)
+    with pytest.raises(InputError, match=f"finger {finger + 1} is too short"):
+        close_finger(scene, np.array([0.0, 0.03, 0.0]), finger)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_flush_edge_lies_on_the_palm(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scene = make_scene(convex_polygon(rng, 6))
+    for edge in range(6):
+        x = rng.uniform(-1, 1)
+        q = place_flush(scene, edge, x)
+        heights = place_corners(scene, q)[:, 1]
+        assert q[0] == x and -np.pi < q[2] <= np.pi
+        np.testing.assert_allclose(heights[[edge, (edge + 1) % 6]], 0.0, atol=ROUNDING)
+        assert heights.min() > -ROUNDING
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_mirrored_scene_closes_mirrored(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = convex_polygon(rng, 6)
+    scene, mirrored = make_scene(points), make_scene((points * [-1, 1])[::-1])
+    q = random_pose(rng, scene)
+    q_mirrored = q * [-1, 1, -1]
+    for finger in (0, 1):
+        angle = close_finger(scene, q, finger)
+        other = close_finger(mirrored, q_mirrored, 1 - finger)
+        # Equal up to whole turns, in which the two conventions differ.
+        assert np.cos(angle) == pytest.approx(-np.cos(other), abs=ROUNDING)
+        assert np.sin(angle) == pytest.approx(np.sin(other), abs=ROUNDING)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_split_by_first_joint(heptagon: Problem, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    v = rng.uniform(-1, 1, (4, 5))
+    for phase in heptagon.phases:
+        A = phase.formation.evaluate(heptagon.start + v / 10, v).A
+        P_AI, P_AII = split_by_first_joint(A)
+        assert P_AI.shape == (4, 4, 4) and P_AII.shape == (4, 4)
+        parts = np.einsum("nij,nj->ni", P_AI, v[:, [0, 1, 2, 4]]) + P_AII * v[:, [3]]
+        np.testing.assert_allclose(parts, np.einsum("nij,nj->ni", A, v), atol=1e-15)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_many_configurations_are_evaluated_one_by_one(heptagon: Problem, count: int) -> None:
+    formation = heptagon.phases[0].formation
+    rng = np.random.default_rng(count)
+    z, v = heptagon.start + rng.uniform(-0.1, 0.1, (2, count, 5))
+    together = formation.evaluate(z, v)
+    for i in range(count):
+        alone = formation.evaluate(z[i : i + 1], v[i : i + 1])
+        for many, one in zip(together, alone, strict=True):
+            assert (many[i] == one[0]).all()
+    assert formation.evaluate_limits(z).shape == (count, len(formation.limits))
+    gap = formation.evaluate_gap(formation.contacts[2], z)
+    np.testing.assert_array_equal(gap, together.C[:, 2])
+
+
+def test_formation_knows_its_contacts_and_friction() -> None:
+    scene = replace(make_scene(SQUARE), friction=Friction(0.1, 0.2, 0.3))
+    formation = make_formation(scene, "v0-palm v1-finger1 e2-tip2")
+    assert formation.n_contacts == 3
+    assert formation.names == ("v0-palm", "v1-finger1", "e2-tip2")
+    assert formation.friction.tolist() == [0.1, 0.2, 0.3]
+
+
+def limits_at(scene: Scene, names: str, z: Array) -> dict[str, float]:
+    formation = make_formation(scene, names)
+    values = formation.evaluate_limits(z[None])[0]
+    texts = [limit.text for limit in formation.limits]
+    assert len(set(texts)) == len(texts)
+    return dict(zip(texts, values, strict=True))
+
+
+UPRIGHT = np.pi / 2
+WIDE = make_scene(SQUARE, base=0.08, depth=0.0, length=0.12)
+LOW = make_scene(SQUARE, base=0.08, depth=0.0, length=0.04)
+TALL = make_scene(SQUARE, base=0.08, depth=0.0, length=0.06)
+SHORT = make_scene(SQUARE, base=0.08, depth=0.0, length=0.02)
+STANDING = np.array([0.045, 0.03, 0.0, UPRIGHT, UPRIGHT])
+LEFT = np.array([-0.045, 0.03, 0.0, UPRIGHT, UPRIGHT])
+
+
+@pytest.mark.parametrize(
+    "scene, names, z, text",
+    [
+        (WIDE, "v0-palm v1-finger1", STANDING, "v1 touches the palm"),
+        (WIDE, "v0-palm v1-finger1", STANDING, "v2 touches finger 1"),
+        (WIDE, "v0-palm v1-finger1", STANDING, "v1 runs off finger 1 at its base"),
+        (WIDE, "v0-palm v0-finger2", LEFT, "v3 touches finger 2"),
+        (WIDE, "v0-palm v0-finger2", LEFT, "v0 runs off finger 2 at its base"),
+        (TALL, "v0-palm v2-finger1", STANDING, "v2 runs off finger 1 at its tip"),
+        (TALL, "v0-palm v2-finger1", STANDING, "v1 touches finger 1"),
+        (WIDE, "v0-palm v1-palm", STANDING, "v1 touches finger 1"),
+        (SHORT, "v0-palm v1-palm", STANDING, "e1 touches the tip of finger 1"),
+        (SHORT, "v0-palm e1-tip1", STANDING, "v1 touches finger 1"),
+        (SHORT, "v0-palm v1-finger1", STANDING, "e1 touches the tip of finger 1"),
+    ],
+)
+def test_limit_that_is_reached(scene: Scene, names: str, z: Array, text: str) -> None:
+    """The square stands on the palm beside an upright link."""
+    assert limits_at(scene, names, z)[text] == pytest.approx(0.0, abs=ROUNDING)
+
+
+@pytest.mark.parametrize(
+    "scene, names, z, text, clear",
+    [
+        (WIDE, "v0-palm v1-palm", STANDING, "v2 touches the palm", 0.06),
+        (WIDE, "v0-palm v2-finger1", STANDING, "v0 touches finger 1", 0.06),
+        (WIDE, "v0-palm v2-finger1", STANDING, "v2 runs off finger 1 at its base", 0.06),
+        (WIDE, "v0-palm v2-finger1", STANDING, "v2 runs off finger 1 at its tip", 0.06),
+        (WIDE, "v0-palm v1-palm", STANDING, "v0 touches finger 2", 0.09),
+        (SHORT, "v0-palm e1-tip1", STANDING, "the tip of finger 1 runs off edge 1 at v1", 0.02),
+        (SHORT, "v0-palm e1-tip1", STANDING, "the tip of finger 1 runs off edge 1 at v2", 0.04),
+    ],
+)
+def test_limit_is_the_clearance(
+    scene: Scene, names: str, z: Array, text: str, clear: float
+) -> None:
+    assert limits_at(scene, names, z)[text] == pytest.approx(clear, abs=ROUNDING)
+
+
+@pytest.mark.parametrize(
+    "names, text, gained",
+    [
+        ("v2-finger1", "v2 runs off finger 1 at its tip", "v2-tip1"),
+        ("v2-finger1", "v2 runs off finger 1 at its base", None),
+        ("e1-tip2", "the tip of finger 2 runs off edge 1 at v1", "v1-tip2"),
+        ("e3-tip2", "the tip of finger 2 runs off edge 3 at v0", "v0-tip2"),
+        ("v0-tip1", "v0 leaves the tip of finger 1 for the side of the link", "v0-finger1"),
+        ("v0-tip1", "edge 3 turns onto the tip of finger 1", "e3-tip1"),
+        ("v0-tip1", "edge 0 turns onto the tip of finger 1", "e0-tip1"),
+        ("v2-finger1", "v3 touches finger 1", "v3-finger1"),
+    ],
+)
+def test_limit_knows_what_is_gained(names: str, text: str, gained: str | None) -> None:
+    limits = {limit.text: limit.gained for limit in make_formation(WIDE, names).limits}
+    assert limits[text] == (parse_contact(gained, WIDE) if gained else None)
+
+
+def test_nothing_is_gained_at_the_end_of_a_pointed_link() -> None:
+    pointed = make_scene(SQUARE, radius=0.0)
+    ends = [
+        limit for limit in make_formation(pointed, "e1-tip1").limits if "runs off" in limit.text
+    ]
+    assert [limit.gained for limit in ends] == [None, None]
+
+
+@pytest.mark.parametrize("finger", [0, 1])
+def test_a_limit_breaks_as_soon_as_a_free_link_overlaps(finger: int) -> None:
+    """Formations without contacts on a finger: its limits and the measured overlap agree."""
+    rng = np.random.default_rng(finger)
+    seen = {True: 0, False: 0}
+    for _ in range(60):
+        scene = make_scene(convex_polygon(rng, 5), length=0.22, base=0.13)
+        q = random_pose(rng, scene)
+        lowest = int(place_corners(scene, q)[:, 1].argmin())
+        formation = make_formation(scene, f"v{lowest}-palm")
+        closed = [close_finger(scene, q, k) for k in (0, 1)]
+        # A free link opens a little or enters the object by less than its own thickness.
+        turn = rng.uniform(-0.02, 0.02)
+        outwards = [-1.0, 1.0]
+        angles = np.array(closed) + 0.1 * np.array(outwards)
+        angles[finger] = closed[finger] + turn
+        z = np.array([*q, *angles])
+        clear = bool((formation.evaluate_limits(z[None])[0] > 0).all())
+        assert clear == (finger_gap(scene, q, finger, angles[finger])[0] > 0)
+        seen[clear] += 1
+    assert min(seen.values()) > 10
+
+
+@pytest.mark.parametrize("finger", [0, 1])
+def test_object_may_hang_over_the_back_of_a_tip(finger: int) -> None:
+    """The tip holds the lower edge; its outer end hangs lower than the tip, behind the link."""
+    scene = make_scene(SQUARE, length=0.1)
+    side = 1 if finger == 0 else -1
+    angles = np.array([np.pi / 2 - 0.9, np.pi / 2 + 0.9])
+    angles[finger] = np.pi / 2
+    normal = rotate(-0.3 * side, [0.0, 1.0])
+    centre = place_tips(scene, finger, angles[finger]) + (0.005 + 0.03) * normal
+    z = np.array([*centre, -0.3 * side, *angles])
+    hanging = place_corners(scene, z)[1 if finger == 0 else 0]
+    assert hanging[1] < place_tips(scene, finger, angles[finger])[1]
+    assert finger_gap(scene, z[:3], finger, angles[finger])[0] == pytest.approx(0.0, abs=1e-15)
+    formation = make_formation(scene, f"e0-tip{finger + 1}")
+    assert (formation.evaluate_limits(z[None])[0] > 0.01).all()
+
+
+def test_describe() -> None:
+    contacts = [parse_contact(name, WIDE) for name in ("v1-palm", "e0-tip1")]
+    assert describe(contacts) == "e0-tip1 v1-palm"
+    assert describe([]) == "nothing"

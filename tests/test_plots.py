@@ -1,0 +1,412 @@
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon
+from matplotlib.text import Text
+
+import wholearm
+from wholearm import plots
+from wholearm.errors import InputError
+from wholearm.model import Array
+from wholearm.problem import Problem
+from wholearm.torque import TorqueProfile
+from wholearm.trajectory import Trajectory, assemble
+
+HEPTAGON = Path(__file__).parents[1] / "problems" / "heptagon_four_contacts.toml"
+
+
+@dataclasses.dataclass
+class Replayed:
+    t: Array
+    phase: Any
+    tau: Array
+    c_n: Array
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    return wholearm.load(str(HEPTAGON))
+
+
+@pytest.fixture(scope="module")
+def planned(problem: Problem) -> Trajectory:
+    return wholearm.solve(problem, intervals=20)
+
+
+@pytest.fixture(scope="module")
+def figure(planned: Trajectory) -> Figure:
+    return plots.force_margins(planned)
+
+
+@pytest.fixture
+def axes() -> Axes:
+    figure = Figure()
+    FigureCanvasAgg(figure)
+    return figure.add_subplot()
+
+
+def line_of(axes: Axes, label: str) -> Line2D:
+    (line,) = (line for line in axes.lines if line.get_label() == label)
+    return line
+
+
+def data_of(line: Line2D) -> tuple[Array, Array]:
+    x, y = line.get_data()
+    return np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+
+
+def levels(axes: Axes) -> list[float]:
+    """Heights of the lines that cross the whole axes."""
+    every = [data_of(line) for line in axes.lines]
+    return [float(y[0]) for x, y in every if x.tolist() == [0, 1] and y[0] == y[1]]
+
+
+def repeat(trajectory: Trajectory, phases: list[int]) -> Trajectory:
+    """The trajectory's phases in another order and number, with torques joined from samples."""
+    motions = [trajectory.motions[k] for k in phases]
+    parts = [trajectory.phase == k for k in phases]
+    starts = np.cumsum([0.0, *(motion.duration for motion in motions)])
+    t = [
+        trajectory.t[p] - trajectory.t[p][0] + start
+        for p, start in zip(parts, starts[:-1], strict=True)
+    ]
+    tau = np.concatenate([trajectory.tau[part] for part in parts])
+    joined = np.maximum.accumulate(np.concatenate(t))
+    return assemble(motions, TorqueProfile.join_rows(joined, tau), trajectory.meta, 101)
+
+
+def visible(figure: Figure) -> list[tuple[str, Any]]:
+    """Every text that is drawn and its box in pixels; tick labels beyond the limits are not."""
+    canvas: Any = figure.canvas
+    canvas.draw()
+    renderer = canvas.get_renderer()
+    drawn = {id(text) for text in figure.findobj(Text)}
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            low, high = sorted(axis.get_view_interval())
+            for tick in axis.get_major_ticks():
+                inside = low <= tick.get_loc() <= high
+                if not inside or not tick.label1.get_visible() or not axes.axison:
+                    drawn.discard(id(tick.label1))
+                drawn.discard(id(tick.label2))
+    chosen = [text for text in figure.findobj(Text) if id(text) in drawn]
+    shown = [t for t in chosen if isinstance(t, Text) and t.get_visible() and t.get_text().strip()]
+    return [(text.get_text(), text.get_window_extent(renderer)) for text in shown]
+
+
+def check_layout(figure: Figure) -> None:
+    """No text outside the figure, none upon another, none smaller than 8 points."""
+    found = visible(figure)
+    assert len(found) > 20
+    for name, box in found:
+        assert box.x0 >= 0 and box.y0 >= 0, name
+        assert box.x1 <= figure.bbox.width and box.y1 <= figure.bbox.height, name
+    for (one, a), (other, b) in itertools.combinations(found, 2):
+        apart = a.x1 <= b.x0 or b.x1 <= a.x0 or a.y1 <= b.y0 or b.y1 <= a.y0
+        assert apart, (one, other)
+    for text in figure.findobj(Text):
+        assert isinstance(text, Text)
+        assert float(text.get_fontsize()) >= 8
+
+
+def test_figure_has_a_strip_and_two_panels_with_units(figure: Figure) -> None:
+    *strip, margins, torques = figure.axes
+    assert len(strip) == 6
+    assert "[N]" in margins.get_ylabel()
+    assert "[N m]" in torques.get_ylabel()
+    assert "[s]" in torques.get_xlabel()
+    assert margins.get_xlim() == torques.get_xlim()
+
+
+def test_strip_has_one_scale_and_its_bar(figure: Figure) -> None:
+    figure.canvas.draw()
+    scales = []
+    for axes in figure.axes[:6]:
+        box, (left, right), (low, high) = axes.bbox, axes.get_xlim(), axes.get_ylim()
+        scales += [box.width / (right - left), box.height / (high - low)]
+    np.testing.assert_allclose(scales, scales[0], rtol=1e-6)
+    assert "50 mm" in [text.get_text() for text in figure.axes[0].texts]
+    assert np.ptp(data_of(figure.axes[0].lines[-1])[0]) == pytest.approx(0.05)
+
+
+def test_snapshots_say_when_and_which_phase(figure: Figure, planned: Trajectory) -> None:
+    captions = [axes.texts[-1].get_text() for axes in figure.axes[1:6]]
+    times = [float(caption.split()[0]) for caption in captions]
+    np.testing.assert_allclose(times, planned.phase_starts[1:], atol=5e-4)
+    assert [c.split("\n")[1] for c in captions] == [f"phase {k}" for k in range(2, 6)] + ["end"]
+
+
+def test_margins_are_the_trajectory_with_breaks_at_phases(
+    figure: Figure, planned: Trajectory
+) -> None:
+    margins = figure.axes[-2]
+    boundaries = np.flatnonzero(np.diff(planned.phase)) + 1
+    for index, name in enumerate(planned.contacts):
+        t, values = data_of(line_of(margins, name))
+        rows = ~np.isnan(t)
+        np.testing.assert_array_equal(t[rows], planned.t)
+        np.testing.assert_array_equal(values[rows], planned.c_n[:, index] - 0.05)
+        assert np.isnan(values[~rows]).all()
+        before = np.cumsum(rows)[~rows]
+        assert set(boundaries) <= set(before)
+
+
+def test_forces_step_at_phases_and_reversals_only(planned: Trajectory) -> None:
+    steps = plots.find_steps(planned)
+    boundaries = np.flatnonzero(np.diff(planned.phase)) + 1
+    assert set(boundaries) <= set(steps)
+    # Nothing right beside a boundary, whose torque steps are the boundary's own.
+    assert not set(boundaries + 1) & set(steps) and not set(boundaries - 1) & set(steps)
+    reversed_at = np.flatnonzero((planned.c_t[1:] * planned.c_t[:-1] < 0).any(axis=1)) + 1
+    assert len(reversed_at) and set(reversed_at) <= set(steps)
+    # What is drawn through is no jump: it shrinks with the samples' distance.
+    plain = np.setdiff1d(np.arange(1, len(planned.t)), steps)
+    change = np.abs(planned.c_n[plain] - planned.c_n[plain - 1])
+    assert np.nanmedian(change) < 0.1
+
+
+def test_zero_line_and_limits_are_there(
+    figure: Figure, planned: Trajectory, problem: Problem
+) -> None:
+    margins, torques = figure.axes[-2:]
+    assert 0.0 in levels(margins)
+    low, high = margins.get_ylim()
+    assert low < -problem.epsilon and high > np.nanmax(planned.c_n) - problem.epsilon
+    limits = problem.scene.torque_limit
+    assert sorted(y for y in levels(torques) if y) == sorted([*limits, *-limits])
+    for line in torques.lines:
+        if line.get_label() == "limits":
+            assert line.is_dashed()
+
+
+def test_unequal_limits_are_drawn_each(axes: Axes, planned: Trajectory) -> None:
+    plots.draw_torques(axes, planned.torque, np.array([2.0, 3.0]))
+    assert sorted(y for y in levels(axes) if y) == [-3.0, -2.0, 2.0, 3.0]
+    assert axes.get_ylim()[1] > 3.0
+
+
+def test_every_contact_is_named_and_styled_alike(figure: Figure, planned: Trajectory) -> None:
+    margins = figure.axes[-2]
+    legend = margins.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == list(planned.contacts)
+    for axes, phase in zip(figure.axes[:6], [0, 1, 2, 3, 4, 4], strict=True):
+        for name in planned.motions[phase].contacts:
+            assert line_of(axes, name).get_markerfacecolor() == line_of(margins, name).get_color()
+
+
+def test_styles_differ_for_two_dozen_contacts() -> None:
+    styles = plots.choose_styles([f"v{i}-palm" for i in range(24)])
+    assert len(set(styles.values())) == 24
+
+
+def test_torque_lines_have_both_ends_of_every_step(axes: Axes) -> None:
+    profile = TorqueProfile(
+        np.array([0.0, 0.5, 2.0]),
+        np.array([[[0.25, 0.25, 0.0], [1.0, 0.0, 0.0]], [[-1.0, 0.0, 0.5], [1.0, 0.0, 0.0]]]),
+    )
+    line, other = plots.draw_torques(axes, profile, np.array([2.0, 2.0]))
+    t, tau = data_of(line)
+    np.testing.assert_allclose(tau[t == 0.5], [0.5, -0.5])
+    inside = t != 0.5
+    np.testing.assert_allclose(tau[inside], profile.at(t[inside])[:, 0], atol=1e-12)
+    np.testing.assert_allclose(data_of(other)[1], 1.0)
+
+
+def test_planned_torques_are_drawn_exactly(figure: Figure, planned: Trajectory) -> None:
+    for index in range(2):
+        t, tau = data_of(line_of(figure.axes[-1], f"finger {index + 1}"))
+        inside = np.abs(t[:, None] - planned.torque.breaks).min(axis=1) > 1e-9
+        expected = planned.torque.at(t[inside])[:, index]
+        np.testing.assert_allclose(tau[inside], expected, atol=1e-10)
+
+
+@pytest.mark.parametrize("row", [0, 320, -1])
+def test_snapshot_is_to_scale(axes: Axes, planned: Trajectory, problem: Problem, row: int) -> None:
+    z, names = planned.z[row], planned.motions[planned.phase[row]].contacts
+    scene, styles = problem.scene, plots.choose_styles(planned.contacts)
+    _, *links, body = plots.draw_snapshot(axes, scene, z, names, styles)[:4]
+    c, s = np.cos(z[2]), np.sin(z[2])
+    corners = [(z[0] + c * x - s * y, z[1] + s * x + c * y) for x, y in scene.polygon.vertices]
+    assert isinstance(body, Polygon)
+    np.testing.assert_allclose(body.get_xy()[:-1], corners, atol=1e-15)
+    for link, finger, angle in zip(links, scene.fingers, z[3:], strict=True):
+        assert isinstance(link, Polygon)
+        offset = link.get_xy() - np.asarray(finger.base)
+        axis = np.array([np.cos(angle), np.sin(angle)])
+        along = np.clip(offset @ axis, 0.0, finger.length)
+        distance = np.hypot(*(offset - along[:, None] * axis).T)
+        np.testing.assert_allclose(distance, finger.radius, atol=1e-15)
+        assert np.max(offset @ axis) == pytest.approx(finger.length + finger.radius)
+    marks = {str(line.get_label()): line for line in axes.lines}
+    for name in names:
+        found = np.ravel(data_of(marks[name]))
+        vertex = corners[int(name[1])]
+        np.testing.assert_allclose(found, vertex, atol=1e-12)
+    numbers = [text.get_text() for text in axes.texts]
+    assert numbers == [str(i) for i in range(7)]
+
+
+def test_touching_vertices_lie_on_the_links_outline(planned: Trajectory, problem: Problem) -> None:
+    for row in (0, 320, len(planned.t) - 1):
+        z = planned.z[row]
+        names = [name for name in planned.motions[planned.phase[row]].contacts if "finger" in name]
+        for name, point in zip(names, plots.place_contacts(problem.scene, z, names), strict=True):
+            finger = int(name[-1]) - 1
+            outline = plots.trace_link(problem.scene.fingers[finger], z[3 + finger])
+            run = np.roll(outline, -1, axis=0) - outline
+            part = ((point - outline) * run).sum(axis=1) / np.maximum((run**2).sum(axis=1), 1e-30)
+            nearest = outline + np.clip(part, 0, 1)[:, None] * run
+            assert np.hypot(*(nearest - point).T).min() < 1e-7
+
+
+def test_tip_contacts_are_marked_on_the_tips_surface(problem: Problem) -> None:
+    point = plots.place_contacts(problem.scene, problem.start, ["e3-tip1"])[0]
+    finger, angle = problem.scene.fingers[0], problem.start[3]
+    tip = np.asarray(finger.base) + finger.length * np.array([np.cos(angle), np.sin(angle)])
+    assert np.hypot(*(point - tip)) == pytest.approx(finger.radius)
+
+
+def test_snapshots_are_at_least_six_and_at_most_seven(planned: Trajectory) -> None:
+    for phases in ([0], [0, 1], [0, 1, 2], [0, 1, 2, 3], list(range(5)), [0, 1] * 5):
+        trajectory = repeat(planned, phases)
+        rows = plots.choose_snapshots(trajectory)
+        assert 6 <= len(rows) <= 7
+        assert rows[0] == 0 and rows[-1] == len(trajectory.t) - 1
+        assert (np.diff(rows) > 0).all()
+        if len(phases) < 7:
+            boundaries = np.flatnonzero(np.diff(trajectory.phase)) + 1
+            assert set(boundaries) <= set(rows)
+
+
+def test_text_is_inside_and_apart(figure: Figure) -> None:
+    check_layout(figure)
+
+
+@pytest.mark.parametrize("phases", [[0], [2, 3], [0, 1, 2, 3], [0, 1, 2, 3, 4] * 4])
+def test_text_is_inside_and_apart_for_other_plans(planned: Trajectory, phases: list[int]) -> None:
+    trajectory = repeat(planned, phases)
+    check_layout(plots.force_margins(trajectory))
+
+
+def test_loaded_trajectory_gives_the_same_figure(
+    planned: Trajectory, figure: Figure, tmp_path: Path
+) -> None:
+    planned.save(tmp_path / "plan.npz")
+    loaded = plots.force_margins(wholearm.load_trajectory(tmp_path / "plan.npz"))
+    plots.save(figure, tmp_path / "planned.svg")
+    plots.save(loaded, tmp_path / "loaded.svg")
+    assert (tmp_path / "planned.svg").read_bytes() == (tmp_path / "loaded.svg").read_bytes()
+
+
+def test_simulation_is_drawn_over_the_plan(planned: Trajectory) -> None:
+    c_n = planned.c_n.copy()
+    c_n[100, 0] = -3.0
+    simulation: Any = Replayed(planned.t, planned.phase, planned.tau, c_n)
+    figure = plots.force_margins(planned, simulation=simulation)
+    margins, torques = figure.axes[-2:]
+    line = line_of(margins, "simulated")
+    t, values = data_of(line)
+    rows = ~np.isnan(t)
+    assert (~rows).sum() == 4
+    np.testing.assert_array_equal(values[rows], c_n[:, 0] - 0.05)
+    assert margins.get_ylim()[0] < -3.05
+    assert line.is_dashed() and line_of(torques, "simulated").is_dashed()
+    check_layout(figure)
+
+
+@pytest.mark.parametrize(("epsilon", "largest"), [(0.0, 3.0), (0.05, 9.9), (2.0, 40.0), (5.0, 1e4)])
+def test_scale_shows_zero_and_the_largest_margin(
+    axes: Axes, planned: Trajectory, epsilon: float, largest: float
+) -> None:
+    c_n = epsilon + (planned.c_n - 0.05) * largest / (np.nanmax(planned.c_n) - 0.05)
+    scaled = dataclasses.replace(planned, c_n=c_n)
+    plots.draw_margins(axes, scaled, epsilon, plots.choose_styles(planned.contacts))
+    axes.figure.canvas.draw()
+    low, high = axes.get_ylim()
+    assert low < min(-epsilon, 0.0) and high > largest
+    zero, top = axes.transData.transform([(0, 0), (0, largest)])[:, 1]
+    assert 0.05 < (zero - axes.bbox.y0) / axes.bbox.height < 0.5 < top / axes.bbox.y1
+    labels = [tick.get_text() for tick in axes.get_yticklabels()]
+    assert "0" in labels
+    assert all(re.fullmatch("\u2212?[0-9.]+", label) for label in labels)
+
+
+@pytest.mark.parametrize(
+    ("ending", "magic"), [(".png", b"\x89PNG\r\n"), (".PDF", b"%PDF-"), (".svg", b"<?xml")]
+)
+def test_save_writes_the_format_of_the_ending_and_the_same_bytes(
+    figure: Figure, planned: Trajectory, tmp_path: Path, ending: str, magic: bytes
+) -> None:
+    first, second, third = (tmp_path / f"{name}{ending}" for name in "abc")
+    plots.save(figure, first)
+    plots.save(figure, second)
+    plots.save(plots.force_margins(planned), str(third))
+    assert first.read_bytes().startswith(magic)
+    assert first.read_bytes() == second.read_bytes() == third.read_bytes()
+    assert b"Date" not in first.read_bytes() and b"dc:date" not in first.read_bytes()
+    assert len(first.read_bytes()) < 1_000_000
+
+
+def test_png_has_at_least_150_dots_per_inch(figure: Figure, tmp_path: Path) -> None:
+    plots.save(figure, tmp_path / "a.png")
+    width = int.from_bytes((tmp_path / "a.png").read_bytes()[16:20], "big")
+    assert width >= 150 * plots.SIZE[0]
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a", "png", "a.png.txt"])
+def test_save_refuses_other_endings(figure: Figure, tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError, match=r"allowed are \.png, \.pdf, \.svg") as caught:
+        plots.save(figure, tmp_path / name)
+    assert name in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_save_names_the_place_that_cannot_be_written(figure: Figure, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be written") as caught:
+        plots.save(figure, tmp_path / "none" / "a.png")
+    assert os.path.join("none", "a.png") in str(caught.value)
+
+
+def test_trajectory_without_its_problem_is_refused(planned: Trajectory) -> None:
+    bare = dataclasses.replace(planned, meta={"epsilon": 0.05})
+    with pytest.raises(InputError, match=r"meta\.problem"):
+        plots.force_margins(bare)
+
+
+def test_odd_names_are_drawn_as_they_are(planned: Trajectory) -> None:
+    for name in ("cost $5 and \\frac{", "a long name " * 20, ""):
+        meta = {**planned.meta, "name": name}
+        check_layout(plots.force_margins(dataclasses.replace(planned, meta=meta)))
+
+
+def test_settings_of_matplotlib_are_left_alone_and_pyplot_is_not_imported(
+    planned: Trajectory, tmp_path: Path
+) -> None:
+    planned.save(tmp_path / "plan.npz")
+    code = (
+        "import sys, matplotlib, wholearm\n"
+        "before = matplotlib.rcParams.copy()\n"
+        f"plan = wholearm.load_trajectory({str(tmp_path / 'plan.npz')!r})\n"
+        "figure = wholearm.plots.force_margins(plan)\n"
+        "for ending in ('png', 'pdf', 'svg'):\n"
+        f"    wholearm.plots.save(figure, {str(tmp_path)!r} + '/a.' + ending)\n"
+        "assert matplotlib.rcParams.copy() == before\n"
+        "assert 'matplotlib.pyplot' not in sys.modules\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

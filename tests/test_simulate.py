@@ -1,0 +1,445 @@
+from __future__ import annotations
+
+import dataclasses
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from planned import CosineMotion, change, plan
+from wholearm.baseline_simulation import simulate_with_scipy, solve_motion
+from wholearm.contact import parse_contact
+from wholearm.dynamics import Directions, forward
+from wholearm.errors import InputError, JammingError, SimulationError
+from wholearm.events import EventKind, OutcomeKind
+from wholearm.formation import Formation
+from wholearm.model import Array, Finger, Friction, Scene
+from wholearm.problem import Phase, Problem, Until
+from wholearm.simulate import simulate
+from wholearm.sticking import balances, find_rest
+from wholearm.torque import TorqueProfile
+
+
+def pick(index: int) -> tuple[Problem, CosineMotion]:
+    """One phase of the heptagon as a problem of its own, and its motion."""
+    problem, trajectory = plan()
+    motion = trajectory.motions[index]
+    assert isinstance(motion, CosineMotion)
+    old = problem.phases[index]
+    phase = Phase(0, old.formation, old.until)
+    return dataclasses.replace(problem, start=motion.curve.start, phases=(phase,)), motion
+
+
+def rebuild(problem: Problem, **edits: object) -> Problem:
+    """The problem on an edited scene."""
+    scene = dataclasses.replace(problem.scene, **edits)  # type: ignore[arg-type]
+    phases = tuple(
+        Phase(p.index, Formation(scene, p.formation.contacts), p.until) for p in problem.phases
+    )
+    return dataclasses.replace(problem, scene=scene, phases=phases)
+
+
+def smooth_fingers(scene: Scene) -> tuple[Finger, ...]:
+    return tuple(dataclasses.replace(f, viscous=0.0, dry=0.0) for f in scene.fingers)
+
+
+def constant(tau: tuple[float, float], duration: float = 0.2) -> TorqueProfile:
+    return TorqueProfile(np.array([0.0, duration]), np.array(tau).reshape(1, 2, 1))
+
+
+def test_imports_nothing_of_the_planner() -> None:
+    code = "import sys, wholearm.simulate; print(*sys.modules)"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(run.stdout.split())
+    planner = {
+        "path",
+        "curve",
+        "pathmotion",
+        "collocation",
+        "pathplan",
+        "pathnlp",
+        "pathdata",
+        "timeplan",
+        "plan",
+    }
+    assert not loaded & {f"wholearm.{name}" for name in planner}
+    assert not loaded & {"scipy", "matplotlib"}
+
+
+def test_follows_the_plan() -> None:
+    problem, trajectory = plan()
+    simulation = simulate(problem, trajectory.torque, times=trajectory.t)
+    assert simulation.outcome.kind is OutcomeKind.GOAL_REACHED
+    for index, motion in enumerate(trajectory.motions):
+        rows = simulation.phase == index
+        end = motion.evaluate(np.array([motion.duration])).z[0]
+        # Both are solutions to about 1e-12; the interpolated torques add 1e-11.
+        assert np.allclose(simulation.z[rows][-1], end, atol=1e-9, rtol=0)
+        names = [simulation.contacts.index(name) for name in motion.contacts]
+        start = trajectory.phase_starts[index]
+        here = np.flatnonzero(rows & ~np.isnan(simulation.c_n).all(axis=1))
+        # Leave out the instants at which forces jump.
+        near = np.abs(simulation.t[here, None] - start - motion.turns).min(axis=1) < 1e-6  # type: ignore[attr-defined]
+        here = here[~near]
+        samples = motion.evaluate(simulation.t[here] - start)
+        assert np.allclose(simulation.c_n[np.ix_(here, names)], samples.c_n, atol=1e-6, rtol=0)
+        assert np.allclose(simulation.c_t[np.ix_(here, names)], samples.c_t, atol=1e-6, rtol=0)
+        assert np.allclose(simulation.z_ddot[here], samples.z_ddot, atol=1e-6, rtol=0)
+    energies = simulation.energies
+    assert np.abs(energies.residual).max() < 1e-9 * energies.work[-1]
+    arrivals = simulation.find(EventKind.ARRIVAL)
+    assert [event.phase for event in arrivals] == [0, 1, 2, 3, 4]
+    assert all(abs(event.value) < 1e-4 for event in arrivals)
+    boundaries = trajectory.phase_starts[1:]
+    assert np.allclose([event.time for event in arrivals], boundaries, atol=1e-5, rtol=0)
+
+
+def test_contacts_stay_closed() -> None:
+    problem, trajectory = plan()
+    simulation = simulate(problem, trajectory.torque)
+    for index, phase in enumerate(problem.phases):
+        rows = simulation.phase == index
+        kinematics = phase.formation.evaluate(simulation.z[rows], simulation.z_dot[rows])
+        rates = np.einsum("nij,nj->ni", kinematics.A, simulation.z_dot[rows])
+        # Each step is projected, which leaves rounding.
+        assert np.abs(kinematics.C).max() < 1e-15
+        assert np.abs(rates).max() < 1e-13
+
+
+@pytest.mark.parametrize("index", [0, 2, 4])
+def test_finds_the_reversals_of_the_curve(index: int) -> None:
+    problem, motion = pick(index)
+    simulation = simulate(problem, motion.fit(40, 7))
+    reversals = simulation.find(EventKind.REVERSAL)
+    assert [e.time for e in reversals] == pytest.approx(list(motion.turns[1:-1]), abs=1e-9)
+
+
+@pytest.mark.parametrize("late", [-4e-7, 4e-7])
+def test_a_torque_step_belongs_to_its_reversal(late: float) -> None:
+    problem, motion = pick(0)
+    exact = motion.fit(40, 7)
+    turn = motion.turns[1]
+    moved = np.where(np.abs(exact.breaks - turn) < 1e-12, turn + late, exact.breaks)
+    torque = TorqueProfile(moved, exact.coefficients)
+    wanted = turn + late / 2
+    simulation = simulate(problem, torque, times=[wanted])
+    assert simulation.outcome.reached
+    (reversal,) = simulation.find(EventKind.REVERSAL)
+    (step,) = simulation.find(EventKind.TORQUE_STEP)
+    assert step.time == turn + late
+    # The wrong torques act for 0.4 us at about 1 m/s^2.
+    assert reversal.time == pytest.approx(turn, abs=1e-5)
+    t = simulation.t[~np.isnan(simulation.c_n).all(axis=1)]
+    between = sorted([reversal.time, step.time])
+    assert not ((t > between[0]) & (t < between[1])).any()
+    assert np.isfinite(simulation.at(wanted)).all()
+
+
+def test_error_follows_tolerance() -> None:
+    problem, motion = pick(1)
+    torque = motion.fit(1, 24)
+    times = np.array([0.15, 0.3, 0.37])
+    reference = simulate(problem, torque, tolerance=1e-13, times=times)
+    errors = []
+    for tolerance in (1e-4, 1e-6, 1e-8, 1e-10):
+        simulation = simulate(problem, torque, tolerance=tolerance, times=times)
+        error = max(np.abs(simulation.at(t) - reference.at(t)).max() for t in times)
+        # The local error is controlled; a few steps add up.
+        assert error < 20 * tolerance
+        errors.append(error)
+    assert errors == sorted(errors, reverse=True)
+    assert errors[-1] < 1e-10
+
+
+@pytest.mark.parametrize("index", [1, 3])
+def test_agrees_with_the_baseline(index: int) -> None:
+    problem, motion = pick(index)
+    torque = motion.fit(1, 24)
+    segment = motion.curve.segments[0]
+    stop = 0.8 * motion.duration
+    run = simulate_with_scipy(
+        problem,
+        0,
+        torque,
+        problem.start,
+        np.zeros(5),
+        segment.Xi,
+        segment.sigma,
+        (0.0, stop),
+        rtol=1e-12,
+        atol=1e-12,
+    )
+    state = simulate(problem, torque, tolerance=1e-12, times=[stop]).at(stop)
+    assert np.allclose(state, np.hstack([run.z[-1], run.z_dot[-1]]), atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("v0-palm", "v1-palm", "v2-finger1", "v5-finger2"),
+        ("v1-palm", "e3-tip1", "v6-finger2", "e6-tip2"),
+    ],
+)
+def test_baseline_agrees_with_the_dynamics(names: tuple[str, ...]) -> None:
+    problem, _ = plan()
+    formation = Formation(problem.scene, tuple(parse_contact(n, problem.scene) for n in names))
+    rng = np.random.default_rng(4)
+    for _ in range(5):
+        # Neither needs closed contacts: the equations are linear in the unknowns anywhere.
+        z, v = problem.start + 0.1 * rng.normal(size=5), rng.normal(size=5)
+        tau, signs = rng.normal(size=2), rng.choice([-1.0, 1.0], size=6)
+        directions = Directions(signs[:4], signs[4:])
+        try:
+            expected = forward(formation, z, v, tau, directions)
+        except JammingError:
+            continue
+        found = solve_motion(problem.scene, formation.contacts, z, v, tau, *directions)
+        for a, b in zip(found, expected, strict=True):
+            assert np.allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
+
+
+def test_states_do_not_depend_on_the_times_asked_for() -> None:
+    problem, trajectory = plan()
+    torque = trajectory.torque
+    rng = np.random.default_rng(1)
+    few = simulate(problem, torque, times=[0.55, 1.9])
+    many = simulate(problem, torque, times=[0.55, 1.9, *rng.uniform(0, 2, 200)])
+    for t in (0.55, 1.9):
+        assert np.allclose(few.at(t), many.at(t), atol=1e-9, rtol=0)
+    with pytest.raises(ValueError, match="not recorded"):
+        few.at(0.1234)
+
+
+def test_energy_is_conserved_without_friction() -> None:
+    problem, motion = pick(3)
+    free = rebuild(problem, friction=Friction(0.0, 0.0, 0.0), fingers=smooth_fingers(problem.scene))
+    torque = CosineMotion(
+        dataclasses.replace(motion.curve, formation=free.phases[0].formation),
+        motion.duration,
+        motion.squeeze,
+    ).fit(1, 24)
+    energies = simulate(free, torque, tolerance=1e-11).energies
+    assert energies.work.max() > 1e-3
+    for loss in (energies.viscous, energies.dry, energies.contact):
+        assert not loss.any()
+    assert np.abs(energies.residual).max() < 1e-9 * energies.work.max()
+
+
+def test_sticks_without_torques() -> None:
+    problem, _ = plan()
+    simulation = simulate(problem, constant((0.0, 0.0)), times=[0.1])
+    assert simulation.outcome.kind is OutcomeKind.GOAL_MISSED
+    assert "short of v3-finger1" in simulation.outcome.text
+    assert [e.kind for e in simulation.events] == [EventKind.STICK, EventKind.END]
+    assert np.isnan(simulation.c_n).all()
+    assert np.abs(simulation.z - problem.start).max() < 1e-15
+    assert simulation.missed_by == pytest.approx(simulation.events[-1].value)
+
+
+def test_starts_when_a_ramp_overcomes_friction() -> None:
+    problem, motion = pick(1)
+    tau = motion.evaluate(np.array([0.0])).tau[0]
+    rise = np.stack([tau / 2, tau / 2], axis=1)[None]
+    simulation = simulate(problem, TorqueProfile(np.array([0.0, 0.4]), rise))
+    start = simulation.find(EventKind.START)[0].time
+    segment = motion.curve.segments[0]
+
+    def acceleration(t: float) -> float:
+        directions = Directions(segment.Xi, segment.sigma)
+        z_ddot, _ = forward(
+            problem.phases[0].formation, problem.start, np.zeros(5), tau * t / 0.4, directions
+        )
+        return float(z_ddot @ motion.evaluate(np.array([0.0])).z_ddot[0])
+
+    assert 0.05 < start < 0.4
+    assert acceleration(start - 1e-6) < 0 < acceleration(start + 1e-6)
+
+
+def test_a_contact_pulled_at_rest_is_lost() -> None:
+    problem, _ = plan()
+    simulation = simulate(problem, constant((-0.2, 0.2)))
+    assert simulation.outcome.kind is OutcomeKind.CONTACT_LOST
+    assert "finger" in simulation.events[-1].contact
+    assert simulation.events[-1].time == 0.0
+    assert simulation.events[-1].value < 0
+
+
+def test_balance_at_rest() -> None:
+    problem, _ = plan()
+    contacts = problem.phases[0].formation.contacts
+    assert balances(problem.scene, contacts, problem.start, np.zeros(2))
+    # Fingers that open by less than their dry friction stay; by more, they do not.
+    assert balances(problem.scene, contacts, problem.start, np.array([-0.0099, 0.0099]))
+    assert not balances(problem.scene, contacts, problem.start, np.array([-0.0101, 0.0]))
+
+
+def test_torque_steps_are_recorded_twice() -> None:
+    problem, motion = pick(1)
+    torque = motion.fit(40, 7)
+
+    def kick(starts: Array, c: Array) -> Array:
+        c[starts >= 0.2 - 1e-12, :, 0] += [0.01, -0.01]
+        return c
+
+    stepped = change(torque, kick)
+    simulation = simulate(problem, stepped)
+    (event,) = simulation.find(EventKind.TORQUE_STEP)
+    rows = np.flatnonzero(simulation.t == event.time)
+    assert len(rows) == 2
+    before, after = rows
+    assert simulation.tau[after] - simulation.tau[before] == pytest.approx([0.01, -0.01])
+    assert np.array_equal(simulation.z[before], simulation.z[after])
+    assert np.array_equal(simulation.z_dot[before], simulation.z_dot[after])
+    assert np.nanmax(np.abs(simulation.c_n[after] - simulation.c_n[before])) > 1e-3
+
+
+def test_contact_is_lost_when_the_squeeze_fades() -> None:
+    problem, motion = pick(1)
+    fading = dataclasses.replace(motion, fade=1.0)
+    torque = fading.fit(40, 7)
+    simulation = simulate(problem, torque, tolerance=1e-11)
+    assert simulation.outcome.kind is OutcomeKind.CONTACT_LOST
+    event = simulation.events[-1]
+    assert event.kind is EventKind.CONTACT_LOST
+    lost = problem.phases[0].formation.names.index(event.contact)
+    # Inverse dynamics know the place; the interpolated torques are good to about 1e-11.
+    c_n = fading.evaluate(np.array([event.time])).c_n[0]
+    assert abs(c_n[lost]) < 1e-8
+    assert (np.delete(c_n, lost) > 0.01).all()
+    segment = motion.curve.segments[0]
+    run = simulate_with_scipy(
+        problem,
+        0,
+        torque,
+        problem.start,
+        np.zeros(5),
+        segment.Xi,
+        segment.sigma,
+        (0.0, 0.4),
+        rtol=1e-11,
+        atol=1e-11,
+        watch_forces=True,
+    )
+    assert run.lost == lost
+    # SciPy finds an event on its interpolant, which is less accurate than its steps.
+    assert event.time == pytest.approx(run.t[-1], abs=1e-7)
+    assert simulation.outcome.text == (
+        f"c_n of {event.contact} falls to zero at t = {event.time:.5g} s, phase 1"
+    )
+
+
+def test_overshoot_arrives_at_a_speed() -> None:
+    problem, trajectory = plan()
+
+    def brake_less(starts: Array, c: Array) -> Array:
+        c[(starts > 0.3) & (starts < 0.4 - 1e-9)] *= 0.97
+        return c
+
+    simulation = simulate(problem, change(trajectory.torque, brake_less))
+    event = simulation.find(EventKind.ARRIVAL)[0]
+    last = int(np.flatnonzero(simulation.phase == 0)[-1])
+    assert event.time == simulation.t[last] < 0.395
+    gained = problem.phases[0].until.contact
+    assert gained is not None
+    formation = Formation(problem.scene, (gained,))
+    z, z_dot = simulation.z[last], simulation.z_dot[last]
+    kinematics = formation.evaluate(z[None], z_dot[None])
+    assert abs(kinematics.C[0, 0]) < 1e-15
+    assert event.value == pytest.approx(-kinematics.A[0, 0] @ z_dot, rel=1e-9)
+    assert event.value > 1e-3
+    # The arrival is plastic: all kinetic energy is lost.
+    energies = simulation.energies
+    kinetic = 0.5 * z_dot**2 @ problem.scene.mass_diagonal
+    assert energies.impact[last + 1] == pytest.approx(kinetic, rel=1e-9)
+    assert not simulation.z_dot[last + 1].any()
+    assert np.abs(energies.residual).max() < 1e-9 * energies.work.max()
+
+
+def test_short_of_the_goal_it_comes_to_rest() -> None:
+    problem, trajectory = plan()
+
+    def brake_more(starts: Array, c: Array) -> Array:
+        c[(starts > 0.3) & (starts < 0.4 - 1e-9)] *= 1.05
+        return c
+
+    simulation = simulate(problem, change(trajectory.torque, brake_more))
+    event = simulation.find(EventKind.REST)[0]
+    row = int(np.flatnonzero(simulation.t == event.time)[-1])
+    assert event.phase == 0 and event.time < 0.4
+    assert not simulation.z_dot[row].any()
+
+
+def test_another_limit_ends_the_motion() -> None:
+    problem, motion = pick(1)
+    phase = Phase(0, problem.phases[0].formation, Until(coordinate="x", value=-1.0))
+    aimless = dataclasses.replace(problem, phases=(phase,))
+    tau = motion.evaluate(np.array([0.0])).tau[0]
+    simulation = simulate(aimless, constant((float(tau[0]), float(tau[1])), 2.0))
+    assert simulation.outcome.kind is OutcomeKind.LIMIT_REACHED
+    assert "v6 touches finger 2" in simulation.outcome.text
+    assert np.abs(simulation.z[-1] - motion.curve.end).max() < 1e-7
+
+
+def test_until_may_be_a_coordinate() -> None:
+    problem, motion = pick(1)
+    middle = float(motion.evaluate(np.array([0.2])).z[0, 0])
+    phase = Phase(0, problem.phases[0].formation, Until(coordinate="x", value=middle))
+    simulation = simulate(dataclasses.replace(problem, phases=(phase,)), motion.fit(40, 7))
+    assert simulation.outcome.reached
+    assert simulation.t[-1] == pytest.approx(0.2, abs=1e-9)
+    samples = motion.evaluate(np.array([0.2]))
+    assert simulation.events[-1].value == pytest.approx(abs(samples.z_dot[0, 0]), abs=1e-8)
+
+
+def test_jamming_is_an_error_that_names_phase_and_time() -> None:
+    problem, motion = pick(2)
+    # On this much friction the phase starts, and jams on the way.
+    rough = rebuild(problem, friction=Friction(0.4, 0.1, 2.0))
+    curve = dataclasses.replace(motion.curve, formation=rough.phases[0].formation)
+    torque = CosineMotion(curve, motion.duration, 0.3).fit(40, 7)
+    place = r"v6-finger2 jams in phase 1 at t = 0\.1\d+ s: friction"
+    with pytest.raises(JammingError, match=place):
+        simulate(rough, torque)
+
+
+def test_a_jammed_formation_at_rest() -> None:
+    problem, motion = pick(1)
+    rough = rebuild(problem, friction=Friction(1.5, 1.5, 1.5))
+    rest = find_rest(rough.phases[0].formation, rough.start)
+    assert max(way.ratio for way in rest.ways) < 0
+    simulation = simulate(rough, constant((0.0, 0.0)))
+    assert simulation.outcome.kind is OutcomeKind.GOAL_MISSED
+    assert np.abs(simulation.z - rough.start).max() < 1e-15
+    # Torques that nothing balances have no motion to go with either.
+    tau = motion.evaluate(np.array([0.0])).tau[0]
+    with pytest.raises(JammingError, match="jams at rest in phase 1 at t = 0 s"):
+        simulate(rough, constant((float(tau[0]), float(tau[1]))))
+
+
+def test_formation_that_does_not_close_is_an_error() -> None:
+    problem, _ = plan()
+    wrong = dataclasses.replace(problem, start=problem.start + np.eye(5)[1])
+    with pytest.raises(SimulationError, match="does not touch in phase 1 at t = 0 s"):
+        simulate(wrong, constant((0.0, 0.0)))
+
+
+@pytest.mark.parametrize("tolerance", [0.0, -1e-9, math.nan, 1.0])
+def test_bad_tolerance(tolerance: float) -> None:
+    problem, trajectory = plan()
+    with pytest.raises(InputError, match="tolerance"):
+        simulate(problem, trajectory.torque, tolerance=tolerance)
+
+
+def test_bad_times() -> None:
+    problem, trajectory = plan()
+    with pytest.raises(InputError, match="times"):
+        simulate(problem, trajectory.torque, times=[0.0, math.nan])
+
+
+def test_progress_is_reported() -> None:
+    problem, trajectory = plan()
+    seen: list[str] = []
+    simulate(problem, trajectory.torque, progress=seen.append)
+    assert seen == [f"simulating phase {k} of 5" for k in range(1, 6)]

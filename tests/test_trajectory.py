@@ -1,0 +1,259 @@
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wholearm.errors import InputError
+from wholearm.model import Array
+from wholearm.torque import TorqueProfile
+from wholearm.trajectory import SampledMotion, Samples, Trajectory, assemble, load_trajectory
+
+ARRAYS = ["t", "q", "theta", "q_dot", "theta_dot", "q_ddot", "theta_ddot", "tau", "c_n", "c_t"]
+TEXT = ["contacts", "meta"]
+TORQUE = ["torque_breaks", "torque_coefficients"]
+
+
+@dataclass(frozen=True)
+class Polynomials:
+    """A motion of quintic coordinates and linear forces."""
+
+    duration: float
+    contacts: tuple[str, ...]
+    seed: int
+
+    def evaluate(self, t: Array) -> Samples:
+        rng = np.random.default_rng(self.seed)
+        z = [np.polynomial.Polynomial(c) for c in rng.uniform(-1, 1, (5, 6))]
+        lines = rng.uniform(-1, 1, (2, 2 + 2 * len(self.contacts)))
+        forces = lines[0] + np.asarray(t)[:, None] * lines[1]
+        m = len(self.contacts)
+        return Samples(
+            np.column_stack([p(t) for p in z]),
+            np.column_stack([p.deriv()(t) for p in z]),
+            np.column_stack([p.deriv(2)(t) for p in z]),
+            forces[:, :2],
+            forces[:, 2 : 2 + m],
+            forces[:, 2 + m :],
+        )
+
+
+MOTIONS = (
+    Polynomials(0.7, ("v0-palm", "v1-palm", "v2-finger1"), 1),
+    Polynomials(0.2, ("v1-palm", "e2-tip1", "v2-finger1"), 2),
+)
+
+
+@pytest.fixture
+def trajectory() -> Trajectory:
+    torque = TorqueProfile(
+        np.array([0.0, 0.7, 0.9]), np.random.default_rng(0).uniform(-1, 1, (2, 2, 4))
+    )
+    return assemble(MOTIONS, torque, {"status": "solved", "epsilon": 0.05}, samples=9)
+
+
+def read_arrays(trajectory: Trajectory) -> dict[str, Any]:
+    arrays: dict[str, Any] = {name: getattr(trajectory, name) for name in [*ARRAYS, "phase"]}
+    arrays |= {
+        "contacts": np.array(trajectory.contacts),
+        "torque_breaks": trajectory.torque.breaks,
+        "torque_coefficients": trajectory.torque.coefficients,
+        "meta": np.array(json.dumps(dict(trajectory.meta))),
+    }
+    return arrays
+
+
+def test_assemble_lays_phases_end_to_end(trajectory: Trajectory) -> None:
+    assert trajectory.contacts == ("v0-palm", "v1-palm", "v2-finger1", "e2-tip1")
+    expected = np.concatenate([np.linspace(0, 0.7, 9), 0.7 + np.linspace(0, 0.2, 9)])
+    np.testing.assert_allclose(trajectory.t, expected, rtol=1e-15)
+    assert trajectory.phase.tolist() == [0] * 9 + [1] * 9
+    np.testing.assert_allclose(trajectory.phase_starts, [0.0, 0.7, 0.9])
+    assert trajectory.duration == pytest.approx(0.9)
+    second = MOTIONS[1].evaluate(np.linspace(0, 0.2, 9))
+    np.testing.assert_array_equal(trajectory.z[9:], second.z)
+    np.testing.assert_array_equal(trajectory.z_dot[9:], second.z_dot)
+    np.testing.assert_array_equal(trajectory.z_ddot[9:], second.z_ddot)
+    np.testing.assert_array_equal(trajectory.tau[9:], second.tau)
+    np.testing.assert_array_equal(trajectory.c_n[9:, [1, 3, 2]], second.c_n)
+    np.testing.assert_array_equal(trajectory.c_t[9:, [1, 3, 2]], second.c_t)
+    assert np.isnan(trajectory.c_n[9:, 0]).all() and np.isnan(trajectory.c_t[:9, 3]).all()
+
+
+@pytest.mark.parametrize("t, phase, local", [(0.0, 0, 0.0), (0.3, 0, 0.3), (0.7, 1, 0.0)])
+def test_at_asks_the_right_phase(
+    trajectory: Trajectory, t: float, phase: int, local: float
+) -> None:
+    expected = MOTIONS[phase].evaluate(np.array([local]))
+    for found, wanted in zip(trajectory.at(t), expected, strict=True):
+        np.testing.assert_allclose(found, wanted, atol=1e-15)
+
+
+def test_at_reaches_the_end_and_no_farther(trajectory: Trajectory) -> None:
+    end = trajectory.at(trajectory.duration)
+    np.testing.assert_allclose(end.z, MOTIONS[1].evaluate(np.array([0.2])).z, atol=1e-14)
+    for t in (-1e-9, trajectory.duration + 1e-9, float("nan")):
+        with pytest.raises(ValueError, match="outside the trajectory"):
+            trajectory.at(t)
+
+
+def test_file_keeps_every_bit(trajectory: Trajectory, tmp_path: Path) -> None:
+    trajectory.save(tmp_path / "a.npz")
+    loaded = load_trajectory(tmp_path / "a.npz")
+    for name in [*ARRAYS, "phase"]:
+        one, other = getattr(trajectory, name), getattr(loaded, name)
+        assert one.dtype == other.dtype and one.tobytes() == other.tobytes()
+    assert loaded.contacts == trajectory.contacts and loaded.meta == trajectory.meta
+    np.testing.assert_array_equal(loaded.torque.breaks, trajectory.torque.breaks)
+    np.testing.assert_array_equal(loaded.torque.coefficients, trajectory.torque.coefficients)
+    # And the same file again from what was read.
+    loaded.save(tmp_path / "b.npz")
+    with np.load(tmp_path / "a.npz") as a, np.load(tmp_path / "b.npz") as b:
+        assert a.files == b.files
+        assert all(a[name].tobytes() == b[name].tobytes() for name in a.files)
+
+
+def test_loaded_motions_reproduce_quintics(trajectory: Trajectory, tmp_path: Path) -> None:
+    trajectory.save(tmp_path / "a.npz")
+    loaded = load_trajectory(tmp_path / "a.npz")
+    for motion, known in zip(loaded.motions, MOTIONS, strict=True):
+        assert set(motion.contacts) == set(known.contacts)
+        assert motion.duration == pytest.approx(known.duration)
+        t = np.linspace(0, known.duration, 101)
+        found, wanted = motion.evaluate(t), known.evaluate(t)
+        # Second derivatives divide rounding by the square of the step, 1/40 s.
+        for value, exact, error in zip(
+            found[:4], wanted[:4], (1e-14, 1e-12, 1e-10, 1e-14), strict=True
+        ):
+            np.testing.assert_allclose(value, exact, atol=error)
+        order = [known.contacts.index(name) for name in motion.contacts]
+        np.testing.assert_allclose(found.c_n, wanted.c_n[:, order], atol=1e-13)
+        np.testing.assert_allclose(found.c_t, wanted.c_t[:, order], atol=1e-13)
+
+
+def test_sampled_motion_goes_through_its_samples() -> None:
+    rng = np.random.default_rng(4)
+    t = np.cumsum(rng.uniform(0.1, 0.3, 6))
+    known = Samples(*(rng.uniform(-1, 1, (6, width)) for width in (5, 5, 5, 2, 4, 4)))
+    motion = SampledMotion(t, ("a", "b", "c", "d"), known)
+    for found, wanted in zip(motion.evaluate(t - t[0]), known, strict=True):
+        np.testing.assert_allclose(found, wanted, atol=1e-11)
+
+
+def changed(arrays: dict[str, Any], name: str, change: str) -> Any:
+    value = np.array(arrays[name])
+    if change == "0-d":
+        return np.array(1.0)
+    if change == "short":
+        return value[:-1]
+    if change == "wide":
+        return np.concatenate([value, value], axis=-1)
+    if change == "text":
+        return np.full(value.shape, "x")
+    value = value.astype(float)
+    value.flat[3 if value.size > 3 else 0] = {"nan": np.nan, "inf": np.inf}[change]
+    return value
+
+
+@pytest.mark.parametrize("name", [*ARRAYS, "phase", *TEXT, *TORQUE])
+def test_missing_array_is_named(trajectory: Trajectory, tmp_path: Path, name: str) -> None:
+    arrays = read_arrays(trajectory)
+    del arrays[name]
+    np.savez(tmp_path / "a.npz", **arrays)
+    with pytest.raises(InputError, match="array is missing") as caught:
+        load_trajectory(tmp_path / "a.npz")
+    assert (caught.value.source, caught.value.key) == (str(tmp_path / "a.npz"), name)
+
+
+@pytest.mark.parametrize(
+    "name, change",
+    [(name, change) for name in [*ARRAYS, "phase"] for change in ("0-d", "inf", "text")]
+    + [(name, "nan") for name in ARRAYS if name not in ("c_n", "c_t")]
+    + [(name, "short") for name in [*ARRAYS[1:], "phase", "torque_coefficients"]]
+    + [(name, "wide") for name in ARRAYS[1:]]
+    + [(name, change) for name in TORQUE for change in ("0-d", "nan", "text")]
+    + [("contacts", "0-d")],
+)
+def test_bad_array_is_named(trajectory: Trajectory, tmp_path: Path, name: str, change: str) -> None:
+    arrays = read_arrays(trajectory)
+    arrays[name] = changed(arrays, name, change)
+    np.savez(tmp_path / "a.npz", **arrays)
+    with pytest.raises(InputError) as caught:
+        load_trajectory(tmp_path / "a.npz")
+    # A wrong length of t or of contacts shows in what depends on it.
+    loose = {"t": {"t", "q"}, "contacts": {"contacts", "c_n"}}
+    assert caught.value.key in loose.get(name, {name})
+
+
+@pytest.mark.parametrize(
+    "name, value, problem",
+    [
+        ("meta", np.array("{"), "is not JSON"),
+        ("meta", np.array("[1]"), "not a JSON object"),
+        ("meta", np.array(["{}", "{}"]), "is not JSON"),
+        ("meta", np.array(1.0), "not a JSON object"),
+        ("contacts", np.arange(4.0), "does not hold text"),
+        ("t", np.linspace(1, 2, 18), "start at 0"),
+        ("t", np.linspace(0, -1, 18), "increase"),
+        ("t", np.zeros(18), "increase"),
+        ("phase", np.array([0] * 9 + [2] * 9), "count up"),
+        ("phase", np.array([1] * 9 + [0] * 9), "count up"),
+        ("phase", np.array([0] * 17 + [1]), "two or more rows"),
+        ("phase", np.array([0] * 9 + [10**12] * 9), "count up"),
+        ("phase", np.array([0.0] * 9 + [1.0] * 9), "float64"),
+        ("torque_breaks", np.array([0.0, 0.9, 0.7]), "increase"),
+        ("torque_breaks", np.array([0.0, 0.9]), "pieces"),
+    ],
+)
+def test_bad_value_is_named(
+    trajectory: Trajectory, tmp_path: Path, name: str, value: Any, problem: str
+) -> None:
+    np.savez(tmp_path / "a.npz", **(read_arrays(trajectory) | {name: value}))
+    with pytest.raises(InputError, match=problem) as caught:
+        load_trajectory(tmp_path / "a.npz")
+    assert caught.value.key == ("torque_coefficients" if problem == "pieces" else name)
+
+
+def test_empty_arrays(trajectory: Trajectory, tmp_path: Path) -> None:
+    arrays = read_arrays(trajectory)
+    arrays |= {name: arrays[name][:0] for name in [*ARRAYS, "phase"]}
+    np.savez(tmp_path / "a.npz", **arrays)
+    with pytest.raises(InputError, match="phase"):
+        load_trajectory(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("content", [b"", b"not an archive", b"PK\x03\x04 broken", None])
+def test_not_a_trajectory_file(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "a.npz"
+    if content is None:
+        with path.open("wb") as stream:
+            np.save(stream, np.zeros(3))
+    else:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match="is not a trajectory file") as caught:
+        load_trajectory(path)
+    assert caught.value.source == str(path)
+
+
+@pytest.mark.parametrize("name", ["absent.npz", "."])
+def test_unreadable_file(tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        load_trajectory(tmp_path / name)
+
+
+def test_truncated_file(trajectory: Trajectory, tmp_path: Path) -> None:
+    trajectory.save(tmp_path / "a.npz")
+    content = (tmp_path / "a.npz").read_bytes()
+    (tmp_path / "a.npz").write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError, match="is not a trajectory file"):
+        load_trajectory(tmp_path / "a.npz")
+
+
+def test_unwritable_place_leaves_nothing(trajectory: Trajectory, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be written"):
+        trajectory.save(tmp_path / "absent" / "a.npz")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,171 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from planned import change, plan
+from wholearm.errors import InputError
+from wholearm.model import Array
+from wholearm.torque import TorqueProfile
+from wholearm.verify import find_least, verify
+
+
+def brake_less(starts: Array, c: Array) -> Array:
+    c[(starts > 0.3) & (starts < 0.4 - 1e-9)] *= 0.97
+    return c
+
+
+def test_a_good_plan_passes() -> None:
+    problem, trajectory = plan()
+    report = verify(problem, trajectory)
+    assert report.ok and report.reached and report.exit_status == 0
+    assert report.failures == report.warnings == ()
+    assert report.missed_by == 0.0
+    assert len(report.phases) == 5
+    for phase in report.phases:
+        assert phase.arrival is not None and phase.arrival_rate is not None
+        assert phase.arrival == pytest.approx(0.4 * phase.number, abs=1e-5)
+        assert abs(phase.arrival_rate) < 1e-4
+        for deviation in (phase.end_deviation, phase.deviation):
+            assert deviation is not None
+            # The interpolated torques are good to about 1e-11.
+            assert deviation.position < 1e-9 and deviation.angle < 1e-9
+    assert report.energy.relative < 1e-9
+
+
+def test_least_forces_are_those_of_inverse_dynamics() -> None:
+    problem, trajectory = plan()
+    report = verify(problem, trajectory)
+    for phase, motion in zip(report.phases, trajectory.motions, strict=True):
+        turns = motion.turns  # type: ignore[attr-defined]
+        t = np.concatenate([np.linspace(a, b - 1e-12, 4001) for a, b in pairwise(turns)])
+        c_n = motion.evaluate(t).c_n
+        for margin in phase.contacts:
+            column = motion.contacts.index(margin.contact)
+            # 4001 samples miss a minimum by less than 1e-7 N, the parabola by less than 1e-6 N.
+            assert margin.least == pytest.approx(c_n[:, column].min(), abs=2e-6)
+            assert margin.margin == pytest.approx(margin.least - problem.epsilon)
+
+
+def test_a_thin_margin_fails_a_plan_but_not_torques() -> None:
+    problem, trajectory = plan()
+    strict = dataclasses.replace(problem, epsilon=0.25)
+    report = verify(strict, trajectory)
+    assert report.exit_status == 1 and report.reached
+    (text,) = report.failures
+    thin = report.phases[0].contacts[3]
+    assert text == (
+        f"c_n of v5-finger2 falls to {thin.least:.5g} N, below epsilon = 0.25 N, "
+        f"at t = {thin.time:.5g} s, phase 1"
+    )
+    relaxed = verify(strict, trajectory.torque)
+    assert relaxed.ok and relaxed.warnings == report.failures
+    assert relaxed.phases[0].deviation is None
+
+
+def test_epsilon_on_the_edge_is_kept() -> None:
+    problem, trajectory = plan()
+    least = min(c.least for p in verify(problem, trajectory).phases for c in p.contacts)
+    touching = dataclasses.replace(problem, epsilon=least + 5e-7)
+    assert verify(touching, trajectory).ok
+    over = dataclasses.replace(problem, epsilon=least + 2e-6)
+    assert not verify(over, trajectory).ok
+
+
+def test_a_lost_contact_fails() -> None:
+    problem, trajectory = plan()
+    report = verify(problem, change(trajectory.torque, brake_less))
+    assert report.exit_status == 1 and not report.reached
+    assert report.failures == (report.outcome,)
+    assert report.outcome.startswith("c_n of ") and report.outcome.endswith("phase 2")
+    worst = min(report.phases[-1].contacts, key=lambda c: c.least if c.least < math.inf else 1.0)
+    assert worst.contact in report.outcome and worst.least < 0
+    assert f"failure: {report.outcome}" not in report.to_text()
+    assert report.to_text().startswith(f"{problem.name}: FAILED\n{report.outcome}\n")
+
+
+def test_a_missed_goal_fails() -> None:
+    problem, trajectory = plan()
+    torque = trajectory.torque
+    keep = int(np.searchsorted(torque.breaks, 1.9))
+    report = verify(problem, TorqueProfile(torque.breaks[: keep + 1], torque.coefficients[:keep]))
+    assert not report.ok and not report.reached
+    assert "short of phi = -50 deg" in report.failures[0]
+    last = trajectory.motions[4].evaluate(np.array([torque.breaks[keep] - 1.6]))
+    assert report.missed_by == pytest.approx(abs(last.z[0, 2] - math.radians(-50)), abs=1e-9)
+    assert report.phases[-1].arrival is None
+
+
+def test_torques_for_nothing() -> None:
+    problem, _ = plan()
+    report = verify(problem, TorqueProfile(np.array([0.0, 0.1]), np.zeros((1, 2, 1))))
+    assert not report.ok
+    assert all(math.isnan(c.least) for c in report.phases[0].contacts)
+    assert report.energy.work == report.energy.relative == 0.0
+    values = report.to_dict()
+    assert values["phases"][0]["contacts"][0]["least"] is None
+    assert json.loads(json.dumps(values, allow_nan=False)) == values
+    assert "-" in report.to_text()
+
+
+def test_torques_beyond_their_limit_are_a_warning() -> None:
+    problem, trajectory = plan()
+    right, left = (dataclasses.replace(f, torque_limit=1.0) for f in problem.scene.fingers)
+    weak = dataclasses.replace(problem.scene, fingers=(right, left))
+    report = verify(dataclasses.replace(problem, scene=weak), trajectory.torque)
+    assert report.ok
+    assert any("above its limit 1 N m" in text for text in report.warnings)
+
+
+def test_text_and_values() -> None:
+    problem, trajectory = plan()
+    report = verify(problem, trajectory)
+    values = report.to_dict()
+    assert json.loads(json.dumps(values, allow_nan=False)) == values
+    assert values["ok"] is True and values["exit_status"] == 0
+    text = report.to_text()
+    assert "least c_n [N]" in text and "work of the torques" in text
+    assert all(contact.name in text for contact in problem.contacts)
+    lines = [line for line in text.splitlines() if " v0-palm " in line]
+    assert len({line.index("v0-palm") for line in lines}) == 1
+    assert all(line == line.rstrip() for line in text.splitlines())
+
+
+def test_energy_balance_adds_up() -> None:
+    problem, trajectory = plan()
+    energy = verify(problem, change(trajectory.torque, brake_less)).energy
+    out = energy.kinetic + energy.potential
+    out += energy.viscous + energy.dry + energy.contact + energy.impact
+    assert energy.impact > 1e-7
+    assert energy.work == pytest.approx(out, rel=1e-9)
+    assert energy.residual == pytest.approx(energy.work - out, abs=1e-14)
+
+
+def test_another_problem_is_refused() -> None:
+    problem, trajectory = plan()
+    shorter = dataclasses.replace(problem, phases=problem.phases[:2])
+    with pytest.raises(InputError, match="v6-finger2"):
+        verify(shorter, trajectory)
+
+
+def test_least_of_a_parabola_is_exact() -> None:
+    t = np.array([0.0, 0.4, 1.0])
+    least, time = find_least(t, (t - 0.55) ** 2 + 0.2, t[[0, -1]])
+    assert least == pytest.approx(0.2, abs=1e-15)
+    assert time == pytest.approx(0.55, abs=1e-15)
+
+
+def test_no_parabola_crosses_a_kink_or_a_jump() -> None:
+    flat_then_steep = np.array([0.05, 0.05, 0.05, 1.0, 2.0])
+    t = np.array([0.0, 0.1, 0.2, 0.3, 0.4])
+    assert find_least(t, flat_then_steep, np.array([0.0, 0.2, 0.4]))[0] == 0.05
+    t = np.array([0.0, 0.1, 0.1, 0.2, 0.3])
+    values = np.array([1.0, 1.0, 0.2, 0.3, 0.5])
+    # Inside the second stretch the parabola through its three points has its least at its start.
+    assert find_least(t, values, np.array([0.0, 0.3]))[0] == pytest.approx(0.2, abs=0.01)
+    assert all(math.isnan(x) for x in find_least(t, np.full(5, np.nan), t))
