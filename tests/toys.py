@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -11,30 +12,28 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from wholearm import pathplan
-from wholearm.dynamics import PathForces
+from wholearm import pathdata
+from wholearm.curve import Curve, Segment
+from wholearm.dynamics import Directions, PathForces
 from wholearm.model import Array
 from wholearm.options import PlanOptions
-from wholearm.path import Curve, Segment
-from wholearm.pathdata import KNOTS, LOOKS, PhaseData, Places
-from wholearm.pathmotion import Grid
 from wholearm.pathplan import PathPlan, plan_path
 
-Law = Callable[[Array, NDArray[np.int64]], tuple[Array, ...]]
-"""Coefficients (Ta, Tl, Tv), each (n, 2), at n arc lengths of given segments."""
+Law = Callable[[Array, NDArray[np.bool_]], tuple[Array, ...]]
+"""Coefficients (Ta, Tl, Tv), each (n, 2), at n arc lengths, before or after the break."""
 
 
 @dataclass(frozen=True)
 class Toy:
     """A point on a line with one contact: c_n = squeeze and tau = Ta a + Tl squeeze + Tv v.
 
-    The joints move at the rates `rates` per metre and are held to `limit` and `speed_limit`.
+    The joints move one radian per metre and are held to `limit` and `speed_limit`.
     """
 
     law: Law
     length: float = 1.0
     breaks: tuple[float, ...] = ()
-    limit: tuple[float, float] = (2.0, 1e3)
+    limit: tuple[float, float] = (2.0, 2.0)
     speed_limit: tuple[float, float] = (np.inf, np.inf)
     epsilon: float = 0.05
 
@@ -47,43 +46,70 @@ class Toy:
             speed_limit=np.array(self.speed_limit),
         )
         segments = [
-            Segment(*pair, np.ones(1), np.ones(2)) for pair in zip(ends[:-1], ends[1:], strict=True)
+            Segment(start, stop, np.ones(1), np.full(2, float(index)))
+            for index, (start, stop) in enumerate(zip(ends[:-1], ends[1:], strict=True))
         ]
         formation = SimpleNamespace(scene=scene, n_contacts=1, names=("v0-palm",))
         stub: Any = SimpleNamespace(length=self.length, segments=segments, formation=formation)
-        stub.evaluate = lambda s: SimpleNamespace(z=np.zeros((len(s), 5)) + s[:, None])
+        stub.evaluate = _evaluate
         curve: Curve = stub
         return curve
 
-    def places(self, s: Array, segment: NDArray[np.int64]) -> Places:
-        none, one = np.zeros((len(s), 1)), np.ones((len(s), 1))
-        flat = np.zeros((len(s), 2))
-        Ta, Tl, Tv = self.law(s, segment)
-        forces = PathForces(none, none, none, one, flat, Ta, flat, Tl, Tv)
-        return Places(forces, np.ones((len(s), 2)))
-
-    def prepare(self, curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
-        solid = np.flatnonzero(grid.steps > 0)
-
-        def inside(fractions: Array) -> Places:
-            s = grid.s[solid, None] + fractions * grid.steps[solid, None]
-            return self.places(s.ravel(), np.repeat(grid.segment[solid], len(fractions)))
-
-        nodes = self.places(grid.s, grid.segment)
-        return PhaseData(curve, epsilon, grid, nodes, inside(KNOTS), inside(LOOKS), solid)
-
     def plan(self, duration: float | None = None, **options: Any) -> PathPlan:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(pathplan, "prepare", self.prepare)
+        with self.in_place():
             return plan_path(self.curve, self.epsilon, PlanOptions(**options), 1, duration)
+
+    @contextmanager
+    def in_place(self) -> Iterator[None]:
+        """Let the planner see this toy's forces."""
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(pathdata, "inverse", self._inverse)
+            patch.setattr(pathdata, "reduced_inertia", lambda *_: np.ones(1))
+            yield
+
+    def _inverse(
+        self, _: Any, z: Array, z_s: Array, z_ss: Array, directions: Directions, __: Any
+    ) -> PathForces:
+        none, one = np.zeros((len(z), 1)), np.ones((len(z), 1))
+        flat = np.zeros((len(z), 2))
+        # The segment's number stands in for the directions of its joints.
+        Ta, Tl, Tv = self.law(z[:, 0], directions.sigma[:, 0] > 0)
+        return PathForces(none, none, none, one, flat, Ta, flat, Tl, Tv)
+
+
+class _Point(tuple[Array, Array, Array]):
+    kinematics = None
+
+    @property
+    def z(self) -> Array:
+        return self[0]
+
+    @property
+    def z_s(self) -> Array:
+        return self[1]
+
+
+def _evaluate(s: Array) -> _Point:
+    z = np.outer(s, [1.0, 0.0, 0.0, 1.0, 1.0])
+    return _Point((z, np.ones_like(z), 0 * z))
 
 
 def constant(Ta: float, Tl: float = 0.0, Tv: float = 0.0) -> Law:
-    """tau_1 = Ta a + Tl squeeze + Tv v; tau_2 the same with a of the other sign."""
+    """tau_1 = Ta a + Tl squeeze + Tv v; tau_2 the same with the other sign of a and v."""
 
-    def law(s: Array, segment: NDArray[np.int64]) -> tuple[Array, ...]:
+    def law(s: Array, later: NDArray[np.bool_]) -> tuple[Array, ...]:
         one = np.ones(len(s))
         columns = [(Ta, -Ta), (Tl, Tl), (Tv, -Tv)]
         return tuple(np.column_stack([left * one, right * one]) for left, right in columns)
+
+    return law
+
+
+def inertia(of: Callable[[Array, NDArray[np.bool_]], Array]) -> Law:
+    """tau_1 = inertia a and tau_2 = 0, with an inertia that depends on the place."""
+
+    def law(s: Array, later: NDArray[np.bool_]) -> tuple[Array, ...]:
+        flat = np.zeros((len(s), 2))
+        return np.column_stack([of(s, later), 0 * s]), flat, flat
 
     return law

@@ -7,7 +7,7 @@ import io
 import os
 import platform
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import matplotlib
@@ -21,7 +21,8 @@ from .files import write_whole
 from .plots import save
 
 _LOOKS = {
-    "path NLP": ("#0072B2", "o"),
+    "phase time": ("#0072B2", "o"),
+    "simulated end": ("#009E73", "D"),
     "wholearm": ("#0072B2", "o"),
     "SciPy DOP853": ("#D55E00", "s"),
     "SciPy RK45": ("#CC79A7", "^"),
@@ -84,12 +85,13 @@ def draw_run_times(rows: Sequence[Row]) -> Figure:
         figure = Figure(figsize=(10.0, 4.4), layout="constrained")
         FigureCanvasAgg(figure)
         planner, simulator = figure.subplots(1, 2)
-        _draw_study(planner, rows, "planner: phase time", "path NLP")
+        _draw_study(planner, rows, "planner: phase time", "path NLP", "phase time")
+        _draw_study(planner, rows, "planner: simulated end", "path NLP", "simulated end")
         _draw_baseline(planner, rows)
         planner.set_title("Planning all phases, over the number of intervals")
-        planner.set_xlabel("relative error of the phase time [-]")
+        planner.set_xlabel("error of the phase time [-], of the simulated end [m, rad]")
         for method in ("wholearm", "SciPy DOP853", "SciPy RK45"):
-            _draw_study(simulator, rows, "simulator", method)
+            _draw_study(simulator, rows, "simulator", method, method)
         simulator.set_title("Simulating all phases, over the tolerance")
         simulator.set_xlabel("largest error of z and z' [m, rad, m/s, rad/s]")
         for axes in (planner, simulator):
@@ -102,20 +104,15 @@ def draw_run_times(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def _draw_study(axes: Axes, rows: Sequence[Row], study: str, method: str) -> None:
+def _draw_study(axes: Axes, rows: Sequence[Row], study: str, method: str, label: str) -> None:
     mine = [row for row in rows if row.study == study and row.method == method and row.error]
-    colour, marker = _LOOKS[method]
-    errors = [row.error or 0.0 for row in mine]
-    axes.plot(errors, [row.seconds for row in mine], color=colour, marker=marker, label=method)
-    if study.startswith("planner"):
-        for row in mine:
-            axes.annotate(
-                row.setting,
-                (row.error or 0.0, row.seconds),
-                (4, 4),
-                textcoords="offset points",
-                fontsize=8,
-            )
+    points = [(row.error or 0.0, row.seconds) for row in mine]
+    colour, marker = _LOOKS[label]
+    axes.plot(*zip(*points, strict=True), color=colour, marker=marker, label=label)
+    if label == "phase time":
+        for row, point in zip(mine, points, strict=True):
+            look: Any = {"textcoords": "offset points", "fontsize": 8}
+            axes.annotate(row.setting, point, (4, 4), **look)
 
 
 def _draw_baseline(axes: Axes, rows: Sequence[Row]) -> None:
@@ -124,4 +121,6 @@ def _draw_baseline(axes: Axes, rows: Sequence[Row]) -> None:
     whole = [row.seconds for row in mine if row.setting == "all phases"]
     if errors and whole:
         colour, marker = _LOOKS["plain Opti"]
-        axes.plot([max(errors)], whole, color=colour, marker=marker, ls="", label="plain Opti")
+        axes.plot(
+            [max(errors)], whole, color=colour, marker=marker, ls="", label="plain Opti, phase time"
+        )

@@ -1,12 +1,11 @@
 """What one phase gives the planner: forces along its curve, at nodes and between them.
 
-Forces are evaluated at the nodes and at three places of every interval. They are smooth there, so
-polynomials through these five carry them to all places where limits are looked at.
+Forces are evaluated at the nodes and at a few places of every interval, the knots. They are smooth
+there, so polynomials through the knots carry them to all places where limits are looked at.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,10 +18,12 @@ from .model import Array
 from .pathmotion import Grid, PathMotion, Profile, directions_of
 from .torque import TorqueProfile
 
-KNOTS = np.linspace(0.0, 1.0, 5)
-"""Where in an interval forces are evaluated, its ends included."""
-LOOKS = np.arange(1, 16) / 16
-"""Where in an interval limits are looked at."""
+
+class Fineness(NamedTuple):
+    """Where in an interval forces are evaluated and limits looked at, its ends included."""
+
+    knots: Array
+    looks: Array
 
 
 class Places(NamedTuple):
@@ -46,10 +47,11 @@ class PhaseData(NamedTuple):
     grid : Grid
     nodes : Places
         At the nodes.
+    fine : Fineness
     knots : Places
-        At `KNOTS` of every solid interval, interval by interval.
+        At the knots of every solid interval, interval by interval.
     looks : Places
-        At `LOOKS` of every solid interval, interval by interval.
+        At the looks of every solid interval, interval by interval.
     solid : ndarray of int
         The intervals that have a length.
     """
@@ -58,6 +60,7 @@ class PhaseData(NamedTuple):
     epsilon: float
     grid: Grid
     nodes: Places
+    fine: Fineness
     knots: Places
     looks: Places
     solid: NDArray[np.int64]
@@ -96,11 +99,12 @@ class PhaseData(NamedTuple):
 
         And how far b is beyond what the speed limits allow, shape (n_solid,), relative.
         """
-        here = self.spread(profile, LOOKS)
-        short = np.maximum(-self.slack(self.looks, here, margin), 0.0)
-        speeding = np.maximum(here.b / self.largest_b(self.looks) - 1, 0.0)
-        shape = (len(self.solid), len(LOOKS))
-        return short.reshape(*shape, -1).max(axis=1), speeding.reshape(shape).max(axis=1)
+        here = self.spread(profile, self.fine.looks)
+        speed_slack = 1 - here.b / self.largest_b(self.looks)
+        slack = np.column_stack([self.slack(self.looks, here, margin), speed_slack])
+        least = find_least(slack.reshape(len(self.solid), len(self.fine.looks), -1))
+        short = np.maximum(-least, 0.0)
+        return short[:, :-1], short[:, -1]
 
     def slack_beside(self, profile: Profile, margin: float, short: Array) -> Array:
         """The lesser slack of the two nodes of each solid interval, shape (n_solid, n_c + 4).
@@ -128,7 +132,8 @@ def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
         If friction makes the reduced inertia vanish or turn negative anywhere.
     """
     solid = np.flatnonzero(grid.steps > 0)
-    inner = KNOTS[1:-1]
+    fine = choose_fineness(len(grid.s))
+    inner = fine.knots[1:-1]
     between = (grid.s[solid, None] + inner * grid.steps[solid, None]).ravel()
     s = np.concatenate([grid.s, between])
     segment = np.concatenate([grid.segment, np.repeat(grid.segment[solid], len(inner))])
@@ -147,33 +152,46 @@ def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
     order = np.hstack([solid[:, None], own, solid[:, None] + 1])
     knots = every.pick(order.ravel())
 
+    powers = np.arange(len(fine.knots))
+    # Powers on [-1, 1]: on [0, 1] thirteen knots would cost nine digits.
+    looks_x, knots_x = 2 * fine.looks - 1, 2 * fine.knots - 1
+    carrier = looks_x[:, None] ** powers @ np.linalg.inv(knots_x[:, None] ** powers)
+
     def carry(values: Array) -> Array:
-        table = values.reshape(len(solid), len(KNOTS), -1)
-        return (_knots_to_looks() @ table).reshape(len(solid) * len(LOOKS), -1)
+        table = values.reshape(len(solid), len(fine.knots), -1)
+        return (carrier @ table).reshape(len(solid) * len(fine.looks), -1)
 
     looks = Places(PathForces(*(carry(part) for part in knots.forces)), carry(knots.rates))
     nodes = every.pick(slice(None, len(grid.s)))
-    return PhaseData(curve, epsilon, grid, nodes, knots, looks, solid)
+    return PhaseData(curve, epsilon, grid, nodes, fine, knots, looks, solid)
 
 
-@lru_cache(maxsize=1)
-def _knots_to_looks() -> Array:
-    """Matrix that takes values at `KNOTS` to those of their polynomial at `LOOKS`."""
-    powers = np.arange(len(KNOTS))
-    return np.asarray(LOOKS[:, None] ** powers @ np.linalg.inv(KNOTS[:, None] ** powers))
+def choose_fineness(nodes: int) -> Fineness:
+    """Choose more knots and looks where intervals are long."""
+    knots, looks = (5, 17) if nodes > 64 else (13, 65)
+    return Fineness(np.linspace(0.0, 1.0, knots), np.linspace(0.0, 1.0, looks))
+
+
+def find_least(values: Array) -> Array:
+    """Least value along the middle axis of evenly spaced values, also between them (parabolas)."""
+    before, here, after = values[:, :-2], values[:, 1:-1], values[:, 2:]
+    bend = before - 2 * here + after
+    inside = (here <= before) & (here <= after) & (bend > 0)
+    dip = np.divide((after - before) ** 2, 8 * bend, out=np.zeros_like(here), where=inside)
+    return np.asarray(np.minimum((here - dip).min(axis=1), values[:, [0, -1]].min(axis=1)))
 
 
 def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, float]:
-    """Torque of a motion as one polynomial in time per interval, through its values at `KNOTS`.
+    """Torque of a motion as one polynomial in time per interval, through its values at the knots.
 
     Also returns the integral of tau^T tau [(N m)^2 s].
     """
     k = data.solid
-    values = data.knots.forces.tau(*data.spread(motion.profile, KNOTS))
-    values = values.reshape(len(k), len(KNOTS), 2)
-    spans = motion.durations(KNOTS)[k]
+    values = data.knots.forces.tau(*data.spread(motion.profile, data.fine.knots))
+    values = values.reshape(len(k), len(data.fine.knots), 2)
+    spans = motion.durations(data.fine.knots)[k]
     x = 2 * spans / spans[:, -1:] - 1
-    powers = np.arange(len(KNOTS))
+    powers = np.arange(len(data.fine.knots))
     vandermonde = x[..., None] ** powers
     coefficients = np.linalg.solve(vandermonde, values)
     moments = (1 - (-1.0) ** (powers + 1)) / (powers + 1)

@@ -76,6 +76,8 @@ class PathMotion:
         rise = np.diff(a)[:, None]
         run = fractions * h
         later = b[:-1, None] + run * (2 * a[:-1, None] + fractions * rise)
+        # Rounding would cost the run to rest the square root of its digits.
+        later = np.where(fractions == 1.0, b[1:, None], later)
         speeds = np.sqrt(b[:-1, None]) + np.sqrt(np.maximum(later, 0.0))
         some = run > 0
         speeds = np.where(some, speeds, 1.0)

@@ -191,8 +191,8 @@ def build_path_nlp(n_contacts: int, intervals: int, objective: Objective) -> Pat
         c_rows = c_n - ca.repmat(margin, n, n_contacts)
         cost, last = -margin, [duration]
     else:
-        shortfall = ca.dot(node_weights, ca.sum2(short))
-        cost = shortfall + 1e-3 * duration
+        # Every node counts alike: where intervals are short, being short must not be cheap.
+        cost = ca.sum1(ca.sum2(short)) / n + 1e-4 * duration
         c_rows = c_n + short[:, :n_contacts]
         tau_rows = ca.horzcat(tau + short[:, n_contacts:], tau - short[:, n_contacts:])
     nodes = ca.horzcat(b, a, squeeze, short).T
@@ -213,6 +213,7 @@ def build_path_nlp(n_contacts: int, intervals: int, objective: Objective) -> Pat
         "print_time": False,
         "record_time": True,
         "calc_lam_p": False,
+        "no_nlp_grad": True,
         "show_eval_warnings": False,
         "error_on_fail": False,
     }

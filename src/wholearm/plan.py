@@ -144,5 +144,7 @@ def _join(plans: Sequence[PathPlan]) -> TorqueProfile:
     for plan in plans:
         breaks.append(start + plan.torque.breaks[1:])
         start += plan.motion.duration
-    coefficients = np.concatenate([plan.torque.coefficients for plan in plans])
-    return TorqueProfile(np.concatenate(breaks), coefficients)
+    blocks = [plan.torque.coefficients for plan in plans]
+    longest = max(block.shape[2] for block in blocks)
+    wide = [np.pad(block, ((0, 0), (0, 0), (0, longest - block.shape[2]))) for block in blocks]
+    return TorqueProfile(np.concatenate(breaks), np.concatenate(wide))

@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from wholearm.errors import InputError
+from wholearm.options import CHOICES, Objective, PlanOptions
+
+
+@pytest.mark.parametrize("choice", ["time", "effort", "margin"])
+def test_objectives_are_given_by_name_or_as_members(choice: str) -> None:
+    assert PlanOptions(objective=choice).goal is Objective(choice)
+    assert PlanOptions(objective=Objective(choice)) == PlanOptions(objective=choice)
+    assert choice in CHOICES
+
+
+def test_numbers_are_kept() -> None:
+    options = PlanOptions("margin", intervals=10, time_weight=3, duration=2, samples=2)
+    assert (options.intervals, options.time_weight, options.duration) == (10, 3.0, 2.0)
+    assert isinstance(options.time_weight, float) and isinstance(options.duration, float)
+
+
+@pytest.mark.parametrize(
+    "key, given",
+    [
+        ("objective", "speed"),
+        ("objective", "elastic"),
+        ("objective", Objective.ELASTIC),
+        ("objective", None),
+        ("objective", 3),
+        ("intervals", 9),
+        ("intervals", -80),
+        ("intervals", 80.0),
+        ("intervals", True),
+        ("intervals", "80"),
+        ("samples", 1),
+        ("samples", 2.5),
+        ("time_weight", 0.0),
+        ("time_weight", -1.0),
+        ("time_weight", math.nan),
+        ("time_weight", math.inf),
+        ("time_weight", "1"),
+        ("duration", 0.0),
+        ("duration", -0.1),
+        ("duration", math.nan),
+    ],
+)
+def test_bad_options_are_named(key: str, given: Any) -> None:
+    options = {"objective": "margin"} | {key: given}
+    with pytest.raises(InputError) as caught:
+        PlanOptions(**options)
+    assert caught.value.key == key and caught.value.exit_status == 2
+    assert repr(given) in str(caught.value)
+
+
+@pytest.mark.parametrize("objective", ["time", "effort"])
+def test_only_the_margin_has_a_duration(objective: str) -> None:
+    with pytest.raises(InputError, match="duration: is for the objective margin only"):
+        PlanOptions(objective=objective, duration=1.0)
