@@ -9,6 +9,7 @@ import math
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Any, TypeVar
 
 import numpy as np
@@ -34,27 +35,47 @@ _FINGER = {
 }
 
 
+class End(Enum):
+    """How a phase passes into the next one."""
+
+    REST = "rest"
+    """Everything stops."""
+    SMOOTH = "smooth"
+    """Position and velocity are continuous: a contact is gained softly or released."""
+
+
 @dataclass(frozen=True)
 class Until:
-    """What ends a phase: a contact gained, or a coordinate of the pose reached.
+    """What ends a phase: a contact gained, a coordinate of the pose reached, or a release.
 
     Attributes
     ----------
     contact : Contact or None
         The contact that is gained.
     coordinate : {"", "x", "phi"}
-        The coordinate, when there is no contact.
+        The coordinate, when there is one.
     value : float or None, [m] or [rad]
+
+    Notes
+    -----
+    With neither contact nor coordinate the phase ends where the planner chooses, by releasing the
+    contacts that the next phase does not have.
     """
 
     contact: Contact | None = None
     coordinate: str = ""
     value: float | None = None
 
+    @property
+    def is_release(self) -> bool:
+        """Whether the phase ends by a release, where the planner chooses."""
+        return self.contact is None and self.value is None
+
     def __str__(self) -> str:
         if self.contact is not None:
             return self.contact.name
-        assert self.value is not None
+        if self.value is None:
+            return "release"
         if self.coordinate == "x":
             return f"x = {self.value:g} m"
         return f"phi = {math.degrees(self.value):g} deg"
@@ -62,7 +83,7 @@ class Until:
 
 @dataclass(frozen=True, eq=False)
 class Phase:
-    """A stretch of the motion on one contact formation, from rest to rest.
+    """A stretch of the motion on one contact formation.
 
     Attributes
     ----------
@@ -70,11 +91,14 @@ class Phase:
         From 0; messages and files count from 1.
     formation : Formation
     until : Until
+    end : End
+        How it passes into the next phase; the last one ends at rest.
     """
 
     index: int
     formation: Formation
     until: Until
+    end: End = End.REST
 
     @property
     def number(self) -> int:
@@ -152,6 +176,8 @@ def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
     if not isinstance(given, list) or not given:
         raise InputError("", "phases", f"{given!r} is not a list of one or more [[phases]]")
     phases = tuple(_read_phase(scene, i, entry) for i, entry in enumerate(given))
+    for phase, following in zip(phases, [*phases[1:], None], strict=True):
+        _check_end(phase, following)
     problem = Problem(name, scene, epsilon, start, phases, source, table)
     _check_first_formation(problem)
     return problem
@@ -199,7 +225,7 @@ def _read_phase(scene: Scene, index: int, entry: object) -> Phase:
     key = f"phases[{index + 1}]"
     if not isinstance(entry, dict):
         raise InputError("", key, f"{entry!r} is not a table")
-    _check_keys(entry, key, {"contacts", "until"}, required={"contacts", "until"})
+    _check_keys(entry, key, {"contacts", "until", "end"}, required={"contacts"})
     names = entry["contacts"]
     if not isinstance(names, list) or not names:
         raise InputError("", f"{key}.contacts", f"{names!r} is not a list of contact names")
@@ -207,10 +233,19 @@ def _read_phase(scene: Scene, index: int, entry: object) -> Phase:
     twice = {contact.name for contact in contacts if contacts.count(contact) > 1}
     if twice:
         raise InputError("", f"{key}.contacts", f"{', '.join(sorted(twice))} is given twice")
-    until = _at(f"{key}.until", lambda: _read_until(scene, entry["until"]))
-    if until.contact in contacts:
+    given = entry.get("end", End.REST.value)
+    if given not in [end.value for end in End]:
+        raise InputError("", f"{key}.end", f"{given!r} given; allowed are 'rest' and 'smooth'")
+    until, end = Until(), End(given)
+    if "until" in entry:
+        until = _at(f"{key}.until", lambda: _read_until(scene, entry["until"]))
+    elif end is End.REST:
+        raise InputError(
+            "", f"{key}.until", "is missing; only a phase with end = 'smooth' has none"
+        )
+    if until.contact in contacts and until.contact is not None:
         raise InputError("", f"{key}.until", f"{until} is already in the phase's contacts")
-    return Phase(index, Formation(scene, tuple(contacts)), until)
+    return Phase(index, Formation(scene, tuple(contacts)), until, end)
 
 
 def _read_until(scene: Scene, given: object) -> Until:
@@ -224,6 +259,25 @@ def _read_until(scene: Scene, given: object) -> Until:
     if key == "x":
         return Until(coordinate="x", value=number)
     return Until(coordinate="phi", value=math.radians(number))
+
+
+def _check_end(phase: Phase, following: Phase | None) -> None:
+    """Check that a phase passes into the next one as its `end` says."""
+    if phase.end is End.REST:
+        return
+    key = f"phases[{phase.number}].end"
+    if following is None:
+        raise InputError("", key, "'smooth' given, but the last phase ends at rest")
+    before = {*phase.formation.contacts, phase.until.contact}
+    extra = [c.name for c in following.formation.contacts if c not in before]
+    if extra:
+        raise InputError(
+            "", key, f"'smooth' given, but phase {following.number} has {', '.join(extra)} too"
+        )
+    if phase.until.is_release and set(following.formation.contacts) == set(
+        phase.formation.contacts
+    ):
+        raise InputError("", key, f"phase {following.number} releases no contact")
 
 
 def _check_first_formation(problem: Problem) -> None:
