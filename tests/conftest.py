@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from wholearm.curve import Curve
-from wholearm.path import load, trace_phases
+from wholearm.outline import load
+from wholearm.path import trace_phases
 from wholearm.plan import solve
 from wholearm.problem import Problem
 from wholearm.trajectory import Trajectory

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wholearm.contact import parse_contact
+from wholearm.contact import Contact, parse_contact
+from wholearm.curve import Curve
 from wholearm.formation import Formation
 from wholearm.model import Array, Finger, Friction, Polygon, Scene
+from wholearm.trajectory import Samples
 
 SQUARE = [[-0.03, -0.03], [0.03, -0.03], [0.03, 0.03], [-0.03, 0.03]]
 
@@ -112,3 +116,83 @@ def make_scene(
 
 def make_formation(scene: Scene, names: str) -> Formation:
     return Formation(scene, tuple(parse_contact(name, scene) for name in names.split()))
+
+
+def with_speed_limit(curve: Curve, limits: tuple[float, float]) -> Curve:
+    scene = curve.formation.scene
+    right, left = (
+        replace(link, speed_limit=limit) for link, limit in zip(scene.fingers, limits, strict=True)
+    )
+    slow = Scene(scene.polygon, (right, left), scene.friction, scene.gravity)
+    return replace(curve, formation=Formation(slow, curve.formation.contacts))
+
+
+def touch(scene: Scene, contact: Contact, z: Array) -> tuple[Array, Array]:
+    """Contact point and normal into the object of a vertex on the palm or on a link's side."""
+    assert contact.feature == "v" and contact.surface in ("palm", "finger")
+    corner = place_corners(scene, z)[contact.index]
+    if contact.finger is None:
+        return corner, np.array([0.0, 1.0])
+    heading = z[3 + contact.finger]
+    side = 1.0 if contact.finger == 0 else -1.0
+    return corner, side * np.array([-np.sin(heading), np.cos(heading)])
+
+
+def measure_gaps(formation: Formation, z: Array) -> Array:
+    """Gaps of a formation of vertex contacts, shape (n_c,) [m]."""
+    gaps = []
+    for contact in formation.contacts:
+        point, normal = touch(formation.scene, contact, z)
+        link = None if contact.finger is None else formation.scene.fingers[contact.finger]
+        base = np.zeros(2) if link is None else np.asarray(link.base)
+        gaps.append((point - base) @ normal - (0.0 if link is None else link.radius))
+    return np.array(gaps)
+
+
+def measure_slip(formation: Formation, z: Array, v: Array) -> Array:
+    """Sliding velocities of a formation of vertex contacts, shape (n_c,) [m/s]."""
+    slips = []
+    for contact in formation.contacts:
+        point, n = touch(formation.scene, contact, z)
+        arm = point - z[:2]
+        speed = v[:2] + v[2] * np.array([-arm[1], arm[0]])
+        if contact.finger is not None:
+            lever = point - np.asarray(formation.scene.fingers[contact.finger].base)
+            speed = speed - v[3 + contact.finger] * np.array([-lever[1], lever[0]])
+        slips.append(speed @ np.array([n[1], -n[0]]))
+    return np.array(slips)
+
+
+def unbalance(formation: Formation, row: Samples, sigma: Array) -> tuple[Array, Array]:
+    """What each body's balance misses, and the largest term in it, shape (5,) each.
+
+    Forces x and y and the moment of the object, then the moments of the joints.
+
+    Parameters
+    ----------
+    row : Samples
+        Of one instant, without the axis over instants.
+    sigma : ndarray, shape (2,)
+        Directions of the joints.
+    """
+    scene = formation.scene
+    body, terms = scene.polygon, [np.zeros(5)]
+    assert body.inertia is not None
+    terms.append(np.array([0.0, -body.mass * scene.gravity, 0.0, 0.0, 0.0]))
+    masses = [body.mass, body.mass, body.inertia, *(link.inertia for link in scene.fingers)]
+    terms.append(-np.array(masses) * row.z_ddot)
+    terms.append(np.array([0.0, 0.0, 0.0, *row.tau]))
+    drag = [
+        link.viscous * row.z_dot[3 + k] + link.dry * sigma[k]
+        for k, link in enumerate(scene.fingers)
+    ]
+    terms.append(-np.array([0.0, 0.0, 0.0, *drag]))
+    for k, contact in enumerate(formation.contacts):
+        point, n = touch(scene, contact, row.z)
+        for force in (row.c_n[k] * n, row.c_t[k] * np.array([n[1], -n[0]])):
+            term = np.array([*force, cross(point - row.z[:2], force), 0.0, 0.0])
+            if contact.finger is not None:
+                base = np.asarray(scene.fingers[contact.finger].base)
+                term[3 + contact.finger] = cross(point - base, -force)
+            terms.append(term)
+    return np.sum(terms, axis=0), np.abs(terms).max(axis=0)

@@ -13,7 +13,8 @@ import numpy as np
 from wholearm.curve import Curve
 from wholearm.dynamics import Directions, inverse
 from wholearm.model import Array
-from wholearm.path import load, trace_phases
+from wholearm.outline import load
+from wholearm.path import trace_phases
 from wholearm.problem import Problem
 from wholearm.torque import TorqueProfile
 from wholearm.trajectory import Samples, Trajectory, assemble

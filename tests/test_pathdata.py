@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import quad
 
+from plane import with_speed_limit
 from wholearm.curve import Curve
 from wholearm.dynamics import PathForces, inverse
 from wholearm.errors import JammingError
@@ -152,15 +153,6 @@ def test_beside_takes_the_larger_neighbour(curves: tuple[Curve, ...]) -> None:
     for node in range(len(data.grid.s)):
         near = [inside[i] for i, k in enumerate(data.solid) if node in (k, k + 1)]
         np.testing.assert_array_equal(nodes[node], np.max(near, axis=0))
-
-
-def with_speed_limit(curve: Curve, limits: tuple[float, float]) -> Curve:
-    scene = curve.formation.scene
-    right, left = (
-        replace(link, speed_limit=limit) for link, limit in zip(scene.fingers, limits, strict=True)
-    )
-    slow = Scene(scene.polygon, (right, left), scene.friction, scene.gravity)
-    return replace(curve, formation=Formation(slow, curve.formation.contacts))
 
 
 def test_speed_limits_bound_b(curves: tuple[Curve, ...]) -> None:

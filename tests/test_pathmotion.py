@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
@@ -26,10 +28,9 @@ SEEDS = range(6)
 
 def stub_curve(length: float, breaks: list[float]) -> Curve:
     ends = [0.0, *breaks, length]
-    pairs = zip(ends[:-1], ends[1:], strict=True)
     stub: Any = SimpleNamespace(
         length=length,
-        segments=tuple(Segment(a, b, np.ones(4), np.ones(2)) for a, b in pairs),
+        segments=tuple(Segment(a, b, np.ones(4), np.ones(2)) for a, b in pairwise(ends)),
         formation=SimpleNamespace(names=("v0-palm",)),
     )
     curve: Curve = stub
@@ -65,9 +66,7 @@ def test_motion_integrates_its_acceleration(seed: int) -> None:
 
         span = (motion.times[k], motion.times[k + 1])
         inner = np.linspace(*span, 7)
-        result = solve_ivp(
-            rate, span, state, t_eval=inner, method="DOP853", rtol=1e-13, atol=1e-16
-        )
+        result = solve_ivp(rate, span, state, t_eval=inner, method="DOP853", rtol=1e-13, atol=1e-16)
         s, _, here = motion.locate(inner[1:-1])
         # Each interval adds the integrator's 1e-13 relative.
         length = motion.curve.length
@@ -169,7 +168,7 @@ def test_a_run_out_of_near_rest() -> None:
     assert motion.duration == pytest.approx(exact, rel=1e-6)
 
 
-SERIES = {
+SERIES: dict[Any, Callable[[int], float]] = {
     _sinh_ratio: lambda n: 1 / math.factorial(2 * n + 1),
     _cosh_ratio: lambda n: 1 / math.factorial(2 * n + 2),
     _arctanh_ratio: lambda n: 1 / (2 * n + 1),

@@ -207,6 +207,7 @@ def test_effort_is_not_symbolic_in_the_data() -> None:
 
 # Best motions in closed form: a point driven along a line of 1 m.
 
+
 def observe(toy: Toy, exact: float, **options: Any) -> tuple[Array, float]:
     """Relative errors over doubled numbers of intervals, and the slope that fits their decay."""
     counts = np.array([20, 40, 80, 160])
@@ -283,7 +284,7 @@ def test_largest_margin_within_a_duration(duration: float) -> None:
 
 def test_inertia_that_steps_at_a_reversal() -> None:
     """Inertia 1, then 2: the switch at 3/8, and the acceleration jumps at 1/2."""
-    toy = Toy(inertia(lambda s, later: 1.0 + later), breaks=(0.5,))
+    toy = Toy(inertia(lambda s, later: np.where(later, 2.0, 1.0)), breaks=(0.5,))
     top, at_break = math.sqrt(0.75 * LIMIT), math.sqrt(0.5 * LIMIT)
     exact = (top + (top - at_break)) / LIMIT + at_break / (LIMIT / 2)
     errors, order = observe(toy, exact)
@@ -309,7 +310,7 @@ def test_inertia_that_grows_along_the_way() -> None:
 
 @pytest.mark.parametrize("drag", [0.1, 0.5])
 def test_viscous_joints(drag: float) -> None:
-    """v' = F - B v, then v' = -F - B v."""
+    """Speeding up v' = F - B v, braking v' = -F - B v."""
 
     def speeding(t: float) -> float:
         return LIMIT / drag * (t + math.expm1(-drag * t) / drag)

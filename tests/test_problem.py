@@ -12,7 +12,7 @@ import pytest
 from conftest import HEPTAGON
 from plane import finger_gap, place_corners
 from wholearm.errors import InputError
-from wholearm.path import load
+from wholearm.outline import load
 from wholearm.problem import Problem, build_problem, read_problem
 
 TEXT = HEPTAGON.read_text(encoding="utf-8")
@@ -197,7 +197,7 @@ def test_bad_input_names_the_key(edit: Edit, key: str, text: str) -> None:
         ("phi_deg = -50.0", "phi_deg = 50.0", "phases[5].until", "phi = 50 deg is never reached"),
         ('until = "v3-finger1"', "until = { x = 0.03 }", "phases[2].contacts", "does not touch"),
         ('["v1-palm", "v3-finger1", "v6-finger2", "v0-finger2"]', '["v1-palm", "v3-finger1"]',
-         "phases[4].contacts", "2 contacts given"),
+         "phases[5].contacts", "does not touch at the end of phase 4"),
     ],
 )  # fmt: skip
 def test_bad_file_names_the_file(tmp_path: Path, old: str, new: str, key: str, text: str) -> None:

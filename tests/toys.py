@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
@@ -47,7 +48,7 @@ class Toy:
         )
         segments = [
             Segment(start, stop, np.ones(1), np.full(2, float(index)))
-            for index, (start, stop) in enumerate(zip(ends[:-1], ends[1:], strict=True))
+            for index, (start, stop) in enumerate(pairwise(ends))
         ]
         formation = SimpleNamespace(scene=scene, n_contacts=1, names=("v0-palm",))
         stub: Any = SimpleNamespace(length=self.length, segments=segments, formation=formation)

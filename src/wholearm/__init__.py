@@ -10,7 +10,9 @@ Everything is imported when it is first used, so that a program pays only for wh
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
         SolverError,
         WholearmError,
     )
-    from .path import load
+    from .outline import load
     from .plan import solve
     from .simulate import simulate
     from .torque import TorqueProfile, read_torque_csv
@@ -41,7 +43,7 @@ _HOMES = {
     "TorqueProfile": "torque",
     "Trajectory": "trajectory",
     "WholearmError": "errors",
-    "load": "path",
+    "load": "outline",
     "load_trajectory": "trajectory",
     "read_torque_csv": "torque",
     "simulate": "simulate",
@@ -81,3 +83,15 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
+
+
+class _Package(ModuleType):
+    """Keeps `simulate` and `verify` functions when the modules of the same name are imported."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name in _HOMES and isinstance(value, ModuleType):
+            value = getattr(value, name)
+        super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -102,7 +102,7 @@ class _Version(argparse.Action):
 def _solve(options: argparse.Namespace) -> int:
     from .files import require_writable
     from .options import PlanOptions
-    from .path import load
+    from .outline import load
     from .plan import solve_with
 
     output = options.output or _stem(options.problem) + ".npz"
@@ -148,7 +148,7 @@ def _summarise(trajectory: Trajectory, output: str) -> str:
 
 def _verify(options: argparse.Namespace) -> int:
     from .model import require_number
-    from .path import load
+    from .outline import load
     from .verify import verify
 
     tolerance = require_number(options.tolerance, "--tolerance", positive=True)
@@ -194,7 +194,7 @@ def _plot(options: argparse.Namespace) -> int:
 
 def _bench(options: argparse.Namespace) -> int:
     from .bench import run_bench
-    from .path import load
+    from .outline import load
 
     written = run_bench(load(options.problem), options.output, progress=_progress())
     _clear_progress()

@@ -18,7 +18,7 @@ from .curve import Curve, Panel, border, describe_pose, find_root, metric_weight
 from .errors import InputError
 from .formation import TOUCHING, Formation, describe, find_touching
 from .model import Array
-from .problem import Phase, Problem, Until, read_problem
+from .problem import End, Phase, Problem, Until
 
 NODES = 17
 """Nodes of a panel."""
@@ -30,22 +30,12 @@ LONGEST = 60.0
 """Longest curve that is traced, in radii of gyration: several turns of the object."""
 
 
-def load(path: str) -> Problem:
-    """Read a problem file and check that every phase can be carried out geometrically.
-
-    Raises
-    ------
-    InputError
-        If the file is malformed, a formation does not touch, or an `until` is never reached.
-    """
-    problem = read_problem(path)
-    trace_phases(problem)
-    return problem
-
-
 @lru_cache(maxsize=8)
 def trace_phases(problem: Problem) -> tuple[Curve, ...]:
     """Trace the curve of every phase, each from the end of the one before.
+
+    Only as far as geometry alone says where a phase ends: up to the first that has more than one
+    freedom or does not end at rest.
 
     Raises
     ------
@@ -55,25 +45,54 @@ def trace_phases(problem: Problem) -> tuple[Curve, ...]:
     curves: list[Curve] = []
     z = problem.start
     for phase in problem.phases:
-        _require_touching(problem, phase, z, curves[-1] if curves else None)
-        curves.append(_trace_phase(problem, phase, z))
+        if not runs_on_curve(phase):
+            break
+        curves.append(trace_phase(problem, phase, z))
         z = curves[-1].end
     return tuple(curves)
 
 
-def _require_touching(problem: Problem, phase: Phase, z: Array, before: Curve | None) -> None:
+def runs_on_curve(phase: Phase) -> bool:
+    """Whether a phase has one freedom and ends at rest."""
+    return phase.formation.n_contacts == 4 and phase.end is End.REST
+
+
+def trace_phase(problem: Problem, phase: Phase, z: Array) -> Curve:
+    """Trace a one-freedom phase from `z` to its `until`, or as far as it goes before a release.
+
+    Raises
+    ------
+    InputError
+        If the contacts do not touch at `z`, or the `until` is never reached.
+    """
+    require_touching(problem, phase, z)
+    if not phase.until.is_release:
+        return _trace_phase(problem, phase, z)
+    formation, until = phase.formation, phase.until
+    ways = [trace_curve(formation, z, way, until) for way in _headings(formation, z, until)]
+    curve = max(ways, key=lambda curve: curve.length)
+    if curve.length < HELD:
+        key = f"phases[{phase.number}].contacts"
+        raise InputError(problem.source, key, f"cannot move: {curve.ending}")
+    return curve
+
+
+def require_touching(problem: Problem, phase: Phase, z: Array) -> None:
+    """Check that a phase's contacts touch at `z`, shape (5,), and that nothing is overlapped.
+
+    Raises
+    ------
+    InputError
+        If not; lists what touches.
+    """
     key = f"phases[{phase.number}].contacts"
     formation = phase.formation
-    if formation.n_contacts != 4:
-        raise InputError(
-            problem.source, key, f"{formation.n_contacts} contacts given; a phase takes 4"
-        )
     gaps = formation.evaluate(z[None], np.zeros((1, 5))).C[0]
     if np.abs(gaps).max() > TOUCHING:
         missing = [
             c.name for c, gap in zip(formation.contacts, gaps, strict=True) if abs(gap) > TOUCHING
         ]
-        when = "at the start" if before is None else f"at the end of phase {phase.index}"
+        when = f"at the end of phase {phase.index}" if phase.index else "at the start"
         touching = describe(find_touching(problem.scene, z))
         raise InputError(
             problem.source,
@@ -182,7 +201,8 @@ def until_distance(formation: Formation, until: Until, z: Array) -> Array:
     """How far each configuration is from `until`, shape (n,): a gap [m], metres or radians."""
     if until.contact is not None:
         return formation.evaluate_gap(until.contact, z)
-    assert until.value is not None
+    if until.value is None:
+        return np.ones(len(z))
     return np.asarray(z[:, 0 if until.coordinate == "x" else 2] - until.value)
 
 

@@ -1,0 +1,51 @@
+"""Collocation schemes as data: points in an interval, and integrals of what passes through them."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from .model import Array
+
+
+class Scheme(NamedTuple):
+    """A collocation scheme on [0, 1].
+
+    Attributes
+    ----------
+    points : ndarray, shape (d,)
+        Increasing; the last one is 1.
+    integrals : ndarray, shape (d, d)
+        Row j integrates, from 0 to point j, the polynomial through values at the points.
+    extend : ndarray, shape (d + 1, d + 1)
+        Powers of x = 0 .. d from values at 0 and the points.
+    """
+
+    points: Array
+    integrals: Array
+    extend: Array
+
+    @property
+    def degree(self) -> int:
+        """Number of points d."""
+        return len(self.points)
+
+
+@lru_cache(maxsize=8)
+def radau(degree: int) -> Scheme:
+    """Radau IIA points, order 2 d - 1: the zeros of P_d - P_d-1, 1 among them.
+
+    Source: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II, section IV.5.
+    """
+    series = np.zeros(degree + 1)
+    series[degree - 1 :] = -1.0, 1.0
+    roots = np.sort(np.polynomial.legendre.legroots(series).real)
+    points = (roots + 1) / 2
+    points[-1] = 1.0
+    powers = np.arange(1, degree + 1)
+    invert = np.linalg.inv(points[:, None] ** (powers - 1))
+    integrals = (points[:, None] ** powers / powers) @ invert
+    ends = np.append(0.0, points)
+    return Scheme(points, integrals, np.linalg.inv(ends[:, None] ** np.arange(degree + 1)))

@@ -1,0 +1,176 @@
+"""A first idea of a motion, from geometry alone: what the time-domain planner starts from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .contact import Contact
+from .curve import Curve, metric_weights
+from .dynamics import Directions
+from .errors import InputError
+from .formation import Formation
+from .model import Array
+from .path import require_touching, runs_on_curve, trace_phase, trace_phases
+from .problem import Phase, Problem, read_problem
+
+POINTS = 25
+"""Configurations along an outline."""
+RELEASE_AT = 0.3
+"""Where on a curve without an end of its own a release is guessed."""
+
+
+def load(path: str) -> Problem:
+    """Read a problem file and check that every phase can be carried out geometrically.
+
+    Raises
+    ------
+    InputError
+        If the file is malformed, a formation does not touch, or an `until` is never reached.
+    """
+    problem = read_problem(path)
+    curves = trace_phases(problem)
+    z = curves[-1].end if curves else problem.start
+    for phase in problem.phases[len(curves) :]:
+        if runs_on_curve(phase):
+            z = trace_phase(problem, phase, z).end
+        else:
+            z = outline_phase(problem, phase, z)[-1].z[-1]
+    return problem
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """A stretch of a phase without a reversal, as configurations along it.
+
+    Attributes
+    ----------
+    formation : Formation
+    z : ndarray, shape (n, 5)
+        With all contacts closed, evenly spread.
+    directions : Directions
+    turns : tuple of int
+        Rows of (contacts, joints) whose rate is zero at the end of the stretch, where it reverses.
+    """
+
+    formation: Formation
+    z: Array
+    directions: Directions
+    turns: tuple[int, ...] = ()
+
+    @property
+    def length(self) -> float:
+        """Arc length in the metric of curves [m]."""
+        steps = np.diff(self.z, axis=0)
+        return float(np.sqrt(steps**2 @ metric_weights(self.formation.scene)).sum())
+
+
+def outline_curve(curve: Curve, share: float = 1.0) -> list[Outline]:
+    """Outline a curve, or the first `share` of it, split at its reversals."""
+    stop = share * curve.length
+    parts = [part for part in curve.segments if part.start < stop]
+    outlines = []
+    for part, following in zip(parts, [*parts[1:], None], strict=True):
+        s = np.linspace(part.start, min(part.stop, stop), POINTS)
+        signs = np.concatenate([part.Xi, part.sigma])
+        turns: tuple[int, ...] = ()
+        if following is not None:
+            flips = signs != np.concatenate([following.Xi, following.sigma])
+            turns = tuple(np.flatnonzero(flips).tolist())
+        directions = Directions(part.Xi, part.sigma)
+        outlines.append(Outline(curve.formation, curve.evaluate(s).z, directions, turns))
+    return outlines
+
+
+def outline_phase(problem: Problem, phase: Phase, z: Array) -> list[Outline]:
+    """Outline a phase from `z`, shape (5,), to its end.
+
+    Raises
+    ------
+    InputError
+        If the contacts do not touch at `z`, leave no freedom, or the end cannot be reached.
+    """
+    formation = phase.formation
+    require_touching(problem, phase, z)
+    freedoms = count_freedoms(formation, z)
+    if freedoms == 0:
+        key = f"phases[{phase.number}].contacts"
+        raise InputError(problem.source, key, "the contacts leave no freedom to move")
+    if freedoms == 1:
+        curve = trace_phase(problem, phase, z)
+        return outline_curve(curve, RELEASE_AT if phase.until.is_release else 1.0)
+    goal = _find_goal(problem, phase, z)
+    return [_connect(formation, z, goal)]
+
+
+def count_freedoms(formation: Formation, z: Array) -> int:
+    """Freedoms that a formation leaves at `z`: 5 less the rank of A."""
+    A = formation.evaluate(z[None], np.zeros((1, 5))).A[0]
+    values = np.linalg.svd(A / np.sqrt(metric_weights(formation.scene)))[1]
+    return 5 - int((values > 1e-9 * values[0]).sum())
+
+
+def _find_goal(problem: Problem, phase: Phase, z: Array) -> Array:
+    """Nearest configuration at which the phase ends."""
+    formation, until = phase.formation, phase.until
+    key = f"phases[{phase.number}].until"
+    if until.contact is not None:
+        goal = close(Formation(formation.scene, (*formation.contacts, until.contact)), z)
+    elif until.value is not None:
+        row = 0 if until.coordinate == "x" else 2
+        goal = close(formation, z, (row, until.value))
+    else:
+        raise InputError(problem.source, key, "is missing; only one freedom needs none")
+    if goal is None:
+        raise InputError(problem.source, key, f"{until} cannot be reached with these contacts")
+    return goal
+
+
+def close(formation: Formation, z: Array, fixed: tuple[int, float] | None = None) -> Array | None:
+    """Nearest configuration with all contacts closed, by Gauss-Newton; None if there is none.
+
+    Parameters
+    ----------
+    formation : Formation
+    z : ndarray, shape (5,)
+        Where to start.
+    fixed : (int, float), optional
+        Row of z and the value that it has to take.
+    """
+    metric = metric_weights(formation.scene)
+    for _ in range(50):
+        kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
+        residual, rows = kinematics.C[0], kinematics.A[0]
+        if fixed is not None:
+            residual = np.append(residual, z[fixed[0]] - fixed[1])
+            rows = np.vstack([rows, np.eye(5)[fixed[0]]])
+        lift = (rows / metric).T
+        change = lift @ np.linalg.lstsq(rows @ lift, residual, rcond=1e-12)[0]
+        # Long steps overshoot where links turn; a tenth of a radian keeps to one branch.
+        change *= min(1.0, 0.1 / max(np.abs(change[2:]).max(), 1e-12))
+        z = z - change
+        if np.abs(residual).max() < 1e-12:
+            return z
+    return None
+
+
+def _connect(formation: Formation, start: Array, goal: Array) -> Outline:
+    """A straight line, pulled onto the contacts, with the directions of its middle."""
+    points = [start]
+    for x in np.linspace(0.0, 1.0, POINTS)[1:]:
+        point = close(formation, start + x * (goal - start))
+        points.append(points[-1] if point is None else point)
+    z = np.array(points)
+    speed = np.gradient(z, axis=0)
+    slip = np.einsum("nij,nj->ni", formation.evaluate(z, speed).A_t, speed)
+    rates = np.hstack([slip, speed[:, 3:]]).sum(axis=0)
+    signs = np.where(rates < 0, -1.0, 1.0)
+    return Outline(formation, z, Directions(signs[:-2], signs[-2:]))
+
+
+def released_contacts(phase: Phase, following: Phase | None) -> tuple[Contact, ...]:
+    """Contacts of a phase that the next one does not have."""
+    if following is None:
+        return ()
+    return tuple(c for c in phase.formation.contacts if c not in following.formation.contacts)

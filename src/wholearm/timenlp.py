@@ -1,0 +1,344 @@
+"""The planning NLP in the time domain, for formations with any number of freedoms.
+
+A stage is a stretch on one formation with fixed directions of friction, of free duration T, in K
+intervals with d collocation points each. At every point z, z', z'', c_n and tau are unknowns, and
+
+    C(z) = 0,  A z' = 0,  A z'' + A' z' = 0,
+    M5 z'' + B z' + D sigma = g + S tau + G^T c_n,
+    c_n >= epsilon,  |tau| <= limit,  Xi A_t z' >= 0,  sigma theta' >= 0.
+
+So contacts hold at every point, without drift, and friction never pushes the wrong way. Along the
+contacts' tangent space alone, with an orthonormal basis N of the null space of A at a guess of
+each interval, the differential equations are collocated:
+
+    N^T (z_j - z_0 - h sum_l a_jl z'_l) = 0,  N^T (z'_j - z'_0 - h sum_l a_jl z''_l) = 0.
+
+Stages that follow one another share position and velocity. The equations of a point are one
+expanded function, mapped over the points of a stage.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from .collocation import Scheme
+from .contact import Expression, build_features, build_gap
+from .curve import metric_weights
+from .dynamics import Directions
+from .formation import Formation
+from .model import Array
+from .options import Objective
+from .problem import Until
+
+SHORTEST = 1e-4
+"""Least duration of a stage [s]."""
+LONGEST = 20.0
+"""Largest duration of a stage [s]."""
+
+_IPOPT = {
+    "print_level": 0,
+    "sb": "yes",
+    "tol": 1e-8,
+    "max_iter": 500,
+    # The default relaxes every bound by 1e-8, so that limits would be missed with success.
+    "bound_relax_factor": 0.0,
+    "fast_step_computation": "yes",
+    # A fixed ordering: the automatic one can differ between machines.
+    "mumps_permuting_scaling": 0,
+    "mumps_pivot_order": 0,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """A stretch on one formation with fixed directions of friction.
+
+    Attributes
+    ----------
+    phase : int
+        Index of the phase it belongs to.
+    formation : Formation
+    directions : Directions
+    z : ndarray, shape (K d + 1, 5)
+        Guess, at the start and at every collocation point.
+    duration : float, [s]
+        Guess.
+    until : Until or None
+        What is reached at the end; None if the stage ends by a reversal or a release.
+    turns : tuple of int
+        Rows of (contacts, joints) whose rate is zero at the end.
+    gained : Formation or None
+        The next stage's formation where that has a contact more, which is gained softly.
+    watched : tuple of int
+        Limits of the formation that are kept positive at every point.
+    """
+
+    phase: int
+    formation: Formation
+    directions: Directions
+    z: Array
+    duration: float
+    until: Until | None = None
+    turns: tuple[int, ...] = ()
+    gained: Formation | None = None
+    watched: tuple[int, ...] = ()
+
+
+class StagePoints(NamedTuple):
+    """A stage's unknowns at its K d points.
+
+    Attributes
+    ----------
+    duration : float, [s]
+    z, v, a : ndarray, shape (K d, 5)
+    c_n : ndarray, shape (K d, n_c), [N]
+    tau : ndarray, shape (K d, 2), [N m]
+    """
+
+    duration: float
+    z: Array
+    v: Array
+    a: Array
+    c_n: Array
+    tau: Array
+
+    def pack(self) -> Array:
+        """The unknowns as one vector, point by point."""
+        table = np.hstack([self.z, self.v, self.a, self.c_n, self.tau])
+        return np.append(self.duration, table.ravel())
+
+    @staticmethod
+    def unpack(x: Array, n_c: int) -> StagePoints:
+        """The unknowns from one vector."""
+        table = x[1:].reshape(-1, 17 + n_c)
+        parts = np.split(table, [5, 10, 15, 15 + n_c], axis=1)
+        return StagePoints(float(x[0]), *parts)
+
+
+@dataclass(frozen=True, eq=False)
+class TimeNLP:
+    """A built NLP.
+
+    Attributes
+    ----------
+    solver : casadi.Function
+    low, high : ndarray
+        Bounds of the constraints.
+    build_time : float, [s]
+    """
+
+    solver: Expression
+    low: Array
+    high: Array
+    build_time: float
+
+
+class _Rows:
+    """Constraints under construction."""
+
+    def __init__(self) -> None:
+        self.parts: list[Expression] = []
+        self.low: list[Array] = []
+        self.high: list[Array] = []
+
+    def add(self, rows: Expression, low: float = 0.0, high: float = 0.0) -> None:
+        rows = ca.vec(rows)
+        self.parts.append(rows)
+        self.low.append(np.full(rows.numel(), low))
+        self.high.append(np.full(rows.numel(), high))
+
+
+def build_time_nlp(
+    stages: Sequence[Stage],
+    scheme: Scheme,
+    start: tuple[Array, Array],
+    objective: Objective,
+    time_weight: float,
+) -> TimeNLP:
+    """Build the NLP of stages that follow one another and end at rest.
+
+    The unknowns are those of `StagePoints.pack`, stage after stage; for `margin` the least margin
+    follows. The parameters are the force [N] that c_n exceeds at each point and contact.
+
+    Parameters
+    ----------
+    stages : sequence of Stage
+    scheme : Scheme
+    start : tuple of ndarray, shape (5,)
+        z and z' at the start.
+    objective : Objective
+    time_weight : float, [(N m)^2]
+        For `effort`.
+    """
+    started = time.perf_counter()
+    rows = _Rows()
+    unknowns, durations, efforts, floors = [], [], [], []
+    margin = ca.MX.sym("margin", 1 if objective is Objective.MARGIN else 0)
+    z_before, v_before = ca.DM(start[0]), ca.DM(start[1])
+    rho = stages[0].formation.scene.polygon.gyration_radius
+    for stage in stages:
+        count, n_c = len(stage.z) - 1, stage.formation.n_contacts
+        duration, table = ca.MX.sym("T"), ca.MX.sym("points", 17 + n_c, count)
+        unknowns += [duration, ca.vec(table)]
+        durations.append(duration)
+        z, v, a, c_n, tau = ca.vertsplit(table, [0, 5, 10, 15, 15 + n_c, 17 + n_c])
+        Xi, sigma = (ca.repmat(ca.DM(part), 1, count) for part in stage.directions)
+        physics, senses = _point_function(stage.formation).map(count)(z, v, a, c_n, tau, Xi, sigma)
+        rows.add(physics)
+        rows.add(senses, 0.0, np.inf)
+        _collocate(rows, stage, scheme, (z, v, a), (z_before, v_before), duration)
+        if stage.watched:
+            rows.add(_watch_function(stage.formation, stage.watched).map(count)(z) / rho, 0, np.inf)
+        floor = ca.MX.sym("floor", n_c, count)
+        floors.append(ca.vec(floor))
+        pressed = c_n - floor
+        rows.add(pressed if margin.is_empty() else pressed - margin, 0.0, np.inf)
+        z_before, v_before = z[:, -1], v[:, -1]
+        _end_stage(rows, stage, z_before, v_before, rho)
+        efforts.append(_integrate_squares(tau, scheme, duration, count))
+    _rest(rows, stages[-1], v_before)
+    total = sum(durations)
+    cost = {
+        Objective.TIME: total,
+        Objective.EFFORT: sum(efforts) + time_weight * total,
+        Objective.MARGIN: -margin,
+    }[objective]
+    if objective is Objective.MARGIN:
+        rows.add(total, 0.0, np.inf)
+    nlp = {
+        "x": ca.vertcat(*unknowns, margin),
+        "p": ca.vertcat(*floors),
+        "f": cost,
+        "g": ca.vertcat(*rows.parts),
+    }
+    options = {
+        "ipopt": _IPOPT,
+        "print_time": False,
+        "record_time": True,
+        "calc_lam_p": False,
+        "no_nlp_grad": True,
+        "show_eval_warnings": False,
+        "error_on_fail": False,
+    }
+    solver = ca.nlpsol("time_nlp", "ipopt", nlp, options)
+    low, high = np.concatenate(rows.low), np.concatenate(rows.high)
+    return TimeNLP(solver, low, high, time.perf_counter() - started)
+
+
+@lru_cache(maxsize=32)
+def _point_function(formation: Formation) -> Expression:
+    """Function (z, z', z'', c_n, tau, Xi, sigma) -> equations and senses of friction at a point."""
+    scene, n_c = formation.scene, formation.n_contacts
+    z, v, a = (ca.SX.sym(name, 5) for name in ("z", "v", "a"))
+    c_n, tau = ca.SX.sym("c_n", n_c), ca.SX.sym("tau", 2)
+    Xi, sigma = ca.SX.sym("Xi", n_c), ca.SX.sym("sigma", 2)
+    C, A, A_t, A_dot_v = formation.function(z, v)
+    G = A - ca.diag(ca.DM(formation.friction) * Xi) @ A_t
+    friction = ca.DM(scene.viscous) * v + ca.DM(scene.dry) * ca.vertcat(0, 0, 0, sigma)
+    applied = ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau)
+    balance = ca.DM(scene.mass_diagonal) * a + friction - applied - G.T @ c_n
+    rho = scene.polygon.gyration_radius
+    equations = ca.vertcat(C / rho, A @ v, 0.1 * (A @ a + A_dot_v), balance)
+    senses = ca.vertcat(Xi * (A_t @ v) / rho, sigma * v[3:])
+    return ca.Function("point", [z, v, a, c_n, tau, Xi, sigma], [equations, senses])
+
+
+@lru_cache(maxsize=64)
+def _watch_function(formation: Formation, watched: tuple[int, ...]) -> Expression:
+    values = ca.vertcat(*(formation.limits[k].value for k in watched))
+    return ca.Function("watch", [build_features(formation.scene).z], [values])
+
+
+def _collocate(
+    rows: _Rows,
+    stage: Stage,
+    scheme: Scheme,
+    points: tuple[Expression, Expression, Expression],
+    start: tuple[Expression, Expression],
+    duration: Expression,
+) -> None:
+    """Collocate z' and z'' along the tangent space, interval by interval."""
+    z, v, a = points
+    degree = scheme.degree
+    count = z.shape[1] // degree
+    step = duration / count
+    integrals = ca.DM(scheme.integrals.T)
+    metric = metric_weights(stage.formation.scene)
+    z_0, v_0 = start
+    for k in range(count):
+        mine = slice(k * degree, (k + 1) * degree)
+        basis = ca.DM(_tangent_basis(stage.formation, stage.z[k * degree + degree // 2], metric).T)
+        for state, rate, first in ((z, v, z_0), (v, a, v_0)):
+            defect = (
+                state[:, mine] - ca.repmat(first, 1, degree) - step * (rate[:, mine] @ integrals)
+            )
+            rows.add(basis @ defect / np.sqrt(metric[2]))
+        z_0, v_0 = z[:, mine.stop - 1], v[:, mine.stop - 1]
+
+
+def _tangent_basis(formation: Formation, z: Array, metric: Array) -> Array:
+    """Basis of the null space of A, orthonormal in the metric of curves, as covectors (5, f)."""
+    A = formation.evaluate(z[None], np.zeros((1, 5))).A[0]
+    _, values, right = np.linalg.svd(A / np.sqrt(metric))
+    rank = int((values > 1e-9 * values[0]).sum())
+    return np.asarray((right[rank:] * np.sqrt(metric)).T)
+
+
+def _end_stage(rows: _Rows, stage: Stage, z: Expression, v: Expression, rho: float) -> None:
+    """What holds at the end of a stage, but for rest at the end of the last one."""
+    formation = stage.formation
+    if stage.until is not None:
+        if stage.until.contact is not None:
+            z_ = build_features(formation.scene).z
+            gap = ca.Function("gap", [z_], [build_gap(stage.until.contact, formation.scene)])
+            rows.add(gap(z) / rho)
+        elif stage.until.value is not None:
+            rows.add(z[0 if stage.until.coordinate == "x" else 2] - stage.until.value)
+    if stage.turns:
+        _, _, A_t, _ = formation.function(z, v)
+        rates = ca.vertcat(A_t @ v / rho, v[3:])
+        rows.add(ca.vertcat(*(rates[k] for k in stage.turns)))
+    if stage.gained is not None:
+        extra = [i for i, c in enumerate(stage.gained.contacts) if c not in formation.contacts]
+        _, A, _, _ = stage.gained.function(z, v)
+        rows.add(ca.vertcat(*(A[i, :] @ v for i in extra)) / rho)
+
+
+def _rest(rows: _Rows, stage: Stage, v: Expression) -> None:
+    metric = metric_weights(stage.formation.scene)
+    basis = _tangent_basis(stage.formation, stage.z[-1], metric)
+    rows.add(ca.DM(basis.T) @ v / np.sqrt(metric[2]))
+
+
+def _integrate_squares(
+    tau: Expression, scheme: Scheme, duration: Expression, count: int
+) -> Expression:
+    """Integral of tau^T tau over a stage, by the scheme's quadrature."""
+    intervals = count // scheme.degree
+    weights = ca.DM(np.tile(scheme.integrals[-1], intervals) / intervals)
+    return duration * ca.dot(weights, ca.sum1(tau**2).T)
+
+
+def bound_unknowns(stages: Sequence[Stage], extra: int) -> tuple[Array, Array]:
+    """Bounds of the unknowns: durations and torques; `extra` free ones at the end."""
+    lows: list[Any] = []
+    highs: list[Any] = []
+    for stage in stages:
+        count, n_c = len(stage.z) - 1, stage.formation.n_contacts
+        high = np.full((count, 17 + n_c), np.inf)
+        scene = stage.formation.scene
+        high[:, 8:10] = scene.speed_limit
+        high[:, 15 + n_c :] = scene.torque_limit
+        low = -high
+        lows.append(np.append(SHORTEST, low.ravel()))
+        highs.append(np.append(LONGEST, high.ravel()))
+    lows.append(np.full(extra, -np.inf))
+    highs.append(np.full(extra, np.inf))
+    return np.concatenate(lows), np.concatenate(highs)

@@ -1,0 +1,449 @@
+from __future__ import annotations
+
+import copy
+import json
+import os
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import wholearm
+from conftest import HEPTAGON
+from wholearm.cli import build_parser, main
+from wholearm.trajectory import Trajectory, load_trajectory
+
+TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
+Edit = Callable[[dict[str, Any]], object]
+
+
+def to_toml(value: Any) -> str:
+    """A TOML value on one line; only what problem files hold."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {to_toml(v)}" for key, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(to_toml, value)) + "]"
+    if isinstance(value, float) and value != value:
+        return "nan"
+    return json.dumps(value)
+
+
+def write_problem(folder: Path, edit: Edit) -> str:
+    table = copy.deepcopy(TABLE)
+    edit(table)
+    path = folder / "problem.toml"
+    path.write_text("\n".join(f"{key} = {to_toml(v)}" for key, v in table.items()))
+    return str(path)
+
+
+def put(*keys: Any) -> Edit:
+    """An edit that sets the last key but one to the last."""
+
+    def edit(table: Any) -> None:
+        *parents, last, value = keys
+        for key in parents:
+            table = table[key]
+        table[last] = value
+
+    return edit
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder that is also the current one."""
+    place = tmp_path / "work"
+    place.mkdir()
+    monkeypatch.chdir(place)
+    return place
+
+
+@pytest.fixture(scope="module")
+def planned(trajectory: Trajectory, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the default plan as plan.npz and torques.csv."""
+    place = tmp_path_factory.mktemp("planned")
+    trajectory.save(place / "plan.npz")
+    trajectory.save_torques(place / "torques.csv")
+    return place
+
+
+def fails(capsys: pytest.CaptureFixture[str], status: int, *arguments: str) -> str:
+    """Run a command that is to fail and return the one line it says."""
+    assert main(arguments) == status
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = captured.err.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("wholearm: ")
+    return lines[0].removeprefix("wholearm: ")
+
+
+def test_solve_writes_the_plan(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["solve", str(HEPTAGON), "-o", "a.npz", "--torques", "a.csv", "--samples", "21"]
+    assert main(arguments) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    lines = out.splitlines()
+    assert len(lines) == 7 and lines[0].split()[:2] == ["phase", "duration"]
+    plan = load_trajectory("a.npz")
+    shown = [float(line.split()[1]) for line in lines[1:6]]
+    np.testing.assert_allclose(shown, plan.meta["phase_durations"], atol=5e-7)
+    assert min(float(line.split()[2]) for line in lines[1:6]) == pytest.approx(0.05, abs=1e-5)
+    assert max(float(line.split()[3]) for line in lines[1:6]) <= 2.0
+    assert lines[6] == (f"time = {plan.duration:.6f} s, {plan.duration:.6f} s in all; wrote a.npz")
+    assert len(plan.t) == 5 * 21
+    assert Path("a.csv").read_text().startswith("t,tau1,tau2\n0.0,")
+    assert sorted(path.name for path in folder.iterdir()) == ["a.csv", "a.npz"]
+
+
+def test_solve_names_its_output_after_the_problem(folder: Path) -> None:
+    assert main(["solve", str(HEPTAGON), "--intervals", "20"]) == 0
+    assert [path.name for path in folder.iterdir()] == ["heptagon_four_contacts.npz"]
+
+
+@pytest.mark.parametrize("objective", ["time", "effort", "margin"])
+def test_solve_prints_json(
+    folder: Path, capsys: pytest.CaptureFixture[str], objective: str
+) -> None:
+    extra = {"effort": ["--time-weight", "2"], "margin": ["--duration", "0.8"]}
+    options = ["--objective", objective, "--intervals", "40", *extra.get(objective, [])]
+    assert main(["solve", str(HEPTAGON), "-o", "a.npz", "--json", *options]) == 0
+    meta = json.loads(capsys.readouterr().out)
+    assert meta == load_trajectory("a.npz").meta
+    assert meta["objective"] == objective and meta["intervals"] == 40
+    if objective == "effort":
+        assert meta["time_weight"] == 2.0
+    if objective == "margin":
+        assert 0.05 < meta["value"] < 1 and sum(meta["phase_durations"]) <= 0.8 * (1 + 1e-6)
+
+
+def clockwise(table: dict[str, Any]) -> None:
+    table["object"]["vertices"].reverse()
+
+
+def dent(table: dict[str, Any]) -> None:
+    table["object"]["vertices"][2] = [0.0, -0.0063]
+
+
+def drop_mass(table: dict[str, Any]) -> None:
+    del table["object"]["mass"]
+
+
+BAD_PROBLEMS: dict[str, tuple[Edit, str, str]] = {
+    "clockwise": (clockwise, "object.vertices", "the polygon is clockwise or flat"),
+    "dent": (dent, "object.vertices[2]", "the polygon is not strictly convex"),
+    "nan": (put("object", "vertices", 1, 0, float("nan")), "object.vertices[1]", "nan is not a"),
+    "nan mass": (put("object", "mass", float("nan")), "object.mass", "nan is not a positive"),
+    "negative mass": (put("object", "mass", -0.2), "object.mass", "-0.2 is not a positive number"),
+    "no mass": (drop_mass, "object.mass", "is missing"),
+    "unknown key": (put("object", "mas", 1.0), "object.mas", "did you mean 'mass'?"),
+    "unknown contact": (
+        put("phases", 0, "contacts", 2, "v9-finger1"),
+        "phases[1].contacts",
+        "'v9-finger1' does not exist",
+    ),
+    "not a contact": (
+        put("phases", 2, "contacts", 0, "v1-ceiling"),
+        "phases[3].contacts",
+        "'v1-ceiling' is not a contact",
+    ),
+    "formation that does not touch": (
+        put("phases", 0, "contacts", 2, "v4-finger1"),
+        "phases[1].contacts",
+        "but the closed fingers touch v0-palm v1-palm v2-finger1 v5-finger2",
+    ),
+    "later formation": (
+        put("phases", 1, "contacts", 3, "v4-finger2"),
+        "phases[2].contacts",
+        "v4-finger2 does not touch at the end of phase 1",
+    ),
+    "until never reached": (
+        put("phases", 0, "until", {"phi_deg": 40.0}),
+        "phases[1].until",
+        "phi = 40 deg is never reached: going one way v",
+    ),
+    "start out of reach": (put("start", "x", 0.5), "start", "finger 1 is too short to reach"),
+    "three contacts": (
+        put("phases", 0, "contacts", ["v0-palm", "v1-palm", "v2-finger1"]),
+        "phases[1].contacts",
+        "v0-palm v1-palm v2-finger1 given, but the closed fingers touch",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_PROBLEMS)
+def test_bad_problems(folder: Path, capsys: pytest.CaptureFixture[str], case: str) -> None:
+    edit, key, words = BAD_PROBLEMS[case]
+    path = write_problem(folder, edit)
+    message = fails(capsys, 2, "solve", path, "-o", "a.npz", "--torques", "a.csv")
+    assert message.startswith(f"{path}: {key}: ") and words in message
+    assert [entry.name for entry in folder.iterdir()] == ["problem.toml"]
+
+
+@pytest.mark.parametrize(
+    "edit, words",
+    [
+        (
+            put("epsilon", 50.0),
+            ["phase 1 is infeasible: c_n of v1-palm >= epsilon = 50 N", " at t"],
+        ),
+        (
+            put("fingers", "1", "torque_limit", 0.01),
+            ["torque limit of finger 1 = 0.01 N m", "short"],
+        ),
+        (put("friction", dict.fromkeys(["palm", "finger1", "finger2"], 1.5)), ["jams at x ="]),
+    ],
+)
+def test_problems_without_a_plan(
+    folder: Path, capsys: pytest.CaptureFixture[str], edit: Edit, words: list[str]
+) -> None:
+    path = write_problem(folder, edit)
+    message = fails(capsys, 1, "solve", path, "-o", "a.npz", "--torques", "a.csv")
+    assert all(word in message for word in words), message
+    assert [entry.name for entry in folder.iterdir()] == ["problem.toml"]
+
+
+def test_an_edited_problem_still_solves(folder: Path) -> None:
+    """The failures above are those of their edits, not of writing the file."""
+    assert main(["solve", write_problem(folder, lambda table: None), "--intervals", "20"]) == 0
+
+
+@pytest.mark.parametrize(
+    "content, words",
+    [
+        (b"", "epsilon: is missing"),
+        (b"epsilon = ", "is not TOML: "),
+        (b"\xff\xfe\x00", "is not TOML: "),
+        (None, "cannot be read: No such file or directory"),
+    ],
+)
+@pytest.mark.parametrize("verb", ["solve", "verify", "bench"])
+def test_unreadable_problems(
+    folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    planned: Path,
+    verb: str,
+    content: bytes | None,
+    words: str,
+) -> None:
+    if content is not None:
+        Path("p.toml").write_bytes(content)
+    arguments = {"verify": [str(planned / "plan.npz")], "bench": ["-o", "results"]}
+    message = fails(capsys, 2, verb, "p.toml", *arguments.get(verb, []))
+    assert message.startswith(f"p.toml: {words}")
+    assert {path.name for path in folder.iterdir()} <= {"p.toml"}
+
+
+@pytest.mark.parametrize("option", ["-o", "--torques"])
+@pytest.mark.parametrize(
+    "target, words",
+    [
+        ("absent/out", "is not a folder"),
+        (".", "is a folder"),
+        ("file/out", "is not a folder"),
+    ],
+)
+def test_unwritable_outputs(
+    folder: Path, capsys: pytest.CaptureFixture[str], option: str, target: str, words: str
+) -> None:
+    Path("file").write_text("kept")
+    output = [] if option == "-o" else ["-o", "a.npz"]
+    message = fails(capsys, 2, "solve", str(HEPTAGON), option, target, *output)
+    assert message.startswith(f"{target}: cannot be written: ") and words in message
+    assert [path.name for path in folder.iterdir()] == ["file"]
+    assert Path("file").read_text() == "kept"
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_output_in_a_read_only_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "locked").mkdir(mode=0o500)
+    message = fails(capsys, 2, "solve", str(HEPTAGON), "-o", "locked/a.npz")
+    assert "cannot be written: no permission" in message
+
+
+def test_output_that_is_a_device(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["solve", str(HEPTAGON), "-o", os.devnull, "--intervals", "20"]) == 0
+    assert Path(os.devnull).is_char_device()
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        ([], "COMMAND"),
+        (["slove"], "invalid choice: 'slove'"),
+        (["solve"], "problem"),
+        (["solve", str(HEPTAGON), "--speed", "3"], "unrecognized arguments: --speed 3"),
+        (["solve", str(HEPTAGON), "--intervals", "ten"], "invalid int value: 'ten'"),
+        (["solve", str(HEPTAGON), "--intervals", "5"], "intervals: 5 is not a whole number of 10"),
+        (["solve", str(HEPTAGON), "--objective", "fun"], "objective: 'fun' given; allowed are"),
+        (["solve", str(HEPTAGON), "--duration", "1"], "duration: is for the objective margin"),
+        (["solve", str(HEPTAGON), "--time-weight", "nan"], "time_weight: nan is not a positive"),
+        (["plot", "a.npz"], "-o/--output"),
+        (["verify", str(HEPTAGON), "a.npz", "--tolerance", "0"], "--tolerance: 0.0 is not a pos"),
+    ],
+)
+def test_bad_arguments(
+    folder: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], words: str
+) -> None:
+    message = fails(capsys, 2, *arguments)
+    assert words in message
+    assert list(folder.iterdir()) == []
+
+
+def test_a_duration_below_the_least_time(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["solve", str(HEPTAGON), "--objective", "margin", "--duration", "0.3"]
+    assert "duration = 0.3 s is not longer than the least time" in fails(capsys, 1, *arguments)
+    assert list(folder.iterdir()) == []
+
+
+def test_verify_a_plan(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["verify", str(HEPTAGON), str(planned / "plan.npz")]) == 0
+    out, err = capsys.readouterr()
+    assert err == "" and "v5-finger2" in out
+
+
+def test_verify_torques_as_json(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["verify", str(HEPTAGON), str(planned / "torques.csv"), "--json"]
+    assert main([*command, "--tolerance", "1e-8"]) == 0
+    out, err = capsys.readouterr()
+    report = json.loads(out)
+    assert err == "" and report["ok"] and report["reached"] and report["exit_status"] == 0
+    assert report["tolerance"] == 1e-8 and report["name"] == TABLE["name"]
+    assert len(report["phases"]) == 5 and report["failures"] == []
+
+
+def test_verify_names_a_missed_goal(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("weak.csv").write_text("t,tau1,tau2\n0,0,0\n0.5,0,0\n")
+    assert main(["verify", str(HEPTAGON), "weak.csv"]) == 1
+    out, err = capsys.readouterr()
+    assert err == "" and "FAILED\n" in out
+    assert "the torques end at t = 0.5 s, phase 1, 0.0236 m short of v3-finger1" in out
+
+
+BAD_TORQUES = {
+    "missing column": ("t,tau1\n0,0\n1,0\n", "tau2: column is missing; t,tau1 given"),
+    "empty": ("", "t: column is missing; an empty file given"),
+    "no rows": ("t,tau1,tau2\n", "t: 0 rows given"),
+    "text": ("t,tau1,tau2\n0,0,0\n1,x,0\n", "tau1: 'x' on line 3 is not a finite number"),
+    "nan": ("t,tau1,tau2\n0,0,0\n1,0,nan\n", "tau2: 'nan' on line 3"),
+    "backwards": ("t,tau1,tau2\n0,0,0\n1,0,0\n0.5,0,0\n", "t: time goes back from 1 to 0.5 s"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_TORQUES)
+def test_bad_torque_files(folder: Path, capsys: pytest.CaptureFixture[str], case: str) -> None:
+    text, words = BAD_TORQUES[case]
+    Path("bad.csv").write_text(text)
+    message = fails(capsys, 2, "verify", str(HEPTAGON), "bad.csv")
+    assert message.startswith(f"bad.csv: {words}")
+
+
+@pytest.mark.parametrize(
+    "name, content, words",
+    [
+        ("a.npz", None, "cannot be read: No such file"),
+        ("a.npz", b"", "is not a trajectory file"),
+        ("a.npz", b"nothing like it", "is not a trajectory file"),
+        ("a.txt", b"", "ending '.txt' given; allowed are .npz and .csv"),
+    ],
+)
+def test_bad_trajectory_files(
+    folder: Path, capsys: pytest.CaptureFixture[str], name: str, content: bytes | None, words: str
+) -> None:
+    if content is not None:
+        Path(name).write_bytes(content)
+    message = fails(capsys, 2, "verify", str(HEPTAGON), name)
+    assert message.startswith(f"{name}: {words}")
+    if name.endswith(".npz"):
+        message = fails(capsys, 2, "plot", name, "-o", "a.png")
+        assert message.startswith(f"{name}: {words}")
+    assert not Path("a.png").exists()
+
+
+@pytest.mark.parametrize(
+    "name, start", [("a.png", b"\x89PNG"), ("a.pdf", b"%PDF"), ("a.svg", b"<?xml")]
+)
+def test_plot(
+    folder: Path, planned: Path, capsys: pytest.CaptureFixture[str], name: str, start: bytes
+) -> None:
+    assert main(["plot", str(planned / "plan.npz"), "-o", name]) == 0
+    assert capsys.readouterr().out == f"wrote {name}\n"
+    assert Path(name).read_bytes().startswith(start)
+    assert [path.name for path in folder.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("output, words", [("a.doc", "doc"), ("absent/a.png", "cannot be written")])
+def test_bad_figures(
+    folder: Path, planned: Path, capsys: pytest.CaptureFixture[str], output: str, words: str
+) -> None:
+    message = fails(capsys, 2, "plot", str(planned / "plan.npz"), "-o", output)
+    assert message.startswith(f"{output}: ") and words in message
+    assert list(folder.iterdir()) == []
+
+
+def test_interrupting_leaves_nothing(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("wholearm.plan.plan_path", interrupt)
+    assert main(["solve", str(HEPTAGON)]) == 130
+    assert capsys.readouterr().err == "wholearm: interrupted\n"
+    assert list(folder.iterdir()) == []
+
+
+def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["--help"])
+    assert caught.value.code == 0
+    out = capsys.readouterr().out
+    assert all(f"    {verb} " in out for verb in ("solve", "verify", "plot", "bench"))
+    assert build_parser().prog == "wholearm"
+
+
+def run(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-W", "error", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, **options)
+
+
+def test_version() -> None:
+    result = run("-m", "wholearm", "--version")
+    assert (result.returncode, result.stderr) == (0, "")
+    assert result.stdout == f"wholearm {wholearm.__version__}\n"
+
+
+def test_solve_imports_only_what_it_needs(folder: Path) -> None:
+    """What the process costs over importing casadi and numpy is its own work."""
+    code = (
+        "import sys\nfrom wholearm.cli import main\n"
+        f"assert main(['solve', {str(HEPTAGON)!r}, '-o', 'a.npz']) == 0\n"
+        "unwanted = ('scipy', 'matplotlib', 'wholearm.simulate', 'wholearm.plots')\n"
+        "print([name for name in unwanted if name in sys.modules])"
+    )
+    result = run("-c", code, cwd=folder)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.splitlines()[-1] == "[]"
+
+
+def test_bad_input_is_told_before_anything_heavy_is_imported() -> None:
+    code = (
+        "import sys\nfrom wholearm.cli import main\n"
+        "status = main(['solve'])\n"
+        "print(status, [name for name in ('casadi', 'numpy') if name in sys.modules])"
+    )
+    assert run("-c", code).stdout == "2 []\n"
+
+
+def test_a_closed_pipe_is_no_traceback(folder: Path) -> None:
+    command = [sys.executable, "-m", "wholearm", "solve", str(HEPTAGON), "-o", "a.npz"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout is not None and process.stderr is not None
+    process.stdout.close()
+    assert process.stderr.read() == b""
+    process.stderr.close()
+    assert process.wait() == 1
+    assert Path("a.npz").exists()

@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from types import ModuleType
+
+import pytest
+
+import wholearm
+
+
+def run(code: str) -> list[str]:
+    """What a fresh interpreter prints, line by line."""
+    result = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=True
+    )
+    return result.stdout.splitlines()
+
+
+@pytest.mark.parametrize("name", wholearm.__all__)
+def test_every_name_is_there(name: str) -> None:
+    assert getattr(wholearm, name) is not None
+    # And the same object when asked again.
+    assert getattr(wholearm, name) is getattr(wholearm, name)
+    assert name in dir(wholearm)
+
+
+def test_names_come_from_their_modules() -> None:
+    from wholearm.outline import load
+    from wholearm.plan import solve
+    from wholearm.trajectory import Trajectory
+
+    assert wholearm.load is load and wholearm.solve is solve
+    assert wholearm.Trajectory is Trajectory
+    assert callable(wholearm.verify) and callable(wholearm.simulate)
+    assert isinstance(wholearm.plots, ModuleType) and callable(wholearm.plots.force_margins)
+
+
+def test_unknown_attribute() -> None:
+    with pytest.raises(AttributeError, match="module 'wholearm' has no attribute 'slove'"):
+        wholearm.slove  # noqa: B018
+    assert not hasattr(wholearm, "numpy_")
+
+
+def test_names_are_sorted_and_unique() -> None:
+    public = [name for name in wholearm.__all__ if name != "__version__"]
+    assert public == sorted(set(public))
+
+
+@pytest.mark.parametrize("name", ["verify", "simulate", "plots", "solve"])
+def test_a_function_is_not_shadowed_by_its_module(name: str) -> None:
+    """Importing a submodule must not replace the function of the same name."""
+    expected = "module" if name == "plots" else "function"
+    code = (
+        "import importlib, wholearm\n"
+        "for m in ('verify', 'simulate', 'plots', 'plan'): importlib.import_module('wholearm.' + m)"
+        f"\nprint(type(wholearm.{name}).__name__)"
+        f"\nfrom wholearm import {name}\nprint(type({name}).__name__)"
+    )
+    assert run(code) == [expected, expected]
+
+
+def test_import_is_lazy() -> None:
+    (loaded,) = run(
+        "import sys, wholearm; "
+        "print([m for m in ('casadi', 'numpy', 'scipy', 'matplotlib') if m in sys.modules])"
+    )
+    assert loaded == "[]"

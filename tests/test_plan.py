@@ -1,0 +1,273 @@
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import trapezoid
+
+from plane import measure_gaps, measure_slip, unbalance
+from wholearm.errors import InfeasibleError, InputError
+from wholearm.model import Array
+from wholearm.plan import solve
+from wholearm.problem import Problem
+from wholearm.trajectory import Samples, Trajectory, load_trajectory
+
+OBJECTIVES = ["time", "effort", "margin"]
+LIMIT = 2.0
+
+
+@pytest.fixture(scope="module")
+def plans(heptagon: Problem, trajectory: Trajectory) -> dict[str, Trajectory]:
+    others = {name: solve(heptagon, name) for name in OBJECTIVES[1:]}
+    return {"time": trajectory, **others}
+
+
+def rows_of(trajectory: Trajectory, phase: int) -> Samples:
+    """The samples of one phase, with the forces of its contacts."""
+    rows = trajectory.phase == phase
+    mine = [trajectory.contacts.index(name) for name in trajectory.motions[phase].contacts]
+    return Samples(
+        trajectory.z[rows],
+        trajectory.z_dot[rows],
+        trajectory.z_ddot[rows],
+        trajectory.tau[rows],
+        trajectory.c_n[rows][:, mine],
+        trajectory.c_t[rows][:, mine],
+    )
+
+
+def check_balance(problem: Problem, phase: int, rows: Samples, sigmas: Array) -> None:
+    """Equations of motion, closed contacts and Coulomb's law, body by body, for every row."""
+    formation = problem.phases[phase].formation
+    for k in range(len(rows.z)):
+        row = Samples(*(part[k] for part in rows))
+        residual, size = unbalance(formation, row, sigmas[k])
+        # What is asked of a trajectory file: 1e-8 relative, gaps of 1e-9 m.
+        assert (np.abs(residual) < 1e-8 * size).all()
+        assert np.abs(measure_gaps(formation, row.z)).max() < 1e-9
+        slip = measure_slip(formation, row.z, row.z_dot)
+        moving = np.abs(slip) > 1e-9
+        law = -formation.friction * np.sign(slip) * row.c_n
+        np.testing.assert_allclose(row.c_t[moving], law[moving], rtol=1e-12)
+        np.testing.assert_allclose(np.abs(row.c_t), formation.friction * row.c_n, rtol=1e-12)
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_every_sample_obeys_newton_and_euler(
+    heptagon: Problem, plans: dict[str, Trajectory], objective: str
+) -> None:
+    trajectory = plans[objective]
+    for phase in range(5):
+        rows = rows_of(trajectory, phase)
+        sigma = np.sign(rows.z_dot[:, 3:])
+        # At rest the joints are about to go on as they do beside.
+        sigma[0], sigma[-1] = sigma[1], sigma[-2]
+        check_balance(heptagon, phase, rows, sigma)
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_random_instants_obey_newton_and_euler(
+    heptagon: Problem, plans: dict[str, Trajectory], objective: str
+) -> None:
+    trajectory = plans[objective]
+    starts = trajectory.phase_starts
+    for t in np.random.default_rng(1).uniform(0, trajectory.duration, 150):
+        phase = int(np.searchsorted(starts, t, side="right")) - 1
+        samples = trajectory.at(float(t))
+        check_balance(heptagon, phase, samples, np.sign(samples.z_dot[:, 3:]))
+        expected = trajectory.motions[phase].evaluate(np.array([t - starts[phase]]))
+        np.testing.assert_array_equal(samples.z, expected.z)
+        assert samples.c_n.min() >= heptagon.epsilon - 1e-6
+        assert np.abs(samples.tau).max() <= LIMIT + 1e-6
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_phases_join_at_rest(plans: dict[str, Trajectory], objective: str) -> None:
+    trajectory = plans[objective]
+    starts = np.flatnonzero(np.diff(trajectory.phase, prepend=-1))
+    ends = np.append(starts[1:], len(trajectory.t)) - 1
+    np.testing.assert_allclose(trajectory.t[starts[1:]], trajectory.t[ends[:-1]], atol=1e-15)
+    np.testing.assert_allclose(trajectory.z[starts[1:]], trajectory.z[ends[:-1]], atol=1e-11)
+    # b is zero to rounding, and the speed its root.
+    assert np.abs(trajectory.z_dot[np.append(starts, ends)]).max() < 1e-6
+    assert np.abs(trajectory.z_ddot[np.append(starts, ends)]).max(axis=1).min() > 0.1
+
+
+def test_motion_goes_where_it_should(heptagon: Problem, plans: dict[str, Trajectory]) -> None:
+    for trajectory in plans.values():
+        np.testing.assert_allclose(trajectory.z[0], heptagon.start, atol=1e-12)
+        assert trajectory.q[-1, 2] == pytest.approx(np.radians(-50.0), abs=1e-11)
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_velocities_are_derivatives(plans: dict[str, Trajectory], objective: str) -> None:
+    trajectory, rng = plans[objective], np.random.default_rng(2)
+    for motion in trajectory.motions:
+        t = rng.uniform(0.05, 0.95, 300) * motion.duration
+        h = 2e-4 * motion.duration
+        far, near = (
+            (motion.evaluate(t + d).z - motion.evaluate(t - d).z) / (2 * d) for d in (h, h / 2)
+        )
+        here = motion.evaluate(t)
+        scale = np.abs(here.z_dot).max()
+        # Fourth order away from kinks of s'', second order across one.
+        error = np.abs((4 * near - far) / 3 - here.z_dot).max(axis=1) / scale
+        assert np.median(error) < 1e-9 and error.max() < 1e-5
+        bend = (motion.evaluate(t + h).z_dot - motion.evaluate(t - h).z_dot) / (2 * h)
+        error = np.abs(bend - here.z_ddot).max(axis=1) / np.abs(here.z_ddot).max()
+        # First order across a step of s'' at a reversal.
+        assert np.median(error) < 1e-4 and (error < 1e-2).mean() > 0.98
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_torque_profile_is_that_of_the_motions(
+    plans: dict[str, Trajectory], objective: str
+) -> None:
+    trajectory, rng = plans[objective], np.random.default_rng(3)
+    starts = trajectory.phase_starts
+    assert trajectory.torque.breaks[0] == 0.0
+    assert trajectory.torque.breaks[-1] == pytest.approx(trajectory.duration, abs=1e-15)
+    for start, motion in zip(starts[:-1], trajectory.motions, strict=True):
+        t = rng.uniform(0, motion.duration, 200)
+        exact = motion.evaluate(t).tau
+        # Quartics in time; an interval in which a swings over costs the most.
+        error = np.abs(trajectory.torque.at(start + t) - exact)
+        assert np.median(error) < 1e-9 and error.max() < 5e-6
+    # Right of each boundary the next phase's torque holds, left of it the last one's.
+    hair = 1e-9
+    steps = 0.0
+    for k, start in enumerate(starts[1:-1]):
+        before, after = trajectory.torque.at(np.array([start - hair, start + hair]))
+        ended = trajectory.motions[k]
+        np.testing.assert_allclose(
+            before, ended.evaluate(np.array([ended.duration])).tau[0], rtol=0, atol=1e-5
+        )
+        begun = trajectory.motions[k + 1].evaluate(np.zeros(1)).tau[0]
+        np.testing.assert_allclose(after, begun, rtol=0, atol=1e-5)
+        steps = max(steps, float(np.abs(after - before).max()))
+    assert steps > 0.1
+
+
+def test_objectives_trade_against_each_other(plans: dict[str, Trajectory]) -> None:
+    time, effort, margin = (plans[name] for name in OBJECTIVES)
+
+    def squares(trajectory: Trajectory) -> float:
+        parts = [trajectory.phase == k for k in range(5)]
+        return float(
+            sum(trapezoid((trajectory.tau[p] ** 2).sum(axis=1), trajectory.t[p]) for p in parts)
+        )
+
+    durations = [np.array(p.meta["phase_durations"]) for p in (time, effort, margin)]
+    assert (durations[0] <= durations[1] + 1e-9).all()
+    assert margin.duration <= 2 * time.duration * (1 + 1e-6)
+    assert time.meta["value"] == pytest.approx(time.duration, rel=1e-12)
+    assert effort.meta["value"] == pytest.approx(squares(effort) + effort.duration, rel=1e-3)
+    assert effort.meta["value"] < squares(time) + time.duration
+    assert effort.meta["value"] < squares(margin) + margin.duration
+    least = [np.nanmin(p.c_n) for p in (time, effort, margin)]
+    assert margin.meta["value"] == pytest.approx(least[2], abs=2e-3)
+    assert least[2] > 0.3 and min(least[:2]) >= margin.meta["epsilon"] - 1e-6
+
+
+def test_more_time_never_lowers_the_margin(heptagon: Problem, trajectory: Trajectory) -> None:
+    least = trajectory.duration
+    values = [
+        solve(heptagon, "margin", duration=part * least, intervals=40).meta["value"]
+        for part in (1.02, 1.2, 1.6, 2.0, 3.0, 6.0)
+    ]
+    assert (np.diff(values) >= -1e-5).all()
+    assert values[0] >= heptagon.epsilon and values[-1] > values[0] + 0.1
+
+
+def test_a_heavier_weight_on_time_makes_it_faster(heptagon: Problem) -> None:
+    plans = [
+        solve(heptagon, "effort", time_weight=weight, intervals=40) for weight in (0.1, 1.0, 10.0)
+    ]
+    durations = [plan.duration for plan in plans]
+    assert durations[0] > durations[1] > durations[2]
+    assert [plan.meta["time_weight"] for plan in plans] == [0.1, 1.0, 10.0]
+
+
+def test_default_margin_takes_twice_the_least_time(
+    heptagon: Problem, trajectory: Trajectory
+) -> None:
+    default = solve(heptagon, "margin", intervals=40)
+    least = solve(heptagon, intervals=40).duration
+    given = solve(heptagon, "margin", intervals=40, duration=2 * least)
+    assert default.meta["value"] == pytest.approx(given.meta["value"], rel=1e-9)
+
+
+def test_too_short_a_duration(heptagon: Problem, trajectory: Trajectory) -> None:
+    with pytest.raises(InfeasibleError, match=r"duration = 0\.4 s .* least time, 0\.49\d+ s"):
+        solve(heptagon, "margin", duration=0.4)
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_meta_says_how_it_was_made(
+    heptagon: Problem, plans: dict[str, Trajectory], objective: str
+) -> None:
+    trajectory = plans[objective]
+    meta = json.loads(json.dumps(dict(trajectory.meta)))
+    assert meta == trajectory.meta
+    assert (meta["status"], meta["objective"]) == ("solved", objective)
+    assert (meta["epsilon"], meta["intervals"]) == (0.05, 80)
+    assert meta["name"] == heptagon.name and meta["problem"] == heptagon.table
+    assert meta["value_unit"] == {"time": "s", "effort": "(N m)^2 s", "margin": "N"}[objective]
+    assert sum(meta["phase_durations"]) == pytest.approx(trajectory.duration, rel=1e-14)
+    assert all(len(meta[key]) == 5 for key in ("phase_values", "iterations", "solves"))
+    combine = min if objective == "margin" else sum
+    assert meta["value"] == pytest.approx(combine(meta["phase_values"]))
+    assert {"trace", "build", "solve", "plan"} <= set(meta["timings"])
+    assert all(seconds >= 0 for seconds in meta["timings"].values())
+    assert {"wholearm", "casadi", "numpy", "python"} <= set(meta["versions"])
+
+
+def test_samples_and_progress(heptagon: Problem) -> None:
+    told: list[str] = []
+    trajectory = solve(heptagon, intervals=20, samples=7, progress=told.append)
+    assert trajectory.phase.tolist() == [k for k in range(5) for _ in range(7)]
+    assert trajectory.meta["intervals"] == 20
+    for phase in range(5):
+        rows = trajectory.phase == phase
+        np.testing.assert_allclose(np.diff(trajectory.t[rows], n=2), 0.0, atol=1e-15)
+        held = ~np.isnan(trajectory.c_n[rows]).any(axis=0)
+        names = {n for n, here in zip(trajectory.contacts, held, strict=True) if here}
+        assert names == set(heptagon.phases[phase].formation.names)
+        assert np.isnan(trajectory.c_n[rows][:, ~held]).all()
+    assert told[0] == "tracing the phases" and told[-1] == "sampling"
+    assert [text for text in told if text.startswith("phase 3 of 5")] == ["phase 3 of 5: time"]
+
+
+def test_plan_survives_its_file(trajectory: Trajectory, tmp_path: Any) -> None:
+    trajectory.save(tmp_path / "plan.npz")
+    loaded = load_trajectory(tmp_path / "plan.npz")
+    assert loaded.meta == trajectory.meta
+    t = np.random.default_rng(4).uniform(0, trajectory.duration, 200)
+    np.testing.assert_array_equal(loaded.torque.at(t), trajectory.torque.at(t))
+    for instant in t[:40]:
+        found, exact = loaded.at(float(instant)), trajectory.at(float(instant))
+        # Quintics over 1/200 of a phase; a kink of s'' inside one costs the most.
+        np.testing.assert_allclose(found.z, exact.z, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "options, key",
+    [
+        ({"objective": "fast"}, "objective"),
+        ({"intervals": 3}, "intervals"),
+        ({"samples": 0}, "samples"),
+        ({"time_weight": -1.0}, "time_weight"),
+        ({"duration": 1.0}, "duration"),
+    ],
+)
+def test_bad_options(heptagon: Problem, options: dict[str, Any], key: str) -> None:
+    with pytest.raises(InputError) as caught:
+        solve(heptagon, **options)
+    assert caught.value.key == key
+
+
+def test_unknown_option(heptagon: Problem) -> None:
+    with pytest.raises(TypeError, match="colour"):
+        solve(heptagon, colour="red")
