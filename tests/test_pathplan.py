@@ -22,9 +22,10 @@ from wholearm.errors import InfeasibleError, JammingError, SolverError
 from wholearm.model import Array
 from wholearm.options import PlanOptions
 from wholearm.path import trace_phases
-from wholearm.pathmotion import directions_of
+from wholearm.pathmotion import PathMotion, directions_of
 from wholearm.pathnlp import build_path_nlp
-from wholearm.pathplan import PathPlan, plan_path
+from wholearm.pathplan import plan_path
+from wholearm.phaseplan import PhasePlan
 from wholearm.plan import solve
 from wholearm.problem import Problem, build_problem
 
@@ -37,12 +38,12 @@ ALLOWED = 0.2
 
 
 @cache
-def plan(curve: Curve, objective: str = "time", intervals: int = 80) -> PathPlan:
+def plan(curve: Curve, objective: str = "time", intervals: int = 80) -> PhasePlan[PathMotion]:
     options = PlanOptions(objective=objective, intervals=intervals)
     return plan_path(curve, EPSILON, options, 1, ALLOWED if objective == "margin" else None)
 
 
-def inner_times(chosen: PathPlan, fractions: Array) -> Array:
+def inner_times(chosen: PhasePlan[PathMotion], fractions: Array) -> Array:
     """Times at `fractions` of every interval that has a length."""
     times = chosen.motion.times
     spans = np.diff(times)

@@ -18,7 +18,9 @@ from wholearm.curve import Curve, Segment
 from wholearm.dynamics import Directions, PathForces
 from wholearm.model import Array
 from wholearm.options import PlanOptions
-from wholearm.pathplan import PathPlan, plan_path
+from wholearm.pathmotion import PathMotion
+from wholearm.pathplan import plan_path
+from wholearm.phaseplan import PhasePlan
 
 Law = Callable[[Array, NDArray[np.bool_]], tuple[Array, ...]]
 """Coefficients (Ta, Tl, Tv), each (n, 2), at n arc lengths, before or after the break."""
@@ -56,7 +58,7 @@ class Toy:
         curve: Curve = stub
         return curve
 
-    def plan(self, duration: float | None = None, **options: Any) -> PathPlan:
+    def plan(self, duration: float | None = None, **options: Any) -> PhasePlan[PathMotion]:
         with self.in_place():
             return plan_path(self.curve, self.epsilon, PlanOptions(**options), 1, duration)
 

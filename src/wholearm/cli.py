@@ -1,4 +1,4 @@
-"""The command line: ``wholearm solve|verify|plot|bench``.
+"""The command line: ``wholearm solve|verify|plot|map|bench``.
 
 Exit status 0 means done and all contacts held, 1 infeasible or a contact lost or a goal missed,
 2 bad input. Each command imports what it needs and nothing else.
@@ -27,8 +27,9 @@ class _Parser(argparse.ArgumentParser):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status."""
+    given = sys.argv[1:] if arguments is None else arguments
     try:
-        options = build_parser().parse_args(arguments)
+        options = build_parser().parse_args([_protect(text) for text in given])
         status: int = options.run(options)
         sys.stdout.flush()
         return status
@@ -61,6 +62,9 @@ def build_parser() -> argparse.ArgumentParser:
     solve.add_argument("--duration", type=float, help="longest duration [s], for margin")
     solve.add_argument("--time-weight", type=float, help="weight of time [(N m)^2], for effort")
     solve.add_argument("--samples", type=int, help="rows per phase of the trajectory file")
+    solve.add_argument("--transcription", help="auto, or time for the time domain throughout")
+    solve.add_argument("--time-intervals", type=int, help="intervals of a phase in the time domain")
+    solve.add_argument("--degree", type=int, help="collocation points of an interval there")
     solve.add_argument("--json", action="store_true", help="print the summary as JSON")
 
     verify = _command(commands, "verify", _verify, "replay torques open loop and check the motion")
@@ -73,6 +77,14 @@ def build_parser() -> argparse.ArgumentParser:
     plot.add_argument("trajectory", help="trajectory file (.npz)")
     plot.add_argument("-o", "--output", required=True, help="figure to write (.png, .pdf, .svg)")
     plot.add_argument("--simulate", action="store_true", help="overlay the simulated forces")
+
+    chart = _command(commands, "map", _map, "draw the contact formations over (x, phi)")
+    chart.add_argument("problem", help="problem file (TOML)")
+    chart.add_argument("-o", "--output", help="figure to write (default: map_NAME.png)")
+    chart.add_argument("--plan", metavar="FILE", help="trajectory file (.npz) to draw over it")
+    chart.add_argument("--phi", metavar="LOW,HIGH", help="range of phi [deg] (default: the plan's)")
+    text = "print the formations along a route of two or more poses [m, deg] as [[phases]]"
+    chart.add_argument("--list", metavar="X,PHI", nargs="+", help=text)
 
     bench = _command(commands, "bench", _bench, "measure run time against error")
     bench.add_argument("problem", help="problem file (TOML)")
@@ -100,6 +112,8 @@ class _Version(argparse.Action):
 
 
 def _solve(options: argparse.Namespace) -> int:
+    from dataclasses import fields
+
     from .files import require_writable
     from .options import PlanOptions
     from .outline import load
@@ -108,7 +122,7 @@ def _solve(options: argparse.Namespace) -> int:
     output = options.output or _stem(options.problem) + ".npz"
     given = {
         key: getattr(options, key)
-        for key in ("objective", "intervals", "duration", "time_weight", "samples")
+        for key in (field.name for field in fields(PlanOptions))
         if getattr(options, key) is not None
     }
     plan_options = PlanOptions(**given)
@@ -190,6 +204,62 @@ def _plot(options: argparse.Namespace) -> int:
     _clear_progress()
     print(f"wrote {options.output}")
     return 0
+
+
+def _map(options: argparse.Namespace) -> int:
+    from .problem import read_problem
+
+    route = [_read_pair(text, "--list", "X,PHI in m and degrees") for text in options.list or ()]
+    phi = options.phi and _read_pair(options.phi, "--phi", "LOW,HIGH in degrees")
+    if phi and not 0 < phi[1] - phi[0] <= 360:
+        raise InputError("", "--phi", f"{options.phi!r} given; LOW < HIGH <= LOW + 360 is needed")
+    if route:
+        from math import radians
+
+        from .route import format_route, list_formations
+
+        poses = [(x, radians(angle)) for x, angle in route]
+        print(format_route(list_formations(read_problem(options.problem), *poses)), end="")
+        if options.output is None:
+            return 0
+    return _draw_map(options, phi)
+
+
+def _draw_map(options: argparse.Namespace, phi: tuple[float, float] | None) -> int:
+    from . import plots
+    from .files import require_writable
+    from .formationmap import build_map, choose_window
+    from .mapfigure import draw_map
+    from .problem import read_problem
+    from .trajectory import load_trajectory
+
+    output = options.output or f"map_{_stem(options.problem)}.png"
+    plots.require_format(output)
+    require_writable(output)
+    problem = read_problem(options.problem)
+    plan = None if options.plan is None else load_trajectory(options.plan)
+    window = choose_window(problem, phi)
+    plots.save(draw_map(build_map(problem, window=window, progress=_progress()), plan), output)
+    _clear_progress()
+    print(f"wrote {output}", file=sys.stderr if options.list else sys.stdout)
+    return 0
+
+
+def _read_pair(text: str, key: str, allowed: str) -> tuple[float, float]:
+    from .model import require_number
+
+    parts = text.split(",")
+    try:
+        first, second = (require_number(float(part), key) for part in parts)
+    except ValueError:
+        raise InputError("", key, f"{text.strip()!r} given; allowed is {allowed}") from None
+    return first, second
+
+
+def _protect(text: str) -> str:
+    """Keep argparse from taking a pair of numbers that starts with a minus for an option."""
+    pair = text[:1] == "-" and text[1:2] in tuple(".0123456789") and "," in text
+    return f" {text}" if pair else text
 
 
 def _bench(options: argparse.Namespace) -> int:

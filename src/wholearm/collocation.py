@@ -28,6 +28,14 @@ class Scheme(NamedTuple):
     extend: Array
 
     @property
+    def between(self) -> Array:
+        """Values at 0 and midway between points, from those at the points, shape (d, d)."""
+        powers = np.arange(self.degree)
+        places = np.append(0.0, (self.points[1:] + self.points[:-1]) / 2)
+        invert = np.linalg.inv(self.points[:, None] ** powers)
+        return np.asarray(places[:, None] ** powers @ invert)
+
+    @property
     def degree(self) -> int:
         """Number of points d."""
         return len(self.points)

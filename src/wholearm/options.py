@@ -42,6 +42,13 @@ class PlanOptions:
         What `margin` may take for all phases together; twice the least time when left out.
     samples : int
         Rows per phase of the trajectory file, at least 2.
+    transcription : str
+        ``"auto"`` plans phases with one freedom that end at rest along their curve and others in
+        the time domain; ``"time"`` plans all in the time domain.
+    time_intervals : int
+        Intervals of each phase in the time domain, at least 4.
+    degree : int
+        Collocation points per interval in the time domain, from 2 to 6.
 
     Raises
     ------
@@ -54,16 +61,24 @@ class PlanOptions:
     time_weight: float = 1.0
     duration: float | None = None
     samples: int = 201
+    transcription: str = "auto"
+    time_intervals: int = 10
+    degree: int = 3
 
     def __post_init__(self) -> None:
         given = self.objective
         if given not in CHOICES and given not in [Objective(choice) for choice in CHOICES]:
             raise InputError("", "objective", f"{given!r} given; allowed are {', '.join(CHOICES)}")
         object.__setattr__(self, "objective", Objective(given))
-        for key, least in (("intervals", 10), ("samples", 2)):
+        for key, least in (("intervals", 10), ("samples", 2), ("time_intervals", 4), ("degree", 2)):
             value = getattr(self, key)
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
                 raise InputError("", key, f"{value!r} is not a whole number of {least} or more")
+        if self.degree > 6:
+            raise InputError("", "degree", f"{self.degree} given; allowed are 2 to 6")
+        if self.transcription not in ("auto", "time"):
+            given = self.transcription
+            raise InputError("", "transcription", f"{given!r} given; allowed are auto and time")
         weight = require_number(self.time_weight, "time_weight", positive=True)
         object.__setattr__(self, "time_weight", weight)
         if self.duration is not None:

@@ -17,7 +17,7 @@ from .problem import Phase, Problem, read_problem
 
 POINTS = 25
 """Configurations along an outline."""
-RELEASE_AT = 0.3
+RELEASE_AT = 0.8
 """Where on a curve without an end of its own a release is guessed."""
 
 

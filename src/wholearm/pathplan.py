@@ -30,7 +30,7 @@ from .pathnlp import (
     parameters,
     unpack,
 )
-from .torque import TorqueProfile
+from .phaseplan import PhasePlan
 
 MISS = 5e-7
 """Largest miss of a force or torque limit between nodes [N or N m]; of b and T, relative."""
@@ -40,30 +40,6 @@ _COARSE = 1.5e-4
 """Miss, over the typical force, above which the grid is drawn together."""
 _OVER = 1.05
 """How much more than the miss a limit is tightened."""
-
-
-class PathPlan(NamedTuple):
-    """The plan of one phase.
-
-    Attributes
-    ----------
-    motion : PathMotion
-    torque : TorqueProfile
-        From the start of the phase.
-    value : float
-        Value of the objective: s, (N m)^2 s or N.
-    iterations, solves : int
-        Of Ipopt in all, and how often it ran.
-    build_time, solve_time : float, [s]
-    """
-
-    motion: PathMotion
-    torque: TorqueProfile
-    value: float
-    iterations: int
-    solves: int
-    build_time: float
-    solve_time: float
 
 
 class _Solution(NamedTuple):
@@ -80,7 +56,7 @@ def plan_path(
     options: PlanOptions,
     phase: int,
     duration: float | None = None,
-) -> PathPlan:
+) -> PhasePlan[PathMotion]:
     """Plan one phase along a curve, from rest to rest.
 
     Parameters
@@ -140,7 +116,7 @@ def plan_path(
         Objective.EFFORT: squares + options.time_weight * motion.duration,
         Objective.MARGIN: epsilon + margin,
     }[options.goal]
-    return PathPlan(
+    return PhasePlan(
         motion, torque, value, solution.iterations, solves, nlp.build_time, solution.seconds
     )
 

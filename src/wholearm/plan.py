@@ -1,6 +1,7 @@
 """Planning a problem, phase by phase.
 
-Phases are joined at rest, so each is a problem of its own.
+Phases joined at rest are problems of their own; those joined smoothly are one. A phase with one
+freedom between two rests is planned along its curve, anything else in the time domain.
 """
 
 from __future__ import annotations
@@ -8,20 +9,21 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from . import __version__
-from .curve import Curve
 from .errors import InfeasibleError
 from .options import Objective, PlanOptions
-from .path import trace_phases
-from .pathplan import PathPlan, plan_path
-from .problem import Problem
+from .path import runs_on_curve, trace_phase, trace_phases
+from .pathplan import plan_path
+from .phaseplan import PhasePlan
+from .problem import End, Phase, Problem
 from .torque import TorqueProfile
-from .trajectory import Trajectory, assemble
+from .trajectory import Motion, Trajectory, assemble
 
 UNITS = {Objective.TIME: "s", Objective.EFFORT: "(N m)^2 s", Objective.MARGIN: "N"}
 
@@ -68,15 +70,16 @@ def solve_with(
     started = time.perf_counter()
     report = progress or (lambda _: None)
     report("tracing the phases")
-    curves = trace_phases(problem)
+    trace_phases(problem)
     traced = time.perf_counter()
+    blocks = split_blocks(problem)
+    least: list[PhasePlan[Motion]] = []
+    allowed: list[float | None] = [None] * len(blocks)
     if options.goal is Objective.MARGIN:
-        fastest = PlanOptions(intervals=options.intervals)
-        least = _plan_phases(problem, curves, fastest, [None] * len(curves), report)
-        allowed = _share_duration(least, options.duration)
-    else:
-        least, allowed = [], [None] * len(curves)
-    plans = _plan_phases(problem, curves, options, allowed, report)
+        fastest = replace(options, objective=Objective.TIME, duration=None)
+        least = _plan_blocks(problem, blocks, fastest, allowed, report)
+        allowed = _share_duration(blocks, least, options.duration)
+    plans = _plan_blocks(problem, blocks, options, allowed, report)
     planned = time.perf_counter()
     motions = [plan.motion for plan in plans]
     values = [plan.value for plan in plans]
@@ -92,6 +95,7 @@ def solve_with(
         "phase_values": values,
         "phase_durations": [motion.duration for motion in motions],
         "intervals": options.intervals,
+        "transcription": options.transcription,
         "time_weight": options.time_weight,
         "timings": {
             "trace": traced - started,
@@ -113,23 +117,51 @@ def solve_with(
     return assemble(motions, _join(plans), meta, options.samples)
 
 
-def _plan_phases(
+def split_blocks(problem: Problem) -> list[tuple[Phase, ...]]:
+    """Phases that have to be planned together: those joined smoothly."""
+    blocks: list[tuple[Phase, ...]] = []
+    block: tuple[Phase, ...] = ()
+    for phase in problem.phases:
+        block = (*block, phase)
+        if phase.end is End.REST:
+            blocks.append(block)
+            block = ()
+    return blocks
+
+
+def _plan_blocks(
     problem: Problem,
-    curves: Sequence[Curve],
+    blocks: Sequence[tuple[Phase, ...]],
     options: PlanOptions,
     allowed: Sequence[float | None],
     report: Callable[[str], None],
-) -> list[PathPlan]:
-    plans = []
-    for phase, curve, duration in zip(problem.phases, curves, allowed, strict=True):
-        report(f"phase {phase.number} of {len(curves)}: {options.goal.value}")
-        plans.append(plan_path(curve, problem.epsilon, options, phase.number, duration))
+) -> list[PhasePlan[Motion]]:
+    """Plan block after block, each from where the one before ends."""
+    plans: list[PhasePlan[Motion]] = []
+    curves, z = trace_phases(problem), problem.start
+    for block, duration in zip(blocks, allowed, strict=True):
+        numbers = "-".join(str(phase.number) for phase in block)
+        report(f"phase {numbers} of {len(problem.phases)}: {options.goal.value}")
+        phase = block[0]
+        if runs_on_curve(phase) and options.transcription == "auto":
+            known = phase.index < len(curves)
+            curve = curves[phase.index] if known else trace_phase(problem, phase, z)
+            plans.append(plan_path(curve, problem.epsilon, options, phase.number, duration))
+            z = curve.end
+        else:
+            from .timeplan import plan_phases
+
+            plans += plan_phases(problem, block, z, options, duration)
+            motion = plans[-1].motion
+            z = motion.evaluate(np.array([motion.duration])).z[0]
     return plans
 
 
-def _share_duration(least: Sequence[PathPlan], duration: float | None) -> list[float | None]:
-    """Longest duration of each phase [s]: the whole, shared in proportion to the least times."""
-    times = [plan.motion.duration for plan in least]
+def _share_duration(
+    blocks: Sequence[tuple[Phase, ...]], least: Sequence[PhasePlan[Motion]], duration: float | None
+) -> list[float | None]:
+    """Longest duration of each block [s]: the whole, shared in proportion to the least times."""
+    times = [sum(least[phase.index].motion.duration for phase in block) for block in blocks]
     total = 2 * sum(times) if duration is None else duration
     if total <= sum(times):
         raise InfeasibleError(
@@ -138,7 +170,7 @@ def _share_duration(least: Sequence[PathPlan], duration: float | None) -> list[f
     return [total / sum(times) * own for own in times]
 
 
-def _join(plans: Sequence[PathPlan]) -> TorqueProfile:
+def _join(plans: Sequence[PhasePlan[Motion]]) -> TorqueProfile:
     """Torques of all phases, one after the other."""
     breaks, start = [np.zeros(1)], 0.0
     for plan in plans:

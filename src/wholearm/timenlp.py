@@ -46,13 +46,20 @@ _IPOPT = {
     "print_level": 0,
     "sb": "yes",
     "tol": 1e-8,
-    "max_iter": 500,
     # The default relaxes every bound by 1e-8, so that limits would be missed with success.
     "bound_relax_factor": 0.0,
     "fast_step_computation": "yes",
     # A fixed ordering: the automatic one can differ between machines.
     "mumps_permuting_scaling": 0,
     "mumps_pivot_order": 0,
+    # Together these make a repeated solve take few iterations.
+    "mu_strategy": "adaptive",
+    "warm_start_init_point": "yes",
+    "warm_start_bound_push": 1e-6,
+    "warm_start_bound_frac": 1e-6,
+    "warm_start_slack_bound_push": 1e-6,
+    "warm_start_slack_bound_frac": 1e-6,
+    "warm_start_mult_bound_push": 1e-6,
 }
 
 
@@ -78,6 +85,8 @@ class Stage:
         The next stage's formation where that has a contact more, which is gained softly.
     watched : tuple of int
         Limits of the formation that are kept positive at every point.
+    known : StagePoints or None
+        All unknowns, where an earlier solution gives a better guess than `z` alone.
     """
 
     phase: int
@@ -89,6 +98,7 @@ class Stage:
     turns: tuple[int, ...] = ()
     gained: Formation | None = None
     watched: tuple[int, ...] = ()
+    known: StagePoints | None = None
 
 
 class StagePoints(NamedTuple):
@@ -161,11 +171,13 @@ def build_time_nlp(
     start: tuple[Array, Array],
     objective: Objective,
     time_weight: float,
+    max_iter: int,
 ) -> TimeNLP:
     """Build the NLP of stages that follow one another and end at rest.
 
     The unknowns are those of `StagePoints.pack`, stage after stage; for `margin` the least margin
-    follows. The parameters are the force [N] that c_n exceeds at each point and contact.
+    follows. The parameters, for each stage, are what c_n has to exceed, (n_c, K) [N], and what
+    tau must not exceed, (2, K) [N m], in each interval.
 
     Parameters
     ----------
@@ -176,10 +188,12 @@ def build_time_nlp(
     objective : Objective
     time_weight : float, [(N m)^2]
         For `effort`.
+    max_iter : int
+        Most iterations of Ipopt.
     """
     started = time.perf_counter()
     rows = _Rows()
-    unknowns, durations, efforts, floors = [], [], [], []
+    unknowns, durations, efforts, limits = [], [], [], []
     margin = ca.MX.sym("margin", 1 if objective is Objective.MARGIN else 0)
     z_before, v_before = ca.DM(start[0]), ca.DM(start[1])
     rho = stages[0].formation.scene.polygon.gyration_radius
@@ -196,10 +210,11 @@ def build_time_nlp(
         _collocate(rows, stage, scheme, (z, v, a), (z_before, v_before), duration)
         if stage.watched:
             rows.add(_watch_function(stage.formation, stage.watched).map(count)(z) / rho, 0, np.inf)
-        floor = ca.MX.sym("floor", n_c, count)
-        floors.append(ca.vec(floor))
-        pressed = c_n - floor
-        rows.add(pressed if margin.is_empty() else pressed - margin, 0.0, np.inf)
+        intervals = count // scheme.degree
+        floor, cap = ca.MX.sym("floor", n_c, intervals), ca.MX.sym("cap", 2, intervals)
+        limits += [ca.vec(floor), ca.vec(cap)]
+        least = floor if margin.is_empty() else floor + margin
+        _limit(rows, scheme, (c_n, tau), (least, cap))
         z_before, v_before = z[:, -1], v[:, -1]
         _end_stage(rows, stage, z_before, v_before, rho)
         efforts.append(_integrate_squares(tau, scheme, duration, count))
@@ -214,12 +229,12 @@ def build_time_nlp(
         rows.add(total, 0.0, np.inf)
     nlp = {
         "x": ca.vertcat(*unknowns, margin),
-        "p": ca.vertcat(*floors),
+        "p": ca.vertcat(*limits),
         "f": cost,
         "g": ca.vertcat(*rows.parts),
     }
     options = {
-        "ipopt": _IPOPT,
+        "ipopt": _IPOPT | {"max_iter": max_iter},
         "print_time": False,
         "record_time": True,
         "calc_lam_p": False,
@@ -291,6 +306,23 @@ def _tangent_basis(formation: Formation, z: Array, metric: Array) -> Array:
     return np.asarray((right[rank:] * np.sqrt(metric)).T)
 
 
+def _limit(
+    rows: _Rows,
+    scheme: Scheme,
+    forces: tuple[Expression, Expression],
+    limits: tuple[Expression, Expression],
+) -> None:
+    """Limits at the points, and at as many places between of the polynomials through them."""
+    (c_n, tau), (floor, cap) = forces, limits
+    wide = ca.DM(np.vstack([np.eye(scheme.degree), scheme.between]).T)
+    for k in range(floor.shape[1]):
+        mine = slice(k * scheme.degree, (k + 1) * scheme.degree)
+        rows.add(c_n[:, mine] @ wide - ca.repmat(floor[:, k], 1, wide.shape[1]), 0.0, np.inf)
+        room = ca.repmat(cap[:, k], 1, wide.shape[1])
+        rows.add(room - tau[:, mine] @ wide, 0.0, np.inf)
+        rows.add(room + tau[:, mine] @ wide, 0.0, np.inf)
+
+
 def _end_stage(rows: _Rows, stage: Stage, z: Expression, v: Expression, rho: float) -> None:
     """What holds at the end of a stage, but for rest at the end of the last one."""
     formation = stage.formation
@@ -327,15 +359,13 @@ def _integrate_squares(
 
 
 def bound_unknowns(stages: Sequence[Stage], extra: int) -> tuple[Array, Array]:
-    """Bounds of the unknowns: durations and torques; `extra` free ones at the end."""
+    """Bounds of the unknowns: durations and joint speeds; `extra` free ones at the end."""
     lows: list[Any] = []
     highs: list[Any] = []
     for stage in stages:
         count, n_c = len(stage.z) - 1, stage.formation.n_contacts
         high = np.full((count, 17 + n_c), np.inf)
-        scene = stage.formation.scene
-        high[:, 8:10] = scene.speed_limit
-        high[:, 15 + n_c :] = scene.torque_limit
+        high[:, 8:10] = stage.formation.scene.speed_limit
         low = -high
         lows.append(np.append(SHORTEST, low.ravel()))
         highs.append(np.append(LONGEST, high.ravel()))

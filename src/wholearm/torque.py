@@ -48,6 +48,14 @@ class TorqueProfile:
         powers = x[:, None] ** np.arange(self.coefficients.shape[2])
         return np.asarray(np.einsum("njd,nd->nj", self.coefficients[piece], powers))
 
+    def integrate_squares(self) -> float:
+        """Integral of tau^T tau over all pieces [(N m)^2 s]."""
+        degree = self.coefficients.shape[2]
+        total = np.arange(degree)[:, None] + np.arange(degree)
+        moments = np.where(total % 2 == 0, 2 / (total + 1), 0.0)
+        squares = np.einsum("kjd,de,kje->k", self.coefficients, moments, self.coefficients)
+        return float(squares @ np.diff(self.breaks) / 2)
+
     def rows(self, per_piece: int) -> Array:
         """Rows (t, tau_1, tau_2), `per_piece` + 1 on each piece, two at a break where it steps.
 

@@ -194,20 +194,41 @@ class SampledMotion:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
         grid, known = self.t - self.t[0], self.samples
         k = np.clip(np.searchsorted(grid, t, side="right") - 1, 0, len(grid) - 2)
-        h = (grid[k + 1] - grid[k])[:, None]
-        x = (np.asarray(t)[:, None] - grid[k][:, None]) / h
-        z0, v0, a0 = known.z[k], h * known.z_dot[k], h**2 * known.z_ddot[k]
-        rise = known.z[k + 1] - z0 - v0 - a0 / 2
-        speed = h * known.z_dot[k + 1] - v0 - a0
-        bend = h**2 * known.z_ddot[k + 1] - a0
-        c3 = 10 * rise - 4 * speed + bend / 2
-        c4 = -15 * rise + 7 * speed - bend
-        c5 = 6 * rise - 3 * speed + bend / 2
-        z = z0 + x * (v0 + x * (a0 / 2 + x * (c3 + x * (c4 + x * c5))))
-        z_dot = (v0 + x * (a0 + x * (3 * c3 + x * (4 * c4 + x * 5 * c5)))) / h
-        z_ddot = (a0 + x * (6 * c3 + x * (12 * c4 + x * 20 * c5))) / h**2
+        h, run = grid[k + 1] - grid[k], np.asarray(t) - grid[k]
+        z, z_dot, z_ddot = interpolate_quintic(h, run, known[:3], k)
+        x = (run / h)[:, None]
         forces = [(1 - x) * f[k] + x * f[k + 1] for f in (known.tau, known.c_n, known.c_t)]
         return Samples(z, z_dot, z_ddot, *forces)
+
+
+def interpolate_quintic(
+    h: Array, run: Array, knots: Sequence[Array], left: NDArray[np.int64]
+) -> tuple[Array, Array, Array]:
+    """Quintic through z, z' and z'' at two knots, with its first two derivatives.
+
+    Parameters
+    ----------
+    h, run : ndarray, shape (n,), [s]
+        Time between the two knots, and since the first of them.
+    knots : sequence of three ndarrays, shape (m, 5)
+        z, z' and z'' at all knots.
+    left : ndarray of int, shape (n,)
+        The first of the two knots.
+    """
+    h, x = h[:, None], (run / h)[:, None]
+    z, v, a = knots
+    z0, v0, a0 = z[left], h * v[left], h**2 * a[left]
+    rise = z[left + 1] - z0 - v0 - a0 / 2
+    speed = h * v[left + 1] - v0 - a0
+    bend = h**2 * a[left + 1] - a0
+    c3 = 10 * rise - 4 * speed + bend / 2
+    c4 = -15 * rise + 7 * speed - bend
+    c5 = 6 * rise - 3 * speed + bend / 2
+    return (
+        z0 + x * (v0 + x * (a0 / 2 + x * (c3 + x * (c4 + x * c5)))),
+        (v0 + x * (a0 + x * (3 * c3 + x * (4 * c4 + x * 5 * c5)))) / h,
+        (a0 + x * (6 * c3 + x * (12 * c4 + x * 20 * c5))) / h**2,
+    )
 
 
 def assemble(
