@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import brentq
 
+from wholearm.contact import parse_contact
 from wholearm.curve import Curve
 from wholearm.dynamics import Directions, inverse
+from wholearm.formation import Formation
 from wholearm.model import Array
 from wholearm.outline import load
 from wholearm.path import trace_phases
-from wholearm.problem import Problem
+from wholearm.problem import End, Phase, Problem, Until
 from wholearm.torque import TorqueProfile
-from wholearm.trajectory import Samples, Trajectory, assemble
+from wholearm.trajectory import Motion, Samples, Trajectory, assemble
 
 HEPTAGON = Path(__file__).parents[1] / "problems" / "heptagon_four_contacts.toml"
+DEPENDENT = [1, 3, 4]
+"""Coordinates y, theta_1 and theta_2, which follow from x and phi."""
 SQUEEZES = np.geomspace(0.02, 40.0, 60)
 
 
@@ -46,12 +52,16 @@ class CosineMotion:
         inner = np.arccos(1 - 2 * np.array(places[1:]) / self.curve.length) * self.duration / np.pi
         return np.array([0.0, *inner, self.duration])
 
-    def evaluate(self, t: Array) -> Samples:
+    def law(self, t: Array) -> tuple[Array, Array, Array]:
+        """Place, speed and acceleration along the curve."""
         length, rate = self.curve.length, np.pi / self.duration
-        t = np.clip(t, 0.0, self.duration)
         s = length / 2 * (1 - np.cos(rate * t))
         v = length / 2 * rate * np.sin(rate * t)
-        a = length / 2 * rate**2 * np.cos(rate * t)
+        return s, v, length / 2 * rate**2 * np.cos(rate * t)
+
+    def evaluate(self, t: Array) -> Samples:
+        t = np.clip(t, 0.0, self.duration)
+        s, v, a = self.law(t)
         point = self.curve.evaluate(s)
         owner = np.clip(np.searchsorted(self.turns, t, side="right") - 1, 0, len(self.turns) - 2)
         tau, c_n = np.empty((len(t), 2)), np.empty((len(t), 4))
@@ -74,13 +84,151 @@ class CosineMotion:
 
     def fit(self, pieces: int, degree: int) -> TorqueProfile:
         """The torques as polynomials, broken where a sliding direction reverses."""
-        turns = self.turns
-        counts = np.maximum(1, np.ceil(pieces * np.diff(turns) / self.duration)).astype(int)
-        grids = [
-            np.linspace(*ends, n + 1)[:-1] for ends, n in zip(pairwise(turns), counts, strict=True)
+        return fit(self, self.turns, pieces, degree)
+
+
+@dataclass(frozen=True, eq=False)
+class DepartingMotion(CosineMotion):
+    """A phase run through from rest to `place` on the curve, at `speed` there.
+
+    The law is a cubic in time.
+    """
+
+    place: float = 0.0
+    speed: float = 0.0
+
+    def law(self, t: Array) -> tuple[Array, Array, Array]:
+        s, v, a = hermite(0.0, 0.0, self.place, self.speed, self.duration, t)
+        return s, v, a
+
+    @property
+    def turns(self) -> Array:
+        places = [g.start for g in self.curve.segments[1:] if g.start < self.place]
+        inner = [
+            brentq(lambda t, p=p: self.law(np.array([t]))[0][0] - p, 0, self.duration, xtol=1e-15)
+            for p in places
         ]
-        breaks = np.append(np.concatenate(grids), self.duration)
-        return TorqueProfile.fit(breaks, lambda t: self.evaluate(t).tau, degree)
+        return np.array([0.0, *inner, self.duration])
+
+
+@dataclass(frozen=True, eq=False)
+class LandingMotion:
+    """Three contacts on the way from a place (x, phi) at a speed to another one, to rest there.
+
+    phi is a cubic in time, and x one in phi, so that the direction of travel can be chosen.
+
+    Attributes
+    ----------
+    formation : Formation
+    start, start_dot : ndarray, shape (5,)
+    x, phi : float, [m] and [rad]
+        The end.
+    slope : float, [m/rad]
+        dx/dphi there.
+    duration : float, [s]
+    """
+
+    formation: Formation
+    start: Array
+    start_dot: Array
+    x: float
+    phi: float
+    slope: float
+    duration: float
+
+    @property
+    def contacts(self) -> tuple[str, ...]:
+        return self.formation.names
+
+    def pose(self, t: Array) -> tuple[Array, Array]:
+        """Pose x and phi with their first and second derivatives, each of shape (3, n)."""
+        phi_0, rate = self.start[2], self.start_dot[2]
+        phi = hermite(phi_0, rate, self.phi, 0.0, self.duration, t)
+        slopes = self.start_dot[0] / rate, self.slope
+        X = hermite(self.start[0], slopes[0], self.x, slopes[1], self.phi - phi_0, phi[0] - phi_0)
+        x = np.array([X[0], X[1] * phi[1], X[1] * phi[2] + X[2] * phi[1] ** 2])
+        return x, phi
+
+    def close(self, x: Array, phi: Array) -> Array:
+        """Configurations with every contact closed, shape (n, 5)."""
+        z = np.tile(self.start, (len(x), 1))
+        z[:, 0], z[:, 2] = x, phi
+        for _ in range(50):
+            C, A, _, _ = self.formation.evaluate(z, np.zeros_like(z))
+            step = np.linalg.solve(A[:, :, DEPENDENT], -C[..., None])[..., 0]
+            # Far from the start a whole step could leave the solution's neighbourhood.
+            z[:, DEPENDENT] += step * np.minimum(1.0, 0.2 / np.abs(step).max())
+        return z
+
+    def move(self, t: Array) -> tuple[Array, Array, Array, Array]:
+        """z, z', z'' and the rates of sliding and of the joints, shape (n, n_c + 2)."""
+        x, phi = self.pose(np.asarray(t))
+        z = self.close(x[0], phi[0])
+        z_dot, z_ddot = np.zeros_like(z), np.zeros_like(z)
+        for rates, k in (z_dot, 1), (z_ddot, 2):
+            rates[:, 0], rates[:, 2] = x[k], phi[k]
+            _, A, _, bend = self.formation.evaluate(z, z_dot)
+            right = -np.einsum("nij,nj->ni", A, rates) - (bend if k == 2 else 0.0)
+            rates[:, DEPENDENT] = np.linalg.solve(A[:, :, DEPENDENT], right[..., None])[..., 0]
+        A_t = self.formation.evaluate(z, z_dot).A_t
+        return z, z_dot, z_ddot, np.hstack([np.einsum("nij,nj->ni", A_t, z_dot), z_dot[:, 3:]])
+
+    @cached_property
+    def turns(self) -> Array:
+        """Times at which a contact or a joint reverses, shape (k,), with both ends."""
+        t = np.linspace(0.0, self.duration, 401)[:-1]
+        rates = self.move(t)[3]
+        found = [
+            brentq(lambda u, k=k: self.move(np.array([u]))[3][0, k], t[i], t[i + 1], xtol=1e-15)
+            for i, k in np.argwhere(rates[1:] * rates[:-1] < 0)
+        ]
+        return np.array([0.0, *sorted(found), self.duration])
+
+    def signs(self, t: Array) -> Array:
+        """Directions of sliding and of the joints: those in the middle between two reversals."""
+        middle = self.move((self.turns[1:] + self.turns[:-1]) / 2)[3]
+        owner = np.searchsorted(self.turns, t, side="right") - 1
+        return np.asarray(np.sign(middle)[np.clip(owner, 0, len(middle) - 1)])
+
+    def evaluate(self, t: Array) -> Samples:
+        t = np.clip(t, 0.0, self.duration)
+        scene, signs = self.formation.scene, self.signs(t)
+        z, z_dot, z_ddot, _ = self.move(t)
+        _, A, A_t, _ = self.formation.evaluate(z, z_dot)
+        slip = np.asarray(self.formation.friction * signs[:, :-2], dtype=float)
+        # The five equations of motion, with the unknowns c_n and tau.
+        matrix = np.zeros((len(t), 5, 5))
+        matrix[:, :, :3] = (A - slip[..., None] * A_t).transpose(0, 2, 1)
+        matrix[:, [3, 4], [3, 4]] = 1.0
+        right = scene.mass_diagonal * z_ddot + scene.viscous * z_dot - scene.applied_force
+        right[:, 3:] += scene.dry[3:] * signs[:, -2:]
+        solution = np.linalg.solve(matrix, right[..., None])[..., 0]
+        c_n, tau = np.asarray(solution[:, :3]), np.asarray(solution[:, 3:])
+        return Samples(z, z_dot, z_ddot, tau, c_n, np.asarray(-slip * c_n))
+
+    def fit(self, pieces: int, degree: int) -> TorqueProfile:
+        """The torques as polynomials, broken where a direction reverses."""
+        return fit(self, self.turns, pieces, degree)
+
+
+def hermite(p: float, p_dot: float, q: float, q_dot: float, duration: float, t: Array) -> Array:
+    """The cubic from p to q with the given slopes, and two derivatives, shape (3, n)."""
+    u = t / duration
+    a, b, rise = p_dot * duration, q_dot * duration, q - p
+    c, d = 3 * rise - 2 * a - b, a + b - 2 * rise
+    value = p + a * u + c * u**2 + d * u**3
+    first = (a + 2 * c * u + 3 * d * u**2) / duration
+    return np.array([value, first, (2 * c + 6 * d * u) / duration**2])
+
+
+def fit(motion: Motion, turns: Array, pieces: int, degree: int) -> TorqueProfile:
+    """The torques of a motion as polynomials, broken at `turns`."""
+    counts = np.maximum(1, np.ceil(pieces * np.diff(turns) / motion.duration)).astype(int)
+    grids = [
+        np.linspace(*ends, n + 1)[:-1] for ends, n in zip(pairwise(turns), counts, strict=True)
+    ]
+    breaks = np.append(np.concatenate(grids), motion.duration)
+    return TorqueProfile.fit(breaks, lambda t: motion.evaluate(t).tau, degree)
 
 
 def choose_squeeze(curve: Curve, duration: float, least: float, limit: float) -> float:
@@ -107,6 +255,33 @@ def plan(
     ]
     torque = join([motion.fit(pieces, degree) for motion in motions])
     return problem, assemble(motions, torque, {"epsilon": problem.epsilon}, 201)
+
+
+@lru_cache(maxsize=4)
+def plan_landing(duration: float = 0.2, squeeze: float = 12.0) -> tuple[Problem, Trajectory]:
+    """The heptagon lets vertex 3 go at speed and lands on edge 1, at rest after `duration`.
+
+    Four contacts from rest at the start of the last phase of `plan`, then three. A squeeze of 4
+    is too weak for the first phase.
+    """
+    problem, trajectory = plan()
+    last = trajectory.motions[-1]
+    assert isinstance(last, CosineMotion)
+    scene, curve = problem.scene, last.curve
+    departing = DepartingMotion(curve, 0.5, squeeze, place=0.06, speed=0.2)
+    at = departing.evaluate(np.array([departing.duration]))
+    names = ("v1-palm", "v4-finger1", "v6-finger2")
+    formation = Formation(scene, tuple(parse_contact(name, scene) for name in names))
+    phi = scene.polygon.flush_angle(1)
+    landing = LandingMotion(formation, at.z[0], at.z_dot[0], 0.016, phi, 0.0, duration)
+    phases = (
+        Phase(0, curve.formation, Until(), End.SMOOTH),
+        Phase(1, formation, Until(contact=parse_contact("v2-palm", scene))),
+    )
+    motions: tuple[DepartingMotion, LandingMotion] = (departing, landing)
+    torque = join([motion.fit(60, 7) for motion in motions])
+    one = dataclasses.replace(problem, start=curve.start, phases=phases)
+    return one, assemble(motions, torque, {"epsilon": problem.epsilon}, 201)
 
 
 def join(profiles: list[TorqueProfile]) -> TorqueProfile:

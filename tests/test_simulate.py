@@ -18,7 +18,8 @@ from wholearm.formation import Formation
 from wholearm.model import Array, Finger, Friction, Scene
 from wholearm.problem import Phase, Problem, Until
 from wholearm.simulate import simulate
-from wholearm.sticking import balances, find_rest
+from wholearm.statics import balances
+from wholearm.sticking import find_rest
 from wholearm.torque import TorqueProfile
 
 

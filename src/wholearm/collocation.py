@@ -19,13 +19,10 @@ class Scheme(NamedTuple):
         Increasing; the last one is 1.
     integrals : ndarray, shape (d, d)
         Row j integrates, from 0 to point j, the polynomial through values at the points.
-    extend : ndarray, shape (d + 1, d + 1)
-        Powers of x = 0 .. d from values at 0 and the points.
     """
 
     points: Array
     integrals: Array
-    extend: Array
 
     @property
     def between(self) -> Array:
@@ -55,5 +52,4 @@ def radau(degree: int) -> Scheme:
     powers = np.arange(1, degree + 1)
     invert = np.linalg.inv(points[:, None] ** (powers - 1))
     integrals = (points[:, None] ** powers / powers) @ invert
-    ends = np.append(0.0, points)
-    return Scheme(points, integrals, np.linalg.inv(ends[:, None] ** np.arange(degree + 1)))
+    return Scheme(points, integrals)

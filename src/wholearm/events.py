@@ -30,6 +30,10 @@ class EventKind(Enum):
     """The torques jump."""
     ARRIVAL = "arrival"
     """The end of the phase is reached, and the next formation taken."""
+    RELEASE = "release"
+    """The contacts that the next phase does not have are let go, and its formation is taken."""
+    HELD = "held"
+    """Friction holds a contact or a joint while the rest moves."""
     CONTACT_LOST = "contact lost"
     """A normal force falls to zero."""
     LIMIT = "limit"
@@ -53,8 +57,9 @@ class Event:
     contact : str
         The contact or joint concerned, empty if there is none.
     value : float
-        Arrival: rate at which the distance to the phase's end closes [m/s or rad/s]; contact lost:
-        its c_n [N]; end: the distance to the phase's end [m or rad]; NaN otherwise.
+        Arrival: rate at which the distance to the phase's end closes [m/s or rad/s]; contact lost
+        and release: the c_n that the contact would need [N]; end: the distance to the phase's end
+        [m or rad], NaN if that is a release; NaN otherwise.
     """
 
     time: float
@@ -70,6 +75,7 @@ class OutcomeKind(Enum):
 
     GOAL_REACHED = "goal reached"
     CONTACT_LOST = "contact lost"
+    HELD = "held"
     LIMIT_REACHED = "limit reached"
     GOAL_MISSED = "goal missed"
 
@@ -100,7 +106,7 @@ class Energies:
     viscous, dry, contact : ndarray
         Lost so far to viscous and dry joint friction and to sliding.
     impact : ndarray
-        Lost so far where the motion was stopped by a contact gained.
+        Lost so far where a contact gained stopped the motion, or part of it.
     """
 
     stored: Array
@@ -138,7 +144,8 @@ class Simulation:
     energies : Energies
     outcome : Outcome
     missed_by : float, [m or rad]
-        Distance to the end of the last phase entered; zero when the goal is reached.
+        Distance to the end of the last phase entered; zero when the goal is reached, and NaN if
+        that phase ends by a release.
     steps, rejected : int
         Accepted and rejected Runge-Kutta steps.
     """

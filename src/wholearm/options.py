@@ -62,7 +62,7 @@ class PlanOptions:
     duration: float | None = None
     samples: int = 201
     transcription: str = "auto"
-    time_intervals: int = 10
+    time_intervals: int = 16
     degree: int = 3
 
     def __post_init__(self) -> None:

@@ -10,7 +10,7 @@ from .contact import Contact
 from .curve import Curve, metric_weights
 from .dynamics import Directions
 from .errors import InputError
-from .formation import Formation
+from .formation import TOUCHING, Formation
 from .model import Array
 from .path import require_touching, runs_on_curve, trace_phase, trace_phases
 from .problem import Phase, Problem, read_problem
@@ -19,6 +19,10 @@ POINTS = 25
 """Configurations along an outline."""
 RELEASE_AT = 0.8
 """Where on a curve without an end of its own a release is guessed."""
+_MOST_ACTIVE = 2
+"""Most limits that a phase's end may be right on."""
+_STEP = 1e-6
+"""Step of the differences that give the gradients of limits [m or rad]."""
 
 
 def load(path: str) -> Problem:
@@ -115,19 +119,36 @@ def _find_goal(problem: Problem, phase: Phase, z: Array) -> Array:
     """Nearest configuration at which the phase ends."""
     formation, until = phase.formation, phase.until
     key = f"phases[{phase.number}].until"
+    fixed = None
     if until.contact is not None:
-        goal = close(Formation(formation.scene, (*formation.contacts, until.contact)), z)
+        formation = Formation(formation.scene, (*formation.contacts, until.contact))
     elif until.value is not None:
-        row = 0 if until.coordinate == "x" else 2
-        goal = close(formation, z, (row, until.value))
+        fixed = (0 if until.coordinate == "x" else 2, until.value)
     else:
         raise InputError(problem.source, key, "is missing; only one freedom needs none")
-    if goal is None:
-        raise InputError(problem.source, key, f"{until} cannot be reached with these contacts")
-    return goal
+    active: tuple[int, ...] = ()
+    reason = ""
+    goal = close(formation, z, fixed)
+    while goal is not None:
+        limits = formation.evaluate_limits(goal[None])[0]
+        if limits.min() > -TOUCHING:
+            return goal
+        worst = int(limits.argmin())
+        reason = f": {formation.limits[worst].text} first"
+        if worst in active or len(active) == _MOST_ACTIVE:
+            break
+        active = (*active, worst)
+        goal = close(formation, goal, fixed, active)
+    text = f"{until} cannot be reached with these contacts{reason}"
+    raise InputError(problem.source, key, text)
 
 
-def close(formation: Formation, z: Array, fixed: tuple[int, float] | None = None) -> Array | None:
+def close(
+    formation: Formation,
+    z: Array,
+    fixed: tuple[int, float] | None = None,
+    active: tuple[int, ...] = (),
+) -> Array | None:
     """Nearest configuration with all contacts closed, by Gauss-Newton; None if there is none.
 
     Parameters
@@ -137,6 +158,8 @@ def close(formation: Formation, z: Array, fixed: tuple[int, float] | None = None
         Where to start.
     fixed : (int, float), optional
         Row of z and the value that it has to take.
+    active : tuple of int
+        Limits of the formation that are met exactly.
     """
     metric = metric_weights(formation.scene)
     for _ in range(50):
@@ -145,6 +168,11 @@ def close(formation: Formation, z: Array, fixed: tuple[int, float] | None = None
         if fixed is not None:
             residual = np.append(residual, z[fixed[0]] - fixed[1])
             rows = np.vstack([rows, np.eye(5)[fixed[0]]])
+        if active:
+            residual = np.append(residual, formation.evaluate_limits(z[None])[0, active])
+            steps = np.vstack([_STEP * np.eye(5), -_STEP * np.eye(5)])
+            ahead, behind = np.split(formation.evaluate_limits(z + steps)[:, active], 2)
+            rows = np.vstack([rows, (ahead - behind).T / (2 * _STEP)])
         lift = (rows / metric).T
         change = lift @ np.linalg.lstsq(rows @ lift, residual, rcond=1e-12)[0]
         # Long steps overshoot where links turn; a tenth of a radian keeps to one branch.

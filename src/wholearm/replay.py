@@ -36,11 +36,16 @@ class Replay:
         Of the phase's formation.
     limits : list of str
         What has happened when each of the stepper's limits is zero.
+    releasable : tuple of str
+        The contacts whose release ends the phase.
+    moving : bool
+        Whether the motion goes on into the phase that is entered.
     """
 
     stepper: Stepper
     phase: Phase
     limits: list[str]
+    releasable: tuple[str, ...]
 
     def __init__(
         self,
@@ -62,6 +67,7 @@ class Replay:
         self.h = FIRST_STEP
         self.hold = -math.inf
         self.impact = 0.0
+        self.moving = False
         self.sections: list[Section] = []
         self.events: list[Event] = []
         self.steps = self.rejected = 0
@@ -118,9 +124,17 @@ class Replay:
         for column in (section.times, section.rows, section.impacts):
             column.pop()
 
-    def note(self, kind: EventKind, text: str, contact: str = "", value: float = math.nan) -> None:
-        """Append an event."""
-        self.events.append(Event(self.t, self.phase.index, kind, text, contact, value))
+    def note(
+        self,
+        kind: EventKind,
+        text: str,
+        contact: str = "",
+        value: float = math.nan,
+        time: float | None = None,
+    ) -> None:
+        """Append an event, at present if no time is given."""
+        time = self.t if time is None else time
+        self.events.append(Event(time, self.phase.index, kind, text, contact, value))
 
     def lose(self, contact: str, c_n: float) -> Outcome:
         """End because `contact` would have to pull."""
@@ -129,8 +143,20 @@ class Replay:
         self.note(EventKind.CONTACT_LOST, text, contact, c_n)
         return Outcome(OutcomeKind.CONTACT_LOST, text)
 
+    def stay(self, name: str) -> Outcome:
+        """End because friction holds a contact or a joint while the rest moves."""
+        what = "held joints" if name.startswith("joint") else "rolling contacts"
+        text = f"friction holds {name} {self.when()}, while the rest moves: {what} are not modelled"
+        self.note(EventKind.HELD, text, name)
+        return Outcome(OutcomeKind.HELD, text)
+
     def run_out(self) -> Outcome:
         """End because the torques end."""
+        if self.phase.until.is_release:
+            names = ", ".join(self.releasable)
+            text = f"the torques end {self.when()}, before {names} is released"
+            self.note(EventKind.END, text)
+            return Outcome(OutcomeKind.GOAL_MISSED, text)
         distance = self.value(self.stepper.rows.until)
         unit = "rad" if self.phase.until.coordinate == "phi" else "m"
         text = f"the torques end {self.when()}, {distance:.3g} {unit} short of {self.phase.until}"

@@ -46,18 +46,21 @@ class PhaseReport:
         From 1.
     until : str
         What ends the phase.
+    end : str
+        How it passes into the next one: at rest or smoothly.
     start : float, [s]
     contacts : tuple of ContactMargin
     arrival : float or None, [s]
         When its end was reached, None if it was not.
     arrival_rate : float or None, [m/s or rad/s]
-        How fast the distance to the end was closing then.
+        How fast the distance to the end was closing then; None for a release.
     end_deviation, deviation : Deviation or None
         From the plan, at the end of the phase and at worst; None without a plan.
     """
 
     number: int
     until: str
+    end: str
     start: float
     contacts: tuple[ContactMargin, ...]
     arrival: float | None
@@ -109,7 +112,7 @@ class Report:
     reached : bool
         Whether the goal was reached.
     missed_by : float, [m or rad]
-        Distance to the end of the last phase entered.
+        Distance to the end of the last phase entered, NaN if that is a release.
     failures : tuple of str
         Why the torques are not good, empty if they are.
     warnings : tuple of str
@@ -180,17 +183,17 @@ def _contact_table(report: Report) -> list[str]:
 
 
 def _phase_table(report: Report) -> list[str]:
-    header = ["phase", "until", "arrival [s]", "rate [m/s, rad/s]"]
+    header = ["phase", "until", "end", "arrival [s]", "rate [m/s, rad/s]"]
     planned = any(p.deviation is not None for p in report.phases)
     header += ["end dev. [m]", "[rad]", "largest dev. [m]", "[rad]"] if planned else []
     rows = []
     for p in report.phases:
-        row = [str(p.number), p.until, _show(p.arrival, ".5f"), _show(p.arrival_rate, ".1e")]
+        row = [str(p.number), p.until, p.end, _show(p.arrival, ".5f"), _show(p.arrival_rate, ".1e")]
         for deviation in (p.end_deviation, p.deviation) if planned else ():
             pair = (deviation.position, deviation.angle) if deviation else (None, None)
             row += [_show(value, ".1e") for value in pair]
         rows.append(row)
-    return _table(header, rows, {1})
+    return _table(header, rows, {1, 2})
 
 
 def _energy_table(report: Report) -> list[str]:

@@ -5,8 +5,10 @@ of motion are integrated to a given tolerance with the friction of the sliding d
 step ends at the latest where a torque's polynomial piece ends, and events are located by repeating
 a step with another length. At rest the formation waits until it can start (`wholearm.sticking`).
 
-When the end of a phase is reached the motion stops, since two border curves share no velocity but
-zero at a point with five contacts, and goes on from rest in the next phase's formation.
+When the end of a phase is reached the motion stops, if the phase ends at rest, and goes on from
+rest in the next phase's formation. If it ends smoothly the motion goes on with its velocity, less
+what the contacts of the next formation do not let through; contacts that this formation does not
+have are let go.
 
 Nothing here is shared with the planner but the contacts and the scene.
 """
@@ -20,13 +22,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .errors import InputError, JammingError, SimulationError
-from .events import EventKind, Outcome, OutcomeKind, Section, Simulation, collect
-from .moving import REACHED, REST_WINDOW, Arrival, Ending, move
-from .problem import Phase, Problem
+from .events import EventKind, Outcome, OutcomeKind, Simulation, collect
+from .jumps import REACHED, REST_WINDOW, Arrival, Ending, Released, Rested
+from .moving import move
+from .problem import End, Phase, Problem
 from .replay import Replay
-from .stepper import build_stepper, open_limits
-from .sticking import Collapse, Departure, Rest, close_contacts, find_rest
+from .starting import Departure
+from .sticking import Collapse, Rest, find_rest
 from .torque import TorqueProfile
+from .transitions import enter, go_on, set_off
 
 
 def simulate(
@@ -71,10 +75,10 @@ def simulate(
     if not np.isfinite(wanted).all():
         raise InputError("", "times", "holds numbers that are not finite")
     run = Replay(problem, torque, tolerance, wanted)
-    for phase in problem.phases:
+    for phase, following in zip(problem.phases, [*problem.phases[1:], None], strict=True):
         if progress is not None:
             progress(f"simulating phase {phase.number} of {len(problem.phases)}")
-        outcome = _play(run, phase)
+        outcome = _play(run, phase, following)
         if outcome is not None:
             return _collect(run, outcome)
     goal = problem.phases[-1].until
@@ -82,15 +86,21 @@ def simulate(
     return _collect(run, Outcome(OutcomeKind.GOAL_REACHED, text))
 
 
-def _play(run: Replay, phase: Phase) -> Outcome | None:
+def _play(run: Replay, phase: Phase, following: Phase | None) -> Outcome | None:
     """Simulate one phase; None if its end is reached."""
-    _enter(run, phase)
+    enter(run, phase, following)
+    ending: Departure | Ending = Rested()
+    if run.moving:
+        ending = go_on(run) or move(run)
     brief = 0
     while True:
-        ending: Departure | Ending = _rest(run)
+        if isinstance(ending, Rested):
+            ending = _rest(run)
         if isinstance(ending, Departure):
             started = run.t
-            ending = move(run, ending)
+            run.note(EventKind.START, f"the object starts to move {run.when()}")
+            set_off(run, ending)
+            ending = move(run)
             brief = brief + 1 if run.t - started < 1e-12 else 0
             if brief > 20:
                 raise SimulationError(f"starting and stopping do not end {run.where()}")
@@ -99,33 +109,19 @@ def _play(run: Replay, phase: Phase) -> Outcome | None:
         if isinstance(ending, Arrival):
             _arrive(run, ending)
             return None
-
-
-def _enter(run: Replay, phase: Phase) -> None:
-    """Take the formation of `phase`, at rest."""
-    run.phase = phase
-    before = run.stored
-    try:
-        run.y[:5] = close_contacts(phase.formation, run.y[:5], 10 * REACHED)
-    except SimulationError as error:
-        raise SimulationError(f"{error} {run.where()}") from None
-    run.impact += before - run.stored
-    until, side = phase.until, 1.0
-    if until.value is not None:
-        side = math.copysign(1.0, run.y[0 if until.coordinate == "x" else 2] - until.value)
-    degree = run.coefficients.shape[2] - 1
-    run.stepper = build_stepper(phase.formation, until, side, degree)
-    run.sections.append(Section(phase, run.stepper.to))
-    run.limits = [limit.text for limit in open_limits(phase.formation, until)]
-    run.stepper.inputs[run.stepper.at.tolerance] = run.tolerance
-    run.load_piece()
+        if isinstance(ending, Released):
+            _release(run, ending)
+            return None
 
 
 def _arrive(run: Replay, arrival: Arrival) -> None:
-    """Stop the motion at the end of the phase: a plastic impact if it is not at rest."""
+    """End the phase; if it ends at rest the motion stops, with a plastic impact if need be."""
     until, rate = run.phase.until, arrival.rate
     text = f"{until} reached {run.when()}"
     run.note(EventKind.ARRIVAL, text, str(until), rate)
+    run.moving = run.phase.end is End.SMOOTH
+    if run.moving:
+        return
     before = run.stored
     run.y[5:10] = 0.0
     run.impact += before - run.stored
@@ -133,10 +129,19 @@ def _arrive(run: Replay, arrival: Arrival) -> None:
     run.hold = coming if coming - run.t <= arrival.window else run.t
 
 
-def _rest(run: Replay) -> Departure | Arrival | Outcome:
+def _release(run: Replay, release: Released) -> None:
+    """End the phase where the next one's formation lets contacts go."""
+    names = ", ".join(run.releasable)
+    run.note(EventKind.RELEASE, f"{names} released {run.when()}", names, release.c_n)
+    run.moving = True
+
+
+def _rest(run: Replay) -> Departure | Arrival | Released | Outcome:
     """Wait at rest until the formation can start, the goal is near or something gives way."""
     y = run.y
+    before = run.stored
     y[5:10] = 0.0
+    run.impact += before - run.stored
     run.record(still=True)
     if abs(run.value(run.stepper.rows.until)) < REACHED:
         return Arrival(0.0, REST_WINDOW)
@@ -179,7 +184,7 @@ def _advance(run: Replay, stop: float) -> None:
     run.record(still=True)
 
 
-def _collapse(run: Replay, rest: Rest, change: Collapse) -> Outcome:
+def _collapse(run: Replay, rest: Rest, change: Collapse) -> Released | Outcome:
     """End because nothing balances at rest."""
     _advance(run, max(run.t, run.time(change.x)))
     if change.jammed:
@@ -187,12 +192,18 @@ def _collapse(run: Replay, rest: Rest, change: Collapse) -> Outcome:
             f"{' '.join(rest.formation.names)} jams at rest {run.where()}: friction makes "
             "the reduced inertia vanish or turn negative"
         )
+    if change.held:
+        return run.stay(change.contact)
+    if change.contact in run.releasable:
+        return Released(change.c_n)
     return run.lose(change.contact, change.c_n)
 
 
 def _collect(run: Replay, outcome: Outcome) -> Simulation:
     """Put everything recorded together."""
     missed = 0.0 if outcome.reached else run.value(run.stepper.rows.until)
+    if run.phase.until.is_release:
+        missed = math.nan
     counts = (run.steps, run.rejected)
     return collect(run.problem, run.sections, run.events, outcome, missed, counts)
 

@@ -118,9 +118,10 @@ class EventRows(NamedTuple):
     limit : slice
         The formation's limits [m]; that of the contact to be gained counts as `until` instead.
     until : int
-        Distance to the end of the phase [m or rad].
+        Distance to the end of the phase [m or rad]; one if that is a release.
     speed : int
-        Speed along the heading, in the metric M5.
+        Speed along the heading, in the metric M5; one with more than one freedom, where contacts
+        and joints reverse one by one.
     size : int
     """
 
@@ -163,6 +164,11 @@ class Stepper:
     step: Any
     look: Any
     _keep: Any
+
+    @property
+    def is_free(self) -> bool:
+        """Whether there is more than one freedom."""
+        return self.formation.n_contacts < 4
 
 
 def build_stepper(formation: Formation, until: Until, side: float, degree: int) -> Stepper:
@@ -239,7 +245,9 @@ class _Model:
         z = build_features(formation.scene).z
         limits = formation.limits
         gained = [limit for limit in limits if limit.gained == until.contact]
-        if until.contact is None:
+        if until.is_release:
+            distance = ca.SX(1)
+        elif until.contact is None:
             distance = side * (z[0 if until.coordinate == "x" else 2] - until.value)
         elif gained:
             distance = gained[0].value
@@ -296,7 +304,9 @@ class _Model:
         size = ca.sqrt(ca.dot(v, ca.DM(mass) * v))
         heading = ca.if_else(size > 0, v / ca.fmax(size, 1e-300), self.packed[self.at.heading])
         values, distance, gradient = self.geometry(y[:5])
-        speed = ca.dot(self.packed[self.at.heading], ca.DM(mass) * v)
+        speed = ca.SX(1)
+        if formation.n_contacts >= 4:
+            speed = ca.dot(self.packed[self.at.heading], ca.DM(mass) * v)
         events = ca.vertcat(c_n, self.Xi * v_t, self.sigma * v[3:], values, distance, speed)
         parts = [
             y,

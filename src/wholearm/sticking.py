@@ -1,31 +1,31 @@
-"""A formation with one freedom at rest: which way it starts to move, and when.
+"""A formation at rest: which way it starts to move, and when.
 
-At rest friction can take either sign, so each of the two ways along the free direction is tried
-with the friction that would oppose it. The formation moves that way if it then accelerates that
-way, presses on every contact and closes no other. If neither way does, it sticks; its forces are
-then indeterminate, and all that can be asked is whether any inside the friction cones balance.
+At rest friction can take either sign. With one freedom each of the two ways along the free
+direction is tried with the friction that would oppose it; with more, every choice of directions is
+(`wholearm.starting`). The formation moves that way if it then accelerates that way, presses on
+every contact and closes no other. If no way does, it sticks; its forces are then indeterminate, and
+all that can be asked is whether any inside the friction cones balance.
 Accelerations and normal forces at rest are affine in the torques, so on one polynomial piece of
 them the instant of starting is a root of a polynomial.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .contact import Contact
-from .dynamics import Directions, reduced_inertia
+from .dynamics import Directions
 from .errors import SimulationError
 from .formation import TOUCHING, Formation, Kinematics
-from .model import Array, Scene
+from .model import Array
+from .starting import STILL, Departure, Pattern, Way, find_patterns, solve_at_rest
+from .statics import balances, find_pulls
 from .stepper import SLACK_FORCE, SLACK_LIMIT
 
-STILL = 1e-9
-"""Acceleration, in the metric M5, that counts as rounding."""
-BALANCED = 1e-6
-"""Pull that counts as none: the accuracy of the linear programme [N]."""
 _AHEAD = 1e-5
 """How far ahead along the free direction signs and gaps are looked for [m, rad]."""
 
@@ -57,23 +57,27 @@ class RestDirection:
     ratio: float
     closes: bool
 
+    @property
+    def margins(self) -> list[tuple[Array, float]]:
+        """Rows r and offsets d with r @ (1, tau_1, tau_2) + d >= 0 while it moves this way."""
+        return [(self.acceleration, -STILL), *((row, SLACK_FORCE) for row in self.c_n)]
+
+    def drive(self, tau: Array) -> float:
+        """How strongly it accelerates this way, in the metric M5."""
+        return float(self.acceleration @ [1.0, *tau])
+
+    def slides(self, tau: Array) -> bool:
+        """Whether it accelerates this way, if every contact can press or pull."""
+        return self.drive(tau) > STILL and not self.closes
+
     def moves(self, tau: Array) -> bool:
         """Whether the formation starts to move this way under torques `tau`, shape (2,)."""
-        load = np.array([1.0, *tau])
-        return (
-            self.ratio > 0
-            and not self.closes
-            and float(self.acceleration @ load) > STILL
-            and float((self.c_n @ load).min()) >= -SLACK_FORCE
-        )
+        presses = float((self.c_n @ [1.0, *tau]).min()) >= -SLACK_FORCE
+        return self.ratio > 0 and presses and self.slides(tau)
 
-
-@dataclass(frozen=True, eq=False)
-class Departure:
-    """The formation starts to move at `x` in [-1, 1] of a piece of the torques."""
-
-    x: float
-    direction: RestDirection
+    def depart(self, x: float, tau: Array) -> Departure:
+        """Start this way at `x` of a piece; the torques do not matter."""
+        return Departure(x, self.heading, self.directions)
 
 
 @dataclass(frozen=True)
@@ -84,8 +88,9 @@ class Collapse:
     ----------
     x : float
     contact : str
-        The contact that would have to pull most.
+        The contact that would have to pull most, or that cannot start to slide.
     c_n : float, [N]
+        NaN if the contact cannot start to slide.
     jammed : bool
         Whether friction jams one of the ways.
     """
@@ -94,6 +99,11 @@ class Collapse:
     contact: str
     c_n: float
     jammed: bool
+
+    @property
+    def held(self) -> bool:
+        """Whether the rest would start to move while friction holds the contact or joint."""
+        return math.isnan(self.c_n)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,15 +114,15 @@ class Rest:
     ----------
     formation : Formation
     z : ndarray, shape (5,)
-    ways : tuple of RestDirection
-        The two ways it could move.
+    ways : tuple of Way
+        The ways it could move: two with one freedom, every choice of directions with more.
     touching : tuple of Contact
         Every contact that touches, in the formation or not.
     """
 
     formation: Formation
     z: Array
-    ways: tuple[RestDirection, ...]
+    ways: tuple[Way, ...]
     touching: tuple[Contact, ...]
 
     def wait(self, coefficients: Array, x: float) -> Departure | Collapse | None:
@@ -130,17 +140,18 @@ class Rest:
         Departure, Collapse or None
             None if the formation rests to the end of the piece.
         """
+        tau = _evaluate(coefficients, x)
         for way in self.ways:
-            if way.moves(_evaluate(coefficients, x)):
-                return Departure(x, way)
+            if way.moves(tau):
+                return way.depart(x, tau)
         ends = self._changes(coefficients, x)
         for start, stop in zip(ends, [*ends[1:], 1.0], strict=True):
             middle = (start + stop) / 2
             tau = _evaluate(coefficients, middle)
-            ways = sorted(self.ways, key=lambda way: -float(way.acceleration @ [1.0, *tau]))
+            ways = sorted(self.ways, key=lambda way: -way.drive(tau))
             for way in ways:
                 if way.moves(tau):
-                    return Departure(start, way)
+                    return way.depart(start, tau)
             # Torques that balance form a convex set: the ends of a linear piece speak for it all.
             linear = coefficients.shape[1] <= 2
             for place in (start, stop) if linear else (start, middle, stop):
@@ -152,7 +163,7 @@ class Rest:
         """Where on the piece an acceleration or a normal force changes sign, from `x` on."""
         places = {x}
         for way in self.ways:
-            for row, offset in [(way.acceleration, -STILL), *((f, SLACK_FORCE) for f in way.c_n)]:
+            for row, offset in way.margins:
                 polynomial = row[1:] @ coefficients
                 polynomial[0] += row[0] + offset
                 places |= {root for root in _roots(polynomial) if x < root < 1}
@@ -169,8 +180,10 @@ class Rest:
             middle = (low + high) / 2
             low, high = (middle, high) if self._balances(coefficients, middle) else (low, middle)
         tau = _evaluate(coefficients, high)
+        free = [way for way in self.ways if way.slides(tau)]
+        if not free and isinstance(self.ways[0], Pattern):
+            return Collapse(high, self._find_held(tau), math.nan, self._jams)
         load = np.array([1.0, *tau])
-        free = [way for way in self.ways if way.acceleration @ load > STILL and not way.closes]
         pulls = find_pulls(self.formation.scene, self.touching, self.z, tau)
         if free or np.isinf(pulls).all():
             forces = np.array([way.c_n @ load for way in free or self.ways])
@@ -178,8 +191,22 @@ class Rest:
             least = float(forces.min())
         else:
             name, least = self.touching[int(pulls.argmax())].name, -float(pulls.max())
-        jammed = any(way.ratio <= 0 for way in self.ways)
-        return Collapse(high, name, least, jammed)
+        return Collapse(high, name, least, self._jams)
+
+    @property
+    def _jams(self) -> bool:
+        """Whether friction jams one of the two ways, or every choice of directions."""
+        jammed = [way.ratio <= 0 for way in self.ways]
+        return all(jammed) if isinstance(self.ways[0], Pattern) else any(jammed)
+
+    def _find_held(self, tau: Array) -> str:
+        """The contact or joint that stays, by the choice of directions with fewest that do."""
+        patterns = [way for way in self.ways if isinstance(way, Pattern)]
+        pressing = [p for p in patterns if (p.c_n @ [1.0, *tau] >= -SLACK_FORCE).all()]
+        found = [p.find_held(tau) for p in pressing or patterns]
+        names = (*self.formation.names, "joint 1", "joint 2")
+        fewest = min((held for held in found if len(held)), key=len, default=np.zeros(1, int))
+        return names[int(fewest[0])]
 
 
 def find_rest(formation: Formation, z: Array) -> Rest:
@@ -188,18 +215,22 @@ def find_rest(formation: Formation, z: Array) -> Rest:
     Raises
     ------
     SimulationError
-        If the contacts do not leave exactly one freedom.
+        If the contacts depend on one another, or leave no freedom.
     """
     root = np.sqrt(formation.scene.mass_diagonal)
     kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
     A = kinematics.A[0]
     _, values, right = np.linalg.svd(A / root)
     rank = int((values > 1e-9 * values[0]).sum())
-    if rank != 4:
+    if rank < len(A) or rank == 5:
         raise SimulationError(
-            f"{' '.join(formation.names)} leaves {5 - rank} freedoms; only a formation with one "
-            "can start from rest"
+            f"{' '.join(formation.names)} leaves {5 - rank} freedoms, and no forces that are "
+            "determined; it cannot start from rest"
         )
+    if rank < 4:
+        near = np.abs(formation.evaluate_limits(z[None])[0]) < TOUCHING
+        patterns = find_patterns(formation, z, near)
+        return Rest(formation, z, patterns, formation.contacts + _gained(formation, near))
     heading = right[4] / root
     step = _AHEAD / np.abs(heading).max()
     limits = formation.evaluate_limits(z + step * np.array([[0.0], [1.0], [-1.0]]) * heading)
@@ -218,9 +249,13 @@ def find_rest(formation: Formation, z: Array) -> Rest:
         _build_way(formation, side * heading, Directions(s[:-2], s[-2:]), kinematics, close)
         for side, s, close in zip((1.0, -1.0), signs, closes, strict=True)
     )
+    return Rest(formation, z, ways, formation.contacts + _gained(formation, near))
+
+
+def _gained(formation: Formation, near: NDArray[np.bool_]) -> tuple[Contact, ...]:
+    """Contacts that touch but are not in the formation."""
     gained = [formation.limits[k].gained for k in np.flatnonzero(near)]
-    extra = tuple(contact for contact in gained if contact is not None)
-    return Rest(formation, z, ways, formation.contacts + extra)
+    return tuple(contact for contact in gained if contact is not None)
 
 
 def _build_way(
@@ -230,18 +265,9 @@ def _build_way(
     kinematics: Kinematics,
     closes: bool,
 ) -> RestDirection:
-    scene, A = formation.scene, kinematics.A[0]
-    G = A - (formation.friction * directions.Xi)[:, None] * kinematics.A_t[0]
-    inverse_mass = 1 / scene.mass_diagonal
-    applied = np.zeros((5, 3))
-    applied[:, 0] = scene.applied_force
-    applied[3:, 0] -= scene.dry[3:] * directions.sigma
-    applied[3:, 1:] = np.eye(2)
-    ratio = float(reduced_inertia(formation, kinematics, directions)[0])
-    c_n = np.zeros((len(A), 3))
-    if abs(ratio) > 1e-12:
-        c_n = np.linalg.solve((A * inverse_mass) @ G.T, -(A * inverse_mass) @ applied)
-    return RestDirection(heading, directions, heading @ (applied + G.T @ c_n), c_n, ratio, closes)
+    acceleration, c_n, ratio = solve_at_rest(formation, directions, kinematics)
+    drive = heading * formation.scene.mass_diagonal @ acceleration
+    return RestDirection(heading, directions, drive, c_n, ratio, closes)
 
 
 def _rates(formation: Formation, z: Array, heading: Array) -> Array:
@@ -288,56 +314,6 @@ def close_contacts(formation: Formation, z: Array, within: float = np.inf) -> Ar
             f"{formation.names[worst]}, with a gap of {gaps[worst]:.3g} m, cannot be closed"
         )
     return z
-
-
-def balances(scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array) -> bool:
-    """Whether contact forces inside the friction cones balance gravity and torques at rest."""
-    return not find_pulls(scene, contacts, z, tau).max() > BALANCED
-
-
-def find_pulls(scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array) -> Array:
-    """Least pulls with which contact forces balance gravity and torques at rest.
-
-    A linear programme in c_n >= 0, c_t within U c_n, dry joint friction within D and a pull p >= 0
-    of each contact: least sum of p with g + S (tau - friction) + A^T (c_n - p) + A_t^T c_t = 0.
-
-    Parameters
-    ----------
-    contacts : tuple of Contact
-        All that touch.
-    z : ndarray, shape (5,)
-    tau : ndarray, shape (2,), [N m]
-
-    Returns
-    -------
-    ndarray, shape (n,), [N]
-        Pull of each contact, infinite if none balance; all zero if no contact has to pull.
-    """
-    from scipy.optimize import linprog
-
-    touching = _formation(scene, contacts)
-    kinematics = touching.evaluate(z[None], np.zeros((1, 5)))
-    n_c = touching.n_contacts
-    normal, joints = kinematics.A[0].T, np.eye(5)[:, 3:]
-    balance = np.hstack([normal, kinematics.A_t[0].T, -joints, -normal])
-    cone, unit, none = -np.diag(touching.friction), np.eye(n_c), np.zeros((n_c, 2 + n_c))
-    within = np.vstack([np.hstack([cone, sign * unit, none]) for sign in (1.0, -1.0)])
-    free, pressing = [(None, None)] * n_c, [(0.0, None)] * n_c
-    answer = linprog(
-        np.repeat([0.0, 1.0], [2 * n_c + 2, n_c]),
-        A_ub=within,
-        b_ub=np.zeros(2 * n_c),
-        A_eq=balance,
-        b_eq=-(scene.applied_force + joints @ tau),
-        bounds=[*pressing, *free, *((-d, d) for d in scene.dry[3:]), *pressing],
-        method="highs",
-    )
-    return np.asarray(answer.x[-n_c:]) if answer.status == 0 else np.full(n_c, np.inf)
-
-
-@lru_cache(maxsize=64)
-def _formation(scene: Scene, contacts: tuple[Contact, ...]) -> Formation:
-    return Formation(scene, contacts)
 
 
 def _evaluate(coefficients: Array, x: float) -> Array:

@@ -17,7 +17,12 @@ from .formation import Formation
 from .model import Array
 from .timenlp import StagePoints
 from .torque import TorqueProfile
-from .trajectory import Samples, interpolate_quintic
+from .trajectory import Samples
+
+_NODES = 8
+"""Places per interval at which the equations of motion are solved."""
+_SWEEPS = 6
+"""Times that accelerations are improved. Each gains one to two digits."""
 
 
 class Start(NamedTuple):
@@ -31,9 +36,9 @@ class Start(NamedTuple):
 class StageMotion:
     """One stage as a function of time.
 
-    z is the quintic through z, z' and z'' of neighbouring points, pulled onto the contacts, and z'
-    its derivative; tau is the polynomial through an interval's points, and z'' and c_n follow by
-    forward dynamics. So the equations of motion and the contacts hold at any instant.
+    tau is the polynomial through an interval's points. z is what it leads to from the interval's
+    start, pulled onto the contacts, and z' its derivative; z'' and c_n follow by forward dynamics.
+    So the equations of motion and the contacts hold at any instant.
 
     Attributes
     ----------
@@ -74,37 +79,50 @@ class StageMotion:
         return Batch(build_forward(self.formation))
 
     @cached_property
-    def _knots(self) -> tuple[Array, Array, Array, Array]:
-        """Times, z, z' and z'' at the start and the points of every interval, one after another.
+    def _pieces(self) -> Array:
+        """Powers of x in [-1, 1] that give z over each interval, shape (K, 5, n).
 
-        The torque may step where two intervals meet, so the start of each has its own z''.
+        The accelerations at an interval's points are integrated twice from its start, and those
+        that follow there by forward dynamics again, until they are one motion. What is left at
+        the end, the error of collocation, is spread over the interval.
         """
-        count, degree = self.intervals, self.scheme.degree
-
-        def begin_with(first: Array, values: Array) -> Array:
-            blocks = values.reshape(count, degree, 5)
-            ends = np.concatenate([first[None], blocks[:-1, -1]])[:, None]
-            return np.concatenate([ends, blocks], axis=1)
-
-        z, v = begin_with(self.start.z, self.points.z), begin_with(self.start.v, self.points.v)
-        signs = (np.broadcast_to(part, (count, len(part))) for part in self.directions)
-        tau = self.torque.at(self.torque.breaks[:-1])
-        first = self._forward(z[:, 0], v[:, 0], tau, *signs)[0][..., 0]
-        a = np.concatenate([first[:, None], self.points.a.reshape(count, degree, 5)], axis=1)
-        places = np.arange(count)[:, None] + np.append(0.0, self.scheme.points)
-        t = places * self.duration / count
-        return t.ravel(), z.reshape(-1, 5), v.reshape(-1, 5), a.reshape(-1, 5)
+        count, degree, half = self.intervals, self.scheme.degree, self.duration / self.intervals / 2
+        z, v = (
+            np.concatenate([first[None], values[degree - 1 :: degree]])
+            for first, values in ((self.start.z, self.points.z), (self.start.v, self.points.v))
+        )
+        x = -np.cos(np.pi * np.arange(_NODES) / (_NODES - 1))
+        powers = x[:, None] ** np.arange(_NODES + 2)
+        tau = np.einsum("kjd,nd->knj", self.torque.coefficients, powers[:, :degree])
+        signs = [np.broadcast_to(part, (count * _NODES, len(part))) for part in self.directions]
+        a = _fit(2 * self.scheme.points - 1, self.points.a.reshape(count, degree, 5))
+        for _ in range(_SWEEPS):
+            velocity = _integrate(a, half, v[:-1])
+            place = _integrate(velocity, half, z[:-1])
+            state = (
+                np.einsum("kjd,nd->knj", part, powers[:, : part.shape[2]]).reshape(-1, 5)
+                for part in (place, velocity)
+            )
+            forces = self._forward(*state, tau.reshape(-1, 2), *signs)
+            a = _fit(x, forces[0][..., 0].reshape(count, _NODES, 5))
+        velocity = _integrate(a, half, v[:-1])
+        place = _integrate(velocity, half, z[:-1])
+        miss = (z[1:] - place.sum(axis=2))[..., None], (v[1:] - velocity.sum(axis=2))[..., None]
+        place[..., :4] += miss[0] * [0.5, 0.75, 0.0, -0.25]
+        place[..., :4] += half * miss[1] * [-0.25, -0.25, 0.25, 0.25]
+        return place
 
     def _interpolate(self, t: Array) -> tuple[Array, Array]:
-        """Z and z' by quintics between knots."""
-        grid, z, v, a = self._knots
-        left = np.searchsorted(grid, t, side="right") - 1
-        left = np.clip(left, 0, len(grid) - 2)
-        # The end of one interval and the start of the next are one instant.
-        left -= grid[left + 1] == grid[left]
-        h = grid[left + 1] - grid[left]
-        state = interpolate_quintic(h, t - grid[left], (z, v, a), left)
-        return state[0], state[1]
+        """Z and its derivative by the polynomial of each interval."""
+        breaks = self.torque.breaks
+        piece = np.clip(np.searchsorted(breaks, t, side="right") - 1, 0, self.intervals - 1)
+        half = self.duration / self.intervals / 2
+        x = (t - breaks[piece]) / half - 1
+        places = self._pieces[piece]
+        rates = np.polynomial.polynomial.polyder(places, axis=2) / half
+        powers = x[:, None] ** np.arange(places.shape[2])
+        z = np.einsum("njd,nd->nj", places, powers)
+        return z, np.einsum("njd,nd->nj", rates, powers[:, :-1])
 
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the stage, shape (n,) [s]."""
@@ -121,6 +139,18 @@ class StageMotion:
         a, c_n, _ = self._forward(z, v, tau, Xi, sigma)
         c_t = -formation.friction * self.directions.Xi * c_n[..., 0]
         return Samples(z, v, a[..., 0], tau, c_n[..., 0], c_t)
+
+
+def _fit(x: Array, values: Array) -> Array:
+    """Powers of the polynomials through values, shape (K, n, 5), at `x`, shape (n,): (K, 5, n)."""
+    return np.einsum("dn,knj->kjd", np.linalg.inv(x[:, None] ** np.arange(len(x))), values)
+
+
+def _integrate(powers: Array, scale: float, start: Array) -> Array:
+    """Integral from x = -1, times `scale`, of polynomials (K, 5, n), from `start`, (K, 5)."""
+    integral = np.polynomial.polynomial.polyint(powers, lbnd=-1, scl=scale, axis=2)
+    integral[..., 0] += start
+    return np.asarray(integral)
 
 
 def _lift(A: Array, metric: Array, residual: Array) -> Array:

@@ -29,14 +29,20 @@ import casadi as ca
 import numpy as np
 
 from .collocation import Scheme
-from .contact import Expression, build_features, build_gap
+from .contact import Contact, Expression, build_features, build_gap
 from .curve import metric_weights
 from .dynamics import Directions
-from .formation import Formation
+from .formation import TOUCHING, Formation
 from .model import Array
 from .options import Objective
 from .problem import Until
 
+OPENING = 0.1
+"""Least acceleration with which the gap of a released contact opens [m/s^2]."""
+CLEAR = 2e-5
+"""Gap of a released contact two intervals after its release at least [m]."""
+SLIDING = 0.005
+"""Least sliding over the radius of gyration, and least speed of a joint [rad/s]."""
 SHORTEST = 1e-4
 """Least duration of a stage [s]."""
 LONGEST = 20.0
@@ -85,6 +91,8 @@ class Stage:
         The next stage's formation where that has a contact more, which is gained softly.
     watched : tuple of int
         Limits of the formation that are kept positive at every point.
+    follows : bool
+        Whether it goes on from another stage by a release.
     known : StagePoints or None
         All unknowns, where an earlier solution gives a better guess than `z` alone.
     """
@@ -98,6 +106,7 @@ class Stage:
     turns: tuple[int, ...] = ()
     gained: Formation | None = None
     watched: tuple[int, ...] = ()
+    follows: bool = False
     known: StagePoints | None = None
 
 
@@ -206,10 +215,15 @@ def build_time_nlp(
         Xi, sigma = (ca.repmat(ca.DM(part), 1, count) for part in stage.directions)
         physics, senses = _point_function(stage.formation).map(count)(z, v, a, c_n, tau, Xi, sigma)
         rows.add(physics)
-        rows.add(senses, 0.0, np.inf)
+        rows.add(senses - ca.DM(_least_senses(stage, scheme)), 0.0, np.inf)
         _collocate(rows, stage, scheme, (z, v, a), (z_before, v_before), duration)
         if stage.watched:
-            rows.add(_watch_function(stage.formation, stage.watched).map(count)(z) / rho, 0, np.inf)
+            values = _watch_function(stage.formation, stage.watched).map(count)(z)
+            rows.add((values - ca.DM(_clearance(stage, scheme))) / rho, 0.0, np.inf)
+        for contact in _find_opening(stage):
+            opening = _opening_function(stage.formation, contact).map(scheme.degree)
+            first = [block[:, : scheme.degree] for block in (z, v, a)]
+            rows.add(opening(*first) - OPENING, 0.0, np.inf)
         intervals = count // scheme.degree
         floor, cap = ca.MX.sym("floor", n_c, intervals), ca.MX.sym("cap", 2, intervals)
         limits += [ca.vec(floor), ca.vec(cap)]
@@ -271,6 +285,46 @@ def _watch_function(formation: Formation, watched: tuple[int, ...]) -> Expressio
     return ca.Function("watch", [build_features(formation.scene).z], [values])
 
 
+def _least_senses(stage: Stage, scheme: Scheme) -> Array:
+    """What each sense of friction has to exceed, shape (n_c + 2, K d) [rad/s].
+
+    A contact that hardly slides would be held by friction, which is not what the plan assumes. At
+    both ends, where motion starts, stops or turns, it is nothing.
+    """
+    count = (len(stage.z) - 1) // scheme.degree
+    x = (np.arange(count)[:, None] + scheme.points).ravel() / count
+    return np.tile(SLIDING * 4 * x * (1 - x), (stage.formation.n_contacts + 2, 1))
+
+
+def _clearance(stage: Stage, scheme: Scheme) -> Array:
+    """What each watched limit has to exceed at each point, shape (n_watched, K d) [m].
+
+    Nothing, but for a contact just released: two intervals later it has to be well clear.
+    """
+    values = stage.formation.evaluate_limits(stage.z[:1])[0, list(stage.watched)]
+    released = stage.follows & (np.abs(values) < TOUCHING)
+    later = np.arange(len(stage.z) - 1) >= 2 * scheme.degree
+    return CLEAR * np.outer(released, later)
+
+
+def _find_opening(stage: Stage) -> list[Contact]:
+    """Contacts that touch at the start of a stage but are not in its formation."""
+    if not stage.follows:
+        return []
+    values = stage.formation.evaluate_limits(stage.z[:1])[0]
+    near = np.flatnonzero(np.abs(values) < TOUCHING)
+    gained = [stage.formation.limits[k].gained for k in near]
+    return [contact for contact in gained if contact is not None]
+
+
+@lru_cache(maxsize=64)
+def _opening_function(formation: Formation, contact: Contact) -> Expression:
+    """Function (z, z', z'') -> second derivative of the gap of a contact [m/s^2]."""
+    z, v, a = (ca.SX.sym(name, 5) for name in ("z", "v", "a"))
+    _, A, _, A_dot_v = Formation(formation.scene, (contact,)).function(z, v)
+    return ca.Function("opening", [z, v, a], [A @ a + A_dot_v])
+
+
 def _collocate(
     rows: _Rows,
     stage: Stage,
@@ -279,23 +333,24 @@ def _collocate(
     start: tuple[Expression, Expression],
     duration: Expression,
 ) -> None:
-    """Collocate z' and z'' along the tangent space, interval by interval."""
+    """Collocate z' and z'' along the tangent space.
+
+    Everything is one sparse product over all intervals, which keeps the NLP's graph small.
+    """
     z, v, a = points
     degree = scheme.degree
     count = z.shape[1] // degree
-    step = duration / count
-    integrals = ca.DM(scheme.integrals.T)
     metric = metric_weights(stage.formation.scene)
-    z_0, v_0 = start
-    for k in range(count):
-        mine = slice(k * degree, (k + 1) * degree)
-        basis = ca.DM(_tangent_basis(stage.formation, stage.z[k * degree + degree // 2], metric).T)
-        for state, rate, first in ((z, v, z_0), (v, a, v_0)):
-            defect = (
-                state[:, mine] - ca.repmat(first, 1, degree) - step * (rate[:, mine] @ integrals)
-            )
-            rows.add(basis @ defect / np.sqrt(metric[2]))
-        z_0, v_0 = z[:, mine.stop - 1], v[:, mine.stop - 1]
+    middles = stage.z[degree // 2 :: degree][:count]
+    bases = [_tangent_basis(stage.formation, z_k, metric).T / np.sqrt(metric[2]) for z_k in middles]
+    project = ca.diagcat(*(ca.DM(basis) for basis in bases for _ in range(degree)))
+    integrate = ca.kron(ca.DM.eye(count), ca.DM(scheme.integrals.T))
+    repeat = ca.kron(ca.DM.eye(count), ca.DM.ones(1, degree))
+    last = np.arange(degree - 1, (count - 1) * degree, degree).tolist()
+    for state, rate, first in ((z, v, start[0]), (v, a, start[1])):
+        firsts = ca.horzcat(first, state[:, last]) @ repeat
+        defect = state - firsts - duration / count * (rate @ integrate)
+        rows.add(project @ ca.vec(defect))
 
 
 def _tangent_basis(formation: Formation, z: Array, metric: Array) -> Array:
@@ -314,13 +369,13 @@ def _limit(
 ) -> None:
     """Limits at the points, and at as many places between of the polynomials through them."""
     (c_n, tau), (floor, cap) = forces, limits
-    wide = ca.DM(np.vstack([np.eye(scheme.degree), scheme.between]).T)
-    for k in range(floor.shape[1]):
-        mine = slice(k * scheme.degree, (k + 1) * scheme.degree)
-        rows.add(c_n[:, mine] @ wide - ca.repmat(floor[:, k], 1, wide.shape[1]), 0.0, np.inf)
-        room = ca.repmat(cap[:, k], 1, wide.shape[1])
-        rows.add(room - tau[:, mine] @ wide, 0.0, np.inf)
-        rows.add(room + tau[:, mine] @ wide, 0.0, np.inf)
+    wide = np.vstack([np.eye(scheme.degree), scheme.between]).T
+    eye = ca.DM.eye(floor.shape[1])
+    spread, repeat = ca.kron(eye, ca.DM(wide)), ca.kron(eye, ca.DM.ones(1, wide.shape[1]))
+    torque, room = tau @ spread, cap @ repeat
+    rows.add(c_n @ spread - floor @ repeat, 0.0, np.inf)
+    rows.add(room - torque, 0.0, np.inf)
+    rows.add(room + torque, 0.0, np.inf)
 
 
 def _end_stage(rows: _Rows, stage: Stage, z: Expression, v: Expression, rho: float) -> None:

@@ -25,7 +25,7 @@ from .outline import Outline, outline_phase
 from .phaseplan import PhasePlan
 from .problem import End, Phase, Problem
 from .timemotion import StageMotion, Start, TimeMotion
-from .timenlp import Stage, StagePoints, TimeNLP, bound_unknowns, build_time_nlp
+from .timenlp import SLIDING, Stage, StagePoints, TimeNLP, bound_unknowns, build_time_nlp
 
 MISS = 5e-7
 """Largest miss of a limit between points [N or N m]."""
@@ -37,8 +37,10 @@ LOOKS = 12
 """Places per interval at which limits are looked at."""
 _OVER = 1.5
 """How much more than the miss a limit is tightened."""
-_ITERATIONS = 300
+_ITERATIONS = 150
 """Most iterations of Ipopt for one solve."""
+_PACES = (2.0, 4.0, 1.0, 8.0)
+"""Guessed durations to try, in units of that of a fall."""
 _TRIAL = 80
 """The same when other directions of friction are tried."""
 _MU = 1e-2
@@ -126,9 +128,12 @@ def plan_phases(
         If there is no plan.
     """
     scheme = radau(options.degree)
-    stages = outline_stages(problem, phases, z, scheme, options.time_intervals)
     cost = _Effort()
-    best = _solve(problem, stages, scheme, options, duration, cost, _ITERATIONS)
+    for pace in _PACES:
+        stages = outline_stages(problem, phases, z, scheme, options.time_intervals, pace)
+        best = _solve(problem, stages, scheme, options, duration, cost, _ITERATIONS)
+        if best.success:
+            break
     for _ in range(REVISIONS):
         revised = revise(stages, best.points, scheme)
         if revised is None:
@@ -151,9 +156,17 @@ def plan_phases(
 
 
 def outline_stages(
-    problem: Problem, phases: Sequence[Phase], z: Array, scheme: Scheme, intervals: int
+    problem: Problem,
+    phases: Sequence[Phase],
+    z: Array,
+    scheme: Scheme,
+    intervals: int,
+    pace: float,
 ) -> list[Stage]:
-    """Stages of phases that are joined smoothly, with a first guess."""
+    """Stages of phases that are joined smoothly, with a first guess.
+
+    The guessed duration is `pace` times that of a fall over the length of the outlines.
+    """
     parts: list[tuple[Phase, Outline, bool]] = []
     for phase in phases:
         outlines = outline_phase(problem, phase, z)
@@ -163,7 +176,7 @@ def outline_stages(
         z = outlines[-1].z[-1]
     lengths = np.array([outline.length for _, outline, _ in parts])
     gravity = problem.scene.gravity or 9.81
-    total = 2 * float(np.sqrt(lengths.sum() / gravity))
+    total = pace * float(np.sqrt(lengths.sum() / gravity))
     ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
     # The guess runs as (1 - cos) over all stages, so each has its own share of the time.
     clock = np.arccos(1 - 2 * np.clip(ends, 0.0, 1.0)) / np.pi
@@ -188,6 +201,7 @@ def outline_stages(
                 turns=outline.turns,
                 gained=_gains(problem, phase) if last else None,
                 watched=_choose_watched(phase, outline),
+                follows=k > 0 and parts[k - 1][0] is not phase,
             )
         )
     return stages
@@ -382,8 +396,11 @@ def revise(
         signs = np.concatenate(stage.directions)
         senses = np.hstack([slip / rho, part.v[:, 3:]]) * signs
         fast = np.abs(part.v[:, 2:]).max()
-        held = senses < _STALLED * max(fast, 1e-9)
+        held = senses < 1.01 * SLIDING + _STALLED * fast
         held &= (np.abs(senses).max(axis=1) > 1e-3 * fast)[:, None]
+        # What turns at an end of the stage has both its directions already.
+        turning = set(stage.turns) | (set(stages[k - 1].turns) if k else set())
+        held[:, sorted(turning)] = False
         runs = [(_longest_run(column), row) for row, column in enumerate(held.T)]
         (first, last), row = max(runs, key=lambda run: run[0][1] - run[0][0])
         if last - first < scheme.degree:
@@ -392,7 +409,7 @@ def revise(
         turned[row] *= -1
         other = Directions(turned[: len(signs) - 2], turned[len(signs) - 2 :])
         cuts = [0, first // scheme.degree, -(-last // scheme.degree), len(part.z) // scheme.degree]
-        pieces = []
+        pieces: list[Stage] = []
         for piece in range(3):
             begin, stop = cuts[piece], cuts[piece + 1]
             if stop <= begin:
@@ -407,6 +424,7 @@ def revise(
                     until=None,
                     gained=None,
                     turns=(row,),
+                    follows=stage.follows and not pieces,
                     known=known[1],
                 )
             )

@@ -7,10 +7,10 @@ import math
 import numpy as np
 
 from .errors import InputError
-from .events import EventKind, OutcomeKind, Simulation
+from .events import Event, EventKind, OutcomeKind, Simulation
+from .jumps import SETTLING
 from .model import Array
-from .moving import SETTLING
-from .problem import Problem
+from .problem import End, Phase, Problem
 from .report import ContactMargin, Deviation, EnergyBalance, PhaseReport, Report
 from .simulate import simulate
 from .torque import TorqueProfile
@@ -22,6 +22,9 @@ GOAL = 1e-5
 """Distance to the end of the last phase that counts as the goal [m or rad]."""
 SHORTEST = 2 * SETTLING
 """Interval below which forces may jump, and rounding spoils a parabola [s]."""
+STOPPED = 1e-3
+"""Speed at a phase's end that passes for rest [m/s or rad/s]."""
+_ENDS = (EventKind.ARRIVAL, EventKind.RELEASE)
 SAMPLES = 2000
 """About how many instants normal forces are looked at, besides the simulation's own steps."""
 
@@ -62,14 +65,15 @@ def verify(
         _report_phase(problem, simulation, torque, plan, index)
         for index in range(int(simulation.phase[-1]) + 1)
     )
+    # By rounding the last speeds fall to zero one after the other, so friction may hold a contact.
     reached = simulation.outcome.reached or (
-        simulation.outcome.kind is OutcomeKind.GOAL_MISSED
+        simulation.outcome.kind in (OutcomeKind.GOAL_MISSED, OutcomeKind.HELD)
         and len(phases) == len(problem.phases)
         and abs(simulation.missed_by) <= GOAL
     )
     failures = [] if reached else [simulation.outcome.text]
     thin = _describe_thin(problem, phases, simulation)
-    warnings = _describe_torques(problem, torque)
+    warnings = _describe_torques(problem, torque) + _describe_stops(problem, simulation)
     return Report(
         name=problem.name,
         epsilon=problem.epsilon,
@@ -101,7 +105,7 @@ def _report_phase(
 ) -> PhaseReport:
     phase = problem.phases[index]
     rows = np.flatnonzero(simulation.phase == index)
-    arrivals = [e for e in simulation.find(EventKind.ARRIVAL) if e.phase == index]
+    arrivals = [e for e in simulation.events if e.phase == index and e.kind in _ENDS]
     lost = {e.contact: e for e in simulation.find(EventKind.CONTACT_LOST) if e.phase == index}
     contacts = []
     for name in phase.formation.names:
@@ -112,14 +116,16 @@ def _report_phase(
         contacts.append(ContactMargin(name, least, time, least - problem.epsilon))
     end = worst = None
     if plan is not None:
-        end, worst = _compare(simulation, plan, index, bool(arrivals))
+        # A motion that goes on is compared when its phase was planned to end, not when it did.
+        end, worst = _compare(simulation, plan, index, bool(arrivals), phase.end is End.SMOOTH)
     return PhaseReport(
         number=phase.number,
-        until=str(phase.until),
+        until=_describe_end(arrivals, phase),
+        end=phase.end.value,
         start=float(simulation.t[rows[0]]),
         contacts=tuple(contacts),
         arrival=arrivals[0].time if arrivals else None,
-        arrival_rate=arrivals[0].value if arrivals else None,
+        arrival_rate=arrivals[0].value if arrivals and not phase.until.is_release else None,
         end_deviation=end,
         deviation=worst,
     )
@@ -167,7 +173,7 @@ def find_least(t: Array, values: Array, breaks: Array) -> tuple[float, float]:
 
 
 def _compare(
-    simulation: Simulation, plan: Trajectory, index: int, arrived: bool
+    simulation: Simulation, plan: Trajectory, index: int, arrived: bool, passes: bool
 ) -> tuple[Deviation | None, Deviation | None]:
     """Difference from the plan at the end of a phase and at worst."""
     planned = np.flatnonzero(plan.phase == index)
@@ -180,7 +186,9 @@ def _compare(
     worst = Deviation(_largest(difference[:, :2]), _largest(difference[:, 2:]))
     if not arrived:
         return None, worst
-    last = np.flatnonzero(simulation.phase == index)[-1]
+    last = int(np.flatnonzero(simulation.phase == index)[-1])
+    if passes and known[-1]:
+        last = int(at[-1])
     difference = np.abs(simulation.z[last] - plan.z[planned[-1]])
     return Deviation(_largest(difference[:2]), _largest(difference[2:])), worst
 
@@ -192,15 +200,47 @@ def _largest(values: Array) -> float:
 def _describe_thin(
     problem: Problem, phases: tuple[PhaseReport, ...], simulation: Simulation
 ) -> list[str]:
-    """Sentences on the normal forces below epsilon, but for the contact that was lost."""
+    """Sentences on the normal forces below epsilon, but for contacts where they were lost.
+
+    A contact that is let go without a jump of the torques passes epsilon on its way to zero.
+    """
+    let_go = {
+        (e.phase + 1, n): e.time
+        for e in simulation.find(EventKind.RELEASE)
+        for n in e.contact.split(", ")
+    }
     lost = {(e.phase + 1, e.contact) for e in simulation.find(EventKind.CONTACT_LOST)}
     return [
         f"c_n of {c.contact} falls to {c.least:.5g} N, below epsilon = {problem.epsilon:g} N, "
         f"at t = {c.time:.5g} s, phase {phase.number}"
         for phase in phases
         for c in phase.contacts
-        if c.margin < -MARGIN and (phase.number, c.contact) not in lost
+        if c.margin < -MARGIN
+        and (phase.number, c.contact) not in lost
+        and abs(c.time - let_go.get((phase.number, c.contact), math.inf)) > SHORTEST
     ]
+
+
+def _describe_stops(problem: Problem, simulation: Simulation) -> list[str]:
+    """Sentences on phases with two or more freedoms that end at rest in one of them only."""
+    texts = []
+    for event in simulation.find(EventKind.ARRIVAL):
+        phase = problem.phases[event.phase]
+        last = int(np.flatnonzero(simulation.phase == event.phase)[-1])
+        speed = float(np.abs(simulation.z_dot[last]).max())
+        free = phase.formation.n_contacts < 4 and phase.end is End.REST
+        if free and speed > STOPPED:
+            texts.append(
+                f"{phase.until} is reached while the object or a finger still moves, at up to "
+                f"{speed:.3g} (m/s or rad/s), phase {phase.number}: it is taken to stop there"
+            )
+    return texts
+
+
+def _describe_end(events: list[Event], phase: Phase) -> str:
+    """What ends a phase, with the contacts released if there are."""
+    released = [event.contact for event in events if event.kind is EventKind.RELEASE]
+    return f"release of {released[0]}" if released else str(phase.until)
 
 
 def _describe_torques(problem: Problem, torque: TorqueProfile) -> list[str]:

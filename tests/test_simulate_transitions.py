@@ -1,0 +1,328 @@
+"""The simulation of phases with two freedoms, and of what joins phases without a stop."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from planned import LandingMotion, change, plan_landing
+from wholearm.baseline_simulation import simulate_with_scipy
+from wholearm.contact import parse_contact
+from wholearm.dynamics import Directions, forward
+from wholearm.errors import SimulationError
+from wholearm.events import EventKind, OutcomeKind
+from wholearm.formation import Formation
+from wholearm.model import Array
+from wholearm.problem import End, Phase, Problem, Until
+from wholearm.simulate import simulate
+from wholearm.starting import Departure
+from wholearm.sticking import find_rest
+from wholearm.torque import TorqueProfile
+from wholearm.transitions import project_velocity
+from wholearm.verify import verify
+
+RELEASE = 0.5
+"""When `plan_landing` lets vertex 3 go [s]."""
+
+
+def landing_of(duration: float = 0.2) -> LandingMotion:
+    motion = plan_landing(duration)[1].motions[1]
+    assert isinstance(motion, LandingMotion)
+    return motion
+
+
+def constant(tau: Array, duration: float) -> TorqueProfile:
+    return TorqueProfile(np.array([0.0, duration]), tau.reshape(1, 2, 1))
+
+
+def brake_less(starts: Array, c: Array) -> Array:
+    """Near the end of the landing."""
+    c[starts > 0.66] *= 0.97
+    return c
+
+
+def replace_phases(problem: Problem, *phases: Phase) -> Problem:
+    return dataclasses.replace(problem, phases=phases)
+
+
+def test_releases_and_lands_as_planned() -> None:
+    problem, trajectory = plan_landing()
+    simulation = simulate(problem, trajectory.torque, times=trajectory.t)
+    assert simulation.outcome.kind is OutcomeKind.GOAL_REACHED
+    for index, motion in enumerate(trajectory.motions):
+        rows = np.flatnonzero(simulation.phase == index)
+        end = motion.evaluate(np.array([motion.duration]))
+        # The curve is good to 1e-12; open loop such errors grow about e^50 times a second.
+        assert np.allclose(simulation.z[rows[-1]], end.z[0], atol=1e-8, rtol=0)
+        assert np.allclose(simulation.z_dot[rows[-1]], end.z_dot[0], atol=1e-6, rtol=0)
+        names = [simulation.contacts.index(name) for name in motion.contacts]
+        local = simulation.t[rows] - trajectory.phase_starts[index]
+        inner = np.abs(local[:, None] - motion.turns).min(axis=1) > 1e-6  # type: ignore[attr-defined]
+        samples = motion.evaluate(local[inner])
+        c_n = simulation.c_n[np.ix_(rows[inner], names)]
+        assert np.allclose(c_n, samples.c_n, atol=1e-5, rtol=0)
+    energies = simulation.energies
+    assert np.abs(energies.residual).max() < 1e-9 * energies.work[-1]
+    # What is left of the speed at the landing is lost, and no more.
+    assert 0 <= energies.impact[-1] < 1e-12
+
+
+def test_release_is_an_event_with_the_forces_twice() -> None:
+    problem, trajectory = plan_landing()
+    simulation = simulate(problem, trajectory.torque)
+    (release,) = simulation.find(EventKind.RELEASE)
+    assert (release.time, release.phase, release.contact) == (RELEASE, 0, "v3-finger1")
+    assert release.text == "v3-finger1 released at t = 0.5 s, phase 1"
+    assert release.value < 0
+    before, after = np.flatnonzero(simulation.t == RELEASE)
+    assert list(simulation.phase[[before, after]]) == [0, 1]
+    # Projected on the new contacts the state changes by rounding.
+    assert np.allclose(simulation.z[after], simulation.z[before], atol=1e-15, rtol=0)
+    assert np.allclose(simulation.z_dot[after], simulation.z_dot[before], atol=1e-13, rtol=0)
+    let_go = simulation.contacts.index("v3-finger1")
+    assert simulation.c_n[before, let_go] > problem.epsilon
+    assert np.isnan(simulation.c_n[after:, let_go]).all()
+    gaps = problem.phases[0].formation.evaluate(simulation.z, simulation.z_dot).C[:, 1]
+    assert (gaps[after + 1 :] > 0).all()
+
+
+def test_contacts_stay_closed_with_two_freedoms() -> None:
+    problem, trajectory = plan_landing()
+    simulation = simulate(problem, trajectory.torque)
+    rows = simulation.phase == 1
+    kinematics = problem.phases[1].formation.evaluate(simulation.z[rows], simulation.z_dot[rows])
+    rates = np.einsum("nij,nj->ni", kinematics.A, simulation.z_dot[rows])
+    # Each step is projected, which leaves rounding.
+    assert np.abs(kinematics.C).max() < 1e-15
+    assert np.abs(rates).max() < 1e-13
+
+
+def test_finds_the_reversal_and_the_landing() -> None:
+    problem, trajectory = plan_landing()
+    simulation = simulate(problem, trajectory.torque)
+    reversal = simulation.find(EventKind.REVERSAL)[-1]
+    assert (reversal.contact, reversal.phase) == ("v1-palm", 1)
+    assert reversal.time == pytest.approx(RELEASE + landing_of().turns[1], abs=1e-8)
+    (arrival,) = simulation.find(EventKind.ARRIVAL)
+    assert arrival.time == pytest.approx(RELEASE + 0.2, abs=1e-6)
+    assert abs(arrival.value) < 1e-6
+
+
+def test_agrees_with_the_baseline() -> None:
+    problem, trajectory = plan_landing()
+    motion, stop = landing_of(), 0.58
+    start = motion.evaluate(np.array([0.0]))
+    signs = motion.signs(np.array([0.01]))[0]
+    run = simulate_with_scipy(
+        problem,
+        1,
+        trajectory.torque,
+        start.z[0],
+        start.z_dot[0],
+        signs[:-2],
+        signs[-2:],
+        (RELEASE, stop),
+        rtol=1e-12,
+        atol=1e-12,
+    )
+    state = simulate(problem, trajectory.torque, tolerance=1e-12, times=[stop]).at(stop)
+    # Errors of 1e-12 at the release grow about e^4 times until then.
+    assert np.allclose(state, np.hstack([run.z[-1], run.z_dot[-1]]), atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("off", [-1e-9, 0.0, 1e-9])
+def test_a_coordinate_may_be_passed_at_speed(off: float) -> None:
+    problem, trajectory = plan_landing()
+    first, last = problem.phases
+    value = float(landing_of().start[2]) + off
+    until = Until(coordinate="phi", value=value)
+    passing = replace_phases(problem, dataclasses.replace(first, until=until), last)
+    simulation = simulate(passing, trajectory.torque)
+    assert simulation.outcome.reached
+    arrival = simulation.find(EventKind.ARRIVAL)[0]
+    # By rounding it comes before or after the step of the torques that goes with it.
+    assert arrival.time == RELEASE
+    assert arrival.value == pytest.approx(-landing_of().start_dot[2], rel=1e-6)
+    end = landing_of().evaluate(np.array([0.2])).z[0]
+    assert np.allclose(simulation.z[-1], end, atol=1e-7, rtol=0)
+
+
+def test_a_contact_gained_at_speed_and_kept() -> None:
+    problem, trajectory = plan_landing()
+    first, last = problem.phases
+    gained = last.until.contact
+    assert gained is not None
+    flat = Formation(problem.scene, (*last.formation.contacts, gained))
+    going = dataclasses.replace(last, end=End.SMOOTH)
+    after = Phase(2, flat, Until(coordinate="x", value=1.0))
+    passing = replace_phases(problem, first, going, after)
+    torque = change(trajectory.torque, brake_less)
+    simulation = simulate(passing, torque)
+    arrival = next(e for e in simulation.events if e.kind is EventKind.ARRIVAL)
+    before = int(np.flatnonzero(simulation.phase == 1)[-1])
+    assert simulation.t[before] == simulation.t[before + 1] == arrival.time
+    z, z_dot = simulation.z[before], simulation.z_dot[before]
+    rate = Formation(problem.scene, (gained,)).evaluate(z[None], z_dot[None]).A[0, 0] @ z_dot
+    assert arrival.value == pytest.approx(-rate, rel=1e-9) and arrival.value > 1e-3
+    goes_on = simulation.z_dot[before + 1]
+    assert np.allclose(goes_on, project_velocity(flat, z, z_dot), atol=1e-12, rtol=0)
+    mass = problem.scene.mass_diagonal
+    lost = 0.5 * (z_dot**2 - goes_on**2) @ mass
+    assert simulation.energies.impact[before + 1] == pytest.approx(lost, rel=1e-6)
+    assert np.abs(simulation.energies.residual).max() < 1e-9 * simulation.energies.work.max()
+
+
+def test_landing_too_fast_stops_and_is_reported() -> None:
+    problem, trajectory = plan_landing()
+    torque = change(trajectory.torque, brake_less)
+    simulation = simulate(problem, torque)
+    assert simulation.outcome.reached
+    arrival = simulation.events[-1]
+    assert arrival.time < RELEASE + 0.2 and arrival.value > 1e-3
+    kinetic = 0.5 * simulation.z_dot[-1] ** 2 @ problem.scene.mass_diagonal
+    assert kinetic > 0
+    report = verify(problem, torque)
+    assert report.ok and report.phases[1].arrival_rate == pytest.approx(arrival.value, rel=1e-6)
+    assert any("still moves" in text for text in report.warnings)
+
+
+def test_a_release_that_never_comes() -> None:
+    problem, trajectory = plan_landing()
+    torque = trajectory.torque
+    count = int(np.searchsorted(torque.breaks, RELEASE - 1e-9))
+    short = TorqueProfile(torque.breaks[: count + 1], torque.coefficients[:count])
+    simulation = simulate(problem, short)
+    assert simulation.outcome.kind is OutcomeKind.GOAL_MISSED
+    assert simulation.outcome.text == (
+        "the torques end at t = 0.5 s, phase 1, before v3-finger1 is released"
+    )
+    assert np.isnan(simulation.missed_by)
+    report = verify(problem, short)
+    assert not report.ok and report.to_dict()["missed_by"] is None
+    assert report.phases[0].arrival is None
+
+
+def test_another_contact_lost_is_no_release() -> None:
+    problem, trajectory = plan_landing()
+    first, _ = problem.phases
+    kept = tuple(c for c in first.formation.contacts if c.name != "v4-finger1")
+    last = Phase(1, Formation(problem.scene, kept), Until(coordinate="x", value=1.0))
+    simulation = simulate(replace_phases(problem, first, last), trajectory.torque)
+    assert simulation.outcome.kind is OutcomeKind.CONTACT_LOST
+    lost = simulation.events[-1]
+    assert (lost.contact, lost.time, lost.phase) == ("v3-finger1", RELEASE, 0)
+    assert not simulation.find(EventKind.RELEASE)
+
+
+def test_a_release_as_the_squeeze_fades_and_a_contact_held() -> None:
+    problem, trajectory = plan_landing(squeeze=4.0)
+    simulation = simulate(problem, trajectory.torque)
+    (release,) = simulation.find(EventKind.RELEASE)
+    assert release.time < RELEASE
+    # The torques do not jump, so the force is zero there.
+    assert abs(release.value) < 1e-9
+    departing = trajectory.motions[0].evaluate(np.array([release.time])).c_n[0]
+    assert abs(departing[1]) < 1e-8 and np.delete(departing, 1).min() > 1.0
+    # Palm friction then stops the vertex while the object turns on, which would be rolling.
+    assert simulation.outcome.kind is OutcomeKind.HELD
+    held = simulation.events[-1]
+    assert held.kind is EventKind.HELD and held.contact == "v1-palm" and held.phase == 1
+    assert simulation.outcome.text == (
+        f"friction holds v1-palm at t = {held.time:.5g} s, phase 2, while the rest moves: "
+        "rolling contacts are not modelled"
+    )
+    v_t = problem.phases[1].formation.evaluate(simulation.z[-1:], simulation.z_dot[-1:]).A_t[0, 0]
+    assert abs(v_t @ simulation.z_dot[-1]) < 1e-12
+    report = verify(problem, trajectory)
+    assert report.failures == (simulation.outcome.text,)
+
+
+def test_start_with_two_freedoms() -> None:
+    problem, _ = plan_landing()
+    phase = Phase(0, problem.phases[1].formation, problem.phases[1].until)
+    z = landing_of().evaluate(np.array([0.1])).z[0]
+    rng = np.random.default_rng(3)
+    moving = replace_phases(dataclasses.replace(problem, start=z), phase)
+    rest, seen = find_rest(phase.formation, z), 0
+    assert len(rest.ways) == 2**5
+    while seen < 3:
+        tau = np.array([1.0, -1.0]) * rng.uniform(0.0, 2.0, size=2)
+        change_of_state = rest.wait(tau[:, None], -1.0)
+        if not isinstance(change_of_state, Departure):
+            continue
+        seen += 1
+        directions = change_of_state.directions
+        acceleration, c_n = forward(phase.formation, z, np.zeros(5), tau, directions)
+        A_t = phase.formation.evaluate(z[None], np.zeros((1, 5))).A_t[0]
+        assert (directions.Xi * (A_t @ acceleration) > 0).all()
+        assert (directions.sigma * acceleration[3:] > 0).all() and (c_n > 0).all()
+        torque, stop = constant(tau, 0.01), 0.005
+        simulation = simulate(moving, torque, tolerance=1e-12, times=[stop])
+        assert simulation.events[0].kind is EventKind.START and simulation.events[0].time == 0
+        run = simulate_with_scipy(
+            moving, 0, torque, z, np.zeros(5), *directions, (0.0, stop), rtol=1e-12, atol=1e-12
+        )
+        state = np.hstack([run.z[-1], run.z_dot[-1]])
+        assert np.allclose(simulation.at(stop), state, atol=1e-10, rtol=0)
+
+
+def test_rest_with_two_freedoms() -> None:
+    problem, _ = plan_landing()
+    phase = Phase(0, problem.phases[1].formation, problem.phases[1].until)
+    z = landing_of().evaluate(np.array([0.1])).z[0]
+    still = replace_phases(dataclasses.replace(problem, start=z), phase)
+    squeezed = simulate(still, constant(np.array([2.0, -2.8]), 0.01))
+    assert [e.kind for e in squeezed.events] == [EventKind.STICK, EventKind.END]
+    assert not squeezed.z_dot.any() and "short of v2-palm" in squeezed.outcome.text
+    pulled = simulate(still, constant(np.array([-0.3, 0.3]), 0.01))
+    assert pulled.outcome.kind is OutcomeKind.CONTACT_LOST and pulled.events[-1].value < 0
+    # Neither balance nor sliding everywhere: friction would hold the palm's contact.
+    rolls = simulate(still, constant(np.array([0.4, -0.4]), 0.01))
+    assert rolls.outcome.kind is OutcomeKind.HELD and rolls.events[-1].contact == "v1-palm"
+
+
+def test_a_formation_without_freedom_cannot_start() -> None:
+    problem, _ = plan_landing()
+    names = ("v1-palm", "v3-finger1", "v4-finger1", "v6-finger2", "v0-finger2")
+    contacts = tuple(parse_contact(name, problem.scene) for name in names)
+    with pytest.raises(SimulationError, match="leaves 0 freedoms"):
+        find_rest(Formation(problem.scene, contacts), problem.start)
+
+
+def test_verify_reports_the_release() -> None:
+    problem, trajectory = plan_landing()
+    report = verify(problem, trajectory)
+    assert report.ok and report.failures == ()
+    first, last = report.phases
+    assert (first.until, first.end, first.arrival) == ("release of v3-finger1", "smooth", RELEASE)
+    assert first.arrival_rate is None
+    assert (last.until, last.end) == ("v2-palm", "rest")
+    for phase in report.phases:
+        for deviation in (phase.end_deviation, phase.deviation):
+            assert deviation is not None
+            assert deviation.position < 1e-8 and deviation.angle < 1e-8
+    assert report.energy.relative < 1e-9
+    assert "release of v3-finger1  smooth" in report.to_text()
+
+
+def test_directions_that_stand_still_follow_the_acceleration() -> None:
+    problem, trajectory = plan_landing()
+    motion = landing_of()
+    turn = float(motion.turns[1])
+    # Begin the second phase just where a contact reverses: its speed there is zero.
+    first, last = problem.phases
+    torque = trajectory.torque
+    samples = motion.evaluate(np.array([turn]))
+    until = Until(coordinate="phi", value=float(samples.z[0, 2]))
+    middle = Phase(1, last.formation, until, End.SMOOTH)
+    again = replace_phases(problem, first, middle, dataclasses.replace(last, index=2))
+    simulation = simulate(again, torque)
+    assert simulation.outcome.reached
+    whole = simulate(problem, torque)
+    assert np.allclose(simulation.z[-1], whole.z[-1], atol=1e-7, rtol=0)
+    directions = Directions(*np.split(motion.signs(np.array([turn + 1e-3]))[0], [3]))
+    row = int(np.flatnonzero(simulation.phase == 2)[1])
+    slides = simulation.c_t[row][~np.isnan(simulation.c_t[row])]
+    assert (np.sign(slides) == -directions.Xi).all()
