@@ -15,7 +15,7 @@ from .curve import metric_weights
 from .dynamics import Directions, build_forward
 from .formation import Formation
 from .model import Array
-from .timenlp import StagePoints
+from .stage import StagePoints
 from .torque import TorqueProfile
 from .trajectory import Samples
 
