@@ -7,7 +7,6 @@ from typing import Generic, NamedTuple, TypeVar
 from .torque import TorqueProfile
 from .trajectory import Motion
 
-
 M_co = TypeVar("M_co", bound=Motion, covariant=True)
 
 

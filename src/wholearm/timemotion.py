@@ -143,7 +143,8 @@ class StageMotion:
 
 def _fit(x: Array, values: Array) -> Array:
     """Powers of the polynomials through values, shape (K, n, 5), at `x`, shape (n,): (K, 5, n)."""
-    return np.einsum("dn,knj->kjd", np.linalg.inv(x[:, None] ** np.arange(len(x))), values)
+    invert = np.linalg.inv(x[:, None] ** np.arange(len(x)))
+    return np.asarray(np.einsum("dn,knj->kjd", invert, values))
 
 
 def _integrate(powers: Array, scale: float, start: Array) -> Array:

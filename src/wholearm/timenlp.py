@@ -231,7 +231,7 @@ def _clearance(stage: Stage, scheme: Scheme) -> Array:
     values = stage.formation.evaluate_limits(stage.z[:1])[0, list(stage.watched)]
     released = stage.follows & (np.abs(values) < TOUCHING)
     later = np.arange(len(stage.z) - 1) >= 2 * scheme.degree
-    return CLEAR * np.outer(released, later)
+    return np.asarray(CLEAR * np.outer(released, later), dtype=float)
 
 
 def _find_opening(stage: Stage) -> list[Contact]:

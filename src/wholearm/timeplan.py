@@ -140,7 +140,7 @@ def plan_phases(
     if not best.success:
         raise _explain(problem, phases, stages, best)
     motions = _make_motions(stages, best.points, scheme, Start(z, np.zeros(5)))
-    plans = [_summarise(motion, options, best) for motion in motions.values()]
+    plans = [_summarise(problem, motion, options, best) for motion in motions.values()]
     plans[0] = plans[0]._replace(
         iterations=cost.iterations,
         solves=cost.solves,
@@ -287,13 +287,13 @@ def _find_broken_limits(
 
 
 def _summarise(
-    motion: TimeMotion, options: PlanOptions, solution: _Solution
+    problem: Problem, motion: TimeMotion, options: PlanOptions, solution: _Solution
 ) -> PhasePlan[TimeMotion]:
     torque = motion.torque
     value = {
         Objective.TIME: motion.duration,
         Objective.EFFORT: options.time_weight * motion.duration + torque.integrate_squares(),
-        Objective.MARGIN: -solution.cost,
+        Objective.MARGIN: problem.epsilon - solution.cost,
     }[options.goal]
     return PhasePlan(motion, torque, value, 0, 0, 0.0, 0.0)
 
