@@ -227,7 +227,8 @@ def _solve(
             worst = max(worst, one.tighten(problem, motion, margin))
         if worst <= MISS:
             return solution
-    return solution._replace(status=f"limits are still missed by {worst:.2g} N between points")
+    status = f"limits are still missed by {worst:.2g} N between points"
+    return solution._replace(status=status, success=False)
 
 
 def _first_multipliers(nlp: TimeNLP, low: Array, high: Array) -> dict[str, Array]:
@@ -301,5 +302,35 @@ def _summarise(
 def _explain(
     problem: Problem, phases: Sequence[Phase], stages: Sequence[Stage], solution: _Solution
 ) -> InfeasibleError | SolverError:
-    numbers = ", ".join(str(phase.number) for phase in phases)
-    return SolverError(f"phases {numbers}: Ipopt stopped with {solution.status}")
+    """Say what the solver's last point misses, the worst first."""
+    numbers = " and ".join(str(phase.number) for phase in phases)
+    misses = []
+    start = 0.0
+    for stage, part in zip(stages, solution.points, strict=True):
+        times = start + (np.arange(len(part.z)) + 1) / len(part.z) * part.duration
+        start += part.duration
+        names = [
+            f"c_n of {name} >= epsilon = {problem.epsilon:g} N" for name in stage.formation.names
+        ]
+        names += [
+            f"torque limit of finger {k + 1} = {finger.torque_limit:g} N m"
+            for k, finger in enumerate(problem.scene.fingers)
+        ]
+        units = ["N"] * stage.formation.n_contacts + ["N m"] * 2
+        over = np.abs(part.tau) - problem.scene.torque_limit
+        short = np.hstack([problem.epsilon - part.c_n, over])
+        for row, name in enumerate(names):
+            worst = int(short[:, row].argmax())
+            if short[worst, row] > 1e-4:
+                misses.append(
+                    (
+                        float(short[worst, row]),
+                        f"{name} is {short[worst, row]:.3g} {units[row]} short at "
+                        f"t = {times[worst]:.4f} s, phase {stage.phase + 1}",
+                    )
+                )
+    stopped = f"no plan for phases {numbers}: Ipopt stopped with {solution.status}"
+    if not misses:
+        return SolverError(f"{stopped}; try other time_intervals")
+    ranked = "; ".join(text for _, text in sorted(misses, reverse=True))
+    return InfeasibleError(f"{stopped}; at its last point {ranked}")
