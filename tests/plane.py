@@ -163,6 +163,40 @@ def measure_slip(formation: Formation, z: Array, v: Array) -> Array:
     return np.array(slips)
 
 
+def stack_rows(formation: Formation, z: Array) -> tuple[Array, Array]:
+    """A and A_t of a formation of vertex contacts, shape (n_c, 5) each."""
+    normal: list[Array] = []
+    tangent: list[Array] = []
+    for contact in formation.contacts:
+        point, n = touch(formation.scene, contact, z)
+        for rows, along in ((normal, n), (tangent, np.array([n[1], -n[0]]))):
+            row = np.array([*along, cross(point - z[:2], along), 0.0, 0.0])
+            if contact.finger is not None:
+                base = np.asarray(formation.scene.fingers[contact.finger].base)
+                row[3 + contact.finger] = -cross(point - base, along)
+            rows.append(row)
+    return np.array(normal), np.array(tangent)
+
+
+def accelerate(
+    formation: Formation, z: Array, v: Array, tau: Array, Xi: Array, sigma: Array
+) -> tuple[Array, Array]:
+    """Accelerations, shape (5,), and normal forces, shape (n_c,), of sliding vertex contacts."""
+    scene = formation.scene
+    body = scene.polygon
+    assert body.inertia is not None
+    mass = np.array([body.mass, body.mass, body.inertia, *(f.inertia for f in scene.fingers)])
+    drag = [f.viscous * v[3 + k] + f.dry * sigma[k] for k, f in enumerate(scene.fingers)]
+    applied = np.array([0.0, -body.mass * scene.gravity, 0.0, *(tau - drag)])
+    A, A_t = stack_rows(formation, z)
+    # Central differences along the motion, over a microsecond.
+    ahead, behind = (stack_rows(formation, z + step * v)[0] for step in (1e-6, -1e-6))
+    A_dot_v = (ahead - behind) @ v / 2e-6
+    G = A - (formation.friction * Xi)[:, None] * A_t
+    c_n = np.linalg.solve((A / mass) @ G.T, -A_dot_v - A @ (applied / mass))
+    return (applied + G.T @ c_n) / mass, c_n
+
+
 def unbalance(formation: Formation, row: Samples, sigma: Array) -> tuple[Array, Array]:
     """What each body's balance misses, and the largest term in it, shape (5,) each.
 

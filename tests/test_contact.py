@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -26,6 +27,7 @@ from wholearm.contact import (
 )
 from wholearm.errors import InputError
 from wholearm.model import Array, Scene
+from wholearm.problem import Problem
 
 KITE = [[-0.04, -0.03], [0.02, -0.035], [0.045, 0.01], [0.0, 0.05], [-0.045, 0.02]]
 NAMES = ["v3-palm", "v2-finger1", "v4-finger2", "e1-tip1", "e3-tip2", "v2-tip1", "v4-tip2"]
@@ -249,3 +251,10 @@ def test_pointed_tip_has_no_arc() -> None:
     assert len(candidate_contacts(pointed, 0)) == 10
     with pytest.raises(InputError, match=r"fingers\.1\.radius is 0"):
         parse_contact("v1-tip1", pointed)
+
+
+def test_features_last_as_long_as_their_scene(heptagon: Problem) -> None:
+    first = build_features(heptagon.scene)
+    others = [replace(heptagon.scene, gravity=float(g)) for g in range(1, 60)]
+    assert len({id(build_features(scene)) for scene in others}) == len(others)
+    assert build_features(heptagon.scene) is first

@@ -22,6 +22,14 @@ def test_numbers_are_kept() -> None:
     assert isinstance(options.time_weight, float) and isinstance(options.duration, float)
 
 
+@pytest.mark.parametrize("transcription", ["auto", "time"])
+@pytest.mark.parametrize("degree", [2, 6])
+def test_the_grid_in_the_time_domain_is_kept(transcription: str, degree: int) -> None:
+    options = PlanOptions(transcription=transcription, time_intervals=4, degree=degree)
+    kept = (options.transcription, options.time_intervals, options.degree)
+    assert kept == (transcription, 4, degree)
+
+
 @pytest.mark.parametrize(
     "key, given",
     [
@@ -45,6 +53,17 @@ def test_numbers_are_kept() -> None:
         ("duration", 0.0),
         ("duration", -0.1),
         ("duration", math.nan),
+        ("time_intervals", 3),
+        ("time_intervals", 10.0),
+        ("time_intervals", True),
+        ("time_intervals", "10"),
+        ("degree", 1),
+        ("degree", 7),
+        ("degree", 3.0),
+        ("degree", False),
+        ("transcription", "path"),
+        ("transcription", ""),
+        ("transcription", None),
     ],
 )
 def test_bad_options_are_named(key: str, given: Any) -> None:

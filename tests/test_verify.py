@@ -71,9 +71,10 @@ def test_a_thin_margin_fails_a_plan_but_not_torques() -> None:
 def test_epsilon_on_the_edge_is_kept() -> None:
     problem, trajectory = plan()
     least = min(c.least for p in verify(problem, trajectory).phases for c in p.contacts)
-    touching = dataclasses.replace(problem, epsilon=least + 5e-7)
+    touching = dataclasses.replace(problem, epsilon=1.0015 * least)
     assert verify(touching, trajectory).ok
-    over = dataclasses.replace(problem, epsilon=least + 2e-6)
+    # Beyond rounding and the 0.2 % that an open-loop replay may stray.
+    over = dataclasses.replace(problem, epsilon=1.0025 * least)
     assert not verify(over, trajectory).ok
 
 

@@ -24,8 +24,8 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
@@ -166,6 +166,9 @@ class Limit(NamedTuple):
     gained: Contact | None = None
 
 
+_FEATURES: WeakKeyDictionary[Scene, Features] = WeakKeyDictionary()
+
+
 def parse_contact(name: object, scene: Scene) -> Contact:
     """Return the contact called `name`.
 
@@ -210,9 +213,18 @@ def candidate_contacts(scene: Scene, finger: int | None) -> list[Contact]:
     return contacts
 
 
-@lru_cache(maxsize=32)
 def build_features(scene: Scene) -> Features:
-    """Return the scene's features as expressions; built once per scene."""
+    """Return the scene's features as expressions; built once per scene.
+
+    Expressions of different contacts only fit together if they share one symbol z, so the features
+    are kept for as long as the scene lives.
+    """
+    if scene not in _FEATURES:
+        _FEATURES[scene] = _build_features(scene)
+    return _FEATURES[scene]
+
+
+def _build_features(scene: Scene) -> Features:
     z = ca.SX.sym("z", 5)
     body = scene.polygon.vertices
     run = np.roll(body, -1, axis=0) - body

@@ -39,7 +39,7 @@ from .stage import Stage
 OPENING = 0.1
 """Least acceleration with which the gap of a released contact opens [m/s^2]."""
 CLEAR = 2e-5
-"""Gap of a released contact two intervals after its release at least [m]."""
+"""Gap of a released contact after a third of the stage at least [m]."""
 SLIDING = 0.005
 """Least sliding over the radius of gyration, and least speed of a joint [rad/s]."""
 SHORTEST = 1e-4
@@ -218,20 +218,25 @@ def _least_senses(stage: Stage, scheme: Scheme) -> Array:
     A contact that hardly slides would be held by friction, which is not what the plan assumes. At
     both ends, where motion starts, stops or turns, it is nothing.
     """
-    count = (len(stage.z) - 1) // scheme.degree
-    x = (np.arange(count)[:, None] + scheme.points).ravel() / count
+    x = _fractions(stage, scheme)
     return np.tile(SLIDING * 4 * x * (1 - x), (stage.formation.n_contacts + 2, 1))
 
 
 def _clearance(stage: Stage, scheme: Scheme) -> Array:
     """What each watched limit has to exceed at each point, shape (n_watched, K d) [m].
 
-    Nothing, but for a contact just released: two intervals later it has to be well clear.
+    Nothing, but for a contact just released, which has to be well clear after a third of the stage.
     """
     values = stage.formation.evaluate_limits(stage.z[:1])[0, list(stage.watched)]
     released = stage.follows & (np.abs(values) < TOUCHING)
-    later = np.arange(len(stage.z) - 1) >= 2 * scheme.degree
+    later = _fractions(stage, scheme) > 1 / 3
     return np.asarray(CLEAR * np.outer(released, later), dtype=float)
+
+
+def _fractions(stage: Stage, scheme: Scheme) -> Array:
+    """Time of each point over the stage's duration, shape (K d,)."""
+    count = (len(stage.z) - 1) // scheme.degree
+    return np.asarray((np.arange(count)[:, None] + scheme.points).ravel() / count)
 
 
 def _find_opening(stage: Stage) -> list[Contact]:

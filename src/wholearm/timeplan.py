@@ -31,7 +31,7 @@ ROUNDS = 12
 """Most times that limits are tightened."""
 REVISIONS = 2
 """Most times that directions of friction are revised."""
-LOOKS = 12
+LOOKS = 25
 """Places per interval at which limits are looked at."""
 _OVER = 1.5
 """How much more than the miss a limit is tightened."""
@@ -41,6 +41,8 @@ _PACES = (2.0, 4.0, 1.0, 8.0)
 """Guessed durations to try, in units of that of a fall."""
 _TRIAL = 80
 """The same when other directions of friction are tried."""
+_DEARER = 0.01
+"""How much dearer, relatively, a plan may get by tightening before it is solved from scratch."""
 _MU = 1e-2
 """Multipliers of the first guess."""
 
@@ -204,7 +206,8 @@ def _solve(
         cost.iterations += stats["iter_count"]
         cost.solves += 1
         cost.solve_time += stats["t_wall_total"]
-        if not stats["success"] and solution.success and multipliers:
+        worse = float(result["f"]) - solution.cost > _DEARER * abs(solution.cost)
+        if multipliers and solution.success and (worse or not stats["success"]):
             # From where it was the solver can lose its way; from scratch it often does not.
             solution, multipliers = solution._replace(success=False), {}
             continue
