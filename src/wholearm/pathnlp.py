@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .contact import Expression
+from .ipopt import build_solver
 from .model import Array
 from .options import Objective
 from .pathdata import PhaseData
@@ -39,28 +40,6 @@ _LEAST_B = 1e-8
 """Least b away from rest, in units of the typical one; keeps the square root differentiable."""
 _MU = 1e-2
 """Complementarity of the first guess's multipliers: the barrier parameter to start from."""
-
-_IPOPT = {
-    "print_level": 0,
-    "sb": "yes",
-    "tol": 1e-8,
-    "max_iter": 300,
-    # The default relaxes every bound by 1e-8, so that limits would be missed with success.
-    "bound_relax_factor": 0.0,
-    "fast_step_computation": "yes",
-    # A fixed ordering: the automatic one can differ between machines, and is slow on long grids.
-    "mumps_permuting_scaling": 0,
-    "mumps_pivot_order": 0,
-    # Together these make a repeated solve take two or three iterations.
-    "mu_strategy": "adaptive",
-    "mu_oracle": "probing",
-    "warm_start_init_point": "yes",
-    "warm_start_bound_push": 1e-9,
-    "warm_start_bound_frac": 1e-9,
-    "warm_start_slack_bound_push": 1e-9,
-    "warm_start_slack_bound_frac": 1e-9,
-    "warm_start_mult_bound_push": 1e-9,
-}
 
 
 class Scales(NamedTuple):
@@ -207,17 +186,8 @@ def build_path_nlp(n_contacts: int, intervals: int, objective: Objective) -> Pat
     parameters = ca.vertcat(ends, h, weight, *(ca.vec(block) for block in coefficients))
     nlp = {"x": x, "p": parameters, "f": cost + calm, "g": constraints}
     # Started from nowhere near its optimum, the elastic NLP needs the more robust strategy.
-    strategy = {"mu_strategy": "monotone"} if elastic else {}
-    options = {
-        "ipopt": _IPOPT | strategy,
-        "print_time": False,
-        "record_time": True,
-        "calc_lam_p": False,
-        "no_nlp_grad": True,
-        "show_eval_warnings": False,
-        "error_on_fail": False,
-    }
-    solver = ca.nlpsol("path_nlp", "ipopt", nlp, options)
+    strategy = {"mu_strategy": "monotone"} if elastic else {"mu_oracle": "probing"}
+    solver = build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
     return PathNLP(solver, n_contacts, intervals, objective, time.perf_counter() - started)
 
 

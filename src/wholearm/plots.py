@@ -56,8 +56,7 @@ _STYLE: Any = {
     "ytick.labelsize": 9.0, "legend.handlelength": 1.6, "legend.borderpad": 0.0,
     "pdf.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "wholearm",
 }  # fmt: skip
-# Margins and parts of the figure [in]; below the strip is room for captions and phase labels.
-_LEFT, _RIGHT, _BOTTOM, _TOP = 0.80, 1.30, 0.55, 0.40
+_LEFT, _RIGHT, _BOTTOM, _TOP = 0.80, 1.30, 0.55, 0.40  # margins [in]; parts of the figure [in]:
 _TORQUES, _GAP, _CAPTION, _STRIP = 1.75, 0.22, 0.77, 1.75
 
 

@@ -32,6 +32,7 @@ from .collocation import Scheme
 from .contact import Contact, Expression, build_features, build_gap
 from .curve import metric_weights
 from .formation import TOUCHING, Formation
+from .ipopt import build_solver
 from .model import Array
 from .options import Objective
 from .stage import Stage
@@ -46,26 +47,6 @@ SHORTEST = 1e-4
 """Least duration of a stage [s]."""
 LONGEST = 20.0
 """Largest duration of a stage [s]."""
-
-_IPOPT = {
-    "print_level": 0,
-    "sb": "yes",
-    "tol": 1e-8,
-    # The default relaxes every bound by 1e-8, so that limits would be missed with success.
-    "bound_relax_factor": 0.0,
-    "fast_step_computation": "yes",
-    # A fixed ordering: the automatic one can differ between machines.
-    "mumps_permuting_scaling": 0,
-    "mumps_pivot_order": 0,
-    # Together these make a repeated solve take few iterations.
-    "mu_strategy": "adaptive",
-    "warm_start_init_point": "yes",
-    "warm_start_bound_push": 1e-6,
-    "warm_start_bound_frac": 1e-6,
-    "warm_start_slack_bound_push": 1e-6,
-    "warm_start_slack_bound_frac": 1e-6,
-    "warm_start_mult_bound_push": 1e-6,
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,16 +155,7 @@ def build_time_nlp(
         "f": cost,
         "g": ca.vertcat(*rows.parts),
     }
-    options = {
-        "ipopt": _IPOPT | {"max_iter": max_iter},
-        "print_time": False,
-        "record_time": True,
-        "calc_lam_p": False,
-        "no_nlp_grad": True,
-        "show_eval_warnings": False,
-        "error_on_fail": False,
-    }
-    solver = ca.nlpsol("time_nlp", "ipopt", nlp, options)
+    solver = build_solver("time_nlp", nlp, 1e-6, max_iter=max_iter)
     low, high = np.concatenate(rows.low), np.concatenate(rows.high)
     return TimeNLP(solver, low, high, time.perf_counter() - started)
 
