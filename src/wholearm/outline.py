@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .contact import Contact
 from .curve import Curve, metric_weights
 from .dynamics import Directions
 from .errors import InputError
@@ -194,3 +195,10 @@ def _connect(formation: Formation, start: Array, goal: Array) -> Outline:
     rates = np.hstack([slip, speed[:, 3:]]).sum(axis=0)
     signs = np.where(rates < 0, -1.0, 1.0)
     return Outline(formation, z, Directions(signs[:-2], signs[-2:]))
+
+
+def released_contacts(phase: Phase, following: Phase | None) -> tuple[Contact, ...]:
+    """Contacts of a phase that the next one does not have."""
+    if following is None:
+        return ()
+    return tuple(c for c in phase.formation.contacts if c not in following.formation.contacts)
