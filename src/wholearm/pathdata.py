@@ -18,6 +18,11 @@ from .model import Array
 from .pathmotion import Grid, PathMotion, Profile, directions_of
 from .torque import TorqueProfile
 
+TORQUE_ERROR = 1e-6
+"""Largest error of the torque's polynomials between the knots [N m]."""
+PLACES = 9
+"""Places that they go through where that is exceeded."""
+
 
 class Fineness(NamedTuple):
     """Where in an interval forces are evaluated and limits looked at, its ends included."""
@@ -184,19 +189,29 @@ def find_least(values: Array) -> Array:
 def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, float]:
     """Torque of a motion as one polynomial in time per interval, through its values at the knots.
 
-    Also returns the integral of tau^T tau [(N m)^2 s].
+    Where that misses the torque between the knots, it goes through more places. Also returns the
+    integral of tau^T tau [(N m)^2 s].
     """
+    knots, looks = data.fine
+    torque = _fit(data, motion, data.knots, knots)
+    times = motion.times[data.solid, None] + motion.durations(looks)[data.solid]
+    wanted = data.looks.forces.tau(*data.spread(motion.profile, looks))
+    inner = np.tile((looks > 0) & (looks < 1), len(data.solid))
+    misfit = np.abs(torque.at(times.ravel()[inner]) - wanted[inner]).max()
+    if misfit > TORQUE_ERROR and len(knots) < PLACES:
+        every = (len(looks) - 1) // (PLACES - 1)
+        rows = np.tile(np.arange(len(looks)) % every == 0, len(data.solid))
+        torque = _fit(data, motion, data.looks.pick(rows), looks[::every])
+    return torque, torque.integrate_squares()
+
+
+def _fit(data: PhaseData, motion: PathMotion, places: Places, fractions: Array) -> TorqueProfile:
+    """Polynomials through the torques at `fractions` of every solid interval."""
     k = data.solid
-    values = data.knots.forces.tau(*data.spread(motion.profile, data.fine.knots))
-    values = values.reshape(len(k), len(data.fine.knots), 2)
-    spans = motion.durations(data.fine.knots)[k]
+    values = places.forces.tau(*data.spread(motion.profile, fractions))
+    spans = motion.durations(fractions)[k]
     x = 2 * spans / spans[:, -1:] - 1
-    powers = np.arange(len(data.fine.knots))
-    vandermonde = x[..., None] ** powers
-    coefficients = np.linalg.solve(vandermonde, values)
-    moments = (1 - (-1.0) ** (powers + 1)) / (powers + 1)
-    weights = np.linalg.solve(vandermonde.transpose(0, 2, 1), moments[:, None])[..., 0]
-    squares = (weights * (values**2).sum(axis=2)).sum(axis=1)
+    vandermonde = x[..., None] ** np.arange(len(fractions))
+    coefficients = np.linalg.solve(vandermonde, values.reshape(len(k), len(fractions), 2))
     breaks = np.append(motion.times[k], motion.times[-1])
-    torque = TorqueProfile(breaks, np.asarray(coefficients.transpose(0, 2, 1), dtype=float))
-    return torque, float(squares @ spans[:, -1] / 2)
+    return TorqueProfile(breaks, np.asarray(coefficients.transpose(0, 2, 1), dtype=float))
