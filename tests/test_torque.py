@@ -137,3 +137,14 @@ def test_fit_converges_with_the_degree() -> None:
     breaks = np.array([0.0, 0.5, 1.0])
     errors = [abs(TorqueProfile.fit(breaks, function, d).at(t) - function(t)).max() for d in (3, 9)]
     assert errors[1] < 1e-5 * errors[0]
+
+
+def test_chain_puts_profiles_one_after_the_other() -> None:
+    one = TorqueProfile(np.array([0.0, 1.0]), np.array([[[1.0], [2.0]]]))
+    two = TorqueProfile(np.array([0.0, 0.5, 2.0]), np.array([[[3.0, 1.0], [4.0, 0.0]]] * 2))
+    both = TorqueProfile.chain([one, two])
+    np.testing.assert_array_equal(both.breaks, [0.0, 1.0, 1.5, 3.0])
+    t = np.array([0.1, 0.4, 1.9])
+    # Shifting the times costs rounding only.
+    np.testing.assert_allclose(both.at(1.0 + t), two.at(t), atol=1e-14)
+    np.testing.assert_array_equal(both.at(np.array([0.7])), [[1.0, 2.0]])

@@ -211,17 +211,15 @@ def _cosine_motion(curve: Curve, epsilon: float) -> PathMotion:
 
 def _join_torques(motions: Sequence[PathMotion], degree: int) -> TorqueProfile:
     """Torques of motions one after the other, one piece for each interval."""
-    breaks, blocks, start = [np.zeros(1)], [], 0.0
+    profiles = []
     for motion in motions:
         own = motion.times[np.append(motion.grid.steps > 0, True)]
 
         def torque(t: Array, motion: PathMotion = motion) -> Array:
             return motion.evaluate(t).tau
 
-        breaks.append(start + own[1:])
-        blocks.append(TorqueProfile.fit(own, torque, degree).coefficients)
-        start += motion.duration
-    return TorqueProfile(np.concatenate(breaks), np.concatenate(blocks))
+        profiles.append(TorqueProfile.fit(own, torque, degree))
+    return TorqueProfile.chain(profiles)
 
 
 def _find_marks(motions: Sequence[PathMotion]) -> Array:

@@ -114,7 +114,9 @@ def solve_with(
         "problem": problem.table,
     }
     report("sampling")
-    return assemble(motions, _join(plans), meta, options.samples)
+    return assemble(
+        motions, TorqueProfile.chain([plan.torque for plan in plans]), meta, options.samples
+    )
 
 
 def split_blocks(problem: Problem) -> list[tuple[Phase, ...]]:
@@ -168,15 +170,3 @@ def _share_duration(
             f"duration = {total:g} s is not longer than the least time, {sum(times):.6g} s"
         )
     return [total / sum(times) * own for own in times]
-
-
-def _join(plans: Sequence[PhasePlan[Motion]]) -> TorqueProfile:
-    """Torques of all phases, one after the other."""
-    breaks, start = [np.zeros(1)], 0.0
-    for plan in plans:
-        breaks.append(start + plan.torque.breaks[1:])
-        start += plan.motion.duration
-    blocks = [plan.torque.coefficients for plan in plans]
-    longest = max(block.shape[2] for block in blocks)
-    wide = [np.pad(block, ((0, 0), (0, 0), (0, longest - block.shape[2]))) for block in blocks]
-    return TorqueProfile(np.concatenate(breaks), np.concatenate(wide))

@@ -184,11 +184,7 @@ class TimeMotion:
     @property
     def torque(self) -> TorqueProfile:
         """Torque from the start of the phase."""
-        breaks = [np.zeros(1)]
-        for stage, start in zip(self.stages, self.starts[:-1], strict=True):
-            breaks.append(start + stage.torque.breaks[1:])
-        coefficients = np.concatenate([stage.torque.coefficients for stage in self.stages])
-        return TorqueProfile(np.concatenate(breaks), coefficients)
+        return TorqueProfile.chain([stage.torque for stage in self.stages])
 
     @property
     def end(self) -> Start:

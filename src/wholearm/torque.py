@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,6 +84,18 @@ class TorqueProfile:
         values = values.reshape(len(middle), degree + 1, 2)
         invert = np.linalg.inv(np.vander(x, increasing=True))
         return TorqueProfile(breaks, np.einsum("dm,kmj->kjd", invert, values))
+
+    @staticmethod
+    def chain(profiles: Sequence[TorqueProfile]) -> TorqueProfile:
+        """Profiles that each start at 0, one after the other."""
+        breaks, start = [np.zeros(1)], 0.0
+        for profile in profiles:
+            breaks.append(start + profile.breaks[1:])
+            start = float(breaks[-1][-1])
+        blocks = [profile.coefficients for profile in profiles]
+        longest = max(block.shape[2] for block in blocks)
+        wide = [np.pad(block, ((0, 0), (0, 0), (0, longest - block.shape[2]))) for block in blocks]
+        return TorqueProfile(np.concatenate(breaks), np.concatenate(wide))
 
     @staticmethod
     def join_rows(t: Array, tau: Array) -> TorqueProfile:
