@@ -20,10 +20,15 @@ class Objective(Enum):
     """Largest least normal force within a given duration."""
     ELASTIC = "elastic"
     """Least shortfall of the limits; used to explain why there is no plan."""
+    RELAX = "relax"
+    """Least relaxation of one limit; used to say what would make a plan possible."""
 
 
-CHOICES = tuple(choice.value for choice in Objective if choice is not Objective.ELASTIC)
+CHOICES = tuple(
+    choice.value for choice in Objective if choice not in (Objective.ELASTIC, Objective.RELAX)
+)
 """Objectives that a user can ask for."""
+SOLVERS = ("ipopt", "fatrop")
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,9 @@ class PlanOptions:
         Intervals of each phase in the time domain, at least 4.
     degree : int
         Collocation points per interval in the time domain, from 2 to 6.
+    solver : str
+        ``"ipopt"``, or ``"fatrop"`` for `time` and `effort` along curves; phases in the time
+        domain use Ipopt.
 
     Raises
     ------
@@ -64,6 +72,7 @@ class PlanOptions:
     transcription: str = "auto"
     time_intervals: int = 16
     degree: int = 3
+    solver: str = "ipopt"
 
     def __post_init__(self) -> None:
         given = self.objective
@@ -79,6 +88,13 @@ class PlanOptions:
         if self.transcription not in ("auto", "time"):
             given = self.transcription
             raise InputError("", "transcription", f"{given!r} given; allowed are auto and time")
+        if self.solver not in SOLVERS:
+            allowed = " and ".join(SOLVERS)
+            raise InputError("", "solver", f"{self.solver!r} given; allowed are {allowed}")
+        if self.solver == "fatrop" and self.objective is Objective.MARGIN:
+            raise InputError("", "solver", "'fatrop' plans time and effort; margin needs ipopt")
+        if self.solver == "fatrop" and self.transcription == "time":
+            raise InputError("", "solver", "'fatrop' plans along curves; the time domain needs ipopt")
         weight = require_number(self.time_weight, "time_weight", positive=True)
         object.__setattr__(self, "time_weight", weight)
         if self.duration is not None:

@@ -42,6 +42,22 @@ class Places(NamedTuple):
         return Places(PathForces(*(part[rows] for part in self.forces)), self.rates[rows])
 
 
+class Relaxation(NamedTuple):
+    """Which limit gives way when the relaxation grows, and how fast.
+
+    Attributes
+    ----------
+    worth : ndarray, shape (n_c + 3,), [N, N m, 1]
+        By how much c_n >= epsilon and |tau| <= limit give way per unit of it, and the square of a
+        speed limit, relative to that square.
+    finger : int or None
+        Whose speed limit that is.
+    """
+
+    worth: Array
+    finger: int | None = None
+
+
 class PhaseData(NamedTuple):
     """What one phase gives the NLP.
 
@@ -84,12 +100,24 @@ class PhaseData(NamedTuple):
         limit = self.torque_limit
         return np.hstack([c_n - self.epsilon - margin, tau + limit, limit - tau])
 
-    def largest_b(self, places: Places) -> Array:
-        """Largest b that the joints' speed limits allow, shape (n,) [m^2/s^2]."""
+    def largest_b(self, places: Places, spared: int | None = None) -> Array:
+        """Largest b that the joints' speed limits allow, shape (n,) [m^2/s^2].
+
+        Without that of the joint `spared`, if one is given.
+        """
         limit = self.curve.formation.scene.speed_limit
+        if spared is not None:
+            limit[spared] = np.inf
         if np.isinf(limit).all():
             return np.full(len(places.rates), np.inf)
         return np.asarray(((limit / np.maximum(np.abs(places.rates), 1e-12)) ** 2).min(axis=1))
+
+    def relative_rates(self, places: Places, finger: int | None) -> Array:
+        """d theta / ds of a joint over its speed limit, shape (n,) [s/m]; zero for no joint."""
+        if finger is None:
+            return np.zeros(len(places.rates))
+        limit = self.curve.formation.scene.speed_limit[finger]
+        return np.asarray(places.rates[:, finger] / limit)
 
     def spread(self, profile: Profile, fractions: Array) -> Profile:
         """The profile at `fractions` of every solid interval, interval by interval."""

@@ -11,6 +11,9 @@ lambda_k; between two nodes a and lambda are linear in s, and b' = 2 a (dash: d/
 Where a direction reverses, the grid has an interval of length zero: b is the same on its two sides,
 a and lambda may jump. So one NLP, built once for a number of contacts, intervals and an objective,
 serves every phase: grid, coefficients and limits are its parameters and bounds.
+
+The least margin, and the relaxation of a limit, have an unknown at every node with m_k+1 = m_k. A
+column through all rows would make building the Jacobian quadratic in the number of nodes.
 """
 
 from __future__ import annotations
@@ -24,11 +27,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from .chain import Chain, Links, StagedSolver, stage
 from .contact import Expression
 from .ipopt import build_solver
 from .model import Array
 from .options import Objective
-from .pathdata import PhaseData
+from .pathdata import PhaseData, Relaxation
 from .pathmotion import Grid, Profile
 
 _CALM = 1e-4
@@ -40,6 +44,8 @@ _LEAST_B = 1e-8
 """Least b away from rest, in units of the typical one; keeps the square root differentiable."""
 _MU = 1e-2
 """Complementarity of the first guess's multipliers: the barrier parameter to start from."""
+_CHAINED = (Objective.MARGIN, Objective.RELAX)
+"""Objectives with one more unknown, which every node has a copy of."""
 
 
 class Scales(NamedTuple):
@@ -96,14 +102,14 @@ class PathNLP:
 
     Attributes
     ----------
-    solver : casadi.Function
+    solver : casadi.Function or StagedSolver
         Takes x0, p, bounds and multipliers; see `build_path_nlp` for their order.
     n_contacts, intervals : int
     objective : Objective
     build_time : float, [s]
     """
 
-    solver: Expression
+    solver: Expression | StagedSolver
     n_contacts: int
     intervals: int
     objective: Objective
@@ -111,8 +117,18 @@ class PathNLP:
 
     @property
     def columns(self) -> int:
-        """Unknowns per node: b, a, squeeze, and one shortfall per limit when elastic."""
-        return 3 + (self.n_contacts + 2 if self.objective is Objective.ELASTIC else 0)
+        """Unknowns per node: b, a, squeeze, and what the objective adds."""
+        return 3 + _count_extras(self.objective, self.n_contacts)
+
+    @property
+    def links(self) -> int:
+        """Equations per interval."""
+        return 2 if self.objective in _CHAINED else 1
+
+    @property
+    def first(self) -> int:
+        """The first of the rows that belong to nodes."""
+        return self.links * self.intervals + 2
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
@@ -122,27 +138,38 @@ class PathNLP:
         return mask
 
 
+def _count_extras(objective: Objective, n_contacts: int) -> int:
+    """Unknowns per node besides b, a and squeeze: shortfalls, or the margin or relaxation."""
+    return n_contacts + 2 if objective is Objective.ELASTIC else int(objective in _CHAINED)
+
+
 @lru_cache(maxsize=16)
-def build_path_nlp(n_contacts: int, intervals: int, objective: Objective) -> PathNLP:
+def build_path_nlp(
+    n_contacts: int, intervals: int, objective: Objective, solver: str = "ipopt"
+) -> PathNLP:
     """Build the NLP for every phase of so many contacts.
 
-    The unknowns are (b, a, squeeze, shortfalls) node by node, without b at the two ends, then the
-    least margin for the objective `margin`. The parameters are the speeds at the ends, the steps,
-    the weight of time, and the coefficients of `PathForces` but for C0 and T0, which are part of
-    the bounds. The constraints are the N rows of b' = 2 a, the changes of a over the first and the
-    last interval, c_n and tau node by node, and T for `margin`.
+    The unknowns are (b, a, squeeze, extras) node by node, without b at the two ends. The extras
+    are shortfalls for `elastic`, the least margin for `margin` and the relaxation for `relax`. The
+    parameters are the speeds at the ends, the steps, the weight of time, and the coefficients of
+    `PathForces` but for C0 and T0, which are part of the bounds; for `relax` also what the
+    relaxation is worth for each limit, and b's coefficients in the speed limit. The constraints are
+    the N rows of b' = 2 a, those that chain the margin or the relaxation, the changes of a over the
+    first and the last interval, c_n and tau (and the speed for `relax`) node by node, and T for
+    `margin`.
     """
     started = time.perf_counter()
     n, m = intervals + 1, n_contacts + 2
-    elastic = objective is Objective.ELASTIC
+    staged = solver == "fatrop"
     b_inner, ends = ca.SX.sym("b", n - 2), ca.SX.sym("ends", 2)
     a, squeeze = ca.SX.sym("a", n), ca.SX.sym("squeeze", n)
-    short = ca.SX.sym("short", n, m if elastic else 0)
-    margin = ca.SX.sym("margin", 1 if objective is Objective.MARGIN else 0)
+    extra = ca.SX.sym("extra", n, _count_extras(objective, n_contacts))
     h, weight = ca.SX.sym("h", intervals), ca.SX.sym("weight")
     coefficients = [ca.SX.sym(name, n, m) for name in ("Pa", "Pb", "Pl")] + [ca.SX.sym("Tv", n, 2)]
     b = ca.vertcat(ends[0] ** 2, b_inner, ends[1] ** 2)
-    speed = ca.vertcat(ends[0], ca.sqrt(b_inner), ends[1])
+    # fatrop strays beyond bounds on its way, where the root must not fail.
+    rooted = ca.fmax(b_inner, _LEAST_B) if staged else b_inner
+    speed = ca.vertcat(ends[0], ca.sqrt(rooted), ends[1])
 
     def spread(column: Expression) -> Expression:
         return ca.repmat(column, 1, m)
@@ -151,47 +178,82 @@ def build_path_nlp(n_contacts: int, intervals: int, objective: Objective) -> Pat
     forces = Pa * spread(a) + Pb * spread(b) + Pl * spread(squeeze)
     c_n, tau = forces[:, :n_contacts], forces[:, n_contacts:] + Tv * ca.repmat(speed, 1, 2)
     interval_times = 2 * h / (speed[:-1] + speed[1:])
-    duration = ca.sum1(interval_times)
     node_weights = ca.vertcat(0, h) + ca.vertcat(h, 0)
-    calm = _CALM * ca.dot(node_weights, squeeze**2) + _SMOOTH * (
-        ca.dot(h, (a[1:] - a[:-1]) ** 2) + ca.dot(h, (squeeze[1:] - squeeze[:-1]) ** 2)
-    )
+    node_costs = _CALM * node_weights * squeeze**2
+    link_costs = _SMOOTH * h * ((a[1:] - a[:-1]) ** 2 + (squeeze[1:] - squeeze[:-1]) ** 2)
+    links = [b[1:] - b[:-1] - h * (a[1:] + a[:-1])]
     c_rows, tau_rows, last = c_n, tau, []
+    if objective in _CHAINED:
+        links.append(extra[1:] - extra[:-1])
     if objective is Objective.TIME:
-        cost = duration
+        link_costs += interval_times
     elif objective is Objective.EFFORT:
         # The bounds hold T0, so the full torque is passed as a parameter for the integrand only.
         T0 = ca.SX.sym("T0", n, 2)
         coefficients.append(T0)
         full = tau + T0
         squares = full[:-1, :] ** 2 + full[:-1, :] * full[1:, :] + full[1:, :] ** 2
-        cost = ca.dot(interval_times, ca.sum2(squares)) / 3 + weight * duration
+        link_costs += interval_times * (ca.sum2(squares) / 3 + weight)
     elif objective is Objective.MARGIN:
-        c_rows = c_n - ca.repmat(margin, n, n_contacts)
-        cost, last = -margin, [duration]
-    else:
+        c_rows = c_n - ca.repmat(extra, 1, n_contacts)
+        node_costs[0] -= extra[0]
+        last = [ca.sum1(interval_times)]
+    elif objective is Objective.ELASTIC:
         # Every node counts alike: where intervals are short, being short must not be cheap.
-        cost = ca.sum1(ca.sum2(short)) / n + 1e-4 * duration
+        node_costs += ca.sum2(extra) / n
+        link_costs += 1e-4 * interval_times
+        short = extra
+    else:
+        worth, Rb = ca.SX.sym("worth", 1, m + 1), ca.SX.sym("Rb", n)
+        coefficients += [worth, Rb]
+        short = extra @ worth
+        node_costs[0] += extra[0]
+        link_costs += 1e-5 * interval_times
+    if objective in (Objective.ELASTIC, Objective.RELAX):
         c_rows = c_n + short[:, :n_contacts]
-        tau_rows = ca.horzcat(tau + short[:, n_contacts:], tau - short[:, n_contacts:])
-    nodes = ca.horzcat(b, a, squeeze, short).T
-    x = ca.vertcat(nodes[1:, 0], ca.vec(nodes[:, 1:-1]), nodes[1:, -1], margin)
-    constraints = ca.vertcat(
-        b[1:] - b[:-1] - h * (a[1:] + a[:-1]),
-        a[1] - a[0],
-        a[-1] - a[-2],
-        ca.vec(ca.horzcat(c_rows, tau_rows).T),
-        *last,
+        easing = short[:, n_contacts:m]
+        tau_rows = ca.horzcat(tau + easing, tau - easing)
+    if objective is Objective.RELAX:
+        tau_rows = ca.horzcat(tau_rows, Rb * b - short[:, m])
+    nodes = ca.horzcat(b, a, squeeze, extra).T
+    rows = ca.horzcat(c_rows, tau_rows)
+    chain = Chain(
+        ca.vertcat(nodes[1:, 0], ca.vec(nodes[:, 1:-1]), nodes[1:, -1]),
+        ca.vertcat(ends, h, weight, *(ca.vec(block) for block in coefficients)),
+        np.repeat(np.arange(n), nodes.size1())[1:-1],
+        Links(
+            ca.vertcat(*links, a[1] - a[0], a[-1] - a[-2]),
+            np.append(np.tile(np.arange(intervals), len(links)), [0, intervals - 1]),
+        ),
+        rows,
+        link_costs,
+        node_costs,
     )
-    parameters = ca.vertcat(ends, h, weight, *(ca.vec(block) for block in coefficients))
-    nlp = {"x": x, "p": parameters, "f": cost + calm, "g": constraints}
-    # Started from nowhere near its optimum, the elastic NLP needs the more robust strategy.
-    strategy = {"mu_strategy": "monotone"} if elastic else {"mu_oracle": "probing"}
-    solver = build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
-    return PathNLP(solver, n_contacts, intervals, objective, time.perf_counter() - started)
+    built = stage("path_nlp", chain) if staged else _build_ipopt(chain, last, objective)
+    return PathNLP(built, n_contacts, intervals, objective, time.perf_counter() - started)
 
 
-def parameters(nlp: PathNLP, data: PhaseData, scales: Scales, time_weight: float) -> Array:
+def _build_ipopt(chain: Chain, last: list[Expression], objective: Objective) -> Expression:
+    """Ipopt for an NLP that may have more rows than a chain has."""
+    nlp = {
+        "x": chain.x,
+        "p": chain.p,
+        "f": ca.sum1(chain.link_costs) + ca.sum1(chain.node_costs),
+        "g": ca.vertcat(chain.links.values, ca.vec(chain.rows.T), *last),
+    }
+    # Started from nowhere near their optimum, these need the more robust strategy.
+    robust = objective in (Objective.ELASTIC, Objective.RELAX)
+    strategy = {"mu_strategy": "monotone"} if robust else {"mu_oracle": "probing"}
+    return build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
+
+
+def parameters(
+    nlp: PathNLP,
+    data: PhaseData,
+    scales: Scales,
+    time_weight: float,
+    relaxation: Relaxation | None = None,
+) -> Array:
     """Parameters of the NLP, in its units; see `build_path_nlp` for their order."""
     forces, (b_unit, a_unit, force) = data.nodes.forces, scales.profile
     blocks = [
@@ -202,6 +264,10 @@ def parameters(nlp: PathNLP, data: PhaseData, scales: Scales, time_weight: float
     ]
     if nlp.objective is Objective.EFFORT:
         blocks.append(forces.T0)
+    if relaxation is not None:
+        units = np.append(np.full(nlp.n_contacts, force), np.ones(3))
+        rates = data.relative_rates(data.nodes, relaxation.finger)
+        blocks += [relaxation.worth / units, rates**2 * b_unit]
     steps = data.grid.steps / scales.length
     return np.concatenate([[0.0, 0.0], steps, [time_weight], *(b.ravel("F") for b in blocks)])
 
@@ -211,6 +277,7 @@ def make_bounds(
     data: PhaseData,
     scales: Scales,
     tightening: Tightening,
+    relaxation: Relaxation | None = None,
 ) -> dict[str, Array]:
     """Bounds of the NLP, with every limit tightened."""
     tight, speed_share, duration = tightening
@@ -218,23 +285,27 @@ def make_bounds(
     b_unit = scales.profile[0]
     low, high = np.full((n, nlp.columns), -np.inf), np.full((n, nlp.columns), np.inf)
     low[:, 0] = _LEAST_B
-    high[:, 0] = np.maximum(data.largest_b(data.nodes) * speed_share / b_unit, 2 * _LEAST_B)
-    low[:, 3:] = 0.0
+    relaxed = None if relaxation is None else relaxation.finger
+    b_max = data.largest_b(data.nodes, relaxed)
+    high[:, 0] = np.maximum(b_max * speed_share / b_unit, 2 * _LEAST_B)
+    low[:, 3:] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
     forces, limit = data.nodes.forces, data.torque_limit
     c_low = (data.epsilon + tight[:, :n_c] - forces.C0) / scales.force
     t_low = tight[:, n_c : n_c + 2] - limit - forces.T0
     t_high = limit - tight[:, n_c + 2 :] - forces.T0
     free = np.full_like(t_low, np.inf)
-    if nlp.objective is Objective.ELASTIC:
+    if nlp.objective in (Objective.ELASTIC, Objective.RELAX):
         t_low, t_high = np.hstack([t_low, -free]), np.hstack([free, t_high])
-    equal = np.zeros(nlp.intervals + 2)
+    if nlp.objective is Objective.RELAX:
+        t_low, t_high = np.hstack([t_low, -free[:, :1]]), np.hstack([t_high, np.ones((n, 1))])
+    equal = np.zeros(nlp.first)
     rows_low, rows_high = np.hstack([c_low, t_low]), np.hstack([c_low * 0 + np.inf, t_high])
-    last_low, last_high, margin = [], [], []
+    last_low, last_high = [], []
     if nlp.objective is Objective.MARGIN:
-        last_low, last_high, margin = [-np.inf], [(duration or np.inf) / scales.time], [np.inf]
+        last_low, last_high = [-np.inf], [(duration or np.inf) / scales.time]
     return {
-        "lbx": np.concatenate([low[nlp.free], [-m for m in margin]]),
-        "ubx": np.concatenate([high[nlp.free], margin]),
+        "lbx": low[nlp.free],
+        "ubx": high[nlp.free],
         "lbg": np.concatenate([equal, rows_low.ravel(), last_low]),
         "ubg": np.concatenate([equal, rows_high.ravel(), last_high]),
     }
@@ -255,35 +326,43 @@ def first_multipliers(
     on_b[:, 0] = -_MU / np.maximum(profile.b / scales.profile[0], 1e-3)
     return {
         "lam_x0": on_b[nlp.free],
-        "lam_g0": np.concatenate([np.zeros(nlp.intervals + 2), rows.ravel()]),
+        "lam_g0": np.concatenate([np.zeros(nlp.first), rows.ravel()]),
     }
 
 
 def pack(
     nlp: PathNLP, profile: Profile, scales: Scales, margin: float, short: Array | None = None
 ) -> Array:
-    """Unknowns of the NLP, in its units, from a profile and (elastic) shortfalls [N, N m]."""
+    """Unknowns of the NLP, in its units, from a profile and what its objective adds.
+
+    That is the least margin [N], (elastic) shortfalls [N, N m], or the relaxation, given as margin.
+    """
     table = np.zeros((len(profile.a), nlp.columns))
     if short is not None:
         table[:, 3:] = short / np.repeat([scales.force, 1.0], [nlp.n_contacts, 2])
+    elif nlp.objective in _CHAINED:
+        table[:, 3] = margin / _margin_unit(nlp, scales)
     table[:, :3] = np.column_stack([profile.b, profile.a, profile.squeeze]) / scales.profile
-    last = [margin / scales.force] if nlp.objective is Objective.MARGIN else []
-    return np.concatenate([table[nlp.free], last])
+    return np.asarray(table[nlp.free])
+
+
+def _margin_unit(nlp: PathNLP, scales: Scales) -> float:
+    return scales.force if nlp.objective is Objective.MARGIN else 1.0
 
 
 def unpack(nlp: PathNLP, grid: Grid, x: Array, scales: Scales) -> tuple[Profile, float]:
-    """Profile of a solution, and the least margin [N] if that is an unknown.
+    """Profile of a solution, and the least margin [N] or the relaxation if that is an unknown.
 
     b is integrated again from a, so that b' = 2 a holds to rounding and not to Ipopt's tolerance.
     """
     table = np.zeros((len(grid.s), nlp.columns))
-    table[nlp.free] = x[: int(nlp.free.sum())]
+    table[nlp.free] = x
     a, squeeze = table[:, 1] * scales.profile[1], table[:, 2] * scales.profile[2]
     steps = grid.steps
     a = a - np.dot(steps, a[1:] + a[:-1]) / (2 * grid.s[-1])
     b = np.concatenate([[0.0], np.cumsum(steps * (a[1:] + a[:-1]))])
     b[-1] = 0.0
-    margin = x[-1] * scales.force if nlp.objective is Objective.MARGIN else 0.0
+    margin = x[-1] * _margin_unit(nlp, scales) if nlp.objective in _CHAINED else 0.0
     return Profile(a, b, squeeze), float(margin)
 
 
@@ -302,15 +381,16 @@ def move_multipliers(
         return np.column_stack(columns)
 
     on_x, on_g = multipliers["lam_x0"], multipliers["lam_g0"]
-    inner = int(nlp.free.sum())
     table = np.zeros(nlp.free.shape)
-    table[nlp.free] = on_x[:inner]
-    middles = (place[1:] + place[:-1]) / 2
-    defects = np.interp(middles, nodes[:-1] + 0.5, on_g[:intervals])
-    first = intervals + 2
-    stop = first + len(nodes) * (nlp.n_contacts + 2)
-    rows = carry(on_g[first:stop].reshape(len(nodes), -1)).ravel()
+    table[nlp.free] = on_x
+    middles, ends = (place[1:] + place[:-1]) / 2, nlp.links * intervals
+    links = [
+        np.interp(middles, nodes[:-1] + 0.5, column)
+        for column in on_g[:ends].reshape(nlp.links, intervals)
+    ]
+    stop = nlp.first + len(nodes) * (nlp.n_contacts + 2)
+    rows = carry(on_g[nlp.first : stop].reshape(len(nodes), -1)).ravel()
     return {
-        "lam_x0": np.concatenate([carry(table)[nlp.free], on_x[inner:]]),
-        "lam_g0": np.concatenate([defects, on_g[intervals:first], rows, on_g[stop:]]),
+        "lam_x0": carry(table)[nlp.free],
+        "lam_g0": np.concatenate([*links, on_g[ends : nlp.first], rows, on_g[stop:]]),
     }

@@ -8,15 +8,19 @@ misses more than `MISS`.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from .curve import Curve, describe_pose
-from .errors import InfeasibleError, SolverError
+from .advice import Limit, describe_changes, find_changes
+from .chain import StagedSolver
+from .curve import Curve
+from .errors import InfeasibleError, SolverError, WholearmError
 from .model import Array
 from .options import Objective, PlanOptions
 from .pathdata import PhaseData, fit_torque, prepare
+from .pathexplain import explain
 from .pathmotion import PathMotion, Profile, draw_together, make_grid
 from .pathnlp import (
     PathNLP,
@@ -50,6 +54,14 @@ class _Solution(NamedTuple):
     seconds: float
 
 
+class _StuckError(SolverError):
+    """A solve that failed, with the data that it failed for."""
+
+    def __init__(self, data: PhaseData, message: str) -> None:
+        self.data = data
+        super().__init__(message)
+
+
 def plan_path(
     curve: Curve,
     epsilon: float,
@@ -73,13 +85,64 @@ def plan_path(
     Raises
     ------
     InfeasibleError
-        If no motion keeps the limits; names what is short, where and by how much.
+        If no motion keeps the limits; names what is short, where and by how much, and each single
+        limit with which there would be a plan.
     JammingError
         If friction jams the formation somewhere on the curve.
     SolverError
-        If Ipopt stops without an answer.
+        If the solver stops without an answer.
     """
-    nlp = build_path_nlp(curve.formation.n_contacts, options.intervals, options.goal)
+    try:
+        plan = _plan(curve, epsilon, options, phase, duration)
+    except _StuckError as stuck:
+        late = _explain_duration(curve, epsilon, options, phase, duration)
+        # Advice is about the problem: it does not depend on the solver.
+        robust = replace(options, solver="ipopt")
+        raise late or explain(
+            stuck.data,
+            *guess(stuck.data),
+            phase,
+            str(stuck),
+            lambda changed, least: _plan(changed, least, robust, phase, duration),
+        ) from None
+    if options.goal is Objective.MARGIN and plan.value < epsilon - MISS:
+        late = _explain_duration(curve, epsilon, options, phase, duration)
+        raise late or SolverError(f"phase {phase}: the margin found is below epsilon")
+    return plan
+
+
+def _explain_duration(
+    curve: Curve, epsilon: float, options: PlanOptions, phase: int, duration: float | None
+) -> InfeasibleError | None:
+    """Say so if the duration is shorter than the least time, and which one would do."""
+    if duration is None:
+        return None
+    fastest = replace(options, objective=Objective.TIME, duration=None)
+    try:
+        least = _plan(curve, epsilon, fastest, phase, None).value
+    except WholearmError:
+        return None
+    if least <= duration:
+        return None
+
+    def can_plan(_: int, value: float) -> bool:
+        try:
+            return _plan(curve, epsilon, options, phase, value).value >= epsilon
+        except SolverError:
+            return False
+
+    changes = find_changes([Limit("duration", duration, "s", 1)], lambda _: least, can_plan)
+    return InfeasibleError(
+        f"phase {phase} is infeasible: duration = {duration:g} s is {least - duration:.3g} s "
+        f"shorter than the least time; {describe_changes(changes)}"
+    )
+
+
+def _plan(
+    curve: Curve, epsilon: float, options: PlanOptions, phase: int, duration: float | None
+) -> PhasePlan[PathMotion]:
+    n_contacts = curve.formation.n_contacts
+    nlp = build_path_nlp(n_contacts, options.intervals, options.goal, options.solver)
     data = prepare(curve, epsilon, make_grid(curve, options.intervals), phase)
     profile, scales = guess(data)
     tightening = Tightening.none(data, duration)
@@ -138,7 +201,9 @@ def _solve(
     )
     stats = nlp.solver.stats()
     if not stats["success"]:
-        raise explain(data, phase, stats["return_status"])
+        name = "fatrop" if isinstance(nlp.solver, StagedSolver) else "Ipopt"
+        status = f"phase {phase}: {name} stopped with {stats['return_status']}"
+        raise _StuckError(data, status)
     profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], scales)
     multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
     iterations = start.iterations + stats["iter_count"]
@@ -185,42 +250,3 @@ def guess(data: PhaseData) -> tuple[Profile, Scales]:
     scales = Scales(length, 0.6 * duration, force)
     return Profile(height * slope, height * shape, middle), scales
 
-
-def explain(data: PhaseData, phase: int, status: str) -> InfeasibleError | SolverError:
-    """Say why a phase has no plan: re-solve with every limit soft and rank the shortfalls."""
-    formation = data.curve.formation
-    nlp = build_path_nlp(formation.n_contacts, len(data.grid.s) - 1, Objective.ELASTIC)
-    profile, scales = guess(data)
-    bounds = make_bounds(nlp, data, scales, Tightening.none(data, None))
-    short = np.maximum(_shortfalls(data, profile), 0.0) + 0.1
-    start = pack(nlp, profile, scales, 0.0, short)
-    result = nlp.solver(x0=start, p=parameters(nlp, data, scales, 1.0), **bounds)
-    if not nlp.solver.stats()["success"]:
-        return SolverError(f"phase {phase}: Ipopt stopped with {status}")
-    profile, _ = unpack(nlp, data.grid, result["x"].full()[:, 0], scales)
-    short, n_c = _shortfalls(data, profile), formation.n_contacts
-    if short.max() < 1e-4:
-        return SolverError(
-            f"phase {phase}: Ipopt stopped with {status} although limits can be kept"
-        )
-    names = [f"c_n of {name} >= epsilon = {data.epsilon:g} N" for name in formation.names]
-    names += [f"torque limit of finger {i + 1} = {data.torque_limit[i]:g} N m" for i in range(2)]
-    units = ["N"] * n_c + ["N m"] * 2
-    times = PathMotion(data.curve, data.grid, profile).times
-    z = data.curve.evaluate(data.grid.s).z
-    parts = []
-    for row in np.argsort(-short.max(axis=0)):
-        worst = int(short[:, row].argmax())
-        if short[worst, row] > 1e-4:
-            parts.append(
-                f"{names[row]} is {short[worst, row]:.3g} {units[row]} short at "
-                f"t = {times[worst]:.4f} s ({describe_pose(z[worst])})"
-            )
-    return InfeasibleError(f"phase {phase} is infeasible: {'; '.join(parts)}")
-
-
-def _shortfalls(data: PhaseData, profile: Profile) -> Array:
-    """By how much c_n and tau miss their limits at the nodes, shape (n, n_c + 2) [N, N m]."""
-    slack = data.slack(data.nodes, profile)
-    c_n, torque = slack[:, :-4], np.minimum(slack[:, -4:-2], slack[:, -2:])
-    return -np.hstack([c_n, torque])

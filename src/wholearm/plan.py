@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from . import __version__
+from .advice import Change, Limit, describe_changes, round_outwards
 from .errors import InfeasibleError
 from .options import Objective, PlanOptions
 from .path import runs_on_curve, trace_phase, trace_phases
@@ -96,6 +97,7 @@ def solve_with(
         "phase_durations": [motion.duration for motion in motions],
         "intervals": options.intervals,
         "transcription": options.transcription,
+        "solver": options.solver,
         "time_weight": options.time_weight,
         "timings": {
             "trace": traced - started,
@@ -166,7 +168,10 @@ def _share_duration(
     times = [sum(least[phase.index].motion.duration for phase in block) for block in blocks]
     total = 2 * sum(times) if duration is None else duration
     if total <= sum(times):
+        # The least-time plan shows it; a little more leaves something to choose.
+        enough = Change(Limit("duration", total, "s", 1), round_outwards(1.005 * sum(times), 1))
         raise InfeasibleError(
-            f"duration = {total:g} s is not longer than the least time, {sum(times):.6g} s"
+            f"duration = {total:g} s is not longer than the least time, {sum(times):.6g} s; "
+            f"{describe_changes([enough])}"
         )
     return [total / sum(times) * own for own in times]

@@ -1,0 +1,196 @@
+"""Why a phase along a curve has no plan, and which single limit would have to give way.
+
+All limits are made soft and their shortfalls ranked. Then each limit alone is relaxed as little as
+the others allow, and a plan with that limit is asked for: only what was planned is advised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from .advice import Limit, Shortfall, describe_changes, find_changes, rank_shortfalls
+from .curve import Curve, describe_pose
+from .errors import InfeasibleError, JammingError, SolverError
+from .model import Array, Scene
+from .options import Objective
+from .pathdata import PhaseData, Relaxation
+from .pathmotion import PathMotion, Profile
+from .pathnlp import (
+    Scales,
+    Tightening,
+    build_path_nlp,
+    make_bounds,
+    pack,
+    parameters,
+    unpack,
+)
+
+_SHORT = 1e-4
+"""Least shortfall that counts [N or N m]."""
+
+Replan = Callable[[Curve, float], object]
+"""Plans the phase along a curve with a least normal force [N]; raises if there is no plan."""
+
+
+class _Candidate(NamedTuple):
+    """A limit that may give way, as a function of the NLP's relaxation."""
+
+    limit: Limit
+    relaxation: Relaxation
+    value: Callable[[float], float]
+    apply: Callable[[float], tuple[Curve, float]]
+
+
+def explain(
+    data: PhaseData,
+    profile: Profile,
+    scales: Scales,
+    phase: int,
+    stopped: str,
+    replan: Replan,
+) -> InfeasibleError | SolverError:
+    """Say why a phase has no plan and what would change that.
+
+    Parameters
+    ----------
+    data : PhaseData
+    profile : Profile
+        A guess of the motion.
+    scales : Scales
+    phase : int
+        The phase's number.
+    stopped : str
+        How the solver ended, in words.
+    replan : callable
+    """
+    eased = _ease(data, profile, scales)
+    if eased is None:
+        return SolverError(stopped)
+    shortfalls = _list_shortfalls(data, eased)
+    if not shortfalls:
+        return SolverError(f"{stopped} although limits can be kept")
+    candidates = _list_candidates(data, scales)
+
+    def find_least(index: int) -> float | None:
+        return _relax(data, eased, scales, candidates[index])
+
+    def can_plan(index: int, value: float) -> bool:
+        try:
+            replan(*candidates[index].apply(value))
+        except (InfeasibleError, SolverError, JammingError):
+            return False
+        return True
+
+    limits = [candidate.limit for candidate in candidates]
+    changes = find_changes(limits, find_least, can_plan)
+    return InfeasibleError(
+        f"phase {phase} is infeasible: {rank_shortfalls(shortfalls)}; {describe_changes(changes)}"
+    )
+
+
+def _ease(data: PhaseData, profile: Profile, scales: Scales) -> Profile | None:
+    """The motion with the least shortfalls when every limit is soft."""
+    formation = data.curve.formation
+    nlp = build_path_nlp(formation.n_contacts, len(data.grid.s) - 1, Objective.ELASTIC)
+    short = np.maximum(_shortfalls(data, profile), 0.0) + 0.1
+    result = nlp.solver(
+        x0=pack(nlp, profile, scales, 0.0, short),
+        p=parameters(nlp, data, scales, 1.0),
+        **make_bounds(nlp, data, scales, Tightening.none(data, None)),
+    )
+    if not nlp.solver.stats()["success"]:
+        return None
+    return unpack(nlp, data.grid, result["x"].full()[:, 0], scales)[0]
+
+
+def _shortfalls(data: PhaseData, profile: Profile) -> Array:
+    """By how much c_n and tau miss their limits at the nodes, shape (n, n_c + 2) [N, N m]."""
+    slack = data.slack(data.nodes, profile)
+    c_n, torque = slack[:, :-4], np.minimum(slack[:, -4:-2], slack[:, -2:])
+    return -np.hstack([c_n, torque])
+
+
+def _list_shortfalls(data: PhaseData, profile: Profile) -> list[Shortfall]:
+    short, n_c = _shortfalls(data, profile), data.curve.formation.n_contacts
+    names = [
+        f"c_n of {name} >= epsilon = {data.epsilon:g} N" for name in data.curve.formation.names
+    ]
+    names += [f"torque limit of finger {i + 1} = {data.torque_limit[i]:g} N m" for i in range(2)]
+    units = ["N"] * n_c + ["N m"] * 2
+    times = PathMotion(data.curve, data.grid, profile).times
+    z = data.curve.evaluate(data.grid.s).z
+    found = []
+    for row, (name, unit) in enumerate(zip(names, units, strict=True)):
+        worst = int(short[:, row].argmax())
+        if short[worst, row] > _SHORT:
+            where = f"t = {times[worst]:.4f} s ({describe_pose(z[worst])})"
+            found.append(Shortfall(name, float(short[worst, row]), unit, where))
+    return found
+
+
+def _list_candidates(data: PhaseData, scales: Scales) -> list[_Candidate]:
+    """Torque limits, speed limits if there are any, and epsilon."""
+    curve, epsilon = data.curve, data.epsilon
+    scene, n_c = curve.formation.scene, curve.formation.n_contacts
+    unit = np.eye(n_c + 3)
+    found = []
+    for i in range(2):
+        torque, speed = float(scene.torque_limit[i]), float(scene.speed_limit[i])
+        found.append(
+            _Candidate(
+                Limit(f"torque limit of finger {i + 1}", torque, "N m", 1),
+                Relaxation(torque * unit[n_c + i]),
+                lambda r, torque=torque: torque * (1 + r),
+                lambda value, i=i: (with_limit(curve, i, torque_limit=value), epsilon),
+            )
+        )
+        if np.isfinite(speed):
+            found.append(
+                _Candidate(
+                    Limit(f"speed limit of finger {i + 1}", speed, "rad/s", 1),
+                    Relaxation(unit[-1], i),
+                    lambda r, speed=speed: speed * np.sqrt(1 + r),
+                    lambda value, i=i: (with_limit(curve, i, speed_limit=value), epsilon),
+                )
+            )
+    found.append(
+        _Candidate(
+            Limit("epsilon", epsilon, "N", -1),
+            Relaxation(scales.force * unit[:n_c].sum(axis=0)),
+            lambda r: epsilon - r * scales.force,
+            lambda value: (curve, value),
+        )
+    )
+    return found
+
+
+def _relax(
+    data: PhaseData, profile: Profile, scales: Scales, candidate: _Candidate
+) -> float | None:
+    """The value at which one limit just lets all others be kept, if there is one."""
+    n_c, relaxation = data.curve.formation.n_contacts, candidate.relaxation
+    nlp = build_path_nlp(n_c, len(data.grid.s) - 1, Objective.RELAX)
+    short, worth = _shortfalls(data, profile).max(axis=0), relaxation.worth[: n_c + 2]
+    needed = np.divide(short, worth, out=np.zeros_like(short), where=worth > 0)
+    result = nlp.solver(
+        x0=pack(nlp, profile, scales, max(1.0, 1.5 * float(needed.max()))),
+        p=parameters(nlp, data, scales, 1.0, relaxation),
+        **make_bounds(nlp, data, scales, Tightening.none(data, None), relaxation),
+    )
+    if not nlp.solver.stats()["success"]:
+        return None
+    relaxed = unpack(nlp, data.grid, result["x"].full()[:, 0], scales)[1]
+    return float(candidate.value(relaxed))
+
+
+def with_limit(curve: Curve, finger: int, **limit: float) -> Curve:
+    """The curve with another `torque_limit` or `speed_limit` of one finger."""
+    scene = curve.formation.scene
+    right, left = scene.fingers
+    fingers = (replace(right, **limit), left) if finger == 0 else (right, replace(left, **limit))
+    other = Scene(scene.polygon, fingers, scene.friction, scene.gravity)
+    return replace(curve, formation=replace(curve.formation, scene=other))
