@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .contact import Expression
-from .fatrop import Stages, build_solver, describe_status
+from .fatrop import Stages, build_solver, describe_status, keep_bounds
 from .model import Array
 
 _Numbers = NDArray[np.int64]
@@ -89,6 +89,8 @@ class StagedSolver:
         self, x0: Array, p: Array, lbx: Array, ubx: Array, lbg: Array, ubg: Array, **_: Any
     ) -> dict[str, Expression]:
         """Solve; multipliers to start from are ignored, as fatrop has no use for them."""
+        lbx, ubx = keep_bounds(lbx, ubx)
+        lbg, ubg = keep_bounds(lbg, ubg)
         result = self.solver(
             x0=x0[self.unknowns],
             p=p,
@@ -100,9 +102,11 @@ class StagedSolver:
         own = self.rows != _COPY
         lam_g = np.zeros(len(lbg))
         lam_g[self.rows[own]] = result["lam_g"].full()[own, 0]
-        found = {key: result[key].full()[self.states, 0] for key in ("x", "lam_x")}
-        return {key: ca.DM(value) for key, value in (found | {"lam_g": lam_g}).items()} | {
-            "f": result["f"]
+        return {
+            "x": ca.DM(result["x"].full()[self.states]),
+            "f": result["f"],
+            "lam_x": ca.DM(result["lam_x"].full()[self.states]),
+            "lam_g": ca.DM(lam_g),
         }
 
     def stats(self) -> dict[str, Any]:
@@ -169,9 +173,7 @@ def _sizes(
     return Stages(states, [*states[1:], 0], [*rows, per_node], equations.tolist())
 
 
-def _with_copies(
-    chain: Chain, links: Links, copied: _Numbers, copies: Expression
-) -> Expression:
+def _with_copies(chain: Chain, links: Links, copied: _Numbers, copies: Expression) -> Expression:
     """What links nodes, with the later one of each two replaced by its copy."""
     values = ca.SX(links.values)
     for parity in (0, 1):

@@ -14,7 +14,8 @@ What an NLP has to provide, with stages k = 0 .. N of states x_k and controls u_
   sqrt(fmax(b, least));
 - unknowns scaled to about 1.
 
-It starts from x0 alone: it has no use for multipliers.
+It starts from x0 alone: it has no use for multipliers. Bounds have to go through `keep_bounds`, or
+they are missed by some 1e-8.
 """
 
 from __future__ import annotations
@@ -23,14 +24,23 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import casadi as ca
+import numpy as np
 
 from .contact import Expression
+from .model import Array
 
 _OPTIONS = {
     "print_level": 0,
     # The complementarity left at the end is of this size per row, and adds up over the rows.
     "tolerance": 1e-9,
+    # Without multipliers a start is only as good as the barrier is low.
+    "mu_init": 1e-5,
+    "bound_push": 1e-8,
+    "mu_superlinear_decrease_power": 1.2,
+    "max_iter": 300,
 }
+_RELAXED = 1e-8
+"""By how much fatrop relaxes bounds, relative to the larger of 1 and theirs; it is no option."""
 _STATUS = (
     "solved",
     "too many iterations",
@@ -64,7 +74,9 @@ class Stages(NamedTuple):
     equations: Sequence[bool]
 
 
-def build_solver(name: str, nlp: dict[str, Expression], stages: Stages, **options: Any) -> Expression:
+def build_solver(
+    name: str, nlp: dict[str, Expression], stages: Stages, **options: Any
+) -> Expression:
     """Return a CasADi function that solves a staged NLP with fatrop.
 
     Parameters
@@ -91,6 +103,16 @@ def build_solver(name: str, nlp: dict[str, Expression], stages: Stages, **option
         "error_on_fail": False,
     }
     return ca.nlpsol(name, "fatrop", nlp, casadi_options)
+
+
+def keep_bounds(low: Array, high: Array) -> tuple[Array, Array]:
+    """Bounds that fatrop relaxes to `low` and `high`; equal ones stay."""
+    loose = low < high
+
+    def inset(bound: Array) -> Array:
+        return np.where(loose & np.isfinite(bound), _RELAXED * np.maximum(1.0, np.abs(bound)), 0.0)
+
+    return low + inset(low), high - inset(high)
 
 
 def describe_status(solver: Expression) -> str:

@@ -92,9 +92,9 @@ class PlanOptions:
             allowed = " and ".join(SOLVERS)
             raise InputError("", "solver", f"{self.solver!r} given; allowed are {allowed}")
         if self.solver == "fatrop" and self.objective is Objective.MARGIN:
-            raise InputError("", "solver", "'fatrop' plans time and effort; margin needs ipopt")
+            raise InputError("", "solver", "'fatrop' is for time and effort; margin needs ipopt")
         if self.solver == "fatrop" and self.transcription == "time":
-            raise InputError("", "solver", "'fatrop' plans along curves; the time domain needs ipopt")
+            raise InputError("", "solver", "'fatrop' is for curves; the time domain needs ipopt")
         weight = require_number(self.time_weight, "time_weight", positive=True)
         object.__setattr__(self, "time_weight", weight)
         if self.duration is not None:

@@ -113,7 +113,7 @@ class PhaseData(NamedTuple):
         return np.asarray(((limit / np.maximum(np.abs(places.rates), 1e-12)) ** 2).min(axis=1))
 
     def relative_rates(self, places: Places, finger: int | None) -> Array:
-        """d theta / ds of a joint over its speed limit, shape (n,) [s/m]; zero for no joint."""
+        """Rate of a joint over its speed limit, shape (n,) [s/m]; zero without a joint."""
         if finger is None:
             return np.zeros(len(places.rates))
         limit = self.curve.formation.scene.speed_limit[finger]

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from .advice import Limit, Shortfall, describe_changes, find_changes, rank_shortfalls
 from .curve import Curve, describe_pose
 from .errors import InfeasibleError, JammingError, SolverError
-from .model import Array, Scene
+from .model import Array
 from .options import Objective
 from .pathdata import PhaseData, Relaxation
 from .pathmotion import PathMotion, Profile
@@ -37,12 +37,25 @@ Replan = Callable[[Curve, float], object]
 
 
 class _Candidate(NamedTuple):
-    """A limit that may give way, as a function of the NLP's relaxation."""
+    """A limit that may give way, and what the NLP's relaxation is to it."""
 
     limit: Limit
     relaxation: Relaxation
-    value: Callable[[float], float]
-    apply: Callable[[float], tuple[Curve, float]]
+    key: str
+    finger: int | None
+
+    def value(self, relaxed: float, scales: Scales) -> float:
+        """The limit when relaxed so far."""
+        if self.key == "epsilon":
+            return self.limit.value - relaxed * scales.force
+        power = 1.0 if self.key == "torque_limit" else 0.5
+        return float(self.limit.value * (1 + relaxed) ** power)
+
+    def apply(self, data: PhaseData, value: float) -> tuple[Curve, float]:
+        """Curve and epsilon with another value of the limit."""
+        if self.finger is None:
+            return data.curve, value
+        return with_limit(data.curve, self.finger, self.key, value), data.epsilon
 
 
 def explain(
@@ -80,7 +93,7 @@ def explain(
 
     def can_plan(index: int, value: float) -> bool:
         try:
-            replan(*candidates[index].apply(value))
+            replan(*candidates[index].apply(data, value))
         except (InfeasibleError, SolverError, JammingError):
             return False
         return True
@@ -134,38 +147,19 @@ def _list_shortfalls(data: PhaseData, profile: Profile) -> list[Shortfall]:
 
 def _list_candidates(data: PhaseData, scales: Scales) -> list[_Candidate]:
     """Torque limits, speed limits if there are any, and epsilon."""
-    curve, epsilon = data.curve, data.epsilon
-    scene, n_c = curve.formation.scene, curve.formation.n_contacts
+    scene, n_c = data.curve.formation.scene, data.curve.formation.n_contacts
     unit = np.eye(n_c + 3)
     found = []
     for i in range(2):
         torque, speed = float(scene.torque_limit[i]), float(scene.speed_limit[i])
-        found.append(
-            _Candidate(
-                Limit(f"torque limit of finger {i + 1}", torque, "N m", 1),
-                Relaxation(torque * unit[n_c + i]),
-                lambda r, torque=torque: torque * (1 + r),
-                lambda value, i=i: (with_limit(curve, i, torque_limit=value), epsilon),
-            )
-        )
+        limit = Limit(f"torque limit of finger {i + 1}", torque, "N m", 1)
+        found.append(_Candidate(limit, Relaxation(torque * unit[n_c + i]), "torque_limit", i))
         if np.isfinite(speed):
-            found.append(
-                _Candidate(
-                    Limit(f"speed limit of finger {i + 1}", speed, "rad/s", 1),
-                    Relaxation(unit[-1], i),
-                    lambda r, speed=speed: speed * np.sqrt(1 + r),
-                    lambda value, i=i: (with_limit(curve, i, speed_limit=value), epsilon),
-                )
-            )
-    found.append(
-        _Candidate(
-            Limit("epsilon", epsilon, "N", -1),
-            Relaxation(scales.force * unit[:n_c].sum(axis=0)),
-            lambda r: epsilon - r * scales.force,
-            lambda value: (curve, value),
-        )
-    )
-    return found
+            limit = Limit(f"speed limit of finger {i + 1}", speed, "rad/s", 1)
+            found.append(_Candidate(limit, Relaxation(unit[-1], i), "speed_limit", i))
+    limit = Limit("epsilon", data.epsilon, "N", -1)
+    every = scales.force * unit[:n_c].sum(axis=0)
+    return [*found, _Candidate(limit, Relaxation(every), "epsilon", None)]
 
 
 def _relax(
@@ -184,13 +178,16 @@ def _relax(
     if not nlp.solver.stats()["success"]:
         return None
     relaxed = unpack(nlp, data.grid, result["x"].full()[:, 0], scales)[1]
-    return float(candidate.value(relaxed))
+    return candidate.value(relaxed, scales)
 
 
-def with_limit(curve: Curve, finger: int, **limit: float) -> Curve:
+def with_limit(curve: Curve, finger: int, key: str, value: float) -> Curve:
     """The curve with another `torque_limit` or `speed_limit` of one finger."""
     scene = curve.formation.scene
-    right, left = scene.fingers
-    fingers = (replace(right, **limit), left) if finger == 0 else (right, replace(left, **limit))
-    other = Scene(scene.polygon, fingers, scene.friction, scene.gravity)
+    change: Any = {key: value}
+    right, left = (
+        replace(link, **change) if index == finger else link
+        for index, link in enumerate(scene.fingers)
+    )
+    other = replace(scene, fingers=(right, left))
     return replace(curve, formation=replace(curve.formation, scene=other))

@@ -249,4 +249,3 @@ def guess(data: PhaseData) -> tuple[Profile, Scales]:
     force = max(1.0, data.epsilon, float(np.abs(middle).mean()))
     scales = Scales(length, 0.6 * duration, force)
     return Profile(height * slope, height * shape, middle), scales
-
