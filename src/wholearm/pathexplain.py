@@ -31,6 +31,8 @@ from .pathnlp import (
 
 _SHORT = 1e-4
 """Least shortfall that counts [N or N m]."""
+_FORCE = 10.0
+"""Largest unit of force when a limit is relaxed [N]."""
 
 Replan = Callable[[Curve, float], object]
 """Plans the phase along a curve with a least normal force [N]; raises if there is no plan."""
@@ -86,6 +88,7 @@ def explain(
     shortfalls = _list_shortfalls(data, eased)
     if not shortfalls:
         return SolverError(f"{stopped} although limits can be kept")
+    scales = _quicken(data, scales)
     candidates = _list_candidates(data, scales)
 
     def find_least(index: int) -> float | None:
@@ -103,6 +106,17 @@ def explain(
     return InfeasibleError(
         f"phase {phase} is infeasible: {rank_shortfalls(shortfalls)}; {describe_changes(changes)}"
     )
+
+
+def _quicken(data: PhaseData, scales: Scales) -> Scales:
+    """Units for motions as quick as a fall, with forces that a hand may have.
+
+    In units of a slow motion, or of an absurd epsilon, the small costs that choose among equals
+    would outweigh what is relaxed.
+    """
+    length, gravity = data.curve.length, data.curve.formation.scene.gravity
+    pace = np.sqrt(length / max(gravity, 1e-9))
+    return scales._replace(time=min(scales.time, pace), force=min(scales.force, _FORCE))
 
 
 def _ease(data: PhaseData, profile: Profile, scales: Scales) -> Profile | None:

@@ -42,6 +42,8 @@ ROUNDS = 40
 """Most times that the NLP is solved for one phase."""
 _COARSE = 1.5e-4
 """Miss, over the typical force, above which the grid is drawn together."""
+_SLOW = -12
+"""Height of the slowest guess, as a power of two times that of a fall."""
 _OVER = 1.05
 """How much more than the miss a limit is tightened."""
 
@@ -100,7 +102,7 @@ def plan_path(
         robust = replace(options, solver="ipopt")
         raise late or explain(
             stuck.data,
-            *guess(stuck.data),
+            *guess_slowly(stuck.data),
             phase,
             str(stuck),
             lambda changed, least: _plan(changed, least, robust, phase, duration),
@@ -212,40 +214,64 @@ def _solve(
 
 
 def guess(data: PhaseData) -> tuple[Profile, Scales]:
-    """Guess a motion: b a parabola in s as high as limits allow, the squeeze amid its range."""
-    length, s = data.curve.length, data.grid.s
-    shape, slope = 4 * s / length * (1 - s / length), 2 * (1 - 2 * s / length) / length
+    """Guess a motion: b a parabola in s as high as limits allow, the squeeze amid its range.
 
+    Where limits forbid even a slow one, it is as quick as a fall: a plan, if there is one, is not
+    slow, and in units of a slow one the costs that choose among equals would weigh too much.
+    """
     b_max = data.largest_b(data.nodes)
-
-    def squeeze_range(height: float) -> tuple[Array, Array]:
-        profile = Profile(height * slope, height * shape, 0.0 * s)
-        slack = data.slack(data.nodes, profile)
-        forces = data.nodes.forces
-        rate = np.hstack([forces.Cl, forces.Tl, -forces.Tl])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            bound = -slack / rate
-        low = np.where(rate > 0, bound, -np.inf).max(axis=1)
-        high = np.where(rate < 0, bound, np.inf).min(axis=1)
-        return low, high
+    fall = _fall(data)
 
     def possible(height: float) -> bool:
-        low, high = squeeze_range(height)
-        return bool((low <= high).all() and (height * shape <= b_max).all())
+        low, high = _squeeze_range(data, height)
+        b = _parabola(data, height)[1]
+        return bool((low <= high).all() and (b <= b_max).all())
 
     # Bisection over heights from 2^-12 to 2^8 times that of a fall over this length.
-    low_power, high_power = -12.0, 8.0
-    fall = 2 * data.curve.formation.scene.gravity * length + 1e-9
+    low_power, high_power = float(_SLOW), 8.0
     for _ in range(7):
         power = (low_power + high_power) / 2
         if possible(fall * 2**power):
             low_power = power
         else:
             high_power = power
-    height = 0.7 * fall * 2**low_power
-    low, high = squeeze_range(height)
+    none = low_power == _SLOW
+    return _guess_at(data, 0.7 * fall * (1.0 if none else 2**low_power))
+
+
+def guess_slowly(data: PhaseData) -> tuple[Profile, Scales]:
+    """Guess a slow motion, whatever limits say."""
+    return _guess_at(data, 0.7 * _fall(data) * 2.0**_SLOW)
+
+
+def _fall(data: PhaseData) -> float:
+    """The b of a fall over the length of the curve [m^2/s^2]."""
+    return 2 * data.curve.formation.scene.gravity * data.curve.length + 1e-9
+
+
+def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
+    """The a and b of a parabola in s of this height."""
+    x = data.grid.s / data.curve.length
+    return height * 2 * (1 - 2 * x) / data.curve.length, height * 4 * x * (1 - x)
+
+
+def _squeeze_range(data: PhaseData, height: float) -> tuple[Array, Array]:
+    """Least and largest squeeze that limits allow at each node."""
+    a, b = _parabola(data, height)
+    slack = data.slack(data.nodes, Profile(a, b, np.zeros_like(a)))
+    forces = data.nodes.forces
+    rate = np.hstack([forces.Cl, forces.Tl, -forces.Tl])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        bound = -slack / rate
+    low = np.where(rate > 0, bound, -np.inf).max(axis=1)
+    high = np.where(rate < 0, bound, np.inf).min(axis=1)
+    return low, high
+
+
+def _guess_at(data: PhaseData, height: float) -> tuple[Profile, Scales]:
+    low, high = _squeeze_range(data, height)
     middle = np.where(np.isfinite(low + high) & (low <= high), (low + high) / 2, 0.0)
-    duration = np.pi / 2 * length / np.sqrt(height)
+    duration = np.pi / 2 * data.curve.length / np.sqrt(height)
     force = max(1.0, data.epsilon, float(np.abs(middle).mean()))
-    scales = Scales(length, 0.6 * duration, force)
-    return Profile(height * slope, height * shape, middle), scales
+    scales = Scales(data.curve.length, 0.6 * duration, force)
+    return Profile(*_parabola(data, height), middle), scales
