@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import casadi as ca
@@ -26,13 +27,10 @@ def chain() -> Chain:
     rng = np.random.default_rng(11)
     parts = [ca.SX.sym(f"x{k}", width) for k, width in enumerate(WIDTHS)]
     p = ca.SX.sym("p")
-    links = [
-        ca.sum1(after) - p * before[0] - 0.3
-        for before, after in zip(parts[:-1], parts[1:], strict=True)
-    ]
+    links = [ca.sum1(after) - p * before[0] - 0.3 for before, after in pairwise(parts)]
     costs = [
         ca.exp(0.2 * (before[0] + after[-1])) + 0.1 * (before[-1] - after[0]) ** 2
-        for before, after in zip(parts[:-1], parts[1:], strict=True)
+        for before, after in pairwise(parts)
     ]
     pulls = [ca.sumsqr(part - rng.uniform(-2, 2, part.numel())) for part in parts]
     rows = [ca.horzcat(ca.sum1(part), part[0] - 0.5 * part[-1]) for part in parts]

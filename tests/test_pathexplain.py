@@ -247,7 +247,7 @@ def test_too_short_a_duration_is_named(curves: tuple[Curve, ...], duration: floa
 
 def test_a_duration_for_all_phases_is_advised() -> None:
     problem = edited({})
-    with pytest.raises(InfeasibleError, match="^duration = 0.3 s is not longer") as caught:
+    with pytest.raises(InfeasibleError, match=r"^duration = 0\.3 s is not longer") as caught:
         solve(problem, objective="margin", duration=0.3)
     value = read_advice(str(caught.value))["duration"]
     assert solve(problem, objective="margin", duration=value).duration <= value * (1 + 1e-6)
@@ -269,5 +269,5 @@ def test_changing_one_limit_leaves_everything_else(curves: tuple[Curve, ...]) ->
 def test_a_solver_that_fails_by_itself_is_not_blamed_on_limits(curves: tuple[Curve, ...]) -> None:
     """Least effort of phase 4 is beyond fatrop's numerics; Ipopt solves it."""
     options = PlanOptions("effort", solver="fatrop")
-    with pytest.raises(SolverError, match="^phase 4: fatrop stopped with .* limits can be kept"):
+    with pytest.raises(SolverError, match=r"^phase 4: fatrop stopped with .* limits can be kept"):
         plan_path(curves[3], 0.05, options, 4)

@@ -198,6 +198,20 @@ def test_one_build_serves_every_phase(curves: tuple[Curve, ...]) -> None:
         assert len(parameters(nlp, data, scales, 1.0)) == nlp.solver.size1_in("p")
 
 
+@pytest.mark.parametrize("objective", Objective)
+def test_building_stays_linear(objective: Objective) -> None:
+    """No unknown in more than a few rows, and no more than one row with many unknowns.
+
+    Otherwise the Jacobian would have to be found one unknown at a time.
+    """
+    x, p = build_path_nlp(4, INTERVALS, objective).solver.oracle().sx_in()
+    _, g = build_path_nlp(4, INTERVALS, objective).solver.oracle()(x, p)
+    pattern = ca.jacobian(g, x).sparsity()
+    rows, columns = (np.array(part) for part in pattern.get_triplet())
+    assert np.bincount(columns).max() <= 14
+    assert (np.bincount(rows) > 8).sum() <= (objective is Objective.MARGIN)
+
+
 def test_effort_is_not_symbolic_in_the_data() -> None:
     """The same expression graph for every phase: no number of a scene is built in."""
     oracle = build_path_nlp(4, INTERVALS, Objective.EFFORT).solver.oracle()
