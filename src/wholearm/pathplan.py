@@ -13,14 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .advice import Limit, describe_changes, find_changes
 from .chain import StagedSolver
 from .curve import Curve
 from .errors import InfeasibleError, SolverError, WholearmError
 from .model import Array
 from .options import Objective, PlanOptions
 from .pathdata import PhaseData, fit_torque, prepare
-from .pathexplain import explain
 from .pathmotion import PathMotion, Profile, draw_together, make_grid
 from .pathnlp import (
     PathNLP,
@@ -97,6 +95,8 @@ def plan_path(
     try:
         plan = _plan(curve, epsilon, options, phase, duration)
     except _StuckError as stuck:
+        from .pathexplain import explain
+
         late = _explain_duration(curve, epsilon, options, phase, duration)
         # Advice is about the problem: it does not depend on the solver.
         robust = replace(options, solver="ipopt")
@@ -117,6 +117,8 @@ def _explain_duration(
     curve: Curve, epsilon: float, options: PlanOptions, phase: int, duration: float | None
 ) -> InfeasibleError | None:
     """Say so if the duration is shorter than the least time, and which one would do."""
+    from .advice import Limit, describe_changes, find_changes
+
     if duration is None:
         return None
     fastest = replace(options, objective=Objective.TIME, duration=None)

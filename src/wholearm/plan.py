@@ -16,7 +16,6 @@ import casadi as ca
 import numpy as np
 
 from . import __version__
-from .advice import Change, Limit, describe_changes, round_outwards
 from .errors import InfeasibleError
 from .options import Objective, PlanOptions
 from .path import runs_on_curve, trace_phase, trace_phases
@@ -168,6 +167,8 @@ def _share_duration(
     times = [sum(least[phase.index].motion.duration for phase in block) for block in blocks]
     total = 2 * sum(times) if duration is None else duration
     if total <= sum(times):
+        from .advice import Change, Limit, describe_changes, round_outwards
+
         # The least-time plan shows it; a little more leaves something to choose.
         enough = Change(Limit("duration", total, "s", 1), round_outwards(1.005 * sum(times), 1))
         raise InfeasibleError(
