@@ -27,7 +27,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from .chain import Chain, Links, stage
+from .nodechain import Chain, Links, stage
 from .contact import Expression
 from .ipopt import build_solver
 from .model import Array
@@ -102,7 +102,7 @@ class PathNLP:
 
     Attributes
     ----------
-    solver : casadi.Function or wholearm.chain.StagedSolver
+    solver : casadi.Function or wholearm.nodechain.StagedSolver
         Takes x0, p, bounds and multipliers; see `build_path_nlp` for their order.
     n_contacts, intervals : int
     objective : Objective

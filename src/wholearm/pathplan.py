@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .chain import StagedSolver
+from .nodechain import StagedSolver
 from .curve import Curve
 from .errors import InfeasibleError, SolverError, WholearmError
 from .model import Array

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from wholearm.chain import Chain, Links, StagedSolver, stage
+from wholearm.nodechain import Chain, Links, StagedSolver, stage
 from wholearm.curve import Curve
 from wholearm.ipopt import build_solver
 from wholearm.model import Array
