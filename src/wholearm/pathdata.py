@@ -80,7 +80,7 @@ class PhaseData(NamedTuple):
 
         In the order c_n - epsilon - margin, tau + limit, limit - tau.
         """
-        c_n, tau = places.forces.c_n(*profile), places.forces.tau(*profile)
+        c_n, tau = places.forces.c(*profile), places.forces.tau(*profile)
         limit = self.torque_limit
         return np.hstack([c_n - self.epsilon - margin, tau + limit, limit - tau])
 
