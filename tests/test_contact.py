@@ -156,7 +156,8 @@ def test_slip_coordinate_integrates_the_sliding_velocity(scene: Scene, name: str
         A_t = formation.evaluate(z[None], v[None]).A_t[0]
         np.testing.assert_allclose(function(z)[1].full(), A_t, atol=1e-14)
         rise = float(function(z + STEP * v)[0] - function(z - STEP * v)[0])
-        assert rise / (2 * STEP) == pytest.approx(A_t[0] @ v, abs=DIFFERENCE)
+        # On a tip's arc truncation is (STEP / radius)^2.
+        assert rise / (2 * STEP) == pytest.approx(A_t[0] @ v, abs=(STEP / 0.005) ** 2)
 
 
 @pytest.mark.parametrize("name", NAMES)
