@@ -42,6 +42,31 @@ def name_holds(formation: Formation, epsilon: float) -> list[str]:
     return names
 
 
+def find_weakest(formation: Formation, held: Array) -> tuple[int, float, float | None]:
+    """The contact that gives way first, by pulling or else by slipping.
+
+    Parameters
+    ----------
+    held : ndarray, shape (n_c + 2 R,), [N]
+        H c.
+
+    Returns
+    -------
+    row : int
+        The contact.
+    c_n : float, [N]
+    c_t : float or None, [N]
+        If it slips.
+    """
+    count, rolls = formation.n_contacts, formation.n_rolling
+    row = int(held[:count].argmin())
+    if held[row] < 0 or not rolls:
+        return row, float(held[row]), None
+    k = int(held[count:].argmin()) % rolls
+    row = formation.rolling_rows[k]
+    return row, float(held[row]), float(held[count + rolls + k] - held[count + k]) / 2
+
+
 def slip_margins(formation: Formation, c_n: Array, c_t: Array) -> Array:
     """Margin of each rolling contact to slipping, mu c_n - |c_t|, shape (..., R) [N].
 
