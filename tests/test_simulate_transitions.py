@@ -225,7 +225,7 @@ def test_a_release_as_the_squeeze_fades_and_a_contact_held() -> None:
     assert abs(release.value) < 1e-9
     departing = trajectory.motions[0].evaluate(np.array([release.time])).c_n[0]
     assert abs(departing[1]) < 1e-8 and np.delete(departing, 1).min() > 1.0
-    # Palm friction then stops the vertex while the object turns on, though the phase plans it as sliding.
+    # Palm friction then stops the vertex, which the phase plans as sliding, while the object turns.
     assert simulation.outcome.kind is OutcomeKind.HELD
     held = simulation.events[-1]
     assert held.kind is EventKind.HELD and held.contact == "v1-palm" and held.phase == 1
