@@ -57,7 +57,7 @@ _STYLE: Any = {
     "pdf.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "wholearm",
 }  # fmt: skip
 _LEFT, _RIGHT, _BOTTOM, _TOP = 0.80, 1.30, 0.55, 0.40  # margins [in]; parts of the figure [in]:
-_TORQUES, _CONES, _GAP, _CAPTION, _STRIP = 1.75, 0.95, 0.22, 0.77, 1.75
+_TORQUES, _CONES, _GAP, _CAPTION, _STRIP = 1.75, 0.85, 0.22, 0.77, 1.75
 
 
 class ContactStyle(NamedTuple):
