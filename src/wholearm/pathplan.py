@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .cones import name_holds
 from .curve import Curve, describe_pose
 from .errors import InfeasibleError, SolverError
 from .model import Array
@@ -79,7 +80,8 @@ def plan_path(
     SolverError
         If Ipopt stops without an answer.
     """
-    nlp = build_path_nlp(curve.formation.n_contacts, options.intervals, options.goal)
+    formation = curve.formation
+    nlp = build_path_nlp(formation.n_contacts, options.intervals, options.goal, formation.n_rolling)
     data = prepare(curve, epsilon, make_grid(curve, options.intervals), phase)
     profile, scales = guess(data)
     tightening = Tightening.none(data, duration)
@@ -189,7 +191,8 @@ def guess(data: PhaseData) -> tuple[Profile, Scales]:
 def explain(data: PhaseData, phase: int, status: str) -> InfeasibleError | SolverError:
     """Say why a phase has no plan: re-solve with every limit soft and rank the shortfalls."""
     formation = data.curve.formation
-    nlp = build_path_nlp(formation.n_contacts, len(data.grid.s) - 1, Objective.ELASTIC)
+    intervals, n_c = len(data.grid.s) - 1, formation.n_contacts
+    nlp = build_path_nlp(n_c, intervals, Objective.ELASTIC, formation.n_rolling)
     profile, scales = guess(data)
     bounds = make_bounds(nlp, data, scales, Tightening.none(data, None))
     short = np.maximum(_shortfalls(data, profile), 0.0) + 0.1
@@ -198,14 +201,14 @@ def explain(data: PhaseData, phase: int, status: str) -> InfeasibleError | Solve
     if not nlp.solver.stats()["success"]:
         return SolverError(f"phase {phase}: Ipopt stopped with {status}")
     profile, _ = unpack(nlp, data.grid, result["x"].full()[:, 0], scales)
-    short, n_c = _shortfalls(data, profile), formation.n_contacts
+    short = _shortfalls(data, profile)
     if short.max() < 1e-4:
         return SolverError(
             f"phase {phase}: Ipopt stopped with {status} although limits can be kept"
         )
-    names = [f"c_n of {name} >= epsilon = {data.epsilon:g} N" for name in formation.names]
+    names = name_holds(formation, data.epsilon)
+    units = ["N"] * len(names) + ["N m"] * 2
     names += [f"torque limit of finger {i + 1} = {data.torque_limit[i]:g} N m" for i in range(2)]
-    units = ["N"] * n_c + ["N m"] * 2
     times = PathMotion(data.curve, data.grid, profile).times
     z = data.curve.evaluate(data.grid.s).z
     parts = []
@@ -220,7 +223,7 @@ def explain(data: PhaseData, phase: int, status: str) -> InfeasibleError | Solve
 
 
 def _shortfalls(data: PhaseData, profile: Profile) -> Array:
-    """By how much c_n and tau miss their limits at the nodes, shape (n, n_c + 2) [N, N m]."""
+    """By how much H c and tau miss their limits at the nodes, shape (n, n_h + 2) [N, N m]."""
     slack = data.slack(data.nodes, profile)
-    c_n, torque = slack[:, :-4], np.minimum(slack[:, -4:-2], slack[:, -2:])
-    return -np.hstack([c_n, torque])
+    held, torque = slack[:, :-4], np.minimum(slack[:, -4:-2], slack[:, -2:])
+    return -np.hstack([held, torque])
