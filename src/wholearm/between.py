@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .model import Array
+from .pathdata import find_least
 from .stage import Stage
 from .timemotion import StageMotion
 from .timenlp import CLEAR, TimeNLP
@@ -73,21 +74,18 @@ def find_misses(stage: Stage, motion: StageMotion, least: float) -> Limits:
     formation, inner = stage.formation, np.linspace(1e-9, 1 - 1e-9, LOOKS)
     places = stage.guess.places(inner).ravel()
     samples = motion.evaluate(places * motion.duration)
-    over = np.abs(samples.c_t) - formation.friction * samples.c_n
+    grip = formation.friction * samples.c_n - np.abs(samples.c_t)
     gaps = formation.evaluate_limits(samples.z)[:, list(stage.watched)]
     clear = CLEAR / 2 * np.isin(stage.watched, stage.released)
     later = (not stage.opens) | (places > 1 / 2)
     tables = (
-        least - samples.c_n,
-        over[:, list(formation.rolling_rows)],
-        np.outer(later, clear) - gaps,
+        samples.c_n - least,
+        grip[:, list(formation.rolling_rows)],
+        gaps - np.outer(later, clear),
     )
-    return Limits(
-        *(
-            np.maximum(table.reshape(stage.intervals, LOOKS, table.shape[1]).max(axis=1), 0.0)
-            for table in tables
-        )
-    )
+    shape = (stage.intervals, LOOKS)
+    slack = (find_least(table.reshape(*shape, table.shape[1])) for table in tables)
+    return Limits(*(np.maximum(-part, 0.0) for part in slack))
 
 
 def raise_bounds(
