@@ -103,11 +103,10 @@ def raise_bounds(
         formation, own = stage.formation, nlp.rows_of[k]
         floor = epsilon + raised.c_n
         c_n = nlp.layouts[k].forces[:, :, : formation.n_contacts]
-        # With a margin the rows alone hold c_n.
-        if nlp.lasts < 0:
+        # Where rows hold c_n at the points too, its own bounds must not.
+        if own.limits.presses.shape[1] <= 2:
             low_x[c_n] = floor[:, None]
-        low[own.presses] = floor[:, None]
-        cones = own.points.shape[2] - 2 * formation.n_rolling
-        low[own.points[..., cones:]] = np.tile(raised.cone, 2)[:, None]
+        low[own.limits.presses] = floor[:, None]
+        low[own.limits.cones] = np.tile(raised.cone, 2)[:, None]
         low[own.watches] += raised.gap[:, None] / formation.scene.polygon.gyration_radius
     return low, high
