@@ -61,7 +61,7 @@ SLIDING = 0.05
 would be held by friction."""
 SHORTEST, LONGEST = 1e-4, 20.0
 """Least and largest duration of a stage [s]."""
-_HURRY = 1e-3
+_HURRY = 1e-2
 """Weight of time against shortfalls [N/s]: keeps a motion that is short of something brisk."""
 PUSH = 1e-6
 """How far the first guess is kept from its bounds."""
