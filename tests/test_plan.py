@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 from typing import Any
 
@@ -8,6 +9,7 @@ import pytest
 from scipy.integrate import trapezoid
 
 from plane import measure_gaps, measure_slip, unbalance
+from tipping import box, tip, tipped
 from wholearm.errors import InfeasibleError, InputError
 from wholearm.model import Array
 from wholearm.plan import solve
@@ -271,3 +273,11 @@ def test_bad_options(heptagon: Problem, options: dict[str, Any], key: str) -> No
 def test_unknown_option(heptagon: Problem) -> None:
     with pytest.raises(TypeError, match="colour"):
         solve(heptagon, colour="red")
+
+
+def test_rolling_is_named_in_meta_and_refused_in_the_time_domain() -> None:
+    assert tipped().meta["rolling"] == [[], ["v1-palm"], []]
+    one = dataclasses.replace(box(), start=tip().start, phases=box().phases[1:2])
+    with pytest.raises(InputError, match="v1-palm cannot roll in the time domain") as caught:
+        solve(one, transcription="time")
+    assert caught.value.key == "phases[2].contacts"

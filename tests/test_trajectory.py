@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tipping import tipped
 from wholearm.errors import InputError
 from wholearm.model import Array
 from wholearm.torque import TorqueProfile
@@ -257,3 +258,23 @@ def test_unwritable_place_leaves_nothing(trajectory: Trajectory, tmp_path: Path)
     with pytest.raises(InputError, match="cannot be written"):
         trajectory.save(tmp_path / "absent" / "a.npz")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_rolling_contacts_are_known_and_their_friction_is_interpolated(tmp_path: Path) -> None:
+    plan = tipped()
+    plan.save(tmp_path / "box.npz")
+    loaded = load_trajectory(tmp_path / "box.npz")
+    assert loaded.meta["rolling"] == [[], ["v1-palm"], []]
+    column = plan.contacts.index("v1-palm")
+    expected = np.zeros(plan.c_t.shape, dtype=bool)
+    expected[plan.phase == 1, column] = True
+    for trajectory in (plan, loaded):
+        np.testing.assert_array_equal(trajectory.rolling, expected)
+    t = np.linspace(0.01, plan.motions[1].duration - 0.01, 50)
+    exact, interpolated = (one.motions[1].evaluate(t).c_t[:, 0] for one in (plan, loaded))
+    assert np.ptp(exact) > 0.3
+    np.testing.assert_allclose(interpolated, exact, atol=2e-3)
+
+
+def test_nothing_rolls_unless_it_is_said(trajectory: Trajectory) -> None:
+    assert trajectory.rolling.shape == trajectory.c_t.shape and not trajectory.rolling.any()
