@@ -20,7 +20,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -198,7 +198,7 @@ def build_path_nlp(
     parameters = ca.vertcat(ends, h, weight, *(ca.vec(block) for block in coefficients))
     nlp = {"x": x, "p": parameters, "f": cost + calm, "g": constraints}
     # Started from nowhere near its optimum, the elastic NLP needs the more robust strategy.
-    strategy = {"mu_strategy": "monotone"} if elastic else {"mu_oracle": "probing"}
+    strategy: dict[str, Any] = {"mu_strategy": "monotone"} if elastic else {"mu_oracle": "probing"}
     solver = build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
     seconds = time.perf_counter() - started
     return PathNLP(solver, n_contacts, n_rolling, intervals, objective, seconds)
