@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import dataclasses
 import json
 from typing import Any
 
@@ -9,7 +8,7 @@ import pytest
 from scipy.integrate import trapezoid
 
 from plane import measure_gaps, measure_slip, unbalance
-from tipping import box, tip, tipped
+from tipping import tipped
 from wholearm.errors import InfeasibleError, InputError
 from wholearm.model import Array
 from wholearm.plan import solve
@@ -275,9 +274,6 @@ def test_unknown_option(heptagon: Problem) -> None:
         solve(heptagon, colour="red")
 
 
-def test_rolling_is_named_in_meta_and_refused_in_the_time_domain() -> None:
+def test_meta_names_what_rolls(trajectory: Trajectory) -> None:
     assert tipped().meta["rolling"] == [[], ["v1-palm"], []]
-    one = dataclasses.replace(box(), start=tip().start, phases=box().phases[1:2])
-    with pytest.raises(InputError, match="v1-palm cannot roll in the time domain") as caught:
-        solve(one, transcription="time")
-    assert caught.value.key == "phases[2].contacts"
+    assert trajectory.meta["rolling"] == [[]] * 5

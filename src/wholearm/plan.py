@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from . import __version__
-from .errors import InfeasibleError, InputError
+from .errors import InfeasibleError
 from .options import Objective, PlanOptions
 from .path import runs_on_curve, trace_phase, trace_phases
 from .pathplan import plan_path
@@ -152,25 +152,12 @@ def _plan_blocks(
             plans.append(plan_path(curve, problem.epsilon, options, phase.number, duration))
             z = curve.end
         else:
-            _require_sliding(problem, block)
             from .timeplan import plan_phases
 
             plans += plan_phases(problem, block, z, options, duration)
             motion = plans[-1].motion
             z = motion.evaluate(np.array([motion.duration])).z[0]
     return plans
-
-
-def _require_sliding(problem: Problem, block: Sequence[Phase]) -> None:
-    """Check that nothing rolls in phases that are planned in the time domain."""
-    for phase in block:
-        for contact in phase.formation.rolling:
-            raise InputError(
-                problem.source,
-                f"phases[{phase.number}].contacts",
-                f"{contact} cannot roll in the time domain; contacts roll in phases with one "
-                "freedom (four contacts, counting rolling ones twice) that end at rest",
-            )
 
 
 def _share_duration(
