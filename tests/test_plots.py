@@ -443,4 +443,15 @@ def test_rolling_friction_passes_zero_without_a_step() -> None:
 def test_simulation_is_drawn_over_a_plan_that_rolls() -> None:
     plan = tipping.tipped()
     simulation = wholearm.simulate(tipping.box(), plan.torque)
-    check_layout(plots.force_margins(plan, simulation=simulation))
+    drawn = plots.force_margins(plan, simulation=simulation)
+    check_layout(drawn)
+    dotted = [
+        line for line in drawn.axes[-1].lines if line.get_linestyle() == ":" or line.is_dashed()
+    ]
+    column = plan.contacts.index("v1-palm")
+    rows = simulation.phase == 1
+    share = simulation.c_t[rows, column] / (0.5 * simulation.c_n[rows, column])
+    curves = [data_of(line)[1] for line in dotted if len(data_of(line)[0]) == len(simulation.t)]
+    (curve,) = [values for values in curves if not np.isnan(values).all()]
+    np.testing.assert_allclose(curve[rows], share, rtol=1e-12)
+    assert np.isnan(curve[~rows]).all()

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -274,6 +274,15 @@ def test_rolling_contacts_are_known_and_their_friction_is_interpolated(tmp_path:
     exact, interpolated = (one.motions[1].evaluate(t).c_t[:, 0] for one in (plan, loaded))
     assert np.ptp(exact) > 0.3
     np.testing.assert_allclose(interpolated, exact, atol=2e-3)
+
+
+@pytest.mark.parametrize("given", [3, "v1-palm", ["v1-palm"], {"1": []}])
+def test_bad_names_of_rolling_contacts(trajectory: Trajectory, tmp_path: Path, given: Any) -> None:
+    changed = replace(trajectory, meta={**trajectory.meta, "rolling": given})
+    changed.save(tmp_path / "plan.npz")
+    with pytest.raises(InputError, match="not a list of names") as caught:
+        load_trajectory(tmp_path / "plan.npz")
+    assert caught.value.key == "meta.rolling"
 
 
 def test_nothing_rolls_unless_it_is_said(trajectory: Trajectory) -> None:

@@ -86,6 +86,10 @@ class Formation:
     contacts: tuple[Contact, ...]
     rolling: tuple[Contact, ...] = ()
 
+    def __post_init__(self) -> None:
+        if not set(self.rolling) <= set(self.contacts):
+            raise ValueError(f"{describe(self.rolling)} roll, which are no contacts")
+
     @property
     def n_contacts(self) -> int:
         """Number of contacts n_c."""
