@@ -7,10 +7,10 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from wholearm.nodechain import Chain, Links, StagedSolver, stage
 from wholearm.curve import Curve
 from wholearm.ipopt import build_solver
 from wholearm.model import Array
+from wholearm.nodechain import Chain, Links, StagedSolver, stage
 from wholearm.options import Objective
 from wholearm.pathdata import prepare
 from wholearm.pathmotion import make_grid
@@ -116,7 +116,7 @@ def test_a_staged_path_nlp_solves_the_path_nlp(
     """Its answer satisfies the optimality conditions of the NLP that Ipopt is given."""
     intervals = 40
     plain = build_path_nlp(4, intervals, objective)
-    staged = build_path_nlp(4, intervals, objective, "fatrop")
+    staged = build_path_nlp(4, intervals, objective, solver="fatrop")
     assert isinstance(staged.solver, StagedSolver)
     data = prepare(curves[0], 0.05, make_grid(curves[0], intervals), 1)
     profile, scales = guess(data)

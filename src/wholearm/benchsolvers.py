@@ -64,8 +64,9 @@ def measure_solvers(problem: Problem) -> list[Row]:
 
 
 def _measure(problem: Problem, curve: Curve, phase: int, options: PlanOptions) -> _Result:
-    n_contacts = curve.formation.n_contacts
-    build_path_nlp(n_contacts, options.intervals, options.goal, options.solver)
+    formation = curve.formation
+    sizes = (formation.n_contacts, options.intervals, options.goal, formation.n_rolling)
+    build_path_nlp(*sizes, options.solver)
     seconds, note, solved = [], "", True
     for _ in range(REPEATS):
         started = time.perf_counter()
@@ -81,8 +82,8 @@ def _measure(problem: Problem, curve: Curve, phase: int, options: PlanOptions) -
 def _find_optimum(problem: Problem, curve: Curve, objective: str, solver: str) -> float:
     """Optimum of the NLP with limits as they are, in its units."""
     options = PlanOptions(objective)
-    goal, n_contacts = Objective(objective), curve.formation.n_contacts
-    nlp = build_path_nlp(n_contacts, options.intervals, goal, solver)
+    goal, formation = Objective(objective), curve.formation
+    nlp = build_path_nlp(formation.n_contacts, options.intervals, goal, formation.n_rolling, solver)
     data = prepare(curve, problem.epsilon, make_grid(curve, options.intervals), 1)
     profile, scales = guess(data)
     result: dict[str, Any] = nlp.solver(

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .cones import hold_least, hold_rows
 from .curve import Curve, describe_pose
 from .dynamics import PathForces, inverse, reduced_inertia
 from .errors import JammingError
@@ -32,7 +33,10 @@ class Fineness(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Forces and rates of the joints, d theta / ds with shape (n, 2), at n places of a curve."""
+    """Forces and rates of the joints, d theta / ds with shape (n, 2), at n places of a curve.
+
+    In `forces`, H c (`wholearm.cones`) stands for the contact forces c: c itself if nothing rolls.
+    """
 
     forces: PathForces
     rates: Array
@@ -47,8 +51,8 @@ class Relaxation(NamedTuple):
 
     Attributes
     ----------
-    worth : ndarray, shape (n_c + 3,), [N, N m, 1]
-        By how much c_n >= epsilon and |tau| <= limit give way per unit of it, and the square of a
+    worth : ndarray, shape (n_h + 3,), [N, N m, 1]
+        By how much H c >= least and |tau| <= limit give way per unit of it, and the square of a
         speed limit, relative to that square.
     finger : int or None
         Whose speed limit that is.
@@ -87,18 +91,24 @@ class PhaseData(NamedTuple):
     solid: NDArray[np.int64]
 
     @property
+    def least(self) -> Array:
+        """The least that each row of H c may be, shape (n_h,) [N]."""
+        return hold_least(self.curve.formation, self.epsilon)
+
+    @property
     def torque_limit(self) -> Array:
         """Torque limits, shape (2,) [N m]."""
         return self.curve.formation.scene.torque_limit
 
     def slack(self, places: Places, profile: Profile, margin: float = 0.0) -> Array:
-        """How far each limit is from being missed, shape (n, n_c + 4) [N, N m].
+        """How far each limit is from being missed, shape (n, n_h + 4) [N, N m].
 
-        In the order c_n - epsilon - margin, tau + limit, limit - tau.
+        In the order H c - least (less `margin` for normal forces), tau + limit, limit - tau.
         """
-        c_n, tau = places.forces.c_n(*profile), places.forces.tau(*profile)
-        limit = self.torque_limit
-        return np.hstack([c_n - self.epsilon - margin, tau + limit, limit - tau])
+        held, tau = places.forces.c(*profile), places.forces.tau(*profile)
+        limit, spare = self.torque_limit, self.least.copy()
+        spare[: self.curve.formation.n_contacts] += margin
+        return np.hstack([held - spare, tau + limit, limit - tau])
 
     def largest_b(self, places: Places, spared: int | None = None) -> Array:
         """Largest b that the joints' speed limits allow, shape (n,) [m^2/s^2].
@@ -128,7 +138,7 @@ class PhaseData(NamedTuple):
         return Profile((a + x * rise).ravel(), np.maximum(b, 0.0).ravel(), squeeze.ravel())
 
     def misses(self, profile: Profile, margin: float) -> tuple[Array, Array]:
-        """What limits miss inside each solid interval, shape (n_solid, n_c + 4) [N, N m].
+        """What limits miss inside each solid interval, shape (n_solid, n_h + 4) [N, N m].
 
         And how far b is beyond what the speed limits allow, shape (n_solid,), relative.
         """
@@ -140,7 +150,7 @@ class PhaseData(NamedTuple):
         return short[:, :-1], short[:, -1]
 
     def slack_beside(self, profile: Profile, margin: float, short: Array) -> Array:
-        """The lesser slack of the two nodes of each solid interval, shape (n_solid, n_c + 4).
+        """The lesser slack of the two nodes of each solid interval, shape (n_solid, n_h + 4).
 
         Zero where nothing is `short` in the interval.
         """
@@ -180,6 +190,8 @@ def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
             f"friction makes the reduced inertia {inertia[worst]:.3g} of its frictionless value"
         )
     forces = inverse(formation, *point[:3], directions, point.kinematics)
+    if formation.rolling:
+        forces = forces.press(hold_rows(formation))
     every = Places(forces, point.z_s[:, 3:])
     own = len(grid.s) + np.arange(len(between)).reshape(len(solid), -1)
     order = np.hstack([solid[:, None], own, solid[:, None] + 1])

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .advice import Limit, Shortfall, describe_changes, find_changes, rank_shortfalls
+from .cones import hold_least, name_holds
 from .curve import Curve, describe_pose
 from .errors import InfeasibleError, JammingError, SolverError
 from .model import Array
@@ -122,7 +123,8 @@ def _quicken(data: PhaseData, scales: Scales) -> Scales:
 def _ease(data: PhaseData, profile: Profile, scales: Scales) -> Profile | None:
     """The motion with the least shortfalls when every limit is soft."""
     formation = data.curve.formation
-    nlp = build_path_nlp(formation.n_contacts, len(data.grid.s) - 1, Objective.ELASTIC)
+    intervals, n_c = len(data.grid.s) - 1, formation.n_contacts
+    nlp = build_path_nlp(n_c, intervals, Objective.ELASTIC, formation.n_rolling)
     short = np.maximum(_shortfalls(data, profile), 0.0) + 0.1
     result = nlp.solver(
         x0=pack(nlp, profile, scales, 0.0, short),
@@ -135,19 +137,17 @@ def _ease(data: PhaseData, profile: Profile, scales: Scales) -> Profile | None:
 
 
 def _shortfalls(data: PhaseData, profile: Profile) -> Array:
-    """By how much c_n and tau miss their limits at the nodes, shape (n, n_c + 2) [N, N m]."""
+    """By how much H c and tau miss their limits at the nodes, shape (n, n_h + 2) [N, N m]."""
     slack = data.slack(data.nodes, profile)
-    c_n, torque = slack[:, :-4], np.minimum(slack[:, -4:-2], slack[:, -2:])
-    return -np.hstack([c_n, torque])
+    held, torque = slack[:, :-4], np.minimum(slack[:, -4:-2], slack[:, -2:])
+    return -np.hstack([held, torque])
 
 
 def _list_shortfalls(data: PhaseData, profile: Profile) -> list[Shortfall]:
-    short, n_c = _shortfalls(data, profile), data.curve.formation.n_contacts
-    names = [
-        f"c_n of {name} >= epsilon = {data.epsilon:g} N" for name in data.curve.formation.names
-    ]
+    short = _shortfalls(data, profile)
+    names = name_holds(data.curve.formation, data.epsilon)
+    units = ["N"] * len(names) + ["N m"] * 2
     names += [f"torque limit of finger {i + 1} = {data.torque_limit[i]:g} N m" for i in range(2)]
-    units = ["N"] * n_c + ["N m"] * 2
     times = PathMotion(data.curve, data.grid, profile).times
     z = data.curve.evaluate(data.grid.s).z
     found = []
@@ -161,18 +161,19 @@ def _list_shortfalls(data: PhaseData, profile: Profile) -> list[Shortfall]:
 
 def _list_candidates(data: PhaseData, scales: Scales) -> list[_Candidate]:
     """Torque limits, speed limits if there are any, and epsilon."""
-    scene, n_c = data.curve.formation.scene, data.curve.formation.n_contacts
-    unit = np.eye(n_c + 3)
+    formation, scene = data.curve.formation, data.curve.formation.scene
+    n_h = len(data.least)
+    unit = np.eye(n_h + 3)
     found = []
     for i in range(2):
         torque, speed = float(scene.torque_limit[i]), float(scene.speed_limit[i])
         limit = Limit(f"torque limit of finger {i + 1}", torque, "N m", 1)
-        found.append(_Candidate(limit, Relaxation(torque * unit[n_c + i]), "torque_limit", i))
+        found.append(_Candidate(limit, Relaxation(torque * unit[n_h + i]), "torque_limit", i))
         if np.isfinite(speed):
             limit = Limit(f"speed limit of finger {i + 1}", speed, "rad/s", 1)
             found.append(_Candidate(limit, Relaxation(unit[-1], i), "speed_limit", i))
     limit = Limit("epsilon", data.epsilon, "N", -1)
-    every = scales.force * unit[:n_c].sum(axis=0)
+    every = np.append(scales.force * hold_least(formation, 1.0), np.zeros(3))
     return [*found, _Candidate(limit, Relaxation(every), "epsilon", None)]
 
 
@@ -180,9 +181,10 @@ def _relax(
     data: PhaseData, profile: Profile, scales: Scales, candidate: _Candidate
 ) -> float | None:
     """The value at which one limit just lets all others be kept, if there is one."""
-    n_c, relaxation = data.curve.formation.n_contacts, candidate.relaxation
-    nlp = build_path_nlp(n_c, len(data.grid.s) - 1, Objective.RELAX)
-    short, worth = _shortfalls(data, profile).max(axis=0), relaxation.worth[: n_c + 2]
+    formation, relaxation = data.curve.formation, candidate.relaxation
+    intervals, n_c = len(data.grid.s) - 1, formation.n_contacts
+    nlp = build_path_nlp(n_c, intervals, Objective.RELAX, formation.n_rolling)
+    short, worth = _shortfalls(data, profile).max(axis=0), relaxation.worth[:-1]
     needed = np.divide(short, worth, out=np.zeros_like(short), where=worth > 0)
     result = nlp.solver(
         x0=pack(nlp, profile, scales, max(1.0, 1.5 * float(needed.max()))),

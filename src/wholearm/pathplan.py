@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .nodechain import StagedSolver
 from .curve import Curve
 from .errors import InfeasibleError, SolverError, WholearmError
 from .model import Array
+from .nodechain import StagedSolver
 from .options import Objective, PlanOptions
 from .pathdata import PhaseData, fit_torque, prepare
 from .pathmotion import PathMotion, Profile, draw_together, make_grid
@@ -145,8 +145,8 @@ def _explain_duration(
 def _plan(
     curve: Curve, epsilon: float, options: PlanOptions, phase: int, duration: float | None
 ) -> PhasePlan[PathMotion]:
-    n_contacts = curve.formation.n_contacts
-    nlp = build_path_nlp(n_contacts, options.intervals, options.goal, options.solver)
+    n_contacts, n_rolling = curve.formation.n_contacts, curve.formation.n_rolling
+    nlp = build_path_nlp(n_contacts, options.intervals, options.goal, n_rolling, options.solver)
     data = prepare(curve, epsilon, make_grid(curve, options.intervals), phase)
     profile, scales = guess(data)
     tightening = Tightening.none(data, duration)

@@ -93,6 +93,7 @@ def solve_with(
         "value_unit": UNITS[options.goal],
         "epsilon": problem.epsilon,
         "phase_values": values,
+        "rolling": [[c.name for c in phase.formation.rolling] for phase in problem.phases],
         "phase_durations": [motion.duration for motion in motions],
         "intervals": options.intervals,
         "transcription": options.transcription,

@@ -108,6 +108,14 @@ class Trajectory:
         return np.append(self.t[first], self.t[-1])
 
     @property
+    def rolling(self) -> NDArray[np.bool_]:
+        """Which contacts roll, shape (n, m), as `meta` names them phase by phase."""
+        mask = np.zeros(self.c_t.shape, dtype=bool)
+        for index, names in enumerate(self.meta.get("rolling", [])):
+            mask[self.phase == index] = [name in names for name in self.contacts]
+        return mask
+
+    @property
     def z(self) -> Array:
         """Degrees of freedom (q, theta), shape (n, 5)."""
         return np.hstack([self.q, self.theta])
@@ -299,6 +307,9 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
         raise InputError(source, "meta", f"is not JSON: {error}") from None
     if not isinstance(meta, dict):
         raise InputError(source, "meta", "is not a JSON object")
+    named = meta.get("rolling", [])
+    if not isinstance(named, list) or not all(isinstance(names, list) for names in named):
+        raise InputError(source, "meta.rolling", "is not a list of names for each phase")
     contacts = tuple(str(name) for name in arrays["contacts"])
     known = {name: arrays[name] for name in _ARRAYS}
     torque = TorqueProfile(arrays["torque_breaks"], arrays["torque_coefficients"])

@@ -46,6 +46,7 @@ def enter(run: Replay, phase: Phase, following: Phase | None) -> None:
     run.limits = [limit.text for limit in open_limits(phase.formation, until)]
     run.releasable = find_releasable(phase, following)
     run.stepper.inputs[run.stepper.at.tolerance] = run.tolerance
+    run.stepper.inputs[run.stepper.at.slip] = phase.formation.evaluate_slip(run.y[None, :5])[0]
     run.load_piece()
 
 
@@ -58,10 +59,10 @@ def find_releasable(phase: Phase, following: Phase | None) -> tuple[str, ...]:
 
 
 def project_velocity(formation: Formation, z: Array, v: Array) -> Array:
-    """Velocity nearest to `v` in the metric M5 that keeps every contact, shape (5,)."""
-    A = formation.evaluate(z[None], v[None]).A[0]
-    lift = A.T / formation.scene.mass_diagonal[:, None]
-    return np.asarray(v - lift @ np.linalg.solve(A @ lift, A @ v))
+    """Velocity nearest to `v` in the metric M5 that keeps every constraint, shape (5,)."""
+    P = formation.evaluate(z[None], v[None]).P[0]
+    lift = P.T / formation.scene.mass_diagonal[:, None]
+    return np.asarray(v - lift @ np.linalg.solve(P @ lift, P @ v))
 
 
 def set_off(run: Replay, departure: Departure) -> None:
@@ -85,7 +86,8 @@ def go_on(run: Replay) -> Ending | None:
     s.inputs[s.at.heading] = v / np.sqrt(mass @ v**2)
     rates = np.concatenate([formation.evaluate(y[None, :5], v[None]).A_t[0] @ v, v[3:]])
     signs = np.where(rates < 0, -1.0, 1.0)
-    still = np.flatnonzero(np.abs(rates) < STANDING).tolist()
+    signs[list(formation.rolling_rows)] = 0.0
+    still = np.flatnonzero((np.abs(rates) < STANDING) & (signs != 0)).tolist()
     rows = [s.rows.slide.start + k for k in still]
     choices = product((1.0, -1.0), repeat=len(still))
     _point(run, signs)
