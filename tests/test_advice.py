@@ -55,8 +55,21 @@ def test_only_confirmed_changes_are_found() -> None:
     # The rest of what was asked goes outwards, and not far.
     assert [value for index, value in asked if index == 1] == [0.012, 0.0119]
     beyond = [value for index, value in asked if index == 3]
-    assert beyond == sorted(set(beyond)) and 3.0 == beyond[0] and beyond[-1] < 3.0 * 1.03
+    assert beyond == sorted(set(beyond)) and 3.0 == beyond[0] and beyond[-1] <= 4.5
     assert not any(index == 2 for index, _ in asked)
+
+
+@pytest.mark.parametrize("limit, least", [(TORQUE, 3.0), (EPSILON, 0.04)])
+@pytest.mark.parametrize("needed", [0.0, 0.004, 0.013, 0.06, 0.1, 0.3, 0.49])
+def test_more_than_the_least_is_found_closely(limit: Limit, least: float, needed: float) -> None:
+    """Plans may need more than what limits at the nodes ask for."""
+    border = least * (1 + limit.sign * needed)
+
+    def can_plan(_: int, value: float) -> bool:
+        return limit.sign * (value - border) >= 0
+
+    (change,) = find_changes([limit], lambda _: least, can_plan)
+    assert 0 <= limit.sign * (change.value / border - 1) <= 0.03
 
 
 def test_nothing_falls_below_zero() -> None:
