@@ -390,7 +390,7 @@ def test_interrupting_leaves_nothing(
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("wholearm.plan.plan_path", interrupt)
+    monkeypatch.setattr("wholearm.plan.plan_chain", interrupt)
     assert main(["solve", str(HEPTAGON)]) == 130
     assert capsys.readouterr().err == "wholearm: interrupted\n"
     assert list(folder.iterdir()) == []
