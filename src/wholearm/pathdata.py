@@ -182,7 +182,7 @@ def join(parts: Sequence[PhaseData]) -> PhaseData:
     segments = np.cumsum([0, *(part.grid.segment[-1] + 1 for part in parts)])
     nodes = np.cumsum([0, *(len(part.grid.s) for part in parts)])
 
-    def chain(arrays: Iterable[Array], firsts: Array) -> Any:
+    def chain(arrays: Iterable[NDArray[Any]], firsts: NDArray[Any]) -> Any:
         return np.concatenate([a + first for a, first in zip(arrays, firsts, strict=False)])
 
     def stack(places: Sequence[Places]) -> Places:

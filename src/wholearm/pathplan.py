@@ -144,7 +144,7 @@ def plan_curves(
             f"{_name(phases)}: after {ROUNDS} solves limits are still missed by "
             f"{short.max():.2g} N between nodes; plan with more intervals"
         )
-    plans = []
+    plans: list[PhasePlan[PathMotion]] = []
     for part, motion in zip(parts, motions, strict=True):
         torque, squares = fit_torque(part, motion)
         value = {
