@@ -245,7 +245,8 @@ def explain(
         suffix = f", phase {phase}" if len(phases) > 1 else ""
         texts += [(short, text + suffix) for short, text in _describe_shortfalls(part, own)]
     texts.sort(key=lambda pair: -pair[0])
-    return InfeasibleError(f"{where} is infeasible: {'; '.join(text for _, text in texts)}")
+    verb = "is" if len(phases) == 1 else "are"
+    return InfeasibleError(f"{where} {verb} infeasible: {'; '.join(text for _, text in texts)}")
 
 
 def _describe_shortfalls(data: PhaseData, profile: Profile) -> list[tuple[float, str]]:
