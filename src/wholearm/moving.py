@@ -89,7 +89,7 @@ def _is_there(run: Replay, t: float) -> bool:
 
     By rounding a planned motion ends a little beyond the end of its phase, or has just turned back.
     It has to be at rest there, or to reach a contact softly; a coordinate is passed at any speed,
-    and an impact comes at any, with the step of the torques that goes with it.
+    and an impact comes at any, with the step of the torques that goes with it, or as they end.
     """
     s = run.stepper
     if t != run.breaks[run.piece + 1] or abs(run.value(s.rows.until)) >= REACHED:
@@ -98,7 +98,8 @@ def _is_there(run: Replay, t: float) -> bool:
     if run.phase.end is End.SMOOTH:
         speed = speed if run.phase.until.contact else 0.0
     elif run.phase.end is End.IMPACT:
-        speed = 0.0 if steps_within(run, math.inf) else speed
+        coming = run.piece + 1
+        speed = 0.0 if coming >= len(run.steps_at) or run.steps_at[coming] else speed
     elif s.is_free:
         speed = float(np.abs(s.outputs[s.to.y][5:10]).max())
     return speed < SLOW and bool(s.outputs[s.to.c_n].min() >= -SLACK_FORCE)
