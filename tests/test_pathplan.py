@@ -131,8 +131,8 @@ def test_a_chain_is_one_problem(chain: Chain) -> None:
     assert speeds[0][0] == speeds[2][1] == 0.0
     for before, after in pairwise(speeds):
         assert before[1] == after[0] > 0.1
-    for before, after in pairwise(motions):
-        end, start = (m.evaluate(np.array([t])) for m, t in ((before, before.duration), (after, 0)))
+    for one, other in pairwise(motions):
+        end, start = one.evaluate(np.array([one.duration])), other.evaluate(np.zeros(1))
         np.testing.assert_allclose(start.z, end.z, rtol=0, atol=1e-12)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import tomllib
 from functools import lru_cache
 from typing import Any
@@ -11,8 +12,8 @@ import numpy as np
 import pytest
 
 from conftest import HEPTAGON
-from planned import SQUEEZES, DepartingMotion, change
 from plane import stack_rows
+from planned import SQUEEZES, DepartingMotion, change
 from timed import fastest
 from wholearm.contact import parse_contact
 from wholearm.dynamics import energy
@@ -92,7 +93,8 @@ def test_each_impact_is_that_of_the_law(problem: Problem, replayed: Simulation) 
         before, after = (p.formation for p in problem.phases[event.phase : event.phase + 2])
         impact = strike(before, after, replayed.z[first], replayed.z_dot[last])
         np.testing.assert_allclose(replayed.z_dot[first], impact.v, rtol=0, atol=1e-9)
-        assert (event.contact, event.value) == (impact.least[0], pytest.approx(impact.least[1]))
+        name, least = impact.least
+        assert event.contact == name and event.value == pytest.approx(least)
         assert event.text.startswith(f"impact at t = {event.time:.5g} s, phase {event.phase + 1}")
         for name, p in zip(after.names, impact.p, strict=True):
             assert f"{p:.4g} on {name}" in event.text
@@ -199,22 +201,25 @@ def test_coarser_tolerances_still_find_the_impacts(
     np.testing.assert_allclose(times[0], times[1], rtol=0, atol=1e-5)
 
 
-def test_friction_that_holds_ends_the_motion(problem: Problem, planned: Trajectory) -> None:
-    """With a contact that the impact would turn from sliding to standing."""
-    phase = problem.phases[0]
-    names = ("v1-palm", "v3-finger1")
-    kept = Formation(problem.scene, tuple(parse_contact(n, problem.scene) for n in names))
-    following = Phase(1, kept, problem.phases[1].until)
-    end = planned.motions[0].evaluate(np.array([planned.motions[0].duration]))
-    impact = strike(phase.formation, kept, end.z[0], end.z_dot[0])
-    passing = Problem(**{**vars(problem), "phases": (phase, following)})
+@pytest.mark.parametrize(
+    "names, kind, text",
+    [
+        ("v0-palm v5-finger2 v3-finger1", OutcomeKind.HELD, "friction would hold v3-finger1"),
+        ("v0-palm v1-palm v3-finger1", OutcomeKind.LIMIT_REACHED, "v5-finger2 would not part, at"),
+        ("v1-palm v2-finger1 v3-finger1", OutcomeKind.CONTACT_LOST, "impulse on v2-finger1 would"),
+    ],
+)
+def test_other_formations_that_an_impact_cannot_reach(
+    problem: Problem, planned: Trajectory, names: str, kind: OutcomeKind, text: str
+) -> None:
+    contacts = tuple(parse_contact(name, problem.scene) for name in names.split())
+    following = Phase(1, Formation(problem.scene, contacts), problem.phases[1].until)
+    passing = dataclasses.replace(problem, phases=(problem.phases[0], following))
     simulation = simulate(passing, planned.torque)
+    assert simulation.outcome.kind is kind
     (event,) = simulation.find(EventKind.IMPACT)
-    kinds = {h.kind.value for h in impact.hindrances}
-    assert event.value == pytest.approx(impact.least[1], rel=1e-5)
-    expected = {"held": OutcomeKind.HELD, "pull": OutcomeKind.CONTACT_LOST,
-                "closing": OutcomeKind.LIMIT_REACHED}  # fmt: skip
-    assert kinds and simulation.outcome.kind is expected[impact.hindrances[0].kind.value]
+    assert simulation.outcome.text.startswith(text)
+    assert simulation.outcome.text.endswith(f" in the impact at t = {event.time:.5g} s, phase 1")
 
 
 def test_verify_reports_the_impacts(problem: Problem, planned: Trajectory) -> None:
