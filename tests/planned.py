@@ -75,7 +75,7 @@ class CosineMotion:
                 self.curve.formation, point.z[mine], point.z_s[mine], point.z_ss[mine], directions
             )
             squeeze = self.squeeze * (1 - self.fade * t[mine] / self.duration)
-            c_n[mine] = forces.c_n(a[mine], v[mine] ** 2, squeeze)
+            c_n[mine] = forces.c(a[mine], v[mine] ** 2, squeeze)
             tau[mine] = forces.tau(a[mine], v[mine] ** 2, squeeze)
             Xi[mine] = segment.Xi
         z_dot = point.z_s * v[:, None]
@@ -154,7 +154,7 @@ class LandingMotion:
         z = np.tile(self.start, (len(x), 1))
         z[:, 0], z[:, 2] = x, phi
         for _ in range(50):
-            C, A, _, _ = self.formation.evaluate(z, np.zeros_like(z))
+            C, A = self.formation.evaluate(z, np.zeros_like(z))[:2]
             step = np.linalg.solve(A[:, :, DEPENDENT], -C[..., None])[..., 0]
             # Far from the start a whole step could leave the solution's neighbourhood.
             z[:, DEPENDENT] += step * np.minimum(1.0, 0.2 / np.abs(step).max())
@@ -167,7 +167,7 @@ class LandingMotion:
         z_dot, z_ddot = np.zeros_like(z), np.zeros_like(z)
         for rates, k in (z_dot, 1), (z_ddot, 2):
             rates[:, 0], rates[:, 2] = x[k], phi[k]
-            _, A, _, bend = self.formation.evaluate(z, z_dot)
+            _, A, _, bend = self.formation.evaluate(z, z_dot)[:4]
             right = -np.einsum("nij,nj->ni", A, rates) - (bend if k == 2 else 0.0)
             rates[:, DEPENDENT] = np.linalg.solve(A[:, :, DEPENDENT], right[..., None])[..., 0]
         A_t = self.formation.evaluate(z, z_dot).A_t
@@ -194,7 +194,7 @@ class LandingMotion:
         t = np.clip(t, 0.0, self.duration)
         scene, signs = self.formation.scene, self.signs(t)
         z, z_dot, z_ddot, _ = self.move(t)
-        _, A, A_t, _ = self.formation.evaluate(z, z_dot)
+        _, A, A_t = self.formation.evaluate(z, z_dot)[:3]
         slip = np.asarray(self.formation.friction * signs[:, :-2], dtype=float)
         # The five equations of motion, with the unknowns c_n and tau.
         matrix = np.zeros((len(t), 5, 5))

@@ -185,6 +185,16 @@ def test_impacts_next_to_a_landing_are_refused() -> None:
     assert caught.value.key == "phases[4].end"
 
 
+def test_impacts_between_rolling_contacts_are_refused(problem: Problem) -> None:
+    """Known to the law and the simulator, but not planned yet."""
+    table: dict[str, Any] = copy.deepcopy(dict(problem.table))
+    table["phases"] = table["phases"][:2]
+    table["phases"][1]["contacts"] = ["v1-palm", "v3-finger1 rolling", "v5-finger2"]
+    table["phases"][1] |= {"until": {"phi_deg": -5.0}, "end": "rest"}
+    with pytest.raises(InputError, match="four sliding contacts"):
+        solve(build_problem(table))
+
+
 def unit(values: Array) -> Array:
     return np.asarray(values / np.linalg.norm(values))
 

@@ -18,6 +18,7 @@ from wholearm.dynamics import (
     inverse,
     reduce_to_first_joint,
     reduced_inertia,
+    split_forces,
 )
 from wholearm.errors import JammingError
 from wholearm.formation import Formation, close_finger
@@ -47,7 +48,7 @@ def test_three_routes_agree(curves: tuple[Curve, ...]) -> None:
         z, z_s, z_ss = curve.evaluate(np.array([s]))[:3]
         a, b, squeeze = random_motion(rng)
         forces = inverse(curve.formation, z, z_s, z_ss, directions)
-        tau, c_n = forces.tau(a, b, squeeze)[0], forces.c_n(a, b, squeeze)[0]
+        tau, c_n = forces.tau(a, b, squeeze)[0], forces.c(a, b, squeeze)[0]
         v = z_s[0] * np.sqrt(b)
         z_ddot = z_s[0] * a + z_ss[0] * b
 
@@ -58,7 +59,7 @@ def test_three_routes_agree(curves: tuple[Curve, ...]) -> None:
 
         reduced = reduce_to_first_joint(curve.formation, z[0], v[3], tau, directions)
         assert reduced.acceleration == pytest.approx(z_ddot[3], abs=1e-10 * size)
-        np.testing.assert_allclose(reduced.c_n, c_n, rtol=0, atol=1e-10 * np.abs(c_n).max())
+        np.testing.assert_allclose(reduced.c, c_n, rtol=0, atol=1e-10 * np.abs(c_n).max())
         scalar = reduced.Phi_1 * reduced.acceleration + reduced.Phi_2 * v[3] + reduced.Phi_3
         assert abs(scalar) < 1e-12
 
@@ -73,7 +74,7 @@ def contact_frames(formation: Formation, z: Array) -> tuple[Array, Array]:
 
 
 def newton_euler_residual(
-    formation: Formation, z: Array, v: Array, z_ddot: Array, tau: Array, c_n: Array
+    formation: Formation, z: Array, v: Array, z_ddot: Array, tau: Array, c: Array
 ) -> Array:
     """What is missing in each body's balance: 2 forces and 1 moment, and 2 joint moments."""
     scene = formation.scene
@@ -88,7 +89,11 @@ def newton_euler_residual(
             arm = at - np.asarray(scene.fingers[contact.finger].base)
             finger_speed = v[3 + contact.finger] * np.array([-arm[1], arm[0]])
         slip = (object_speed - finger_speed) @ t
-        force[k] = c_n[k] * (n - scene.friction.of(contact.finger) * np.sign(slip) * t)
+        c_t = -scene.friction.of(contact.finger) * np.sign(slip) * c[k]
+        if contact in formation.rolling:
+            assert abs(slip) < 1e-14
+            c_t = c[formation.n_contacts + formation.rolling_rows.index(k)]
+        force[k] = c[k] * n + c_t * t
     body = scene.polygon
     assert body.inertia is not None
     weight = np.array([0.0, -body.mass * scene.gravity])
@@ -227,7 +232,7 @@ def test_squeeze_moves_no_body(curves: tuple[Curve, ...]) -> None:
         a, b = np.array([0.5]), np.array([0.04])
         v, z_ddot = z_s[0] * 0.2, z_s[0] * 0.5 + z_ss[0] * 0.04
         for squeeze in (np.zeros(1), np.full(1, 3.0)):
-            tau, c_n = forces.tau(a, b, squeeze)[0], forces.c_n(a, b, squeeze)[0]
+            tau, c_n = forces.tau(a, b, squeeze)[0], forces.c(a, b, squeeze)[0]
             residual = newton_euler_residual(curve.formation, z[0], v, z_ddot, tau, c_n)
             assert np.abs(residual).max() < 1e-12 * (1 + np.abs(c_n).max())
 
@@ -315,6 +320,88 @@ def test_forward_takes_any_number_of_contacts(curves: tuple[Curve, ...]) -> None
         z_ddot, c_n = forward(formation, z, v, np.array([0.2, -0.1]), directions)
         residual = newton_euler_residual(formation, z, v, z_ddot, np.array([0.2, -0.1]), c_n)
         assert np.abs(residual).max() < 1e-12 * (1 + np.abs(c_n).max())
+
+
+def rolling_states(
+    curves: tuple[Curve, ...],
+) -> Iterator[tuple[Formation, Array, Array, Directions]]:
+    """Three of a curve's contacts, one of which rolls, with the velocity that is left free."""
+    for curve, s, _ in states(curves, 1):
+        scene, every = curve.formation.scene, curve.formation.contacts
+        for kept, rolls in (((1, 2, 3), 1), ((0, 2, 3), 2), ((1, 2, 3), 3)):
+            formation = Formation(scene, tuple(every[k] for k in kept), (every[rolls],))
+            z = curve.evaluate(np.array([s])).z
+            kinematics = formation.evaluate(z, z)
+            v = 0.3 * np.linalg.svd(kinematics.P[0])[2][-1]
+            slip = kinematics.A_t[0] @ v
+            yield formation, z[0], v, Directions(np.sign(slip), np.sign(v[3:]))
+
+
+def test_rolling_contacts_obey_newton_and_euler(curves: tuple[Curve, ...]) -> None:
+    rng = np.random.default_rng(16)
+    h = 2e-5
+    for formation, z, v, directions in rolling_states(curves):
+        tau = rng.uniform(-1, 1, 2)
+        kinematics = formation.evaluate(z[None], v[None])
+        if reduced_inertia(formation, kinematics, directions)[0] <= 0.05:
+            continue
+        z_ddot, c = forward(formation, z, v, tau, directions)
+        residual = newton_euler_residual(formation, z, v, z_ddot, tau, c)
+        assert c.shape == (4,) and np.abs(residual).max() < 1e-12 * (1 + np.abs(c).max())
+        # Gap and slip coordinates keep their values to second order.
+        path = np.array([z + k * v + k**2 / 2 * z_ddot for k in (-h, 0.0, h)])
+        held = np.hstack([formation.evaluate(path, path).C, formation.evaluate_slip(path)])
+        size = 1 + np.abs(z_ddot).max()
+        np.testing.assert_allclose((held[0] - 2 * held[1] + held[2]) / h**2, 0, atol=1e-6 * size)
+
+
+def test_rolling_friction_does_no_work(curves: tuple[Curve, ...]) -> None:
+    """d/dt energy = power of the torques - friction at joints and at the contacts that slide."""
+    rng = np.random.default_rng(17)
+    for formation, z, v, directions in rolling_states(curves):
+        scene, tau = formation.scene, rng.uniform(-1, 1, 2)
+        kinematics = formation.evaluate(z[None], v[None])
+        if reduced_inertia(formation, kinematics, directions)[0] <= 0.05:
+            continue
+        z_ddot, c = forward(formation, z, v, tau, directions)
+        c_n, c_t = split_forces(formation, c, directions.Xi)
+        h = 1e-5
+        before, after = (
+            energy(formation, (z + k * v + k**2 / 2 * z_ddot)[None], (v + k * z_ddot)[None])[0]
+            for k in (-h, h)
+        )
+        slip = kinematics.A_t[0] @ v
+        slides = [contact not in formation.rolling for contact in formation.contacts]
+        lost = (np.abs(slip) * formation.friction * c_n)[slides].sum()
+        assert -slip @ c_t == pytest.approx(lost, abs=1e-12 * (1 + abs(lost)))
+        lost += scene.viscous @ v**2 + scene.dry @ np.abs(v)
+        power = tau @ v[3:] - lost
+        size = 1 + abs(power) + np.abs(z_ddot).max()
+        assert (after - before) / (2 * h) == pytest.approx(power, abs=1e-8 * size)
+
+
+def test_three_routes_agree_where_a_contact_rolls(curves: tuple[Curve, ...]) -> None:
+    rng = np.random.default_rng(18)
+    for formation, z, v, directions in rolling_states(curves):
+        kinematics = formation.evaluate(z[None], v[None])
+        if abs(reduced_inertia(formation, kinematics, directions)[0]) <= 0.05:
+            continue
+        z_s, speed = v / np.linalg.norm(v), float(np.linalg.norm(v))
+        P = kinematics.P[0]
+        z_ss = np.linalg.lstsq(P, -kinematics.P_dot_v[0] / speed**2)[0]
+        a, _, squeeze = random_motion(rng)
+        b = np.array([speed**2])
+        forces = inverse(formation, z[None], z_s[None], z_ss[None], directions)
+        tau, c = forces.tau(a, b, squeeze)[0], forces.c(a, b, squeeze)[0]
+        acceleration, found, _ = build_forward(formation)(z, v, tau, *directions)
+        size = 1 + np.abs(c).max()
+        np.testing.assert_allclose(found.full()[:, 0], c, atol=1e-9 * size)
+        expected = z_s * a + z_ss * b
+        np.testing.assert_allclose(acceleration.full()[:, 0], expected, atol=1e-8 * size)
+        if reduced_inertia(formation, kinematics, directions)[0] > 0 and abs(v[3]) > 1e-3:
+            reduced = reduce_to_first_joint(formation, z, v[3], tau, directions)
+            assert reduced.acceleration == pytest.approx(expected[3], abs=1e-7 * size)
+            np.testing.assert_allclose(reduced.c, c, atol=1e-7 * size)
 
 
 def test_compiled_forward_returns_the_matrix_that_jams(curves: tuple[Curve, ...]) -> None:

@@ -18,6 +18,7 @@ from plane import (
 from wholearm.contact import parse_contact
 from wholearm.errors import InputError
 from wholearm.formation import (
+    Formation,
     close_finger,
     describe,
     find_touching,
@@ -215,6 +216,47 @@ def test_formation_knows_its_contacts_and_friction() -> None:
     assert formation.n_contacts == 3
     assert formation.names == ("v0-palm", "v1-finger1", "e2-tip2")
     assert formation.friction.tolist() == [0.1, 0.2, 0.3]
+
+
+ROLLING = ["v0-palm", "v2-finger1", "v3-finger2", "e1-tip1", "v2-tip1"]
+
+
+@pytest.mark.parametrize("name", ROLLING)
+def test_a_rolling_contact_adds_its_tangential_row(name: str) -> None:
+    scene = make_scene(SQUARE)
+    sliding = make_formation(scene, f"v1-palm {name} v0-finger2")
+    formation = Formation(scene, sliding.contacts, (parse_contact(name, scene),))
+    assert (formation.n_contacts, formation.n_rolling, formation.n_constraints) == (3, 1, 4)
+    assert formation.rolling_rows == (1,) and formation.contacts == sliding.contacts
+    assert formation.sliding_friction.tolist() == [0.1, 0.0, 0.1]
+    rng = np.random.default_rng(8)
+    z, v = rng.uniform([-0.1, 0.02, -3, 0.3, 0.3], [0.1, 0.15, 3, 2.8, 2.8], (9, 5)), 1e-6
+    speed = rng.uniform(-1, 1, z.shape)
+    here = formation.evaluate(z, speed)
+    np.testing.assert_array_equal(here.P, np.concatenate([here.A, here.A_t[:, 1:2]], axis=1))
+    ahead, behind = (formation.evaluate(z + step * speed, speed).P for step in (v, -v))
+    expected = np.einsum("nij,nj->ni", (ahead - behind) / (2 * v), speed)
+    np.testing.assert_allclose(here.P_dot_v, expected, atol=1e-8)
+
+
+def test_without_rolling_contacts_constraints_are_the_normal_rows() -> None:
+    formation = make_formation(make_scene(SQUARE), "v0-palm v2-finger1")
+    z = np.random.default_rng(9).uniform(0.1, 1.0, (3, 5))
+    kinematics = formation.evaluate(z, z)
+    assert kinematics.P is kinematics.A and kinematics.P_dot_v.shape == (3, 2)
+    np.testing.assert_array_equal(kinematics.P_dot_v, kinematics.A_dot_v)
+    assert formation.evaluate_slip(z).shape == (3, 0) and formation.rolling_rows == ()
+    assert [part.shape for part in formation.roll_function(z[0], z[0])] == [(0, 1), (0, 1)]
+
+
+def test_slip_coordinates_are_in_the_order_of_the_contacts() -> None:
+    """Whatever the order in which the rolling ones are given; x of a vertex on the palm."""
+    scene = make_scene(SQUARE)
+    contacts = make_formation(scene, "v0-palm v1-palm").contacts
+    formation = Formation(scene, contacts, contacts[::-1])
+    assert formation.rolling_rows == (0, 1)
+    z = np.array([[0.01, 0.03, 0.0, 1.0, 2.0]])
+    np.testing.assert_allclose(formation.evaluate_slip(z), [[-0.02, 0.04]], atol=ROUNDING)
 
 
 def limits_at(scene: Scene, names: str, z: Array) -> dict[str, float]:

@@ -224,6 +224,33 @@ def test_friction_that_would_hold_is_no_sliding() -> None:
     assert abs(collision.slips[0]) < 1e-12 and collision.normal[0] > 0
 
 
+@pytest.mark.parametrize("friction", [0.3, 3.0])
+def test_a_corner_that_rolls(friction: float) -> None:
+    """It is caught like a hinge if friction can hold it: angular momentum about it is kept."""
+    v, lean = np.array([0.2, -0.4, 0.0, 0.0, 0.0]), 0.7
+    _, r, scene = drop(v, friction, lean)
+    sliding = make_formation(scene, "v1-palm")
+    rolling = Formation(scene, sliding.contacts, sliding.contacts)
+    z = np.array([0.0, -r[1], lean, 0.5, 2.6])
+    impact = strike(sliding, rolling, z, v)
+    inertia = scene.polygon.inertia
+    assert inertia is not None
+    spin = -MASS * float(cross(r, v[:2])) / (inertia + MASS * r @ r)
+    expected = np.array([spin * r[1], -spin * r[0], spin, 0.0, 0.0])
+    np.testing.assert_allclose(impact.v, expected, rtol=0, atol=1e-12)
+    tangential, normal = MASS * (expected[:2] - v[:2])
+    np.testing.assert_allclose(impact.p, [normal, tangential], rtol=0, atol=1e-12)
+    beyond = abs(tangential) - friction * normal
+    assert impact.possible == (beyond <= 0) == (friction == 3.0)
+    collision = collide(sliding, z, v)
+    if impact.possible:
+        np.testing.assert_allclose(collision.v, impact.v, rtol=0, atol=1e-12)
+    else:
+        assert abs(collision.slips[0]) > 1e-3
+        text = f"v1-palm would slip, {beyond:.3g} N s beyond its friction cone"
+        assert impact.hindrances[0].describe() == text
+
+
 def test_jamming_is_named() -> None:
     """As Painleve's rod: r_x (r_x + mu r_y) / inertia below -1 / mass."""
     impact, r, scene = drop(np.array([2.0, -0.4, 0.0, 0.0, 0.0]), 10.0, lean=0.3)

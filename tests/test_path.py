@@ -8,7 +8,17 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from plane import SQUARE, convex_polygon, finger_gap, make_formation, make_scene, place_corners
+from plane import (
+    SQUARE,
+    convex_polygon,
+    finger_gap,
+    make_formation,
+    make_scene,
+    place_corners,
+    place_tips,
+    rotate,
+)
+from tipping import roll, tip
 from wholearm.contact import Contact
 from wholearm.curve import Curve, metric_weights
 from wholearm.errors import InputError
@@ -74,6 +84,39 @@ def unit_tangent(formation: Formation, z: Array) -> Array:
 def headings(formation: Formation, z: Array) -> tuple[Array, Array]:
     tangent = unit_tangent(formation, z)
     return tangent, -tangent
+
+
+def test_a_box_tips_about_the_vertex_that_rolls() -> None:
+    """Its centroid runs on a circle, and every point of the curve has the vertex in one place."""
+    curve = tip()
+    z = curve.evaluate(interior(curve, 40)).z
+    corners = np.array([place_corners(curve.formation.scene, point)[1] for point in z])
+    place = place_corners(curve.formation.scene, curve.start)[1]
+    np.testing.assert_allclose(corners, np.broadcast_to(place, corners.shape), atol=1e-15)
+    assert np.ptp(z[:, 2]) > 1.4
+    assert curve.reached and curve.end[2] == pytest.approx(-np.pi / 2, abs=1e-12)
+    for segment in curve.segments:
+        assert segment.Xi[0] == 0 and (np.abs(segment.Xi[1:]) == 1).all()
+
+
+def test_a_tip_rolls_on_an_edge() -> None:
+    """What it goes along the edge is what it turns on its radius, against the object."""
+    scene = make_scene(SQUARE, base=0.08, depth=0.0, lengths=(0.04, 0.15), radius=0.01)
+    q = np.array([0.03, -rotate(-0.2, SQUARE)[:, 1].min(), -0.2])
+    z = np.array([*q, close_finger(scene, q, 0), close_finger(scene, q, 1)])
+    formation = roll(make_formation(scene, "v1-palm e1-tip1 v3-finger2"), "e1-tip1")
+    weights = np.sqrt(metric_weights(scene))
+    heading = np.linalg.svd(formation.evaluate(z[None], z[None]).P[0] / weights)[2][-1] / weights
+    curve = trace_curve(formation, z, heading, NEVER)
+    places = np.linspace(0, curve.length, 30)
+    z = curve.evaluate(places).z
+    corners = np.array([place_corners(scene, point) for point in z])
+    run = corners[:, 2] - corners[:, 1]
+    tips = place_tips(scene, 0, z[:, 3])
+    along = ((tips - corners[:, 1]) * run).sum(axis=1) / np.hypot(*run.T)
+    turned = 0.01 * (z[:, 3] - z[:, 2])
+    np.testing.assert_allclose(np.diff(along), np.diff(turned), atol=1e-14)
+    assert np.ptp(along) > 0.002
 
 
 def interior(curve: Curve, count: int) -> Array:

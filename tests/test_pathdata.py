@@ -89,7 +89,7 @@ def test_slack_is_in_its_order(curves: tuple[Curve, ...]) -> None:
     profile = random_profile(data, 1)
     slack = data.slack(data.nodes, profile, margin=0.3)
     forces = direct_forces(curves[0], data.grid.s, data.grid.segment)
-    c_n, tau = forces.c_n(*profile), forces.tau(*profile)
+    c_n, tau = forces.c(*profile), forces.tau(*profile)
     np.testing.assert_allclose(slack[:, :4], c_n - EPSILON - 0.3, atol=1e-11)
     np.testing.assert_allclose(slack[:, 4:6], tau + 2.0, atol=1e-11)
     np.testing.assert_allclose(slack[:, 6:], 2.0 - tau, atol=1e-11)

@@ -22,6 +22,7 @@ import wholearm
 from wholearm import plots
 from wholearm.errors import InputError
 from wholearm.model import Array
+from wholearm.plotdata import choose_snapshots, find_steps
 from wholearm.problem import Problem
 from wholearm.torque import TorqueProfile
 from wholearm.trajectory import Trajectory, assemble
@@ -166,7 +167,7 @@ def test_margins_are_the_trajectory_with_breaks_at_phases(
 
 
 def test_forces_step_at_phases_and_reversals_only(planned: Trajectory) -> None:
-    steps = plots.find_steps(planned)
+    steps = find_steps(planned)
     boundaries = np.flatnonzero(np.diff(planned.phase)) + 1
     assert set(boundaries) <= set(steps)
     # Nothing right beside a boundary, whose torque steps are the boundary's own.
@@ -284,7 +285,7 @@ def test_tip_contacts_are_marked_on_the_tips_surface(problem: Problem) -> None:
 def test_snapshots_are_at_least_six_and_at_most_seven(planned: Trajectory) -> None:
     for phases in ([0], [0, 1], [0, 1, 2], [0, 1, 2, 3], list(range(5)), [0, 1] * 5):
         trajectory = repeat(planned, phases)
-        rows = plots.choose_snapshots(trajectory)
+        rows = choose_snapshots(trajectory)
         assert 6 <= len(rows) <= 7
         assert rows[0] == 0 and rows[-1] == len(trajectory.t) - 1
         assert (np.diff(rows) > 0).all()

@@ -101,6 +101,24 @@ def test_optional_keys() -> None:
     assert str(problem.phases[0].until) == "x = 0.02 m"
 
 
+def test_a_contact_slides_unless_it_is_said_to_roll() -> None:
+    problem = read_edited(put("phases.3.contacts", ["v1-palm rolling", "v0-finger2", "v3-finger1"]))
+    phase, before = problem.phases[3].formation, problem.phases[0].formation
+    assert [contact.name for contact in phase.rolling] == ["v1-palm"]
+    assert phase.rolling[0] == before.contacts[1] and before.rolling == ()
+    assert phase.names == ("v1-palm", "v0-finger2", "v3-finger1")
+    assert [c.name for c in problem.contacts].count("v1-palm") == 1
+
+
+def test_a_contact_without_friction_cannot_roll() -> None:
+    def edit(table: dict[str, Any]) -> None:
+        table["friction"]["finger2"] = 0.0
+        table["phases"][3]["contacts"] = ["v1-palm", "v0-finger2 rolling", "v3-finger1"]
+
+    with pytest.raises(InputError, match=r"v0-finger2 cannot roll .* friction\.finger2 is 0"):
+        read_edited(edit)
+
+
 ALLOWED_UNTIL = "allowed are a contact name"
 
 
@@ -165,6 +183,11 @@ ALLOWED_UNTIL = "allowed are a contact name"
         (put("phases.0.contacts.2", "v4-finger1"), "phases[1].contacts", "fingers touch"),
         (drop("phases.0.contacts.3"), "phases[1].contacts", "v1-palm v2-finger1 v5-finger2"),
         (put("start.x", 0.0), "phases[1].contacts", "v3-finger1 v5-finger2"),
+        (put("phases.0.contacts.1", "v1-palm rolling"), "phases[1].contacts", "makes 5"),
+        (put("phases.0.contacts.1", "v1-palm rolls"), "phases[1].contacts", "'v1-palm rolls'"),
+        (put("phases.0.contacts.1", "v1-palm rolls"), "phases[1].contacts", "' rolling' may"),
+        (put("phases.0.contacts.1", "v0-palm rolling"), "phases[1].contacts", "given twice"),
+        (put("phases.3.until", "v0-palm rolling"), "phases[4].until", "not a contact"),
         (put("phases.3.until", "v0-palmm"), "phases[4].until", "not a contact"),
         (put("phases.3.until", "v1-palm"), "phases[4].until", "already"),
         (put("phases.3.until", 3), "phases[4].until", ALLOWED_UNTIL),

@@ -225,13 +225,13 @@ def test_a_release_as_the_squeeze_fades_and_a_contact_held() -> None:
     assert abs(release.value) < 1e-9
     departing = trajectory.motions[0].evaluate(np.array([release.time])).c_n[0]
     assert abs(departing[1]) < 1e-8 and np.delete(departing, 1).min() > 1.0
-    # Palm friction then stops the vertex while the object turns on, which would be rolling.
+    # Palm friction then stops the vertex, which the phase plans as sliding, while the object turns.
     assert simulation.outcome.kind is OutcomeKind.HELD
     held = simulation.events[-1]
     assert held.kind is EventKind.HELD and held.contact == "v1-palm" and held.phase == 1
     assert simulation.outcome.text == (
         f"friction holds v1-palm at t = {held.time:.5g} s, phase 2, while the rest moves: "
-        "rolling contacts are not modelled"
+        "the phase plans it as sliding"
     )
     v_t = problem.phases[1].formation.evaluate(simulation.z[-1:], simulation.z_dot[-1:]).A_t[0, 0]
     assert abs(v_t @ simulation.z_dot[-1]) < 1e-12

@@ -41,13 +41,26 @@ class PhasePlane:
         self.h = np.concatenate([h for h, _ in parts])
         columns = zip(*(forces for _, forces in parts), strict=True)
         forces = PathForces(*(np.concatenate(column) for column in columns))
-        limit = curves[0].formation.scene.torque_limit
-        self.a = np.hstack([forces.Ca, forces.Ta, -forces.Ta])
-        self.b = np.hstack([forces.Cb, forces.Tb, -forces.Tb])
-        self.squeeze = np.hstack([forces.Cl, forces.Tl, -forces.Tl])
-        none = np.zeros_like(forces.C0)
-        self.root = np.hstack([none, forces.Tv, -forces.Tv])
-        self.constant = np.hstack([forces.C0 - epsilon, forces.T0 + limit, limit - forces.T0])
+        formation = curves[0].formation
+        limit, n_c = formation.scene.torque_limit, formation.n_contacts
+
+        def hold(c: Array) -> Array:
+            """Normal forces, then for each rolling contact mu c_n - c_t and mu c_n + c_t."""
+            columns = [c[:, :n_c]]
+            for k, row in enumerate(formation.rolling_rows):
+                bound = formation.friction[row] * c[:, row]
+                columns.append(np.column_stack([bound - c[:, n_c + k], bound + c[:, n_c + k]]))
+            return np.hstack(columns)
+
+        self.a = np.hstack([hold(forces.Ca), forces.Ta, -forces.Ta])
+        self.b = np.hstack([hold(forces.Cb), forces.Tb, -forces.Tb])
+        self.squeeze = np.hstack([hold(forces.Cl), forces.Tl, -forces.Tl])
+        # Cones are kept as if every normal force were smaller by epsilon.
+        less = forces.C0.copy()
+        less[:, :n_c] -= epsilon
+        held = hold(less)
+        self.root = np.hstack([0 * held, forces.Tv, -forces.Tv])
+        self.constant = np.hstack([held, forces.T0 + limit, limit - forces.T0])
 
     def accelerations(self, k: int, b: Array) -> tuple[Array, Array]:
         """Least and largest a of step k from each b, shape (n,); none where least > largest."""

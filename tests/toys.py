@@ -52,7 +52,15 @@ class Toy:
             Segment(start, stop, np.ones(1), np.full(2, float(index)))
             for index, (start, stop) in enumerate(pairwise(ends))
         ]
-        formation = SimpleNamespace(scene=scene, n_contacts=1, names=("v0-palm",))
+        formation = SimpleNamespace(
+            scene=scene,
+            n_contacts=1,
+            n_rolling=0,
+            names=("v0-palm",),
+            rolling=(),
+            rolling_rows=(),
+            friction=np.zeros(1),
+        )
         stub: Any = SimpleNamespace(length=self.length, segments=segments, formation=formation)
         stub.evaluate = _evaluate
         curve: Curve = stub

@@ -15,41 +15,65 @@ class Scheme(NamedTuple):
 
     Attributes
     ----------
+    name : str
     points : ndarray, shape (d,)
-        Increasing; the last one is 1.
+        Increasing.
     integrals : ndarray, shape (d, d)
         Row j integrates, from 0 to point j, the polynomial through values at the points.
+    weights : ndarray, shape (d,)
+        The same from 0 to 1.
+    order : int
+        Of the error at the end of an interval.
     """
 
+    name: str
     points: Array
     integrals: Array
-
-    @property
-    def between(self) -> Array:
-        """Values at 0 and midway between points, from those at the points, shape (d, d)."""
-        powers = np.arange(self.degree)
-        places = np.append(0.0, (self.points[1:] + self.points[:-1]) / 2)
-        invert = np.linalg.inv(self.points[:, None] ** powers)
-        return np.asarray(places[:, None] ** powers @ invert)
+    weights: Array
+    order: int
 
     @property
     def degree(self) -> int:
         """Number of points d."""
         return len(self.points)
 
+    @property
+    def ends(self) -> bool:
+        """Whether the last point is the end of the interval."""
+        return bool(self.points[-1] == 1.0)
+
+    def interpolate(self, places: Array) -> Array:
+        """Values at `places`, shape (n,), from those at the points: a matrix of shape (n, d)."""
+        powers = np.arange(self.degree)
+        invert = np.linalg.inv(self.points[:, None] ** powers)
+        return np.asarray(places[:, None] ** powers @ invert)
+
 
 @lru_cache(maxsize=8)
-def radau(degree: int) -> Scheme:
-    """Radau IIA points, order 2 d - 1: the zeros of P_d - P_d-1, 1 among them.
+def make_scheme(name: str, degree: int) -> Scheme:
+    """Radau IIA points, order 2 d - 1, or Gauss-Legendre points, order 2 d.
 
+    Radau points are the zeros of P_d - P_d-1, 1 among them, Legendre points those of P_d.
+
+    Parameters
+    ----------
+    name : {"radau", "legendre"}
+    degree : int
+        Number of points d.
+
+    Notes
+    -----
     Source: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II, section IV.5.
     """
     series = np.zeros(degree + 1)
-    series[degree - 1 :] = -1.0, 1.0
-    roots = np.sort(np.polynomial.legendre.legroots(series).real)
-    points = (roots + 1) / 2
-    points[-1] = 1.0
+    series[degree] = 1.0
+    if name == "radau":
+        series[degree - 1] = -1.0
+    points = (np.sort(np.polynomial.legendre.legroots(series).real) + 1) / 2
+    if name == "radau":
+        points[-1] = 1.0
     powers = np.arange(1, degree + 1)
     invert = np.linalg.inv(points[:, None] ** (powers - 1))
     integrals = (points[:, None] ** powers / powers) @ invert
-    return Scheme(points, integrals)
+    order = 2 * degree - (name == "radau")
+    return Scheme(name, points, integrals, (1 / powers) @ invert, order)

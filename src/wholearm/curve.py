@@ -80,7 +80,7 @@ class Segment:
     start, stop : float, [m]
         Arc lengths of its ends.
     Xi : ndarray, shape (n_c,)
-        Sliding directions of the contacts for motion along +s.
+        Sliding directions of the contacts for motion along +s, zero for rolling ones.
     sigma : ndarray, shape (2,)
         Directions of the joints for motion along +s.
     """
@@ -121,7 +121,7 @@ class Curve:
         formation = self.formation
         kinematics = formation.evaluate(z, tangent)
         metric = metric_weights(formation.scene)
-        z_s, z_ss = _solve_tangent(kinematics.A, kinematics.A_dot_v, tangent, metric)
+        z_s, z_ss = _solve_tangent(kinematics.P, kinematics.P_dot_v, tangent, metric)
         return CurvePoint(z, z_s * self.pace, z_ss * self.pace**2, kinematics)
 
     def _interpolate(self, s: Array) -> tuple[Array, Array]:
@@ -155,6 +155,7 @@ class Curve:
         point = self.evaluate(s)
         rho = self.formation.scene.polygon.gyration_radius
         slip = np.einsum("nij,nj->ni", point.kinematics.A_t, point.z_s)
+        slip[:, list(self.formation.rolling_rows)] = 0.0
         return np.hstack([slip, rho * point.z_s[:, 3:]])
 
     @cached_property
@@ -188,12 +189,12 @@ class Curve:
         return tuple(segments)
 
 
-def _solve_tangent(A: Array, A_dot_v: Array, tangent: Array, metric: Array) -> tuple[Array, Array]:
-    """Unit null vector of A nearest to `tangent`, and the curvature orthogonal to it."""
-    matrix = border(A, tangent * metric)
-    right = np.zeros((len(A), 5, 2))
+def _solve_tangent(P: Array, P_dot_v: Array, tangent: Array, metric: Array) -> tuple[Array, Array]:
+    """Unit null vector of P nearest to `tangent`, and the curvature orthogonal to it."""
+    matrix = border(P, tangent * metric)
+    right = np.zeros((len(P), 5, 2))
     right[:, 4, 0] = 1.0
-    right[:, :4, 1] = -A_dot_v
+    right[:, :4, 1] = -P_dot_v
     solution = np.linalg.solve(matrix, right)
     z_s, z_ss = solution[..., 0], solution[..., 1]
     z_s = z_s / np.sqrt(z_s**2 @ metric)[:, None]
@@ -201,10 +202,10 @@ def _solve_tangent(A: Array, A_dot_v: Array, tangent: Array, metric: Array) -> t
     return z_s, z_ss
 
 
-def border(A: Array, last: Array) -> Array:
-    """Append a row to each A: (n, 4, 5) and (5,) or (n, 5) to (n, 5, 5)."""
-    last = np.broadcast_to(last, (len(A), 5))
-    return np.concatenate([A, last[:, None, :]], axis=1)
+def border(P: Array, last: Array) -> Array:
+    """Append a row to each P: (n, 4, 5) and (5,) or (n, 5) to (n, 5, 5)."""
+    last = np.broadcast_to(last, (len(P), 5))
+    return np.concatenate([P, last[:, None, :]], axis=1)
 
 
 def metric_weights(scene: Scene) -> Array:

@@ -38,6 +38,8 @@ class EventKind(Enum):
     """Friction holds a contact or a joint while the rest moves."""
     CONTACT_LOST = "contact lost"
     """A normal force falls to zero."""
+    SLIP = "slip"
+    """A rolling contact leaves its friction cone."""
     LIMIT = "limit"
     """The formation stops being valid in another way."""
     END = "end"
@@ -60,9 +62,9 @@ class Event:
         The contact or joint concerned, empty if there is none.
     value : float
         Arrival: rate at which the distance to the phase's end closes [m/s or rad/s]; contact lost
-        and release: the c_n that the contact would need [N]; impact: the least impulse, that of
-        `contact` [N s]; end: the distance to the phase's end
-        [m or rad], NaN if that is a release; NaN otherwise.
+        and release: the c_n that the contact would need [N]; slip: its margin mu c_n - |c_t| [N];
+        impact: the least impulse, that of `contact` [N s]; end: the distance to the phase's end [m
+        or rad], NaN if that is a release; NaN otherwise.
     """
 
     time: float
@@ -78,6 +80,7 @@ class OutcomeKind(Enum):
 
     GOAL_REACHED = "goal reached"
     CONTACT_LOST = "contact lost"
+    SLIPS = "slips"
     HELD = "held"
     LIMIT_REACHED = "limit reached"
     GOAL_MISSED = "goal missed"

@@ -1,8 +1,15 @@
-"""Contact formations: contacts as constraints A z' = 0, and where they stop being valid.
+"""Contact formations: contacts as constraints P z' = 0, and where they stop being valid.
 
 With the rows of each contact stacked, Eq. (4) reads A z' = 0 with A = [W_n^T, -J_n], the sliding
 velocities are v_t = A_t z' with A_t = [W_t^T, -J_t], and differentiating once more gives
-A z'' + A' z' = 0. For four contacts, Eqs. (6)-(9) split A by the columns of (q, theta_2) and
+A z'' + A' z' = 0. A contact that rolls has v_t = 0 as well, so with R of them the constraints are
+
+    P z' = 0,  P z'' + P' z' = 0,  P = [A; A_t(rolling)],
+
+n_c + R = 2R + S rows for S sliding contacts. Rolling is holonomic here: v_t is the rate of a slip
+coordinate (`wholearm.contact.build_slip`), which keeps its value from where the rolling begins.
+
+For four sliding contacts, Eqs. (6)-(9) split A by the columns of (q, theta_2) and
 theta_1,
 
     P_AI (q', theta_2') + P_AII theta_1' = 0,  P_AI = [W_n^T, -j_2n],  P_AII = -j_1n.
@@ -29,6 +36,7 @@ from .contact import (
     build_gap,
     build_geometry,
     build_limits,
+    build_slip,
     candidate_contacts,
 )
 from .errors import InputError
@@ -47,12 +55,18 @@ class Kinematics(NamedTuple):
     A, A_t : ndarray, shape (n, n_c, 5)
     A_dot_v : ndarray, shape (n, n_c)
         A' v for the velocities v that were given, so that A z'' = -A' z'.
+    P : ndarray, shape (n, n_c + R, 5)
+        Constraint rows [A; A_t(rolling)]; A itself where nothing rolls.
+    P_dot_v : ndarray, shape (n, n_c + R)
+        P' v; A' v itself where nothing rolls.
     """
 
     C: Array
     A: Array
     A_t: Array
     A_dot_v: Array
+    P: Array
+    P_dot_v: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,15 +78,33 @@ class Formation:
     scene : Scene
     contacts : tuple of Contact
         In the order of every array over contacts.
+    rolling : tuple of Contact
+        Those of the contacts that roll; the others slide.
     """
 
     scene: Scene
     contacts: tuple[Contact, ...]
+    rolling: tuple[Contact, ...] = ()
 
     @property
     def n_contacts(self) -> int:
         """Number of contacts n_c."""
         return len(self.contacts)
+
+    @property
+    def n_rolling(self) -> int:
+        """Number of rolling contacts R."""
+        return len(self.rolling)
+
+    @property
+    def n_constraints(self) -> int:
+        """Number of constraint rows, n_c + R, and of independent contact forces."""
+        return len(self.contacts) + len(self.rolling)
+
+    @cached_property
+    def rolling_rows(self) -> tuple[int, ...]:
+        """Which contacts roll, in the order of every array over rolling contacts."""
+        return tuple(self.contacts.index(c) for c in self.contacts if c in self.rolling)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -83,6 +115,13 @@ class Formation:
     def friction(self) -> Array:
         """Diagonal of U, shape (n_c,)."""
         return np.array([self.scene.friction.of(contact.finger) for contact in self.contacts])
+
+    @cached_property
+    def sliding_friction(self) -> Array:
+        """Diagonal of U, shape (n_c,), with zeros for rolling contacts: their c_t is free."""
+        friction = self.friction.copy()
+        friction[list(self.rolling_rows)] = 0.0
+        return friction
 
     @cached_property
     def function(self) -> Expression:
@@ -96,8 +135,36 @@ class Formation:
         return ca.Function("formation", [z, v], [ca.densify(part) for part in outputs])
 
     @cached_property
+    def roll_function(self) -> Expression:
+        """CasADi function (z, v) -> (slip coordinates [m], A_t' v), one row per rolling contact."""
+        z, v = build_features(self.scene).z, ca.SX.sym("v", 5)
+        rolling = [self.contacts[row] for row in self.rolling_rows]
+        slip = ca.vertcat(ca.SX(0, 1), *(build_slip(c, self.scene) for c in rolling))
+        rows = [build_geometry(c, self.scene).A_t for c in rolling]
+        A_t = ca.vertcat(ca.SX(0, 5), *rows)
+        bend = ca.jtimes(A_t @ v, z, v)
+        return ca.Function("roll", [z, v], [ca.densify(slip), ca.densify(bend)])
+
+    def build_constraints(self, z: Expression, v: Expression) -> tuple[Expression, ...]:
+        """Expressions of z and v: the gaps and slip coordinates [m], P, P' v and A_t.
+
+        Gaps and slip coordinates are one column of n_c + R rows. The contacts hold where the gaps
+        are zero and the slip coordinates what they were when the rolling began.
+        """
+        C, A, A_t, A_dot_v = self.function(z, v)
+        if not self.rolling:
+            return C, A, A_dot_v, A_t
+        slip, bend = self.roll_function(z, v)
+        P = ca.vertcat(A, A_t[list(self.rolling_rows), :])
+        return ca.vertcat(C, slip), P, ca.vertcat(A_dot_v, bend), A_t
+
+    @cached_property
     def _batch(self) -> Batch:
         return Batch(self.function)
+
+    @cached_property
+    def _roll_batch(self) -> Batch:
+        return Batch(self.roll_function)
 
     @cached_property
     def limits(self) -> tuple[Limit, ...]:
@@ -148,7 +215,17 @@ class Formation:
             Configurations, and the velocities for A' v.
         """
         C, A, A_t, A_dot_v = self._batch(z, v)
-        return Kinematics(C[..., 0], A, A_t, A_dot_v[..., 0])
+        P, P_dot_v = A, A_dot_v
+        if self.rolling:
+            P = np.concatenate([A, A_t[:, list(self.rolling_rows)]], axis=1)
+            P_dot_v = np.concatenate([A_dot_v, self._roll_batch(z, v)[1]], axis=1)
+        return Kinematics(C[..., 0], A, A_t, A_dot_v[..., 0], P, P_dot_v[..., 0])
+
+    def evaluate_slip(self, z: Array) -> Array:
+        """Slip coordinates of the rolling contacts at n configurations, shape (n, R) [m]."""
+        if not self.rolling:
+            return np.zeros((len(z), 0))
+        return self._roll_batch(z, z)[0][..., 0]
 
     def evaluate_limits(self, z: Array) -> Array:
         """Values of `limits` at n configurations, shape (n, n_limits) [m]."""

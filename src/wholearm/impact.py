@@ -3,15 +3,19 @@
 In no time at all, only impulses act: those of the contacts of the new formation, with friction by
 the sliding law. With v- and v+ the velocities z' before and after,
 
-    M5 (v+ - v-) = G^T p,   A v+ = 0,   G = A - U Xi A_t,   p >= 0,
+    M5 (v+ - v-) = G^T p,   P v+ = 0,
 
-where A, A_t and U are those of the new formation and Xi holds the sliding directions of v+. Joint
-torques, gravity and joint friction are finite and give no impulse. The energy lost is half
-(v+ - v-)^T M5 (v+ - v-) plus the work |v_t|^T U p against friction, so it is never gained.
+where P and G are the constraint and force rows of the new formation (`wholearm.dynamics`): where
+nothing rolls P = A and G = A - U Xi A_t with the sliding directions Xi of v+. The impulses p are
+those of c, and have to obey the same inequalities: every contact presses, and those that roll stay
+in their friction cones. Joint torques, gravity and joint friction are finite and give no impulse.
+The energy lost is half (v+ - v-)^T M5 (v+ - v-) plus the work |v_t|^T U p against sliding friction,
+so it is never gained.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from itertools import product
@@ -19,7 +23,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .dynamics import Directions, reduced_inertia
+from .cones import hold_rows
+from .dynamics import Directions, force_rows, reduced_inertia
 from .formation import TOUCHING, Formation
 from .model import Array
 
@@ -38,6 +43,8 @@ class Obstacle(Enum):
     """Friction holds a contact: no sliding directions are those of the velocity that they give."""
     PULL = "pull"
     """A contact would have to pull."""
+    SLIP = "slip"
+    """A rolling contact would leave its friction cone."""
     CLOSING = "closing"
     """Something that touches, but is not in the formation, would be driven into."""
 
@@ -51,7 +58,8 @@ class Hindrance(NamedTuple):
     name : str
         The contact, or what would happen.
     value : float
-        Its impulse [N s] or rate [m/s]; the reduced inertia over that without friction.
+        Its impulse or margin to slipping [N s], or rate [m/s]; the reduced inertia over that
+        without friction.
     """
 
     kind: Obstacle
@@ -62,6 +70,8 @@ class Hindrance(NamedTuple):
         """Say it in words; `per` is what the numbers are for, if not for the velocity itself."""
         if self.kind is Obstacle.PULL:
             return f"impulse on {self.name} would be {self.value:.3g} N s{per}"
+        if self.kind is Obstacle.SLIP:
+            return f"{self.name} would slip, {-self.value:.3g} N s{per} beyond its friction cone"
         if self.kind is Obstacle.CLOSING:
             return f"{self.name}, at {-self.value:.3g} m/s{per}"
         if self.kind is Obstacle.HELD:
@@ -79,10 +89,10 @@ class Impact:
         The new one.
     v : ndarray, shape (5,)
         v+, in m/s and rad/s; NaN if the formation jams.
-    p : ndarray, shape (n_c,), [N s]
-        Impulses of the contacts, NaN likewise.
+    p : ndarray, shape (n_c + R,), [N s]
+        Impulses of the contacts: normal, then tangential of rolling ones. NaN likewise.
     Xi : ndarray, shape (n_c,)
-        Sliding directions that friction assumes.
+        Sliding directions that friction assumes, zero for rolling contacts.
     hindrances : tuple of Hindrance
         Why it is not possible, the worst first; empty if it is.
     """
@@ -100,8 +110,8 @@ class Impact:
 
     @property
     def least(self) -> tuple[str, float]:
-        """The contact with the least impulse, and that impulse [N s]."""
-        k = int(self.p.argmin())
+        """The contact with the least normal impulse, and that impulse [N s]."""
+        k = int(self.p[: self.formation.n_contacts].argmin())
         return self.formation.names[k], float(self.p[k])
 
 
@@ -116,34 +126,44 @@ def strike(before: Formation, after: Formation, z: Array, v: Array) -> Impact:
         Configuration, and velocity z' just before.
     """
     kinematics = after.evaluate(z[None], v[None])
-    A, A_t, mass = kinematics.A[0], kinematics.A_t[0], after.scene.mass_diagonal
+    P, A_t = kinematics.P[0], kinematics.A_t[0]
+    slides = np.ones(after.n_contacts)
+    slides[list(after.rolling_rows)] = 0.0
+
+    def directions(velocity: Array) -> tuple[float, ...]:
+        return tuple(slides * np.where(A_t @ velocity < 0, -1.0, 1.0))
+
     # Try the sliding of the frictionless impact, then that of each answer; rarely any other.
-    likely = tuple(_signs(A_t @ transfer(mass, A, A, v)[0]))
+    likely = directions(transfer(after.scene.mass_diagonal, P, P, v)[0])
+    others = product(*((1.0, -1.0) if one else (0.0,) for one in slides))
     tried: dict[tuple[float, ...], Impact] = {}
-    for choice in (likely, *product((1.0, -1.0), repeat=after.n_contacts)):
+    for choice in (likely, *others):
         Xi = choice
         while Xi not in tried:
             tried[Xi] = impact = _strike(before, after, z, v, np.array(Xi))
             if _is_sound(impact):
                 return impact
-            Xi = tuple(_signs(A_t @ impact.v))
+            Xi = directions(impact.v)
     return tried[likely]
 
 
 def _strike(before: Formation, after: Formation, z: Array, v: Array, Xi: Array) -> Impact:
     """Throw a velocity onto a formation with given sliding directions."""
     kinematics = after.evaluate(z[None], v[None])
-    A, A_t, mass = kinematics.A[0], kinematics.A_t[0], after.scene.mass_diagonal
-    ratio = float(reduced_inertia(after, kinematics, Directions(Xi, np.ones(2)))[0])
+    P, mass = kinematics.P[0], after.scene.mass_diagonal
+    directions = Directions(Xi, np.ones(2))
+    ratio = float(reduced_inertia(after, kinematics, directions)[0])
     if ratio <= 0:
         jam = Hindrance(Obstacle.JAM, " ".join(after.names), ratio)
-        return Impact(after, np.full(5, np.nan), np.full(len(A), np.nan), Xi, (jam,))
-    v_after, p = transfer(mass, A, A - (after.friction * Xi)[:, None] * A_t, v)
+        return Impact(after, np.full(5, np.nan), np.full(len(P), np.nan), Xi, (jam,))
+    v_after, p = transfer(mass, P, force_rows(after, kinematics, directions)[0], v)
     speed, momentum = np.abs(v).max(), np.abs(mass * v).max()
-    against = Xi * (A_t @ v_after)
+    rolls = [after.names[row] for row in after.rolling_rows]
+    normal, cones = np.split(hold_rows(after) @ p, [after.n_contacts])
     found = [
-        *_list(Obstacle.HELD, after.names, against, ROUNDING * speed),
-        *_list(Obstacle.PULL, after.names, p, ROUNDING * momentum),
+        *_list(Obstacle.HELD, after.names, Xi * (kinematics.A_t[0] @ v_after), ROUNDING * speed),
+        *_list(Obstacle.PULL, after.names, normal, ROUNDING * momentum),
+        *_list(Obstacle.SLIP, [*rolls, *rolls], cones, ROUNDING * momentum),
         *_list(Obstacle.CLOSING, *_rates(before, after, z, v_after), ROUNDING * speed),
     ]
     return Impact(after, v_after, p, Xi, tuple(found))
@@ -166,18 +186,12 @@ def transfer(mass: Array, rows: Array, force_rows: Array, v: Array) -> tuple[Arr
     return np.asarray(v + lift @ p), np.asarray(p)
 
 
-def _signs(rates: Array) -> Array:
-    return np.where(rates < 0, -1.0, 1.0)
-
-
 def _is_sound(impact: Impact) -> bool:
     """Whether the sliding directions are those of the velocity they give."""
     return all(h.kind not in (Obstacle.JAM, Obstacle.HELD) for h in impact.hindrances)
 
 
-def _list(
-    kind: Obstacle, names: tuple[str, ...], values: Array, rounding: float
-) -> list[Hindrance]:
+def _list(kind: Obstacle, names: Sequence[str], values: Array, rounding: float) -> list[Hindrance]:
     """Those of the values that are below zero, the least first."""
     return [
         Hindrance(kind, names[k], float(values[k]))

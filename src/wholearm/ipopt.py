@@ -24,7 +24,13 @@ _OPTIONS = {
 }
 
 
-def build_solver(name: str, nlp: dict[str, Expression], push: float, **options: Any) -> Expression:
+def build_solver(
+    name: str,
+    nlp: dict[str, Expression],
+    push: float,
+    derivatives: dict[str, Expression] | None = None,
+    **options: Any,
+) -> Expression:
     """Return a CasADi function that solves an NLP with Ipopt.
 
     Parameters
@@ -34,6 +40,8 @@ def build_solver(name: str, nlp: dict[str, Expression], push: float, **options: 
         Expressions of x, p, f and g.
     push : float
         How far a given start is kept from its bounds; small to start at a solution.
+    derivatives : dict, optional
+        Functions that CasADi would derive otherwise: `jac_g` and `hess_lag`.
     **options
         Ipopt's, over those that all NLPs share.
     """
@@ -48,5 +56,6 @@ def build_solver(name: str, nlp: dict[str, Expression], push: float, **options: 
         "no_nlp_grad": True,
         "show_eval_warnings": False,
         "error_on_fail": False,
+        **(derivatives or {}),
     }
     return ca.nlpsol(name, "ipopt", nlp, casadi_options)

@@ -83,6 +83,9 @@ def look_again(run: Replay, turned: Sequence[int] = ()) -> Ending | None:
     forces = s.outputs[s.to.c_n]
     if forces.min() < -SLACK_FORCE:
         return let_go(run, np.flatnonzero(forces < -SLACK_FORCE).tolist())
+    cones = s.outputs[s.to.events][s.rows.cone]
+    if (cones < -SLACK_FORCE).any():
+        return slip(run)
     return _hold(run, held[0]) if held else None
 
 
@@ -102,6 +105,15 @@ def let_go(run: Replay, contacts: Sequence[int]) -> Released | Outcome:
         return Released(min(forces[name] for name in run.releasable))
     name = min(pulling, key=forces.__getitem__)
     return run.lose(name, min(0.0, forces[name]))
+
+
+def slip(run: Replay) -> Outcome:
+    """End because the rolling contact that is nearest to it slips, or beyond."""
+    s = run.stepper
+    formation = s.formation
+    cones = s.outputs[s.to.events][s.rows.cone]
+    row = formation.rolling_rows[int(cones.argmin()) % formation.n_rolling]
+    return run.slip(row, float(s.outputs[s.to.c_n][row]), float(s.outputs[s.to.c_t][row]))
 
 
 def turn(run: Replay, rows: Sequence[int]) -> Ending | None:

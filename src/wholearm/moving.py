@@ -17,6 +17,7 @@ from .jumps import (
     coast,
     let_go,
     look_again,
+    slip,
     steps_within,
     turn,
 )
@@ -102,7 +103,8 @@ def _is_there(run: Replay, t: float) -> bool:
         speed = 0.0 if coming >= len(run.steps_at) or run.steps_at[coming] else speed
     elif s.is_free:
         speed = float(np.abs(s.outputs[s.to.y][5:10]).max())
-    return speed < SLOW and bool(s.outputs[s.to.c_n].min() >= -SLACK_FORCE)
+    held = s.outputs[s.to.events][: s.rows.cone.stop]
+    return speed < SLOW and bool(held.min() >= -SLACK_FORCE)
 
 
 def _pass_break(run: Replay) -> Ending | None:
@@ -136,6 +138,8 @@ def _stop_at_event(run: Replay, start: Array, h: float) -> Ending | None:
     pulling = [k for k in kinds if k < rows.force.stop]
     if pulling:
         return let_go(run, pulling)
+    if any(rows.cone.start <= k < rows.cone.stop for k in kinds):
+        return slip(run)
     for k in kinds:
         if rows.limit.start <= k < rows.limit.stop:
             text = f"{run.limits[k - rows.limit.start]} {run.when()}"

@@ -45,10 +45,13 @@ class PlanOptions:
     transcription : str
         ``"auto"`` plans phases with one freedom that are joined at rest or by impacts along their
         curves and others in the time domain; ``"time"`` plans all in the time domain.
-    time_intervals : int
-        Intervals of each phase in the time domain, at least 4.
+    time_intervals : int, optional
+        Intervals of each phase in the time domain, at least 4; when left out, 32 for a phase with
+        one freedom that is planned alone and 16 for others.
     degree : int
         Collocation points per interval in the time domain, from 2 to 6.
+    scheme : str
+        Which points: ``"radau"`` or ``"legendre"``.
 
     Raises
     ------
@@ -62,8 +65,9 @@ class PlanOptions:
     duration: float | None = None
     samples: int = 201
     transcription: str = "auto"
-    time_intervals: int = 16
+    time_intervals: int | None = None
     degree: int = 3
+    scheme: str = "radau"
 
     def __post_init__(self) -> None:
         given = self.objective
@@ -72,10 +76,15 @@ class PlanOptions:
         object.__setattr__(self, "objective", Objective(given))
         for key, least in (("intervals", 10), ("samples", 2), ("time_intervals", 4), ("degree", 2)):
             value = getattr(self, key)
+            if value is None and key == "time_intervals":
+                continue
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
                 raise InputError("", key, f"{value!r} is not a whole number of {least} or more")
         if self.degree > 6:
             raise InputError("", "degree", f"{self.degree} given; allowed are 2 to 6")
+        if self.scheme not in ("radau", "legendre"):
+            given = self.scheme
+            raise InputError("", "scheme", f"{given!r} given; allowed are radau and legendre")
         if self.transcription not in ("auto", "time"):
             given = self.transcription
             raise InputError("", "transcription", f"{given!r} given; allowed are auto and time")

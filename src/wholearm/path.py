@@ -1,9 +1,9 @@
 """One-freedom phases: tracing the curve z(s) that the contacts leave free, from phase to phase.
 
-With four sliding contacts A(z) z' = 0 leaves one direction, so the motion runs along a curve. It is
-traced panel by panel: on each, the points whose projection on the panel's first tangent is a
-Chebyshev-Lobatto node are solved for by Newton, all at once, and the arc length is integrated
-spectrally. No coordinate is singled out, so places
+Four constraints P(z) z' = 0, of four sliding contacts or of two sliding and one rolling, leave
+one direction, so the motion runs along a curve. It is traced panel by panel: on each, the points
+whose projection on the panel's first tangent is a Chebyshev-Lobatto node are solved for by Newton,
+all at once, and the arc length is integrated spectrally. No coordinate is singled out, so places
 where theta_1 (or any other) is stationary are nothing special.
 """
 
@@ -54,7 +54,7 @@ def trace_phases(problem: Problem) -> tuple[Curve, ...]:
 
 def runs_on_curve(phase: Phase) -> bool:
     """Whether a phase has one freedom and ends at rest or with an impact."""
-    return phase.formation.n_contacts == 4 and phase.end is not End.SMOOTH
+    return phase.formation.n_constraints == 4 and phase.end is not End.SMOOTH
 
 
 def trace_phase(problem: Problem, phase: Phase, z: Array) -> Curve:
@@ -134,8 +134,8 @@ def _is_regular(curve: Curve) -> bool:
 def _headings(formation: Formation, z: Array, until: Until) -> list[Array]:
     """Both unit tangents at `z`, the one that approaches `until` first."""
     metric = metric_weights(formation.scene)
-    A = formation.evaluate(z[None], np.zeros((1, 5))).A[0]
-    null = np.linalg.svd(A / np.sqrt(metric))[2][-1] / np.sqrt(metric)
+    P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
+    null = np.linalg.svd(P / np.sqrt(metric))[2][-1] / np.sqrt(metric)
     step = 1e-6 * formation.scene.polygon.gyration_radius
     distances = until_distance(formation, until, np.array([z, z + step * null]))
     forward = null if abs(distances[1]) <= abs(distances[0]) else -null
@@ -148,17 +148,15 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
     Parameters
     ----------
     formation : Formation
-        With four contacts.
+        With four constraints.
     z : ndarray, shape (5,)
-        Start, with all contacts closed.
+        Start, with all contacts closed; rolling ones roll from there.
     heading : ndarray, shape (5,)
         Which way to go.
     until : Until
         What to trace for.
     """
-    scene = formation.scene
-    metric = metric_weights(scene)
-    rho = scene.polygon.gyration_radius
+    rho = formation.scene.polygon.gyration_radius
     names = [limit.text for limit in formation.limits] + [str(until)]
     wanted = [k for k, limit in enumerate(formation.limits) if limit.gained == until.contact]
     wanted = [len(names) - 1] if until.contact is None else wanted
@@ -173,10 +171,11 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
     if until.contact is None:
         side = float(np.sign(until_distance(formation, until, z[None])[0])) or 1.0
     panels: list[Panel] = []
+    slip = formation.evaluate_slip(z[None])[0]
     step, start = rho, 0.0
     tangent = heading
     while start < LONGEST * rho:
-        panel = _build_panel(formation, z, tangent, start, step, metric)
+        panel = _build_panel(formation, slip, z, tangent, start, step)
         if panel is None:
             step /= 2
             if step < 1e-6 * rho:
@@ -235,18 +234,23 @@ def _first_crossing(
 
 
 def _build_panel(
-    formation: Formation, z: Array, heading: Array, start: float, step: float, metric: Array
+    formation: Formation, slip: Array, z: Array, heading: Array, start: float, step: float
 ) -> Panel | None:
-    """Trace one panel of about `step` metres, or return None when that is too far."""
+    """Trace one panel of about `step` metres, or return None when that is too far.
+
+    Rolling contacts keep the slip coordinates `slip`, shape (R,) [m].
+    """
     unit, integrate, analyse = _chebyshev()
+    metric = metric_weights(formation.scene)
     projection = heading * metric
     u = step * unit
     points = z + u[:, None] * heading
     rho = formation.scene.polygon.gyration_radius
     kinematics = formation.evaluate(points, points)
     for _ in range(12):
-        residual = np.column_stack([kinematics.C, (points - z) @ projection - u])
-        matrix = border(kinematics.A, projection)
+        slid = formation.evaluate_slip(points) - slip
+        residual = np.column_stack([kinematics.C, slid, (points - z) @ projection - u])
+        matrix = border(kinematics.P, projection)
         try:
             change = np.linalg.solve(matrix, -residual[..., None])[..., 0]
         except np.linalg.LinAlgError:
@@ -258,7 +262,7 @@ def _build_panel(
             break
     if not size < 1e-10 * rho:
         return None
-    z_u = np.linalg.solve(border(kinematics.A, projection), np.eye(5)[:, 4:])[..., 0]
+    z_u = np.linalg.solve(border(kinematics.P, projection), np.eye(5)[:, 4:])[..., 0]
     speed = np.sqrt(z_u**2 @ metric)
     scaled = np.column_stack([points * np.sqrt(metric) / rho, speed])
     tail = np.abs(analyse @ scaled)[-2:].max()

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .cones import hold_least, hold_rows
 from .curve import Curve, describe_pose
 from .dynamics import PathForces, inverse, reduced_inertia
 from .errors import JammingError
@@ -33,7 +34,10 @@ class Fineness(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Forces and rates of the joints, d theta / ds with shape (n, 2), at n places of a curve."""
+    """Forces and rates of the joints, d theta / ds with shape (n, 2), at n places of a curve.
+
+    In `forces`, H c (`wholearm.cones`) stands for the contact forces c: c itself if nothing rolls.
+    """
 
     forces: PathForces
     rates: Array
@@ -73,18 +77,24 @@ class PhaseData(NamedTuple):
     solid: NDArray[np.int64]
 
     @property
+    def least(self) -> Array:
+        """The least that each row of H c may be, shape (n_h,) [N]."""
+        return hold_least(self.curve.formation, self.epsilon)
+
+    @property
     def torque_limit(self) -> Array:
         """Torque limits, shape (2,) [N m]."""
         return self.curve.formation.scene.torque_limit
 
     def slack(self, places: Places, profile: Profile, margin: float = 0.0) -> Array:
-        """How far each limit is from being missed, shape (n, n_c + 4) [N, N m].
+        """How far each limit is from being missed, shape (n, n_h + 4) [N, N m].
 
-        In the order c_n - epsilon - margin, tau + limit, limit - tau.
+        In the order H c - least (less `margin` for normal forces), tau + limit, limit - tau.
         """
-        c_n, tau = places.forces.c_n(*profile), places.forces.tau(*profile)
-        limit = self.torque_limit
-        return np.hstack([c_n - self.epsilon - margin, tau + limit, limit - tau])
+        held, tau = places.forces.c(*profile), places.forces.tau(*profile)
+        limit, spare = self.torque_limit, self.least.copy()
+        spare[: self.curve.formation.n_contacts] += margin
+        return np.hstack([held - spare, tau + limit, limit - tau])
 
     def largest_b(self, places: Places) -> Array:
         """Largest b that the joints' speed limits allow, shape (n,) [m^2/s^2]."""
@@ -102,7 +112,7 @@ class PhaseData(NamedTuple):
         return Profile((a + x * rise).ravel(), np.maximum(b, 0.0).ravel(), squeeze.ravel())
 
     def misses(self, profile: Profile, margin: float) -> tuple[Array, Array]:
-        """What limits miss inside each solid interval, shape (n_solid, n_c + 4) [N, N m].
+        """What limits miss inside each solid interval, shape (n_solid, n_h + 4) [N, N m].
 
         And how far b is beyond what the speed limits allow, shape (n_solid,), relative.
         """
@@ -114,7 +124,7 @@ class PhaseData(NamedTuple):
         return short[:, :-1], short[:, -1]
 
     def slack_beside(self, profile: Profile, margin: float, short: Array) -> Array:
-        """The lesser slack of the two nodes of each solid interval, shape (n_solid, n_c + 4).
+        """The lesser slack of the two nodes of each solid interval, shape (n_solid, n_h + 4).
 
         Zero where nothing is `short` in the interval.
         """
@@ -154,6 +164,8 @@ def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
             f"friction makes the reduced inertia {inertia[worst]:.3g} of its frictionless value"
         )
     forces = inverse(formation, *point[:3], directions, point.kinematics)
+    if formation.rolling:
+        forces = forces.press(hold_rows(formation))
     every = Places(forces, point.z_s[:, 3:])
     own = len(grid.s) + np.arange(len(between)).reshape(len(solid), -1)
     order = np.hstack([solid[:, None], own, solid[:, None] + 1])
@@ -174,7 +186,7 @@ def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
 
 
 def join(parts: Sequence[PhaseData]) -> PhaseData:
-    """Put phases with as many nodes and contacts each one after the other, joined at speed.
+    """Put phases of sliding contacts, with as many and as many nodes each, one after the other.
 
     Where two meet, the grid has an interval of length zero, as where a direction reverses.
     """

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .curve import Curve
-from .dynamics import Directions, inverse
+from .dynamics import Directions, inverse, split_forces
 from .model import Array
 from .trajectory import Samples
 
@@ -121,14 +121,14 @@ class PathMotion:
         directions = directions_of(self.curve, segment)
         formation = self.curve.formation
         forces = inverse(formation, *point[:3], directions, point.kinematics)
-        c_n = forces.c_n(a, b, squeeze)
+        c_n, c_t = split_forces(formation, forces.c(a, b, squeeze), directions.Xi)
         return Samples(
             point.z,
             point.z_s * np.sqrt(b)[:, None],
             point.z_s * a[:, None] + point.z_ss * b[:, None],
             forces.tau(a, b, squeeze),
             c_n,
-            -formation.friction * directions.Xi * c_n,
+            c_t,
         )
 
 

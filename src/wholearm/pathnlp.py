@@ -5,13 +5,15 @@ friction (`wholearm.dynamics.PathForces`). At the nodes s_k of a grid the unknow
 lambda_k; between two nodes a and lambda are linear in s, and b' = 2 a (dash: d/ds) is then exact:
 
     b_k+1 = b_k + (s_k+1 - s_k) (a_k + a_k+1),
-    c_n >= epsilon,  |tau| <= limit at every node,
+    H c >= least,  |tau| <= limit at every node,
     T = sum of 2 (s_k+1 - s_k) / (sqrt(b_k) + sqrt(b_k+1)).
 
+H c are the normal forces, and the friction cones of contacts that roll (`wholearm.cones`).
+
 Where a direction reverses, the grid has an interval of length zero: b is the same on its two sides,
-a and lambda may jump. So one NLP, built once for a number of contacts, intervals and an objective,
-serves every phase: grid, coefficients and limits are its parameters and bounds. Phases that impacts
-join have such an interval between them, too (`wholearm.chain`).
+a and lambda may jump. So one NLP, built once for some contacts, intervals and an objective, serves
+every phase: grid, coefficients and limits are its parameters and bounds. Phases that impacts join
+have such an interval between them, too (`wholearm.chain`).
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -62,7 +64,7 @@ class Tightening(NamedTuple):
 
     Attributes
     ----------
-    limits : ndarray, shape (N + 1, n_c + 4), [N, N m]
+    limits : ndarray, shape (N + 1, n_h + 4), [N, N m]
         In the order of `PhaseData.slack`.
     speed_share : ndarray, shape (N + 1,)
         Factor on the largest b.
@@ -78,7 +80,7 @@ class Tightening(NamedTuple):
     def none(data: PhaseData, duration: float | None) -> Tightening:
         """Limits as they are."""
         count = len(data.grid.s)
-        limits = np.zeros((count, data.curve.formation.n_contacts + 4))
+        limits = np.zeros((count, len(data.least) + 4))
         return Tightening(limits, np.ones(count), duration)
 
     def by(self, reach: Array, limits: Array, speed_share: Array, late: float) -> Tightening:
@@ -99,21 +101,27 @@ class PathNLP:
     ----------
     solver : casadi.Function
         Takes x0, p, bounds and multipliers; see `build_path_nlp` for their order.
-    n_contacts, intervals : int
+    n_contacts, n_rolling, intervals : int
     objective : Objective
     build_time : float, [s]
     """
 
     solver: Expression
     n_contacts: int
+    n_rolling: int
     intervals: int
     objective: Objective
     build_time: float
 
     @property
+    def n_held(self) -> int:
+        """Number n_h of rows of H c."""
+        return self.n_contacts + 2 * self.n_rolling
+
+    @property
     def columns(self) -> int:
         """Unknowns per node: b, a, squeeze, and one shortfall per limit when elastic."""
-        return 3 + (self.n_contacts + 2 if self.objective is Objective.ELASTIC else 0)
+        return 3 + (self.n_held + 2 if self.objective is Objective.ELASTIC else 0)
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
@@ -124,17 +132,20 @@ class PathNLP:
 
 
 @lru_cache(maxsize=16)
-def build_path_nlp(n_contacts: int, intervals: int, objective: Objective) -> PathNLP:
-    """Build the NLP for every phase of so many contacts.
+def build_path_nlp(
+    n_contacts: int, intervals: int, objective: Objective, n_rolling: int = 0
+) -> PathNLP:
+    """Build the NLP for every phase of so many contacts, of which so many roll.
 
     The unknowns are (b, a, squeeze, shortfalls) node by node, without b at the two ends, then the
     least margin for the objective `margin`. The parameters are the speeds at the ends, the steps,
     the weight of time, and the coefficients of `PathForces` but for C0 and T0, which are part of
     the bounds. The constraints are the N rows of b' = 2 a, the changes of a over the first and the
-    last interval, c_n and tau node by node, and T for `margin`.
+    last interval, H c and tau node by node, and T for `margin`.
     """
     started = time.perf_counter()
-    n, m = intervals + 1, n_contacts + 2
+    n, n_held = intervals + 1, n_contacts + 2 * n_rolling
+    m = n_held + 2
     elastic = objective is Objective.ELASTIC
     b_inner, ends = ca.SX.sym("b", n - 2), ca.SX.sym("ends", 2)
     a, squeeze = ca.SX.sym("a", n), ca.SX.sym("squeeze", n)
@@ -150,14 +161,14 @@ def build_path_nlp(n_contacts: int, intervals: int, objective: Objective) -> Pat
 
     Pa, Pb, Pl, Tv = coefficients
     forces = Pa * spread(a) + Pb * spread(b) + Pl * spread(squeeze)
-    c_n, tau = forces[:, :n_contacts], forces[:, n_contacts:] + Tv * ca.repmat(speed, 1, 2)
+    held, tau = forces[:, :n_held], forces[:, n_held:] + Tv * ca.repmat(speed, 1, 2)
     interval_times = 2 * h / (speed[:-1] + speed[1:])
     duration = ca.sum1(interval_times)
     node_weights = ca.vertcat(0, h) + ca.vertcat(h, 0)
     calm = _CALM * ca.dot(node_weights, squeeze**2) + _SMOOTH * (
         ca.dot(h, (a[1:] - a[:-1]) ** 2) + ca.dot(h, (squeeze[1:] - squeeze[:-1]) ** 2)
     )
-    c_rows, tau_rows, last = c_n, tau, []
+    c_rows, tau_rows, last = held, tau, []
     if objective is Objective.TIME:
         cost = duration
     elif objective is Objective.EFFORT:
@@ -168,13 +179,14 @@ def build_path_nlp(n_contacts: int, intervals: int, objective: Objective) -> Pat
         squares = full[:-1, :] ** 2 + full[:-1, :] * full[1:, :] + full[1:, :] ** 2
         cost = ca.dot(interval_times, ca.sum2(squares)) / 3 + weight * duration
     elif objective is Objective.MARGIN:
-        c_rows = c_n - ca.repmat(margin, n, n_contacts)
+        counted = ca.horzcat(ca.DM.ones(1, n_contacts), ca.DM(1, 2 * n_rolling))
+        c_rows = held - ca.repmat(margin, n, 1) @ counted
         cost, last = -margin, [duration]
     else:
         # Every node counts alike: where intervals are short, being short must not be cheap.
         cost = ca.sum1(ca.sum2(short)) / n + 1e-4 * duration
-        c_rows = c_n + short[:, :n_contacts]
-        tau_rows = ca.horzcat(tau + short[:, n_contacts:], tau - short[:, n_contacts:])
+        c_rows = held + short[:, :n_held]
+        tau_rows = ca.horzcat(tau + short[:, n_held:], tau - short[:, n_held:])
     nodes = ca.horzcat(b, a, squeeze, short).T
     x = ca.vertcat(nodes[1:, 0], ca.vec(nodes[:, 1:-1]), nodes[1:, -1], margin)
     constraints = ca.vertcat(
@@ -187,9 +199,10 @@ def build_path_nlp(n_contacts: int, intervals: int, objective: Objective) -> Pat
     parameters = ca.vertcat(ends, h, weight, *(ca.vec(block) for block in coefficients))
     nlp = {"x": x, "p": parameters, "f": cost + calm, "g": constraints}
     # Started from nowhere near its optimum, the elastic NLP needs the more robust strategy.
-    strategy = {"mu_strategy": "monotone"} if elastic else {"mu_oracle": "probing"}
+    strategy: dict[str, Any] = {"mu_strategy": "monotone"} if elastic else {"mu_oracle": "probing"}
     solver = build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
-    return PathNLP(solver, n_contacts, intervals, objective, time.perf_counter() - started)
+    seconds = time.perf_counter() - started
+    return PathNLP(solver, n_contacts, n_rolling, intervals, objective, seconds)
 
 
 def parameters(nlp: PathNLP, data: PhaseData, scales: Scales, time_weight: float) -> Array:
@@ -215,16 +228,16 @@ def make_bounds(
 ) -> dict[str, Array]:
     """Bounds of the NLP, with every limit tightened."""
     tight, speed_share, duration = tightening
-    n, n_c = len(data.grid.s), nlp.n_contacts
+    n, n_h = len(data.grid.s), nlp.n_held
     b_unit = scales.profile[0]
     low, high = np.full((n, nlp.columns), -np.inf), np.full((n, nlp.columns), np.inf)
     low[:, 0] = _LEAST_B
     high[:, 0] = np.maximum(data.largest_b(data.nodes) * speed_share / b_unit, 2 * _LEAST_B)
     low[:, 3:] = 0.0
     forces, limit = data.nodes.forces, data.torque_limit
-    c_low = (data.epsilon + tight[:, :n_c] - forces.C0) / scales.force
-    t_low = tight[:, n_c : n_c + 2] - limit - forces.T0
-    t_high = limit - tight[:, n_c + 2 :] - forces.T0
+    c_low = (data.least + tight[:, :n_h] - forces.C0) / scales.force
+    t_low = tight[:, n_h : n_h + 2] - limit - forces.T0
+    t_high = limit - tight[:, n_h + 2 :] - forces.T0
     free = np.full_like(t_low, np.inf)
     if nlp.objective is Objective.ELASTIC:
         t_low, t_high = np.hstack([t_low, -free]), np.hstack([free, t_high])
@@ -247,11 +260,11 @@ def first_multipliers(
     """Multipliers that put the first guess near the central path of the barrier problem."""
     if nlp.objective is not Objective.TIME:
         return {}
-    n_c = nlp.n_contacts
+    n_h = nlp.n_held
     slack = data.slack(data.nodes, profile)
-    slack[:, :n_c] /= scales.force
+    slack[:, :n_h] /= scales.force
     pull = _MU / np.maximum(slack, 1e-3)
-    rows = np.hstack([-pull[:, :n_c], pull[:, n_c + 2 :] - pull[:, n_c : n_c + 2]])
+    rows = np.hstack([-pull[:, :n_h], pull[:, n_h + 2 :] - pull[:, n_h : n_h + 2]])
     on_b = np.zeros((len(data.grid.s), nlp.columns))
     on_b[:, 0] = -_MU / np.maximum(profile.b / scales.profile[0], 1e-3)
     return {
@@ -266,7 +279,7 @@ def pack(
     """Unknowns of the NLP, in its units, from a profile and (elastic) shortfalls [N, N m]."""
     table = np.zeros((len(profile.a), nlp.columns))
     if short is not None:
-        table[:, 3:] = short / np.repeat([scales.force, 1.0], [nlp.n_contacts, 2])
+        table[:, 3:] = short / np.repeat([scales.force, 1.0], [nlp.n_held, 2])
     table[:, :3] = np.column_stack([profile.b, profile.a, profile.squeeze]) / scales.profile
     last = [margin / scales.force] if nlp.objective is Objective.MARGIN else []
     return np.concatenate([table[nlp.free], last])
@@ -311,7 +324,7 @@ def move_multipliers(
     middles = (place[1:] + place[:-1]) / 2
     defects = np.interp(middles, nodes[:-1] + 0.5, on_g[:intervals])
     first = intervals + 2
-    stop = first + len(nodes) * (nlp.n_contacts + 2)
+    stop = first + len(nodes) * (nlp.n_held + 2)
     rows = carry(on_g[first:stop].reshape(len(nodes), -1)).ravel()
     return {
         "lam_x0": np.concatenate([carry(table)[nlp.free], on_x[inner:]]),

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .cones import name_holds
 from .curve import Curve, describe_pose
 from .errors import InfeasibleError, SolverError
 from .model import Array
@@ -103,7 +104,8 @@ def plan_curves(
 
     parts = prepare_all(make_grid(curve, options.intervals) for curve in curves)
     data = join(parts)
-    nlp = build_path_nlp(curves[0].formation.n_contacts, len(data.grid.steps), options.goal)
+    first, intervals = curves[0].formation, len(data.grid.steps)
+    nlp = build_path_nlp(first.n_contacts, intervals, options.goal, first.n_rolling)
     profile, scales = guess(data)
     tightening = Tightening.none(data, duration)
     solution = _Solution(profile, 0.0, first_multipliers(nlp, data, profile, scales), 0, 0.0)
@@ -228,8 +230,8 @@ def explain(
 ) -> InfeasibleError | SolverError:
     """Say why phases have no plan: re-solve with every limit soft and rank the shortfalls."""
     data, where = join(parts), _name(phases)
-    n_c = data.curve.formation.n_contacts
-    nlp = build_path_nlp(n_c, len(data.grid.steps), Objective.ELASTIC)
+    first, intervals = data.curve.formation, len(data.grid.steps)
+    nlp = build_path_nlp(first.n_contacts, intervals, Objective.ELASTIC, first.n_rolling)
     profile, scales = guess(data)
     bounds = make_bounds(nlp, data, scales, Tightening.none(data, None))
     short = np.maximum(_shortfalls(data, profile), 0.0) + 0.1
@@ -252,9 +254,9 @@ def explain(
 def _describe_shortfalls(data: PhaseData, profile: Profile) -> list[tuple[float, str]]:
     """What is short on one phase, by how much [N, N m] and in words, the worst first."""
     short, formation = _shortfalls(data, profile), data.curve.formation
-    names = [f"c_n of {name} >= epsilon = {data.epsilon:g} N" for name in formation.names]
+    names = name_holds(formation, data.epsilon)
+    units = ["N"] * len(names) + ["N m"] * 2
     names += [f"torque limit of finger {i + 1} = {data.torque_limit[i]:g} N m" for i in range(2)]
-    units = ["N"] * formation.n_contacts + ["N m"] * 2
     times = PathMotion(data.curve, data.grid, profile).times
     z = data.curve.evaluate(data.grid.s).z
     texts = []
@@ -275,7 +277,7 @@ def _name(phases: Sequence[int]) -> str:
 
 
 def _shortfalls(data: PhaseData, profile: Profile) -> Array:
-    """By how much c_n and tau miss their limits at the nodes, shape (n, n_c + 2) [N, N m]."""
+    """By how much H c and tau miss their limits at the nodes, shape (n, n_h + 2) [N, N m]."""
     slack = data.slack(data.nodes, profile)
-    c_n, torque = slack[:, :-4], np.minimum(slack[:, -4:-2], slack[:, -2:])
-    return -np.hstack([c_n, torque])
+    held, torque = slack[:, :-4], np.minimum(slack[:, -4:-2], slack[:, -2:])
+    return -np.hstack([held, torque])

@@ -96,6 +96,7 @@ def solve_with(
         "value_unit": UNITS[options.goal],
         "epsilon": problem.epsilon,
         "phase_values": values,
+        "rolling": [[c.name for c in phase.formation.rolling] for phase in problem.phases],
         "phase_durations": [motion.duration for motion in motions],
         "transitions": [transition.to_dict() for transition in transitions],
         "intervals": options.intervals,
@@ -152,7 +153,7 @@ def _plan_blocks(
     for block in split_blocks(problem):
         numbers = "-".join(str(phase.number) for phase in block)
         report(f"phase {numbers} of {len(problem.phases)}: {options.goal.value}")
-        if options.transcription == "auto" and all(map(runs_on_curve, block)):
+        if options.transcription == "auto" and _run_on_curves(block):
             own = []
             for phase in block:
                 known = phase.index < len(curves)
@@ -172,6 +173,12 @@ def _plan_blocks(
     return plans, chains
 
 
+def _run_on_curves(block: Sequence[Phase]) -> bool:
+    """Whether phases are planned along their curves: a single one, or several that slide."""
+    rolls = any(phase.formation.rolling for phase in block)
+    return all(map(runs_on_curve, block)) and not (rolls and len(block) > 1)
+
+
 def _refuse_impacts(problem: Problem, block: Sequence[Phase]) -> None:
     """Raise an error for an impact that would have to be planned in the time domain."""
     for phase in block:
@@ -180,7 +187,7 @@ def _refuse_impacts(problem: Problem, block: Sequence[Phase]) -> None:
                 problem.source,
                 f"phases[{phase.number}].end",
                 "'impact' given, but impacts are planned only along curves: between phases with "
-                "four contacts, none of them joined smoothly to another",
+                "four sliding contacts, none of them joined smoothly to another",
             )
 
 

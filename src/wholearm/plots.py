@@ -24,12 +24,12 @@ from matplotlib.patches import Polygon as Outline
 from matplotlib.patches import Rectangle
 from matplotlib.scale import SymmetricalLogTransform
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
-from numpy.typing import NDArray
 
 from .contact import build_features, build_geometry, parse_contact
 from .errors import InputError
 from .files import write_whole
 from .model import Array, Finger, Scene, require_number
+from .plotdata import choose_snapshots, cone_shares, find_steps, sample_torques
 from .problem import build_problem
 from .torque import TorqueProfile
 from .trajectory import Trajectory
@@ -57,7 +57,7 @@ _STYLE: Any = {
     "pdf.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "wholearm",
 }  # fmt: skip
 _LEFT, _RIGHT, _BOTTOM, _TOP = 0.80, 1.30, 0.55, 0.40  # margins [in]; parts of the figure [in]:
-_TORQUES, _GAP, _CAPTION, _STRIP = 1.75, 0.22, 0.77, 1.75
+_TORQUES, _CONES, _GAP, _CAPTION, _STRIP = 1.75, 0.85, 0.22, 0.77, 1.75
 
 
 class ContactStyle(NamedTuple):
@@ -85,7 +85,8 @@ def force_margins(trajectory: Trajectory, *, simulation: Simulation | None = Non
     Returns
     -------
     Figure
-        Axes in the order: snapshots from left to right, margins, torques.
+        Axes in the order: snapshots from left to right, margins, torques, and the friction cones
+        if a contact rolls.
 
     Raises
     ------
@@ -102,6 +103,8 @@ def force_margins(trajectory: Trajectory, *, simulation: Simulation | None = Non
         figure = Figure(figsize=SIZE)
         FigureCanvasAgg(figure)
         low = _BOTTOM + _TORQUES + _GAP
+        rolls = bool(trajectory.rolling.any())
+        cones_at, low = low, low + (_CONES + _GAP if rolls else 0.0)
         high = _draw_strip(figure, trajectory, problem.scene, styles) - _CAPTION
         width = SIZE[0] - _LEFT - _RIGHT
         margins = figure.add_axes(_place(_LEFT, low, width, high - low))
@@ -111,13 +114,18 @@ def force_margins(trajectory: Trajectory, *, simulation: Simulation | None = Non
         draw_torques(torques, trajectory.torque, problem.scene.torque_limit)
         if simulation is not None:
             draw_simulation(margins, torques, simulation, epsilon)
-        for axes in (margins, torques):
+        panels = [margins, torques]
+        if rolls:
+            panels.append(figure.add_axes(_place(_LEFT, cones_at, width, _CONES), sharex=margins))
+            draw_cones(panels[-1], trajectory, problem.scene, styles)
+        for axes in panels:
             draw_phases(axes, trajectory.phase_starts, labels=axes is margins)
             spacing = 0.5 if len(trajectory.contacts) < 14 else 0.1
             axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.02), labelspacing=spacing)
         torques.set(xlabel="time $t$ [s]", xlim=(0.0, trajectory.duration))
-        margins.tick_params(labelbottom=False)
-        figure.align_ylabels([margins, torques])
+        for axes in (margins, *panels[2:]):
+            axes.tick_params(labelbottom=False)
+        figure.align_ylabels(panels)
         look: Any = {"fontsize": 10.5, "fontweight": "bold", "parse_math": False}
         title = _title(trajectory, epsilon)
         figure.text(0.2 / SIZE[0], 1 - 0.12 / SIZE[1], title, va="top", **look)
@@ -147,22 +155,6 @@ def choose_styles(contacts: Sequence[str]) -> dict[str, ContactStyle]:
     """Give every contact its own combination of colour, line and marker."""
     looks = [ContactStyle(colour, *rest) for rest in _LINES for colour in _PALETTE]
     return dict(zip(contacts, cycle(looks), strict=False))
-
-
-def choose_snapshots(trajectory: Trajectory, least: int = 6, most: int = 7) -> NDArray[np.int64]:
-    """Rows of the trajectory to draw: phase boundaries, and instants between if they are few."""
-    starts = trajectory.phase_starts
-    parts = np.ones(len(starts) - 1, dtype=int)
-    while parts.sum() + 1 < least:
-        parts[np.argmax(np.diff(starts) / parts)] += 1
-    rows = [0, len(trajectory.t) - 1]
-    for k, (start, end) in enumerate(pairwise(starts)):
-        own = np.flatnonzero(trajectory.phase == k)
-        for t in np.linspace(start, end, parts[k] + 1)[:-1]:
-            rows.append(own[np.abs(trajectory.t[own] - t).argmin()])
-    chosen = np.unique(rows)
-    few = np.linspace(0, len(chosen) - 1, min(most, len(chosen)))
-    return np.asarray(chosen[few.round().astype(int)])
 
 
 def draw_snapshot(
@@ -242,21 +234,6 @@ def draw_margins(
     return lines
 
 
-def find_steps(trajectory: Trajectory) -> NDArray[np.int64]:
-    """Rows before which forces step: a new phase, a torque's step, a reversed sliding direction."""
-    profile = trajectory.torque
-    before = profile.coefficients[:-1].sum(axis=2)
-    signs = (-1.0) ** np.arange(profile.coefficients.shape[2])
-    after = (profile.coefficients[1:] * signs).sum(axis=2)
-    stepping = np.abs(after - before).max(axis=1) > 1e-3 * np.abs(profile.coefficients).max()
-    breaks, starts = profile.breaks[1:-1], trajectory.phase_starts
-    inner = np.abs(breaks[:, None] - starts).min(axis=1) > 1e-9 * trajectory.duration
-    steps = np.searchsorted(trajectory.t, breaks[stepping & inner], side="right")
-    phases = np.flatnonzero(np.diff(trajectory.phase)) + 1
-    turns = np.flatnonzero((trajectory.c_t[1:] * trajectory.c_t[:-1] < 0).any(axis=1)) + 1
-    return np.unique(np.concatenate([steps, phases, turns]))
-
-
 def _scale_margins(axes: Axes, margins: Array, epsilon: float) -> None:
     """Set a scale that is linear within a hundredth of the largest margin, ticks and limits."""
     largest, smallest = float(np.nanmax(margins)), float(np.nanmin(margins))
@@ -283,6 +260,28 @@ def _scale_margins(axes: Axes, margins: Array, epsilon: float) -> None:
     axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:.6g}".replace("-", "\u2212")))
 
 
+def draw_cones(axes: Axes, trajectory: Trajectory, scene: Scene, styles: Styles) -> list[Line2D]:
+    """Draw c_t / (mu c_n) of every contact while it rolls; at +1 and -1 it would slip.
+
+    Returns one line per contact that rolls, labelled with its name.
+    """
+    fingers = [parse_contact(name, scene).finger for name in trajectory.contacts]
+    shares = cone_shares(trajectory, np.array([scene.friction.of(finger) for finger in fingers]))
+    steps = find_steps(trajectory)
+    t, lines = np.insert(trajectory.t, steps, np.nan), []
+    for index in np.flatnonzero(trajectory.rolling.any(axis=0)):
+        name = trajectory.contacts[index]
+        look: Any = {"color": styles[name].colour, "linestyle": styles[name].line, "zorder": 3}
+        values = np.insert(shares[:, index], steps, np.nan)
+        lines += axes.plot(t, values, linewidth=1.8, label=name, **look)
+    for edge in (-1.0, 1.0):
+        axes.axhline(edge, color="black", linewidth=1.0, zorder=2)
+        axes.axhspan(edge, 1.25 * edge, color=_LOST, linewidth=0, zorder=1.5)
+    axes.axhline(0.0, color=_GRID, linewidth=0.5, zorder=1.6)
+    axes.set(ylim=(-1.25, 1.25), yticks=[-1, 0, 1], ylabel="rolling\n$c_t / (\\mu c_n)$")
+    return lines
+
+
 def draw_torques(axes: Axes, torque: TorqueProfile, limits: Array) -> list[Line2D]:
     """Draw the torques of both joints, with every step upright, and `limits`, shape (2,) [N m].
 
@@ -302,17 +301,6 @@ def draw_torques(axes: Axes, torque: TorqueProfile, limits: Array) -> list[Line2
     reach = 1.12 * max(float(limits.max()), float(np.abs(tau).max()))
     axes.set(ylim=(-reach, reach), ylabel="joint torque $\\tau$ [N m]")
     return lines
-
-
-def sample_torques(torque: TorqueProfile, least: int = 2000) -> tuple[Array, Array]:
-    """Times, shape (n,) [s], and torques, (n, 2) [N m], with both ends of every piece."""
-    pieces, _, order = torque.coefficients.shape
-    count = 2 if order <= 2 else max(order, math.ceil(least / pieces))
-    x = np.linspace(-1.0, 1.0, count)
-    middle, half = (torque.breaks[1:] + torque.breaks[:-1]) / 2, np.diff(torque.breaks) / 2
-    coefficients = np.ascontiguousarray(torque.coefficients)  # einsum's rounding depends on it
-    tau = np.einsum("kjd,xd->kxj", coefficients, np.vander(x, order, increasing=True))
-    return (middle[:, None] + half[:, None] * x).ravel(), tau.reshape(-1, 2)
 
 
 def draw_simulation(

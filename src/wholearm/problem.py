@@ -21,6 +21,9 @@ from .model import Array, Finger, Friction, Polygon, Scene, require_number
 
 _T = TypeVar("_T")
 
+ROLLING = " rolling"
+"""Follows the name of a contact that rolls in a phase's `contacts`."""
+
 _TOP = {"name", "epsilon", "gravity", "object", "fingers", "friction", "start", "phases"}
 _OBJECT = {"vertices", "mass", "inertia"}
 _FINGER = {
@@ -234,10 +237,8 @@ def _read_phase(scene: Scene, index: int, entry: object) -> Phase:
     names = entry["contacts"]
     if not isinstance(names, list) or not names:
         raise InputError("", f"{key}.contacts", f"{names!r} is not a list of contact names")
-    contacts = _at(f"{key}.contacts", lambda: [parse_contact(n, scene) for n in names])
-    twice = {contact.name for contact in contacts if contacts.count(contact) > 1}
-    if twice:
-        raise InputError("", f"{key}.contacts", f"{', '.join(sorted(twice))} is given twice")
+    formation = _at(f"{key}.contacts", lambda: _read_formation(scene, names))
+    contacts = formation.contacts
     given = entry.get("end", End.REST.value)
     if given not in [end.value for end in End]:
         raise InputError("", f"{key}.end", f"{given!r} given; allowed are {_ENDS}")
@@ -250,7 +251,43 @@ def _read_phase(scene: Scene, index: int, entry: object) -> Phase:
         )
     if until.contact in contacts and until.contact is not None:
         raise InputError("", f"{key}.until", f"{until} is already in the phase's contacts")
-    return Phase(index, Formation(scene, tuple(contacts)), until, end)
+    return Phase(index, formation, until, end)
+
+
+def _read_formation(scene: Scene, names: list[object]) -> Formation:
+    """Read contacts, each sliding unless its name is followed by ``rolling``."""
+    stems = [n.removesuffix(ROLLING) if isinstance(n, str) else n for n in names]
+    contacts = tuple(_parse_name(stem, scene) for stem in stems)
+    twice = {contact.name for contact in contacts if contacts.count(contact) > 1}
+    if twice:
+        raise InputError("", "", f"{', '.join(sorted(twice))} is given twice")
+    rolls = [stem != name for stem, name in zip(stems, names, strict=True)]
+    rolling = tuple(contact for contact, own in zip(contacts, rolls, strict=True) if own)
+    formation = Formation(scene, contacts, rolling)
+    for row in formation.rolling_rows:
+        if formation.friction[row] == 0:
+            finger = contacts[row].finger
+            part = "palm" if finger is None else f"finger{finger + 1}"
+            raise InputError(
+                "", "", f"{contacts[row]} cannot roll without friction, and friction.{part} is 0"
+            )
+    if rolling and formation.n_constraints > 4:
+        raise InputError(
+            "",
+            "",
+            f"{len(contacts)} contacts of which {len(rolling)} roll leave no freedom to move: a "
+            f"rolling one counts twice, which makes {formation.n_constraints}; allowed are up to 4",
+        )
+    return formation
+
+
+def _parse_name(name: object, scene: Scene) -> Contact:
+    try:
+        return parse_contact(name, scene)
+    except InputError as error:
+        if isinstance(name, str) and " " in name:
+            raise InputError("", "", f"{error.problem}; {ROLLING!r} may follow") from None
+        raise
 
 
 def _read_until(scene: Scene, given: object) -> Until:

@@ -143,10 +143,20 @@ class Replay:
         self.note(EventKind.CONTACT_LOST, text, contact, c_n)
         return Outcome(OutcomeKind.CONTACT_LOST, text)
 
+    def slip(self, row: int, c_n: float, c_t: float) -> Outcome:
+        """End because a rolling contact slips: the `row`-th of the formation, with forces in N."""
+        formation = self.phase.formation
+        name, bound = formation.names[row], formation.friction[row] * c_n
+        how = "exceeds" if abs(c_t) - bound > 1e-6 else "reaches"
+        text = f"{name} slips: |c_t| = {abs(c_t):.5g} N {how} mu c_n = {bound:.5g} N {self.when()}"
+        self.note(EventKind.SLIP, text, name, bound - abs(c_t))
+        return Outcome(OutcomeKind.SLIPS, text)
+
     def stay(self, name: str) -> Outcome:
         """End because friction holds a contact or a joint while the rest moves."""
-        what = "held joints" if name.startswith("joint") else "rolling contacts"
-        text = f"friction holds {name} {self.when()}, while the rest moves: {what} are not modelled"
+        joint = name.startswith("joint")
+        what = "held joints are not modelled" if joint else "the phase plans it as sliding"
+        text = f"friction holds {name} {self.when()}, while the rest moves: {what}"
         self.note(EventKind.HELD, text, name)
         return Outcome(OutcomeKind.HELD, text)
 

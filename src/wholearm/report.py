@@ -37,6 +37,24 @@ class LeastImpulse:
 
 
 @dataclass(frozen=True)
+class SlipMargin:
+    """The least margin to slipping of one rolling contact in one phase.
+
+    Attributes
+    ----------
+    contact : str
+    least : float, [N]
+        Of mu c_n - |c_t|; NaN if the contact was never seen moving.
+    time : float, [s]
+        When.
+    """
+
+    contact: str
+    least: float
+    time: float
+
+
+@dataclass(frozen=True)
 class Deviation:
     """Largest difference between planned and simulated state: coordinates [m], angles [rad]."""
 
@@ -58,6 +76,8 @@ class PhaseReport:
         How it passes into the next one: at rest, smoothly or with an impact.
     start : float, [s]
     contacts : tuple of ContactMargin
+    rolling : tuple of SlipMargin
+        Of the contacts that roll.
     arrival : float or None, [s]
         When its end was reached, None if it was not.
     arrival_rate : float or None, [m/s or rad/s]
@@ -73,6 +93,7 @@ class PhaseReport:
     end: str
     start: float
     contacts: tuple[ContactMargin, ...]
+    rolling: tuple[SlipMargin, ...]
     arrival: float | None
     arrival_rate: float | None
     impact: LeastImpulse | None
@@ -168,7 +189,8 @@ class Report:
         parts = [f"{self.name}: {'ok' if self.ok else 'FAILED'}", self.outcome]
         parts += [f"failure: {text}" for text in self.failures if text != self.outcome]
         parts += [f"warning: {text}" for text in self.warnings]
-        parts += ["", *_contact_table(self), "", *_phase_table(self), "", *_energy_table(self)]
+        tables = [_contact_table, _rolling_table, _phase_table, _energy_table]
+        parts += [line for table in tables for line in _after_blank(table(self))]
         return "\n".join(parts)
 
 
@@ -191,6 +213,17 @@ def _contact_table(report: Report) -> list[str]:
         for c in p.contacts
     ]  # fmt: skip
     return _table(["phase", "contact", "least c_n [N]", "margin [N]", "at t [s]"], rows, {1})
+
+
+def _rolling_table(report: Report) -> list[str]:
+    """Margins to slipping; nothing if no contact rolls."""
+    rows = [
+        [str(p.number), r.contact, _show(r.least, "+.4f"), _show(r.time, ".5f")]
+        for p in report.phases
+        for r in p.rolling
+    ]
+    header = ["phase", "rolling", "least mu c_n - |c_t| [N]", "at t [s]"]
+    return _table(header, rows, {1}) if rows else []
 
 
 def _phase_table(report: Report) -> list[str]:
@@ -224,6 +257,10 @@ def _energy_table(report: Report) -> list[str]:
         ["residual", energy.residual],
     ]
     return _table(["energy", "[J]"], [[str(n), f"{v: .6e}"] for n, v in rows], {0})
+
+
+def _after_blank(lines: list[str]) -> list[str]:
+    return ["", *lines] if lines else []
 
 
 def _show(value: float | None, form: str) -> str:

@@ -198,6 +198,9 @@ def _collapse(run: Replay, rest: Rest, change: Collapse) -> Released | Outcome:
         )
     if change.held:
         return run.stay(change.contact)
+    if change.c_t is not None:
+        row = run.phase.formation.names.index(change.contact)
+        return run.slip(row, change.c_n, change.c_t)
     if change.contact in run.releasable:
         return Released(change.c_n)
     return run.lose(change.contact, change.c_n)

@@ -14,7 +14,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .dynamics import Directions, reduced_inertia
+from .cones import hold_rows
+from .dynamics import Directions, force_rows, reduced_inertia
 from .formation import Formation, Kinematics
 from .model import Array
 from .stepper import SLACK_FORCE
@@ -48,8 +49,11 @@ class Way(Protocol):
     """One way in which a formation at rest could start to move."""
 
     @property
-    def c_n(self) -> Array:
-        """Normal forces are c_n @ (1, tau_1, tau_2), shape (n_c, 3) [N]."""
+    def held(self) -> Array:
+        """What has to be positive for the contacts to hold, H c, is held @ (1, tau_1, tau_2).
+
+        Shape (n_c + 2 R, 3) [N]; the first n_c are the normal forces.
+        """
 
     @property
     def ratio(self) -> float:
@@ -83,7 +87,8 @@ class Pattern:
         Diagonal of M5.
     acceleration : ndarray, shape (5, 3)
         z''.
-    c_n : ndarray, shape (n_c, 3), [N]
+    held : ndarray, shape (n_c + 2 R, 3), [N]
+        What has to be positive for the contacts to hold, H c (`wholearm.cones`).
     slips : ndarray, shape (n_c + 2, 3)
         Accelerations of the contacts' sliding and of the joints, along `directions`.
     openings : ndarray, shape (k, 3), [m/s^2]
@@ -94,7 +99,7 @@ class Pattern:
     directions: Directions
     mass: Array
     acceleration: Array
-    c_n: Array
+    held: Array
     slips: Array
     openings: Array
     ratio: float
@@ -102,7 +107,7 @@ class Pattern:
     @property
     def margins(self) -> list[tuple[Array, float]]:
         """Rows r and offsets d with r @ (1, tau_1, tau_2) + d >= 0 while it moves this way."""
-        kinds = (self.slips, STILL), (self.openings, CLOSING), (self.c_n, SLACK_FORCE)
+        kinds = (self.slips, STILL), (self.openings, CLOSING), (self.held, SLACK_FORCE)
         return [(row, slack) for rows, slack in kinds for row in rows]
 
     def drive(self, tau: Array) -> float:
@@ -126,7 +131,7 @@ class Pattern:
 
     def moves(self, tau: Array) -> bool:
         """Whether it slides this way and every contact presses."""
-        return bool((self.c_n @ [1.0, *tau] >= -SLACK_FORCE).all()) and self.slides(tau)
+        return bool((self.held @ [1.0, *tau] >= -SLACK_FORCE).all()) and self.slides(tau)
 
     def depart(self, x: float, tau: Array) -> Departure:
         """Start this way at `x` of a piece, where the torques are `tau`."""
@@ -135,7 +140,7 @@ class Pattern:
 
 
 def find_patterns(formation: Formation, z: Array, near: NDArray[np.bool_]) -> tuple[Pattern, ...]:
-    """Every choice of directions at a configuration at rest.
+    """Every choice of directions at a configuration at rest; contacts that roll have none.
 
     Parameters
     ----------
@@ -151,43 +156,46 @@ def find_patterns(formation: Formation, z: Array, near: NDArray[np.bool_]) -> tu
         values = formation.evaluate_limits(z + steps)[:, near]
         gradient = (values[:5] - values[5:]).T / (2 * _STEP)
     count = formation.n_contacts
+    choices: list[tuple[float, ...]] = [(1.0, -1.0)] * (count + 2)
+    for row in formation.rolling_rows:
+        choices[row] = (0.0,)
     return tuple(
         _build_pattern(
             formation, Directions(np.array(s[:count]), np.array(s[count:])), kinematics, gradient
         )
-        for s in product((1.0, -1.0), repeat=count + 2)
+        for s in product(*choices)
     )
 
 
 def solve_at_rest(
     formation: Formation, directions: Directions, kinematics: Kinematics
 ) -> tuple[Array, Array, float]:
-    """Accelerations (5, 3) and normal forces (n_c, 3), affine in the torques, and the ratio."""
-    scene, A = formation.scene, kinematics.A[0]
-    G = A - (formation.friction * directions.Xi)[:, None] * kinematics.A_t[0]
+    """Accelerations (5, 3) and H c (n_c + 2 R, 3), affine in the torques, and the ratio."""
+    scene, P = formation.scene, kinematics.P[0]
+    G = force_rows(formation, kinematics, directions)[0]
     inverse_mass = 1 / scene.mass_diagonal
     applied = np.zeros((5, 3))
     applied[:, 0] = scene.applied_force
     applied[3:, 0] -= scene.dry[3:] * directions.sigma
     applied[3:, 1:] = np.eye(2)
     ratio = float(reduced_inertia(formation, kinematics, directions)[0])
-    c_n = np.zeros((len(A), 3))
+    c = np.zeros((len(P), 3))
     if abs(ratio) > 1e-12:
-        c_n = np.linalg.solve((A * inverse_mass) @ G.T, -(A * inverse_mass) @ applied)
-    return inverse_mass[:, None] * (applied + G.T @ c_n), c_n, ratio
+        c = np.linalg.solve((P * inverse_mass) @ G.T, -(P * inverse_mass) @ applied)
+    return inverse_mass[:, None] * (applied + G.T @ c), hold_rows(formation) @ c, ratio
 
 
 def _build_pattern(
     formation: Formation, directions: Directions, kinematics: Kinematics, gradient: Array
 ) -> Pattern:
-    acceleration, c_n, ratio = solve_at_rest(formation, directions, kinematics)
+    acceleration, held, ratio = solve_at_rest(formation, directions, kinematics)
     rates = np.concatenate([kinematics.A_t[0] @ acceleration, acceleration[3:]])
     signs = np.concatenate(directions)
     return Pattern(
         directions=directions,
         mass=formation.scene.mass_diagonal,
         acceleration=acceleration,
-        c_n=c_n,
+        held=held,
         slips=signs[:, None] * rates,
         openings=gradient @ acceleration,
         ratio=ratio,

@@ -13,7 +13,9 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
+from .cones import hold_rows
 from .contact import Expression, Limit, build_features, build_gap
+from .dynamics import build_force_rows
 from .formation import Formation
 from .model import Array
 from .problem import Until
@@ -40,6 +42,8 @@ class Inputs(NamedTuple):
         Time and step [s]; largest error of z and z' over the step [m, rad, m/s, rad/s].
     Xi, sigma : slice
         Directions of sliding and of the joints.
+    slip : slice
+        Slip coordinates that rolling contacts keep, shape (R,) [m].
     heading : slice
         Velocity at the start of the step, scaled to one in the metric M5 (or the impending one).
     piece : slice
@@ -55,6 +59,7 @@ class Inputs(NamedTuple):
     tolerance: int
     Xi: slice
     sigma: slice
+    slip: slice
     heading: slice
     piece: slice
     torque: slice
@@ -83,7 +88,7 @@ class Outputs(NamedTuple):
     worst : int
         Least of the event values plus their slacks: below zero something has happened.
     dip : int
-        Least c_n at the stages within the step [N].
+        Least c_n and margin to slipping at the stages within the step [N].
     until_rate : int
         Time derivative of the distance to the phase's end.
     events : slice
@@ -113,6 +118,8 @@ class EventRows(NamedTuple):
     ----------
     force : slice
         c_n [N].
+    cone : slice
+        Margins of rolling contacts to slipping, mu c_n - c_t, then mu c_n + c_t [N].
     slide, joint : slice
         Sliding velocities times Xi [m/s], joint speeds times sigma [rad/s].
     limit : slice
@@ -126,6 +133,7 @@ class EventRows(NamedTuple):
     """
 
     force: slice
+    cone: slice
     slide: slice
     joint: slice
     limit: slice
@@ -168,7 +176,7 @@ class Stepper:
     @property
     def is_free(self) -> bool:
         """Whether there is more than one freedom."""
-        return self.formation.n_contacts < 4
+        return self.formation.n_constraints < 4
 
 
 def build_stepper(formation: Formation, until: Until, side: float, degree: int) -> Stepper:
@@ -197,7 +205,8 @@ def build_stepper(formation: Formation, until: Until, side: float, degree: int) 
 
 def _slack(rows: EventRows) -> Array:
     slack = np.full(rows.size, SLACK_SPEED)
-    slack[rows.force], slack[rows.limit] = SLACK_FORCE, SLACK_LIMIT
+    slack[rows.force] = slack[rows.cone] = SLACK_FORCE
+    slack[rows.limit] = SLACK_LIMIT
     slack[rows.until] = 0.0
     return slack
 
@@ -206,22 +215,23 @@ def _slack(rows: EventRows) -> Array:
 def _compile(
     formation: Formation, until: Until, side: float, degree: int
 ) -> tuple[list[Expression], Inputs, Outputs, EventRows]:
-    n_c = formation.n_contacts
-    at = Inputs(*_layout(STATE, 0, 0, 0, n_c, 2, 5, 2, 2 * (degree + 1)))
+    n_c, rolls = formation.n_contacts, formation.n_rolling
+    at = Inputs(*_layout(STATE, None, None, None, n_c, 2, rolls, 5, 2, 2 * (degree + 1)))
     packed = ca.SX.sym("packed", at.size)
     model = _Model(formation, until, side, packed, at)
     y, forces = packed[at.y], []
 
     def rate(state: Expression, t: Expression) -> Expression:
-        rates, c_n, *_ = model.dynamics(state, t)
-        forces.append(c_n)
+        rates, c, *_ = model.dynamics(state, t)
+        forces.append(model.holds @ c)
         return rates
 
     end, fifth, third = build_step(rate, y, packed[at.t], packed[at.h])
     error = build_error(fifth[:10], third[:10], y[:10], packed[at.tolerance])
     dip = ca.mmin(ca.vertcat(*forces))
-    end = _project(formation, end)
-    rows = EventRows(*_layout(n_c, n_c, 2, len(open_limits(formation, until)), 0, 0))
+    end = _project(formation, end, packed[at.slip])
+    limits = len(open_limits(formation, until))
+    rows = EventRows(*_layout(n_c, 2 * rolls, n_c, 2, limits, None, None))
     time = packed[at.t] + packed[at.h]
     functions, to = [], None
     for name, state, when, measured in (
@@ -242,6 +252,7 @@ class _Model:
     ) -> None:
         self.formation, self.packed, self.at = formation, packed, at
         self.Xi, self.sigma = packed[at.Xi], packed[at.sigma]
+        self.holds = ca.sparsify(ca.DM(hold_rows(formation)))
         z = build_features(formation.scene).z
         limits = formation.limits
         gained = [limit for limit in limits if limit.gained == until.contact]
@@ -272,47 +283,51 @@ class _Model:
         return ca.vertcat(*values)
 
     def dynamics(self, y: Expression, t: Expression) -> tuple[Expression, ...]:
-        """Rates of the state, c_n, v_t, tau and K at (z, z') = y[:10]."""
+        """Rates of the state, c, v_t, tau, K and P at (z, z') = y[:10]."""
         formation = self.formation
         scene = formation.scene
         v = y[5:10]
-        _, A, A_t, A_dot_v = formation.function(y[:5], v)
+        _, P, P_dot_v, A_t = formation.build_constraints(y[:5], v)
         tau = self.torque(t)
         inverse_mass = ca.DM(1 / scene.mass_diagonal)
-        slip = ca.DM(formation.friction) * self.Xi
-        G = A - ca.diag(slip) @ A_t
+        G = build_force_rows(formation, P, A_t, self.Xi)
         viscous = ca.DM(scene.viscous[3:]) * v[3:]
         dry = ca.DM(scene.dry[3:]) * self.sigma
         applied = ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau - viscous - dry)
-        K = A @ (inverse_mass * G.T)
-        c_n = ca.solve(K, -A_dot_v - A @ (inverse_mass * applied))
-        acceleration = inverse_mass * (applied + G.T @ c_n)
+        K = P @ (inverse_mass * G.T)
+        c = ca.solve(K, -P_dot_v - P @ (inverse_mass * applied))
+        acceleration = inverse_mass * (applied + G.T @ c)
         v_t = A_t @ v
+        drag = ca.DM(formation.sliding_friction) * self.Xi * c[: formation.n_contacts]
         powers = [ca.dot(force, v[3:]) for force in (tau, viscous, dry)]
-        powers.append(ca.dot(slip * c_n, v_t))
-        return ca.vertcat(v, acceleration, *powers), c_n, v_t, tau, K, A
+        powers.append(ca.dot(drag, v_t))
+        return ca.vertcat(v, acceleration, *powers), c, v_t, tau, K, P
 
     def outputs(
         self, y: Expression, t: Expression, error: Expression, dip: Expression, slack: Array
     ) -> tuple[Expression, Outputs]:
         """All outputs at a state, packed, and their layout."""
         formation = self.formation
-        rates, c_n, v_t, tau, K, A = self.dynamics(y, t)
+        rates, c, v_t, tau, K, P = self.dynamics(y, t)
+        c_n = c[: formation.n_contacts]
+        c_t = -ca.DM(formation.sliding_friction) * self.Xi * c_n
+        c_t[list(formation.rolling_rows)] = c[formation.n_contacts :]
         mass = formation.scene.mass_diagonal
-        frictionless = A @ (ca.DM(1 / mass) * A.T)
+        frictionless = P @ (ca.DM(1 / mass) * P.T)
         v = y[5:10]
         size = ca.sqrt(ca.dot(v, ca.DM(mass) * v))
         heading = ca.if_else(size > 0, v / ca.fmax(size, 1e-300), self.packed[self.at.heading])
         values, distance, gradient = self.geometry(y[:5])
         speed = ca.SX(1)
-        if formation.n_contacts >= 4:
+        if formation.n_constraints >= 4:
             speed = ca.dot(self.packed[self.at.heading], ca.DM(mass) * v)
-        events = ca.vertcat(c_n, self.Xi * v_t, self.sigma * v[3:], values, distance, speed)
+        held = self.holds @ c
+        events = ca.vertcat(held, self.Xi * v_t, self.sigma * v[3:], values, distance, speed)
         parts = [
             y,
             rates[5:10],
             c_n,
-            -ca.DM(formation.friction) * self.Xi * c_n,
+            c_t,
             tau,
             heading,
             ca.det(K) / ca.det(frictionless),
@@ -322,7 +337,7 @@ class _Model:
             gradient @ v,
             events,
         ]
-        sizes = [0 if k in (6, 7, 8, 9, 10) else part.shape[0] for k, part in enumerate(parts)]
+        sizes = [None if k in (6, 7, 8, 9, 10) else part.shape[0] for k, part in enumerate(parts)]
         return ca.densify(ca.vertcat(*parts)), Outputs(*_layout(*sizes))
 
 
@@ -333,28 +348,29 @@ def open_limits(formation: Formation, until: Until) -> list[Limit]:
     ]
 
 
-def _project(formation: Formation, y: Expression) -> Expression:
-    """Move z to C(z) = 0 and z' to A z' = 0, by the shortest way in the metric M5.
+def _project(formation: Formation, y: Expression, slip: Expression) -> Expression:
+    """Move z to closed gaps and the given slip, and z' to P z' = 0, the shortest way in metric M5.
 
     A step leaves gaps of the size of its error, so one Newton iteration closes them to rounding.
     """
     inverse_mass = ca.DM(1 / formation.scene.mass_diagonal)
+    kept = ca.vertcat(ca.SX(formation.n_contacts, 1), slip)
 
     def correct(z: Expression, of_gaps: bool, v: Expression) -> Expression:
-        C, A, _, _ = formation.function(z, v)
-        lift = inverse_mass * A.T
-        return lift @ ca.solve(A @ lift, C if of_gaps else A @ v)
+        held, P, _, _ = formation.build_constraints(z, v)
+        lift = inverse_mass * P.T
+        return lift @ ca.solve(P @ lift, held - kept if of_gaps else P @ v)
 
     z = y[:5] - correct(y[:5], True, ca.SX(5, 1))
     v = y[5:10] - correct(z, False, y[5:10])
     return ca.vertcat(z, v, y[10:])
 
 
-def _layout(*sizes: int) -> tuple[Any, ...]:
-    """Consecutive slices of the given sizes, an index for a size of 0, and the total."""
+def _layout(*sizes: int | None) -> tuple[Any, ...]:
+    """Consecutive slices of the given sizes, an index where None is given, and the total."""
     places: list[Any] = []
     stop = 0
     for size in sizes:
-        places.append(slice(stop, stop + size) if size else stop)
-        stop += size or 1
+        places.append(stop if size is None else slice(stop, stop + size))
+        stop += 1 if size is None else size
     return (*places, stop)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .cones import find_weakest
 from .contact import Contact
 from .dynamics import Directions
 from .errors import SimulationError
@@ -42,8 +43,8 @@ class RestDirection:
         The friction that opposes it.
     acceleration : ndarray, shape (3,)
         Acceleration along `heading` is acceleration @ (1, tau_1, tau_2).
-    c_n : ndarray, shape (n_c, 3)
-        Likewise the normal forces [N].
+    held : ndarray, shape (n_c + 2 R, 3)
+        Likewise what has to be positive for the contacts to hold, H c [N] (`wholearm.cones`).
     ratio : float
         Reduced inertia over that without friction; jammed at zero and below.
     closes : bool
@@ -53,14 +54,14 @@ class RestDirection:
     heading: Array
     directions: Directions
     acceleration: Array
-    c_n: Array
+    held: Array
     ratio: float
     closes: bool
 
     @property
     def margins(self) -> list[tuple[Array, float]]:
         """Rows r and offsets d with r @ (1, tau_1, tau_2) + d >= 0 while it moves this way."""
-        return [(self.acceleration, -STILL), *((row, SLACK_FORCE) for row in self.c_n)]
+        return [(self.acceleration, -STILL), *((row, SLACK_FORCE) for row in self.held)]
 
     def drive(self, tau: Array) -> float:
         """How strongly it accelerates this way, in the metric M5."""
@@ -72,8 +73,8 @@ class RestDirection:
 
     def moves(self, tau: Array) -> bool:
         """Whether the formation starts to move this way under torques `tau`, shape (2,)."""
-        presses = float((self.c_n @ [1.0, *tau]).min()) >= -SLACK_FORCE
-        return self.ratio > 0 and presses and self.slides(tau)
+        holds = float((self.held @ [1.0, *tau]).min()) >= -SLACK_FORCE
+        return self.ratio > 0 and holds and self.slides(tau)
 
     def depart(self, x: float, tau: Array) -> Departure:
         """Start this way at `x` of a piece; the torques do not matter."""
@@ -82,15 +83,17 @@ class RestDirection:
 
 @dataclass(frozen=True)
 class Collapse:
-    """No forces balance any more at `x` of a piece, and no way presses on every contact.
+    """No forces balance any more at `x` of a piece, and no way holds every contact.
 
     Attributes
     ----------
     x : float
     contact : str
-        The contact that would have to pull most, or that cannot start to slide.
+        The contact that would have to pull most, that cannot start to slide, or that slips.
     c_n : float, [N]
         NaN if the contact cannot start to slide.
+    c_t : float or None, [N]
+        Of a rolling contact that slips; `c_n` then keeps it from pulling but not from slipping.
     jammed : bool
         Whether friction jams one of the ways.
     """
@@ -99,6 +102,7 @@ class Collapse:
     contact: str
     c_n: float
     jammed: bool
+    c_t: float | None = None
 
     @property
     def held(self) -> bool:
@@ -186,9 +190,9 @@ class Rest:
         load = np.array([1.0, *tau])
         pulls = find_pulls(self.formation.scene, self.touching, self.z, tau)
         if free or np.isinf(pulls).all():
-            forces = np.array([way.c_n @ load for way in free or self.ways])
-            name = self.formation.names[int(forces.min(axis=0).argmin())]
-            least = float(forces.min())
+            held = min((way.held @ load for way in free or self.ways), key=np.min)
+            row, least, c_t = find_weakest(self.formation, held)
+            return Collapse(high, self.formation.names[row], least, self._jams, c_t)
         else:
             name, least = self.touching[int(pulls.argmax())].name, -float(pulls.max())
         return Collapse(high, name, least, self._jams)
@@ -202,7 +206,7 @@ class Rest:
     def _find_held(self, tau: Array) -> str:
         """The contact or joint that stays, by the choice of directions with fewest that do."""
         patterns = [way for way in self.ways if isinstance(way, Pattern)]
-        pressing = [p for p in patterns if (p.c_n @ [1.0, *tau] >= -SLACK_FORCE).all()]
+        pressing = [p for p in patterns if (p.held @ [1.0, *tau] >= -SLACK_FORCE).all()]
         found = [p.find_held(tau) for p in pressing or patterns]
         names = (*self.formation.names, "joint 1", "joint 2")
         fewest = min((held for held in found if len(held)), key=len, default=np.zeros(1, int))
@@ -219,10 +223,10 @@ def find_rest(formation: Formation, z: Array) -> Rest:
     """
     root = np.sqrt(formation.scene.mass_diagonal)
     kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
-    A = kinematics.A[0]
-    _, values, right = np.linalg.svd(A / root)
+    P = kinematics.P[0]
+    _, values, right = np.linalg.svd(P / root)
     rank = int((values > 1e-9 * values[0]).sum())
-    if rank < len(A) or rank == 5:
+    if rank < len(P) or rank == 5:
         raise SimulationError(
             f"{' '.join(formation.names)} leaves {5 - rank} freedoms, and no forces that are "
             "determined; it cannot start from rest"
@@ -239,11 +243,12 @@ def find_rest(formation: Formation, z: Array) -> Rest:
     rise = (limits[1, near] - limits[2, near]) / 2
     closes = [bool((sign * rise < -SLACK_LIMIT).any()) for sign in (1.0, -1.0)]
     rates = np.concatenate([kinematics.A_t[0] @ heading, heading[3:]])
+    rates[list(formation.rolling_rows)] = 0.0
     still = np.abs(rates) < 1e-9
     signs = np.sign([rates, -rates])
     if still.any():
         # What is stationary here has the direction that it takes up just after.
-        ahead = [_rates(formation, z + sign * step * heading, sign * heading) for sign in (1, -1)]
+        ahead = [_rates(formation, z, step, sign * heading) for sign in (1, -1)]
         signs = np.where(still, np.where(np.abs(ahead) > 1e-12, np.sign(ahead), 0.0), signs)
     ways = tuple(
         _build_way(formation, side * heading, Directions(s[:-2], s[-2:]), kinematics, close)
@@ -265,21 +270,25 @@ def _build_way(
     kinematics: Kinematics,
     closes: bool,
 ) -> RestDirection:
-    acceleration, c_n, ratio = solve_at_rest(formation, directions, kinematics)
+    acceleration, held, ratio = solve_at_rest(formation, directions, kinematics)
     drive = heading * formation.scene.mass_diagonal @ acceleration
-    return RestDirection(heading, directions, drive, c_n, ratio, closes)
+    return RestDirection(heading, directions, drive, held, ratio, closes)
 
 
-def _rates(formation: Formation, z: Array, heading: Array) -> Array:
-    """Sliding and joint rates along the free direction nearest to `heading`, shape (n_c + 2,)."""
-    kinematics = formation.evaluate(close_contacts(formation, z)[None], heading[None])
-    A, inverse_mass = kinematics.A[0], 1 / formation.scene.mass_diagonal
-    lift = inverse_mass[:, None] * A.T
-    tangent = heading - lift @ np.linalg.solve(A @ lift, A @ heading)
+def _rates(formation: Formation, z: Array, step: float, heading: Array) -> Array:
+    """Sliding and joint rates a `step` from `z` along the free direction, shape (n_c + 2,)."""
+    slip = formation.evaluate_slip(z[None])[0]
+    ahead = close_contacts(formation, z + step * heading, slip=slip)
+    kinematics = formation.evaluate(ahead[None], heading[None])
+    P, inverse_mass = kinematics.P[0], 1 / formation.scene.mass_diagonal
+    lift = inverse_mass[:, None] * P.T
+    tangent = heading - lift @ np.linalg.solve(P @ lift, P @ heading)
     return np.concatenate([kinematics.A_t[0] @ tangent, tangent[3:]])
 
 
-def close_contacts(formation: Formation, z: Array, within: float = np.inf) -> Array:
+def close_contacts(
+    formation: Formation, z: Array, within: float = np.inf, slip: Array | None = None
+) -> Array:
     """Nearest configuration, in the metric M5, with every contact of the formation closed.
 
     Parameters
@@ -287,6 +296,9 @@ def close_contacts(formation: Formation, z: Array, within: float = np.inf) -> Ar
     z : ndarray, shape (5,)
     within : float, [m]
         Largest gap to close.
+    slip : ndarray, shape (R,), optional, [m]
+        Slip coordinates to give to rolling contacts; without them these start to roll where they
+        are.
 
     Raises
     ------
@@ -296,17 +308,19 @@ def close_contacts(formation: Formation, z: Array, within: float = np.inf) -> Ar
     inverse_mass = 1 / formation.scene.mass_diagonal
     for _ in range(8):
         kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
-        gaps, A = kinematics.C[0], kinematics.A[0]
+        gaps, rows = kinematics.C[0], kinematics.A[0]
         worst = int(np.abs(gaps).argmax())
         if np.abs(gaps[worst]) > within:
             raise SimulationError(
                 f"{formation.names[worst]}, with a gap of {gaps[worst]:.3g} m, does not touch"
             )
-        if np.abs(gaps[worst]) < 1e-16:
+        slid = np.zeros(0) if slip is None else formation.evaluate_slip(z[None])[0] - slip
+        if np.abs(gaps[worst]) < 1e-16 and (np.abs(slid) < 1e-16).all():
             break
-        lift = inverse_mass[:, None] * A.T
+        rows = rows if slip is None else kinematics.P[0]
+        lift = inverse_mass[:, None] * rows.T
         try:
-            z = z - lift @ np.linalg.solve(A @ lift, gaps)
+            z = z - lift @ np.linalg.solve(rows @ lift, np.concatenate([gaps, slid]))
         except np.linalg.LinAlgError:
             raise SimulationError(f"{' '.join(formation.names)} depend on one another") from None
     if not np.abs(gaps[worst]) < TOUCHING * 1e-3:

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
 from .batch import Batch
 from .collocation import Scheme
 from .curve import metric_weights
-from .dynamics import Directions, build_forward
+from .dynamics import Directions, build_forward, split_forces
 from .formation import Formation
 from .model import Array
 from .stage import StagePoints
@@ -25,35 +24,29 @@ _SWEEPS = 6
 """Times that accelerations are improved. Each gains one to two digits."""
 
 
-class Start(NamedTuple):
-    """State at the start of a stage: z and z', each of shape (5,)."""
-
-    z: Array
-    v: Array
-
-
 @dataclass(frozen=True, eq=False)
 class StageMotion:
     """One stage as a function of time.
 
-    tau is the polynomial through an interval's points. z is what it leads to from the interval's
-    start, pulled onto the contacts, and z' its derivative; z'' and c_n follow by forward dynamics.
-    So the equations of motion and the contacts hold at any instant.
+    tau is linear in each interval. z is what it leads to from the interval's start, pulled onto
+    the contacts, and z' its derivative; z'' and the forces follow by forward dynamics. So the
+    equations of motion and the contacts hold at any instant.
 
     Attributes
     ----------
     formation : Formation
     directions : Directions
     scheme : Scheme
-    start : Start
     points : StagePoints
+    slip : ndarray, shape (R,), [m]
+        Slip coordinates of the rolling contacts.
     """
 
     formation: Formation
     directions: Directions
     scheme: Scheme
-    start: Start
     points: StagePoints
+    slip: Array
 
     @property
     def duration(self) -> float:
@@ -61,18 +54,16 @@ class StageMotion:
         return self.points.duration
 
     @property
-    def intervals(self) -> int:
-        """Number of intervals."""
-        return len(self.points.z) // self.scheme.degree
+    def breaks(self) -> Array:
+        """When each interval starts, and when the last one ends [s]."""
+        return self.duration * self.points.breaks
 
     @cached_property
     def torque(self) -> TorqueProfile:
-        """Torque from the start of the stage, one polynomial per interval."""
-        breaks = np.linspace(0.0, self.duration, self.intervals + 1)
-        values = self.points.tau.reshape(self.intervals, self.scheme.degree, 2)
-        x = 2 * self.scheme.points - 1
-        invert = np.linalg.inv(x[:, None] ** np.arange(self.scheme.degree))
-        return TorqueProfile(breaks, np.einsum("dm,kmj->kjd", invert, values))
+        """Torque from the start of the stage, linear in each interval."""
+        first, last = self.points.tau[:, 0], self.points.tau[:, 1]
+        coefficients = np.stack([(first + last) / 2, (last - first) / 2], axis=2)
+        return TorqueProfile(self.breaks, coefficients)
 
     @cached_property
     def _forward(self) -> Batch:
@@ -86,16 +77,14 @@ class StageMotion:
         that follow there by forward dynamics again, until they are one motion. What is left at
         the end, the error of collocation, is spread over the interval.
         """
-        count, degree, half = self.intervals, self.scheme.degree, self.duration / self.intervals / 2
-        z, v = (
-            np.concatenate([first[None], values[degree - 1 :: degree]])
-            for first, values in ((self.start.z, self.points.z), (self.start.v, self.points.v))
-        )
+        nodes, half = self.points.nodes, np.diff(self.breaks)[:, None, None] / 2
+        z, v = nodes[:, 0], nodes[:, 1]
         x = -np.cos(np.pi * np.arange(_NODES) / (_NODES - 1))
         powers = x[:, None] ** np.arange(_NODES + 2)
-        tau = np.einsum("kjd,nd->knj", self.torque.coefficients, powers[:, :degree])
+        tau = np.einsum("kjd,nd->knj", self.torque.coefficients, powers[:, :2])
+        count = len(half)
         signs = [np.broadcast_to(part, (count * _NODES, len(part))) for part in self.directions]
-        a = _fit(2 * self.scheme.points - 1, self.points.a.reshape(count, degree, 5))
+        a = _fit(2 * self.scheme.points - 1, self.points.a)
         for _ in range(_SWEEPS):
             velocity = _integrate(a, half, v[:-1])
             place = _integrate(velocity, half, z[:-1])
@@ -114,12 +103,12 @@ class StageMotion:
 
     def _interpolate(self, t: Array) -> tuple[Array, Array]:
         """Z and its derivative by the polynomial of each interval."""
-        breaks = self.torque.breaks
-        piece = np.clip(np.searchsorted(breaks, t, side="right") - 1, 0, self.intervals - 1)
-        half = self.duration / self.intervals / 2
+        breaks = self.breaks
+        piece = np.clip(np.searchsorted(breaks, t, side="right") - 1, 0, len(breaks) - 2)
+        half = np.diff(breaks)[piece] / 2
         x = (t - breaks[piece]) / half - 1
         places = self._pieces[piece]
-        rates = np.polynomial.polynomial.polyder(places, axis=2) / half
+        rates = np.polynomial.polynomial.polyder(places, axis=2) / half[:, None, None]
         powers = x[:, None] ** np.arange(places.shape[2])
         z = np.einsum("njd,nd->nj", places, powers)
         return z, np.einsum("njd,nd->nj", rates, powers[:, :-1])
@@ -131,14 +120,15 @@ class StageMotion:
         metric = metric_weights(formation.scene)
         for _ in range(3):
             kinematics = formation.evaluate(z, v)
-            z = z - _lift(kinematics.A, metric, kinematics.C)
+            gaps = np.hstack([kinematics.C, formation.evaluate_slip(z) - self.slip])
+            z = z - _lift(kinematics.P, metric, gaps)
         kinematics = formation.evaluate(z, v)
-        v = v - _lift(kinematics.A, metric, np.einsum("nij,nj->ni", kinematics.A, v))
+        v = v - _lift(kinematics.P, metric, np.einsum("nij,nj->ni", kinematics.P, v))
         tau = self.torque.at(t)
         Xi, sigma = (np.broadcast_to(part, (len(t), len(part))) for part in self.directions)
-        a, c_n, _ = self._forward(z, v, tau, Xi, sigma)
-        c_t = -formation.friction * self.directions.Xi * c_n[..., 0]
-        return Samples(z, v, a[..., 0], tau, c_n[..., 0], c_t)
+        a, c, _ = self._forward(z, v, tau, Xi, sigma)
+        c_n, c_t = split_forces(formation, c[..., 0], Xi)
+        return Samples(z, v, a[..., 0], tau, c_n, c_t)
 
 
 def _fit(x: Array, values: Array) -> Array:
@@ -147,17 +137,17 @@ def _fit(x: Array, values: Array) -> Array:
     return np.asarray(np.einsum("dn,knj->kjd", invert, values))
 
 
-def _integrate(powers: Array, scale: float, start: Array) -> Array:
+def _integrate(powers: Array, scale: Array, start: Array) -> Array:
     """Integral from x = -1, times `scale`, of polynomials (K, 5, n), from `start`, (K, 5)."""
-    integral = np.polynomial.polynomial.polyint(powers, lbnd=-1, scl=scale, axis=2)
+    integral = scale * np.polynomial.polynomial.polyint(powers, lbnd=-1, axis=2)
     integral[..., 0] += start
     return np.asarray(integral)
 
 
-def _lift(A: Array, metric: Array, residual: Array) -> Array:
-    """Shortest changes of z, shape (n, 5), that change the gaps by `residual`, shape (n, n_c)."""
-    spread = (A / metric).transpose(0, 2, 1)
-    return np.asarray((spread @ np.linalg.solve(A @ spread, residual[..., None]))[..., 0])
+def _lift(P: Array, metric: Array, residual: Array) -> Array:
+    """Shortest changes of z, shape (n, 5), that change the constraints by `residual`, (n, n_p)."""
+    spread = (P / metric).transpose(0, 2, 1)
+    return np.asarray((spread @ np.linalg.solve(P @ spread, residual[..., None]))[..., 0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,12 +175,6 @@ class TimeMotion:
     def torque(self) -> TorqueProfile:
         """Torque from the start of the phase."""
         return TorqueProfile.chain([stage.torque for stage in self.stages])
-
-    @property
-    def end(self) -> Start:
-        """State at the end of the phase."""
-        last = self.stages[-1].points
-        return Start(last.z[-1], last.v[-1])
 
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""

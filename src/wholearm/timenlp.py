@@ -1,20 +1,23 @@
 """The planning NLP in the time domain, for formations with any number of freedoms.
 
 A stage is a stretch on one formation with fixed directions of friction, of free duration T, in K
-intervals with d collocation points each. At every point z, z', z'', c_n and tau are unknowns, and
+intervals with d collocation points each. Torques are linear in each interval and may step between.
+Unknowns are z, w = T z' and T at the nodes between intervals, and z, w, u = T^2 z'' and the contact
+forces c at every point, where
 
-    C(z) = 0,  A z' = 0,  A z'' + A' z' = 0,
-    M5 z'' + B z' + D sigma = g + S tau + G^T c_n,
-    c_n >= epsilon,  |tau| <= limit,  Xi A_t z' >= 0,  sigma theta' >= 0.
+    C(z) = 0,  P w = 0,  P u + P'(w) w = 0,
+    M5 u + T B w = T^2 (g - D sigma + S tau + G^T c),
+    c_n >= epsilon,  |tau| <= limit,  Xi A_t w >= 0,  sigma theta' >= 0,  |c_t| <= mu c_n (rolling).
 
 So contacts hold at every point, without drift, and friction never pushes the wrong way. Along the
-contacts' tangent space alone, with an orthonormal basis N of the null space of A at a guess of
-each interval, the differential equations are collocated:
+contacts' tangent space alone, with an orthonormal basis N of the null space of P at a guess of
+each interval, the differential equations are collocated, with h the interval's share of T:
 
-    N^T (z_j - z_0 - h sum_l a_jl z'_l) = 0,  N^T (z'_j - z'_0 - h sum_l a_jl z''_l) = 0.
+    N^T (z_j - z_0 - h sum_l a_jl w_l) = 0,  N^T (w_j - w_0 - h sum_l a_jl u_l) = 0.
 
-Stages that follow one another share position and velocity. The equations of a point are one
-expanded function, mapped over the points of a stage.
+These rows are linear. Unknowns and rows are in the order of time, and each node's z, w and T are a
+function of the interval before it. What stands still at an instant has no sense of friction there:
+an inequality that equations keep at zero would leave the solver no interior.
 """
 
 from __future__ import annotations
@@ -22,31 +25,64 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any
 
-import casadi as ca
 import numpy as np
 
+from .blocknlp import Indices, assemble_nlp
 from .collocation import Scheme
-from .contact import Contact, Expression, build_features, build_gap
+from .contact import Expression
 from .curve import metric_weights
-from .formation import TOUCHING, Formation
+from .formation import Formation
 from .ipopt import build_solver
 from .model import Array
 from .options import Objective
 from .stage import Stage
+from .timekernels import (
+    effort_kernel,
+    end_kernel,
+    goal_kernel,
+    impact_kernel,
+    join_kernel,
+    opening_kernel,
+    point_kernel,
+    watch_kernel,
+)
+from .timelayout import BEFORE, MARGIN, StageLayout, T, W, Z, lay_out
+from .timerows import Rows
 
 OPENING = 0.1
 """Least acceleration with which the gap of a released contact opens [m/s^2]."""
 CLEAR = 2e-5
-"""Gap of a released contact after a third of the stage at least [m]."""
-SLIDING = 0.005
-"""Least sliding over the radius of gyration, and least speed of a joint [rad/s]."""
-SHORTEST = 1e-4
-"""Least duration of a stage [s]."""
-LONGEST = 20.0
-"""Largest duration of a stage [s]."""
+"""Gap of a released contact after a third of the first stage without it at least [m]."""
+SLIDING = 0.05
+"""Least sliding over the radius of gyration, and least speed of a joint [rad/s]: what hardly moves
+would be held by friction."""
+SHORTEST, LONGEST = 1e-4, 20.0
+"""Least and largest duration of a stage [s]."""
+PUSH = 1e-6
+"""How far the first guess is kept from its bounds."""
+
+
+@dataclass(frozen=True, eq=False)
+class StageRows:
+    """Rows of one stage, interval by interval.
+
+    Attributes
+    ----------
+    states : ndarray of int, shape (K, m)
+        How z, w and T go on.
+    points : ndarray of int, shape (K, d, m)
+        What holds at the points; the last 2 R are the friction cones of rolling contacts.
+    presses : ndarray of int, shape (K, m, n_c)
+        What has to exceed the least c_n of its interval and contact.
+    watches : ndarray of int, shape (K, d, m)
+        Limits of the formation.
+    """
+
+    states: Indices
+    points: Indices
+    presses: Indices
+    watches: Indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,278 +92,266 @@ class TimeNLP:
     Attributes
     ----------
     solver : casadi.Function
-    low, high : ndarray
-        Bounds of the constraints.
+    layouts : list of StageLayout
+    rows : Rows
+    rows_of : list of StageRows
+    lasts : int
+        Row of the whole duration, for `margin`; otherwise -1.
     build_time : float, [s]
     """
 
     solver: Expression
-    low: Array
-    high: Array
+    layouts: list[StageLayout]
+    rows: Rows
+    rows_of: list[StageRows]
+    lasts: int
     build_time: float
-
-
-class _Rows:
-    """Constraints under construction."""
-
-    def __init__(self) -> None:
-        self.parts: list[Expression] = []
-        self.low: list[Array] = []
-        self.high: list[Array] = []
-
-    def add(self, rows: Expression, low: float = 0.0, high: float = 0.0) -> None:
-        rows = ca.vec(rows)
-        self.parts.append(rows)
-        self.low.append(np.full(rows.numel(), low))
-        self.high.append(np.full(rows.numel(), high))
 
 
 def build_time_nlp(
     stages: Sequence[Stage],
     scheme: Scheme,
-    start: tuple[Array, Array],
     objective: Objective,
     time_weight: float,
     max_iter: int,
 ) -> TimeNLP:
     """Build the NLP of stages that follow one another and end at rest.
 
-    The unknowns are those of `StagePoints.pack`, stage after stage; for `margin` the least margin
-    follows. The parameters, for each stage, are what c_n has to exceed, (n_c, K) [N], and what
-    tau must not exceed, (2, K) [N m], in each interval.
-
     Parameters
     ----------
     stages : sequence of Stage
     scheme : Scheme
-    start : tuple of ndarray, shape (5,)
-        z and z' at the start.
     objective : Objective
     time_weight : float, [(N m)^2]
         For `effort`.
     max_iter : int
-        Most iterations of Ipopt.
+        Most iterations of the solver.
     """
     started = time.perf_counter()
-    rows = _Rows()
-    unknowns, durations, efforts, limits = [], [], [], []
-    margin = ca.MX.sym("margin", 1 if objective is Objective.MARGIN else 0)
-    z_before, v_before = ca.DM(start[0]), ca.DM(start[1])
-    rho = stages[0].formation.scene.polygon.gyration_radius
-    for stage in stages:
-        count, n_c = len(stage.z) - 1, stage.formation.n_contacts
-        duration, table = ca.MX.sym("T"), ca.MX.sym("points", 17 + n_c, count)
-        unknowns += [duration, ca.vec(table)]
-        durations.append(duration)
-        z, v, a, c_n, tau = ca.vertsplit(table, [0, 5, 10, 15, 15 + n_c, 17 + n_c])
-        Xi, sigma = (ca.repmat(ca.DM(part), 1, count) for part in stage.directions)
-        physics, senses = _point_function(stage.formation).map(count)(z, v, a, c_n, tau, Xi, sigma)
-        rows.add(physics)
-        rows.add(senses - ca.DM(_least_senses(stage, scheme)), 0.0, np.inf)
-        _collocate(rows, stage, scheme, (z, v, a), (z_before, v_before), duration)
-        if stage.watched:
-            values = _watch_function(stage.formation, stage.watched).map(count)(z)
-            rows.add((values - ca.DM(_clearance(stage, scheme))) / rho, 0.0, np.inf)
-        for contact in _find_opening(stage):
-            opening = _opening_function(stage.formation, contact).map(scheme.degree)
-            first = [block[:, : scheme.degree] for block in (z, v, a)]
-            rows.add(opening(*first) - OPENING, 0.0, np.inf)
-        intervals = count // scheme.degree
-        floor, cap = ca.MX.sym("floor", n_c, intervals), ca.MX.sym("cap", 2, intervals)
-        limits += [ca.vec(floor), ca.vec(cap)]
-        least = floor if margin.is_empty() else floor + margin
-        _limit(rows, scheme, (c_n, tau), (least, cap))
-        z_before, v_before = z[:, -1], v[:, -1]
-        _end_stage(rows, stage, z_before, v_before, rho)
-        efforts.append(_integrate_squares(tau, scheme, duration, count))
-    _rest(rows, stages[-1], v_before)
-    total = sum(durations)
-    cost = {
-        Objective.TIME: total,
-        Objective.EFFORT: sum(efforts) + time_weight * total,
-        Objective.MARGIN: -margin,
-    }[objective]
-    if objective is Objective.MARGIN:
-        rows.add(total, 0.0, np.inf)
-    nlp = {
-        "x": ca.vertcat(*unknowns, margin),
-        "p": ca.vertcat(*limits),
-        "f": cost,
-        "g": ca.vertcat(*rows.parts),
-    }
-    solver = build_solver("time_nlp", nlp, 1e-6, max_iter=max_iter)
-    low, high = np.concatenate(rows.low), np.concatenate(rows.high)
-    return TimeNLP(solver, low, high, time.perf_counter() - started)
+    with_margin = objective is Objective.MARGIN
+    layouts = lay_out(stages, scheme, with_margin)
+    rows, cost = Rows(), np.zeros(layouts[-1].stop)
+    _start(rows, layouts[0].nodes[0], stages[0].guess.nodes[0])
+    rows_of = []
+    for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True)):
+        rows_of.append(_add_stage(rows, stage, layout, scheme, stage is stages[-1]))
+        if k + 1 < len(stages):
+            _join(rows, stage, stages[k + 1], layout, layouts[k + 1].nodes[0])
+        if objective is Objective.EFFORT:
+            columns = np.hstack([layout.tau, layout.nodes[:-1, T, None]])
+            rows.charge(effort_kernel(), columns, stage.guess.fractions[:, None])
+        if not with_margin:
+            cost[layout.nodes[-1, T]] = 1.0 if objective is Objective.TIME else time_weight
+    lasts, last, end = -1, stages[-1], layouts[-1].nodes[-1]
+    if with_margin:
+        cost[end[MARGIN]] = -1.0
+        total = rows.linear(1, high=np.inf)
+        rows.put(total, end[[T, BEFORE]], 1.0)
+        lasts = int(total[0])
+    N = tangent_basis(last.formation, last.guess.nodes[-1, 0])
+    rest = rows.linear(N.shape[1])
+    rows.put(rest[:, None], end[W], N.T)
+    built = assemble_nlp(len(cost), rows.triplets, rows.linear_rows, rows.blocks, cost)
+    solver = build_solver("time_nlp", built.nlp, PUSH, built.derivatives, max_iter=max_iter)
+    seconds = time.perf_counter() - started
+    return TimeNLP(solver, layouts, rows, rows_of, lasts, seconds)
 
 
-@lru_cache(maxsize=32)
-def _point_function(formation: Formation) -> Expression:
-    """Function (z, z', z'', c_n, tau, Xi, sigma) -> equations and senses of friction at a point."""
-    scene, n_c = formation.scene, formation.n_contacts
-    z, v, a = (ca.SX.sym(name, 5) for name in ("z", "v", "a"))
-    c_n, tau = ca.SX.sym("c_n", n_c), ca.SX.sym("tau", 2)
-    Xi, sigma = ca.SX.sym("Xi", n_c), ca.SX.sym("sigma", 2)
-    C, A, A_t, A_dot_v = formation.function(z, v)
-    G = A - ca.diag(ca.DM(formation.friction) * Xi) @ A_t
-    friction = ca.DM(scene.viscous) * v + ca.DM(scene.dry) * ca.vertcat(0, 0, 0, sigma)
-    applied = ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau)
-    balance = ca.DM(scene.mass_diagonal) * a + friction - applied - G.T @ c_n
-    rho = scene.polygon.gyration_radius
-    equations = ca.vertcat(C / rho, A @ v, 0.1 * (A @ a + A_dot_v), balance)
-    senses = ca.vertcat(Xi * (A_t @ v) / rho, sigma * v[3:])
-    return ca.Function("point", [z, v, a, c_n, tau, Xi, sigma], [equations, senses])
+def _start(rows: Rows, node: Indices, state: Array) -> None:
+    """Rest at the first node, and nothing passed yet."""
+    own = rows.linear(10, low=state.ravel(), high=state.ravel())
+    rows.put(own, node[:T], 1.0)
+    if len(node) > MARGIN:
+        rows.put(rows.linear(1), node[BEFORE], 1.0)
 
 
-@lru_cache(maxsize=64)
-def _watch_function(formation: Formation, watched: tuple[int, ...]) -> Expression:
-    values = ca.vertcat(*(formation.limits[k].value for k in watched))
-    return ca.Function("watch", [build_features(formation.scene).z], [values])
-
-
-def _least_senses(stage: Stage, scheme: Scheme) -> Array:
-    """What each sense of friction has to exceed, shape (n_c + 2, K d) [rad/s].
-
-    A contact that hardly slides would be held by friction, which is not what the plan assumes. At
-    both ends, where motion starts, stops or turns, it is nothing.
-    """
-    x = _fractions(stage, scheme)
-    return np.tile(SLIDING * 4 * x * (1 - x), (stage.formation.n_contacts + 2, 1))
-
-
-def _clearance(stage: Stage, scheme: Scheme) -> Array:
-    """What each watched limit has to exceed at each point, shape (n_watched, K d) [m].
-
-    Nothing, but for a contact just released, which has to be well clear after a third of the stage.
-    """
-    values = stage.formation.evaluate_limits(stage.z[:1])[0, list(stage.watched)]
-    released = stage.follows & (np.abs(values) < TOUCHING)
-    later = _fractions(stage, scheme) > 1 / 3
-    return np.asarray(CLEAR * np.outer(released, later), dtype=float)
-
-
-def _fractions(stage: Stage, scheme: Scheme) -> Array:
-    """Time of each point over the stage's duration, shape (K d,)."""
-    count = (len(stage.z) - 1) // scheme.degree
-    return np.asarray((np.arange(count)[:, None] + scheme.points).ravel() / count)
-
-
-def _find_opening(stage: Stage) -> list[Contact]:
-    """Contacts that touch at the start of a stage but are not in its formation."""
-    if not stage.follows:
-        return []
-    values = stage.formation.evaluate_limits(stage.z[:1])[0]
-    near = np.flatnonzero(np.abs(values) < TOUCHING)
-    gained = [stage.formation.limits[k].gained for k in near]
-    return [contact for contact in gained if contact is not None]
-
-
-@lru_cache(maxsize=64)
-def _opening_function(formation: Formation, contact: Contact) -> Expression:
-    """Function (z, z', z'') -> second derivative of the gap of a contact [m/s^2]."""
-    z, v, a = (ca.SX.sym(name, 5) for name in ("z", "v", "a"))
-    _, A, _, A_dot_v = Formation(formation.scene, (contact,)).function(z, v)
-    return ca.Function("opening", [z, v, a], [A @ a + A_dot_v])
-
-
-def _collocate(
-    rows: _Rows,
-    stage: Stage,
-    scheme: Scheme,
-    points: tuple[Expression, Expression, Expression],
-    start: tuple[Expression, Expression],
-    duration: Expression,
-) -> None:
-    """Collocate z' and z'' along the tangent space.
-
-    Everything is one sparse product over all intervals, which keeps the NLP's graph small.
-    """
-    z, v, a = points
-    degree = scheme.degree
-    count = z.shape[1] // degree
-    metric = metric_weights(stage.formation.scene)
-    middles = stage.z[degree // 2 :: degree][:count]
-    bases = [_tangent_basis(stage.formation, z_k, metric).T / np.sqrt(metric[2]) for z_k in middles]
-    project = ca.diagcat(*(ca.DM(basis) for basis in bases for _ in range(degree)))
-    integrate = ca.kron(ca.DM.eye(count), ca.DM(scheme.integrals.T))
-    repeat = ca.kron(ca.DM.eye(count), ca.DM.ones(1, degree))
-    last = np.arange(degree - 1, (count - 1) * degree, degree).tolist()
-    for state, rate, first in ((z, v, start[0]), (v, a, start[1])):
-        firsts = ca.horzcat(first, state[:, last]) @ repeat
-        defect = state - firsts - duration / count * (rate @ integrate)
-        rows.add(project @ ca.vec(defect))
-
-
-def _tangent_basis(formation: Formation, z: Array, metric: Array) -> Array:
-    """Basis of the null space of A, orthonormal in the metric of curves, as covectors (5, f)."""
-    A = formation.evaluate(z[None], np.zeros((1, 5))).A[0]
-    _, values, right = np.linalg.svd(A / np.sqrt(metric))
-    rank = int((values > 1e-9 * values[0]).sum())
-    return np.asarray((right[rank:] * np.sqrt(metric)).T)
-
-
-def _limit(
-    rows: _Rows,
-    scheme: Scheme,
-    forces: tuple[Expression, Expression],
-    limits: tuple[Expression, Expression],
-) -> None:
-    """Limits at the points, and at as many places between of the polynomials through them."""
-    (c_n, tau), (floor, cap) = forces, limits
-    wide = np.vstack([np.eye(scheme.degree), scheme.between]).T
-    eye = ca.DM.eye(floor.shape[1])
-    spread, repeat = ca.kron(eye, ca.DM(wide)), ca.kron(eye, ca.DM.ones(1, wide.shape[1]))
-    torque, room = tau @ spread, cap @ repeat
-    rows.add(c_n @ spread - floor @ repeat, 0.0, np.inf)
-    rows.add(room - torque, 0.0, np.inf)
-    rows.add(room + torque, 0.0, np.inf)
-
-
-def _end_stage(rows: _Rows, stage: Stage, z: Expression, v: Expression, rho: float) -> None:
-    """What holds at the end of a stage, but for rest at the end of the last one."""
+def _add_stage(
+    rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool
+) -> StageRows:
+    """What holds in a stage."""
     formation = stage.formation
-    if stage.until is not None:
-        if stage.until.contact is not None:
-            z_ = build_features(formation.scene).z
-            gap = ca.Function("gap", [z_], [build_gap(stage.until.contact, formation.scene)])
-            rows.add(gap(z) / rho)
-        elif stage.until.value is not None:
-            rows.add(z[0 if stage.until.coordinate == "x" else 2] - stage.until.value)
-    if stage.turns:
-        _, _, A_t, _ = formation.function(z, v)
-        rates = ca.vertcat(A_t @ v / rho, v[3:])
-        rows.add(ca.vertcat(*(rates[k] for k in stage.turns)))
-    if stage.gained is not None:
-        extra = [i for i, c in enumerate(stage.gained.contacts) if c not in formation.contacts]
-        _, A, _, _ = stage.gained.function(z, v)
-        rows.add(ca.vertcat(*(A[i, :] @ v for i in extra)) / rho)
+    node, coming = layout.nodes[:-1], layout.nodes[1:]
+    chain = rows.linear(*node.shape)
+    rows.put(chain, coming, 1.0)
+    rows.put(chain[:, :T], layout.ends, -1.0)
+    rows.put(chain[:, T:], node[:, T:], -1.0)
+    states = np.hstack([chain, _collocate(rows, stage, layout, scheme)])
+    points = _balance(rows, stage, layout, scheme, last)
+    if not scheme.ends:
+        first = node[:, Z] if formation.rolling else node[:, :0]
+        kernel = end_kernel(formation)
+        own = rows.nonlinear(stage.intervals, kernel.outputs)
+        rows.repeat(kernel, np.hstack([layout.ends, first]), own)
+        states = np.hstack([states, own])
+    watches = _watch(rows, stage, layout, scheme)
+    gained = [formation.limits[k].gained for k in stage.released]
+    for contact in [c for c in gained if c is not None and stage.opens]:
+        count = scheme.degree
+        columns = [layout.z[0], layout.w[0], layout.u[0], np.full((count, 1), node[0, T])]
+        own = rows.nonlinear(count, 1, low=OPENING, high=np.inf)
+        rows.repeat(opening_kernel(formation, contact), np.hstack(columns), own)
+    speed = formation.scene.speed_limit
+    for k in np.flatnonzero(np.isfinite(speed)):
+        for sign in (1.0, -1.0):
+            own = rows.linear(*layout.w.shape[:2], high=np.inf)
+            rows.put(own, layout.w[..., 3 + k], sign)
+            rows.put(own, node[:, T, None], speed[k])
+    goal = goal_kernel(formation, stage.until, stage.turns, stage.gained)
+    if goal is not None:
+        rows.repeat(goal, layout.nodes[-1:, :T], rows.nonlinear(1, goal.outputs))
+    return StageRows(states, points, _press(rows, stage, layout, scheme), watches)
 
 
-def _rest(rows: _Rows, stage: Stage, v: Expression) -> None:
-    metric = metric_weights(stage.formation.scene)
-    basis = _tangent_basis(stage.formation, stage.z[-1], metric)
-    rows.add(ca.DM(basis.T) @ v / np.sqrt(metric[2]))
+def _collocate(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
+    """Collocate z and w along the tangent space, shape (K, m)."""
+    collected = []
+    integrals = scheme.integrals
+    for k, h in enumerate(stage.guess.fractions):
+        N = tangent_basis(stage.formation, stage.guess.z[k, scheme.degree // 2]).T
+        for state, rate, part in ((layout.z, layout.w, Z), (layout.w, layout.u, W)):
+            here, table = state[k], integrals
+            if not scheme.ends:
+                here = np.vstack([here, layout.ends[k, part]])
+                table = np.vstack([integrals, scheme.weights])
+            own = rows.linear(len(here), len(N))
+            rows.put(own[:, :, None], here[:, None], N)
+            rows.put(own[:, :, None], layout.nodes[k, part], -N)
+            rows.put(own[:, None, :, None], rate[k][:, None], -h * table[:, :, None, None] * N)
+            collected.append(own.ravel())
+    return np.array(collected).reshape(stage.intervals, -1)
 
 
-def _integrate_squares(
-    tau: Expression, scheme: Scheme, duration: Expression, count: int
-) -> Expression:
-    """Integral of tau^T tau over a stage, by the scheme's quadrature."""
-    intervals = count // scheme.degree
-    weights = ca.DM(np.tile(scheme.integrals[-1], intervals) / intervals)
-    return duration * ca.dot(weights, ca.sum1(tau**2).T)
+def _balance(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool) -> Indices:
+    """The equations of motion, constraints and senses at every point, shape (K, d, n)."""
+    formation, shape = stage.formation, layout.z.shape[:2]
+    n_c, kernel = formation.n_contacts, point_kernel(formation)
+    node = layout.nodes[:-1]
+
+    def spread(table: Indices) -> Indices:
+        return np.broadcast_to(table[:, None], (*shape, table.shape[1]))
+
+    columns = [layout.z, layout.w, layout.u, layout.forces, spread(layout.tau)]
+    columns += [spread(node[:, T, None]), spread(node[:, Z] if formation.rolling else node[:, :0])]
+    signs = np.concatenate(stage.directions)
+    parameters = np.empty((*shape, n_c + 5))
+    parameters[..., : n_c + 2] = signs
+    parameters[..., n_c + 2] = scheme.points
+    parameters[..., n_c + 3] = least_rates(stage, scheme)
+    parameters[..., n_c + 4] = stage.guess.duration
+    sliding = [k for k in range(n_c) if k not in formation.rolling_rows]
+    still = _find_still(stage, last) if scheme.ends else set()
+    senses = kernel.outputs - len(sliding) - 2 * formation.n_rolling
+    high = np.where(np.arange(kernel.outputs) < senses, 0.0, np.inf)
+    low = np.zeros((*shape, kernel.outputs))
+    low[-1, -1, [senses + i for i, k in enumerate(sliding) if k in still]] = -np.inf
+    own = rows.nonlinear(*shape, kernel.outputs, low=low, high=high)
+    count = shape[0] * shape[1]
+    table = np.concatenate(columns, axis=2).reshape(count, -1)
+    rows.repeat(kernel, table, own.reshape(count, -1), parameters.reshape(count, -1))
+    return own
 
 
-def bound_unknowns(stages: Sequence[Stage], extra: int) -> tuple[Array, Array]:
-    """Bounds of the unknowns: durations and joint speeds; `extra` free ones at the end."""
-    lows: list[Any] = []
-    highs: list[Any] = []
-    for stage in stages:
-        count, n_c = len(stage.z) - 1, stage.formation.n_contacts
-        high = np.full((count, 17 + n_c), np.inf)
-        high[:, 8:10] = stage.formation.scene.speed_limit
-        low = -high
-        lows.append(np.append(SHORTEST, low.ravel()))
-        highs.append(np.append(LONGEST, high.ravel()))
-    lows.append(np.full(extra, -np.inf))
-    highs.append(np.full(extra, np.inf))
-    return np.concatenate(lows), np.concatenate(highs)
+def least_rates(stage: Stage, scheme: Scheme) -> Array:
+    """Least rate of each point, shape (K, d) [rad/s].
+
+    It is nothing where motion starts, stops or turns, and in a stage with one freedom: there all
+    moves together, and friction cannot hold one contact alone.
+    """
+    at = stage.guess.places(scheme.points)
+    free = stage.formation.n_constraints < 4
+    return np.asarray(SLIDING * free * np.minimum(1.0, 8 * np.minimum(at, 1 - at)))
+
+
+def _find_still(stage: Stage, last: bool) -> set[int]:
+    """Rows of (contacts, joints) that stand still at the end of a stage."""
+    return set(range(stage.formation.n_contacts + 2)) if last else set(stage.turns)
+
+
+def _watch(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
+    """Keep limits positive, but for the one that is reached at the end, shape (K, d, m)."""
+    formation, (K, d) = stage.formation, layout.z.shape[:2]
+    if not stage.watched:
+        return np.zeros((K, d, 0), dtype=np.int64)
+    released = np.isin(stage.watched, stage.released)
+    later = (not stage.opens) | (stage.guess.places(scheme.points)[..., None] > 1 / 3)
+    low = CLEAR / formation.scene.polygon.gyration_radius * (later & released)
+    goal = None if stage.until is None else stage.until.contact
+    reached = [goal is not None and formation.limits[k].gained == goal for k in stage.watched]
+    if scheme.ends:
+        low[-1, -1, reached] = -np.inf
+    own = rows.nonlinear(K, d, len(stage.watched), low=low, high=np.inf)
+    kernel = watch_kernel(formation, stage.watched)
+    rows.repeat(kernel, layout.z.reshape(K * d, 5), own.reshape(K * d, -1))
+    return own
+
+
+def _press(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
+    """c_n where the torques may step; with a margin, at the points too."""
+    c_n = layout.forces[:, :, : stage.formation.n_contacts]
+    # A bound does at the points without a margin.
+    margin = layout.nodes.shape[1] > MARGIN
+    places = np.zeros(1) if scheme.ends else np.array([0.0, 1.0])
+    if margin:
+        places = np.append(places, scheme.points)
+    own = rows.linear(len(c_n), len(places), c_n.shape[2], high=np.inf)
+    table = scheme.interpolate(places)
+    # Entries of points not at their own place are left out.
+    for i, row in enumerate(table):
+        for j in np.flatnonzero(np.abs(row) > 1e-12):
+            rows.put(own[:, i], c_n[:, j], row[j])
+    if margin:
+        rows.put(own, layout.nodes[:-1, MARGIN, None, None], -1.0)
+    return own
+
+
+def _join(rows: Rows, stage: Stage, coming: Stage, layout: StageLayout, first: Indices) -> None:
+    """Position and velocity go on from one stage to the next; an impact changes the velocity."""
+    last, following = layout.nodes[-1], layout.following
+    place = rows.linear(6)
+    rows.put(place, np.append(first[Z], first[T]), 1.0)
+    rows.put(place, np.append(last[Z], following[0]), -1.0)
+    columns = [first[W], last[W], [last[T], following[0]]]
+    if stage.strikes:
+        kernel = impact_kernel(stage.formation, coming.formation)
+        equal = np.arange(kernel.outputs) < 5 + coming.formation.n_constraints
+        own = rows.nonlinear(1, kernel.outputs, high=np.where(equal, 0.0, np.inf))
+        columns += [last[Z], following[1:]]
+        rows.repeat(kernel, np.concatenate(columns)[None], own, coming.directions.Xi[None])
+    else:
+        rows.repeat(join_kernel(), np.concatenate(columns)[None], rows.nonlinear(1, 5))
+    if len(first) > MARGIN:
+        more = rows.linear(2)
+        rows.put(more, first[MARGIN:], 1.0)
+        rows.put(more, last[MARGIN:], -1.0)
+        rows.put(more[1], last[T], -1.0)
+
+
+def tangent_basis(formation: Formation, z: Array) -> Array:
+    """Basis of the null space of P at `z`, shape (5, f), orthonormal in radii of gyration."""
+    metric = metric_weights(formation.scene)
+    P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
+    _, values, right = np.linalg.svd(P / np.sqrt(metric))
+    rank = int((values > 1e-9 * values[0]).sum())
+    return np.asarray((right[rank:] * np.sqrt(metric)).T / np.sqrt(metric[2]))
+
+
+def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tuple[Array, Array]:
+    """Bounds of the unknowns but for the least c_n: durations, torques, joint speeds, impulses."""
+    size = nlp.layouts[-1].stop
+    low, high = np.full(size, -np.inf), np.full(size, np.inf)
+    for stage, layout in zip(stages, nlp.layouts, strict=True):
+        limit = np.tile(stage.formation.scene.torque_limit, 2)
+        low[layout.tau], high[layout.tau] = -limit, limit
+        low[layout.nodes[:, T]], high[layout.nodes[:, T]] = SHORTEST, LONGEST
+        still = _find_still(stage, stage is stages[-1]) if scheme.ends else set()
+        rate = least_rates(stage, scheme) * stage.guess.duration
+        for joint, sigma in enumerate(stage.directions.sigma):
+            own = layout.w[..., 3 + joint]
+            ends = np.zeros_like(own, dtype=bool)
+            ends[-1, -1] = stage.formation.n_contacts + joint in still
+            low[own] = np.where((sigma < 0) | ends, -np.inf, rate)
+            high[own] = np.where((sigma > 0) | ends, np.inf, -rate)
+        if len(layout.following) > 1:
+            coming = stages[list(stages).index(stage) + 1].formation.n_contacts
+            low[layout.following[1 : 1 + coming]] = 0.0
+    return low, high

@@ -1,54 +1,55 @@
 """Planning phases in the time domain: stages, first guess, NLP, and limits between points.
 
-Phases that pass smoothly into one another are one NLP. It starts from the phases' outlines, with
-the directions of friction that these have. Where the solution would rather slide the other way (a
-sense of friction is active over a stretch), the stage is split and the NLP solved again. Limits are
-looked at between points and tightened there by what they miss.
+Phases that pass into one another in motion are one NLP. It starts from the phases' outlines, with
+the directions of friction that these have, on few intervals; these are then halved, each time
+starting from the solution before. Where the solution would rather slide the other way (a sense of
+friction is at its least over a stretch), the stage is split and the NLP solved again. Limits are
+looked at between points: intervals that miss them by much are halved, and what is then left is
+added to the limits.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
-from .collocation import Scheme, radau
+from .between import Limits, find_misses, raise_bounds
+from .collocation import Scheme, make_scheme
 from .errors import InfeasibleError, SolverError
 from .model import Array
 from .options import Objective, PlanOptions
 from .phaseplan import PhasePlan
 from .problem import Phase, Problem
-from .stage import Stage, StagePoints
-from .staging import outline_stages, revise
-from .timemotion import StageMotion, Start, TimeMotion
+from .revising import adopt, halve, turn_friction, watch_broken
+from .stage import Stage
+from .staging import outline_stages
+from .timelayout import pack, unpack
+from .timemotion import StageMotion, TimeMotion
 from .timenlp import TimeNLP, bound_unknowns, build_time_nlp
+from .warmstart import Multipliers, carry_multipliers, first_multipliers
 
-MISS = 5e-7
-"""Largest miss of a limit between points [N or N m]."""
 ROUNDS = 12
 """Most times that limits are tightened."""
+REFINEMENTS = 1
+"""Most times that intervals are halved because of misses."""
 REVISIONS = 2
 """Most times that directions of friction are revised."""
-LOOKS = 25
-"""Places per interval at which limits are looked at."""
-_OVER = 1.5
-"""How much more than the miss a limit is tightened."""
+FIRST = 8
+"""Most intervals of a phase to start with."""
 _ITERATIONS = 150
-"""Most iterations of Ipopt for one solve."""
+"""Most iterations of one solve."""
 _PACES = (2.0, 4.0, 1.0, 8.0)
 """Guessed durations to try, in units of that of a fall."""
-_TRIAL = 80
-"""The same when other directions of friction are tried."""
 _DEARER = 0.01
 """How much dearer, relatively, a plan may get by tightening before it is solved from scratch."""
-_MU = 1e-2
-"""Multipliers of the first guess."""
 
 
 @dataclass
-class _Effort:
+class Effort:
     """What solving has cost so far."""
 
     iterations: int = 0
@@ -57,45 +58,145 @@ class _Effort:
     solve_time: float = 0.0
 
 
-class _Solution(NamedTuple):
-    points: tuple[StagePoints, ...]
-    cost: float
-    status: str
-    success: bool
-
-
-class _Limits(NamedTuple):
-    """Limits of one stage, interval by interval, tightened so that they hold between points.
+class Solution(NamedTuple):
+    """Stages with what the solver found as their guess.
 
     Attributes
     ----------
-    floor : ndarray, shape (K, n_c), [N]
-        What c_n has to exceed.
-    cap : ndarray, shape (K, 2), [N m]
-        What tau must not exceed.
+    stages : list of Stage
+    cost : float
+        Objective.
+    margin : float, [N]
+        Least c_n over epsilon, if that is an unknown.
+    status : str
+        The solver's word for how it ended.
+    success : bool
+    nlp : TimeNLP
+        What was solved.
+    multipliers : dict
+        What it ended with.
     """
 
-    floor: Array
-    cap: Array
+    stages: list[Stage]
+    cost: float
+    margin: float
+    status: str
+    success: bool
+    nlp: TimeNLP
+    multipliers: Multipliers
 
-    @staticmethod
-    def plain(problem: Problem, stage: Stage, scheme: Scheme) -> _Limits:
-        """The problem's own limits."""
-        count = (len(stage.z) - 1) // scheme.degree
-        floor = np.full((count, stage.formation.n_contacts), problem.epsilon)
-        return _Limits(floor, np.tile(problem.scene.torque_limit, (count, 1)))
+    @property
+    def watched(self) -> list[tuple[int, ...]]:
+        """Limits that each stage watches."""
+        return [stage.watched for stage in self.stages]
 
-    def tighten(self, problem: Problem, motion: StageMotion, margin: float) -> float:
-        """Tighten in place by what the motion misses between points; returns the largest miss."""
-        count = motion.intervals
-        places = np.arange(count)[:, None] + np.linspace(1e-9, 1 - 1e-9, LOOKS)
-        samples = motion.evaluate(places.ravel() * motion.duration / count)
-        short = problem.epsilon + margin - samples.c_n.reshape(count, LOOKS, -1).min(axis=1)
-        over = np.abs(samples.tau).reshape(count, LOOKS, 2).max(axis=1)
-        over = over - problem.scene.torque_limit
-        self.floor[:] += _OVER * np.maximum(short, 0.0)
-        self.cap[:] -= _OVER * np.maximum(over, 0.0)
-        return float(max(short.max(), over.max()))
+
+@dataclass
+class _Search:
+    """A search for a plan: what stays the same from solve to solve, and what it has cost."""
+
+    problem: Problem
+    options: PlanOptions
+    scheme: Scheme
+    duration: float | None
+    effort: Effort = field(default_factory=Effort)
+
+    @property
+    def with_margin(self) -> bool:
+        return self.options.goal is Objective.MARGIN
+
+    def solve(self, stages: list[Stage], before: Solution | None = None) -> Solution:
+        """Solve from the stages' guesses, until no limit is broken at the points."""
+        while True:
+            nlp = self.build(stages)
+            multipliers = None
+            if before is not None and before.watched == [stage.watched for stage in stages]:
+                multipliers = carry_multipliers(
+                    before.multipliers, before.nlp, nlp, before.stages, stages
+                )
+            plain = [Limits.none(stage) for stage in stages]
+            margin = before.margin if before else 0.0
+            solution = self.run(nlp, stages, plain, multipliers, margin)
+            watching = watch_broken(solution.stages) if solution.success else None
+            if watching is None:
+                return solution
+            stages = watching
+
+    def build(self, stages: Sequence[Stage]) -> TimeNLP:
+        """Build the NLP."""
+        options = self.options
+        nlp = build_time_nlp(stages, self.scheme, options.goal, options.time_weight, _ITERATIONS)
+        self.effort.build_time += nlp.build_time
+        return nlp
+
+    def run(
+        self,
+        nlp: TimeNLP,
+        stages: Sequence[Stage],
+        limits: Sequence[Limits],
+        multipliers: Multipliers | None,
+        margin: float,
+    ) -> Solution:
+        """Run the solver once."""
+        low, high = bound_unknowns(nlp, stages, self.scheme)
+        low_g, high_g = raise_bounds(nlp, stages, limits, self.problem.epsilon, low)
+        if self.duration is not None and nlp.lasts >= 0:
+            high_g[nlp.lasts] = self.duration
+        result = nlp.solver(
+            x0=pack([stage.guess for stage in stages], nlp.layouts, margin),
+            lbx=low,
+            ubx=high,
+            lbg=low_g,
+            ubg=high_g,
+            **(multipliers or first_multipliers((low, high), (low_g, high_g))),
+        )
+        stats = nlp.solver.stats()
+        self.effort.iterations += stats["iter_count"]
+        self.effort.solves += 1
+        self.effort.solve_time += stats["t_wall_total"]
+        x, cost = result["x"].full()[:, 0], float(result["f"])
+        return Solution(
+            adopt(stages, unpack(stages, x, nlp.layouts)),
+            cost,
+            -cost if self.with_margin else 0.0,
+            stats["return_status"],
+            stats["success"],
+            nlp,
+            {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")},
+        )
+
+    def hold(self, solution: Solution) -> Solution:
+        """Go on from a solution until limits hold between points too."""
+        refined = 0
+        limits = [Limits.none(stage) for stage in solution.stages]
+        for _ in range(ROUNDS):
+            motions = make_motions(solution.stages, self.scheme)
+            least = self.problem.epsilon + solution.margin
+            misses = [
+                find_misses(stage, motion, least)
+                for stage, motion in zip(solution.stages, motions, strict=True)
+            ]
+            worst = max(miss.worst for miss in misses)
+            if worst <= 1:
+                return solution
+            marked = [miss.coarse for miss in misses]
+            if refined < REFINEMENTS and any(mine.any() for mine in marked):
+                refined += 1
+                finer = self.solve(halve(solution.stages, self.scheme, marked), solution)
+                if finer.success:
+                    solution = finer
+                    limits = [Limits.none(stage) for stage in solution.stages]
+                    continue
+            limits = [raised.raised(miss) for raised, miss in zip(limits, misses, strict=True)]
+            tighter = self.run(
+                solution.nlp, solution.stages, limits, solution.multipliers, solution.margin
+            )
+            dearer = tighter.cost - solution.cost > _DEARER * abs(solution.cost)
+            if not tighter.success or dearer:
+                return tighter._replace(success=False)
+            solution = tighter
+        status = f"limits are still missed {worst:.2g} times what is allowed between points"
+        return solution._replace(status=status, success=False)
 
 
 def plan_phases(
@@ -105,13 +206,13 @@ def plan_phases(
     options: PlanOptions,
     duration: float | None = None,
 ) -> list[PhasePlan[TimeMotion]]:
-    """Plan phases that are joined smoothly, from rest at `z` to rest.
+    """Plan phases that are one NLP, from rest at `z` to rest.
 
     Parameters
     ----------
     problem : Problem
     phases : sequence of Phase
-        All but the last one end smoothly.
+        All but the last one end in motion.
     z : ndarray, shape (5,)
     options : PlanOptions
     duration : float, optional, [s]
@@ -124,216 +225,91 @@ def plan_phases(
     InfeasibleError, SolverError
         If there is no plan.
     """
-    scheme = radau(options.degree)
-    cost = _Effort()
-    for pace in _PACES:
-        stages = outline_stages(problem, phases, z, scheme, options.time_intervals, pace)
-        best = _solve(problem, stages, scheme, options, duration, cost, _ITERATIONS)
-        if best.success:
-            break
-    for _ in range(REVISIONS):
-        revised = revise(stages, best.points, scheme)
-        if revised is None:
-            break
-        other = _solve(problem, revised, scheme, options, duration, cost, _TRIAL)
-        if not other.success or (best.success and other.cost > best.cost - 1e-7 * abs(best.cost)):
-            break
-        stages, best = revised, other
-    if not best.success:
-        raise _explain(problem, phases, stages, best)
-    motions = _make_motions(stages, best.points, scheme, Start(z, np.zeros(5)))
-    plans = [_summarise(problem, motion, options, best) for motion in motions.values()]
+    scheme = make_scheme(options.scheme, options.degree)
+    search = _Search(problem, options, scheme, duration)
+    solution = _search(search, phases, z)
+    if not solution.success:
+        raise _explain(problem, phases, solution)
+    motions = make_motions(solution.stages, scheme)
+    plans = []
+    for phase in phases:
+        own = [m for m, s in zip(motions, solution.stages, strict=True) if s.phase == phase.index]
+        plans.append(_summarise(problem, TimeMotion(own), options, solution))
+    effort = search.effort
     plans[0] = plans[0]._replace(
-        iterations=cost.iterations,
-        solves=cost.solves,
-        build_time=cost.build_time,
-        solve_time=cost.solve_time,
+        iterations=effort.iterations,
+        solves=effort.solves,
+        build_time=effort.build_time,
+        solve_time=effort.solve_time,
     )
     return plans
 
 
-def _first_points(stage: Stage, scheme: Scheme) -> StagePoints:
-    if stage.known is not None:
-        return stage.known
-    count, n_c = len(stage.z) - 1, stage.formation.n_contacts
-    steps = (np.arange(count // scheme.degree)[:, None] + scheme.points).ravel()
-    t = np.append(0.0, steps) * stage.duration * scheme.degree / count
-    v = np.gradient(stage.z, t, axis=0)[1:]
-    nothing = np.zeros((count, 5))
-    return StagePoints(
-        stage.duration, stage.z[1:], v, nothing, np.ones((count, n_c)), np.zeros((count, 2))
-    )
+def _search(search: _Search, phases: Sequence[Phase], z: Array) -> Solution:
+    """Try guesses and numbers of intervals until a solution holds."""
+    wanted = search.options.time_intervals or _choose_intervals(phases)
+    halvings = max(0, math.ceil(math.log2(wanted / FIRST)))
+    failed: Solution | None = None
+    for times in dict.fromkeys((halvings, 0)):
+        for pace in _PACES:
+            first = math.ceil(wanted / 2**times)
+            stages = outline_stages(search.problem, phases, z, search.scheme, first, pace)
+            solution = search.solve(stages)
+            if solution.success:
+                solution = _improve(search, solution, times)
+            if solution.success:
+                return solution
+            failed = failed or solution
+    assert failed is not None
+    return failed
 
 
-def _solve(
-    problem: Problem,
-    stages: Sequence[Stage],
-    scheme: Scheme,
-    options: PlanOptions,
-    duration: float | None,
-    cost: _Effort,
-    max_iter: int,
-) -> _Solution:
-    """Solve for given stages, until limits hold between points too."""
-    z = stages[0].z[0]
-    start = (z, np.zeros(5))
-    points = [_first_points(stage, scheme) for stage in stages]
-    limits = [_Limits.plain(problem, stage, scheme) for stage in stages]
-    margin = 0.0
-    with_margin = options.goal is Objective.MARGIN
-    nlp: TimeNLP | None = None
-    solution = _Solution(tuple(points), np.inf, "", False)
-    multipliers: dict[str, Array] = {}
-    for _ in range(ROUNDS):
-        if nlp is None:
-            nlp = build_time_nlp(stages, scheme, start, options.goal, options.time_weight, max_iter)
-            cost.build_time += nlp.build_time
-            low, high = bound_unknowns(stages, int(with_margin))
-        rows_high = nlp.high.copy()
-        if with_margin:
-            rows_high[-1] = np.inf if duration is None else duration
-        begin = np.concatenate([part.pack() for part in points])
-        result = nlp.solver(
-            x0=np.append(begin, [margin] * with_margin),
-            p=np.concatenate([np.append(one.floor, one.cap) for one in limits]),
-            lbx=low,
-            ubx=high,
-            lbg=nlp.low,
-            ubg=rows_high,
-            **(multipliers or _first_multipliers(nlp, low, high)),
-        )
-        stats = nlp.solver.stats()
-        cost.iterations += stats["iter_count"]
-        cost.solves += 1
-        cost.solve_time += stats["t_wall_total"]
-        worse = float(result["f"]) - solution.cost > _DEARER * abs(solution.cost)
-        if multipliers and solution.success and (worse or not stats["success"]):
-            # From where it was the solver can lose its way; from scratch it often does not.
-            solution, multipliers = solution._replace(success=False), {}
-            continue
-        x = result["x"].full()[:, 0]
-        multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
-        margin = float(x[-1]) if with_margin else 0.0
-        points = _split(stages, x)
-        solution = _Solution(
-            tuple(points), float(result["f"]), stats["return_status"], stats["success"]
-        )
+def _choose_intervals(phases: Sequence[Phase]) -> int:
+    """Intervals of each phase: a phase with one freedom has fewer unknowns in each."""
+    return 32 if len(phases) == 1 and phases[0].formation.n_constraints == 4 else 16
+
+
+def _improve(search: _Search, solution: Solution, halvings: int) -> Solution:
+    """Revise friction, halve all intervals, and make limits hold in between."""
+    for _ in range(REVISIONS):
+        turned = turn_friction(solution.stages, search.scheme)
+        other = search.solve(turned) if turned is not None else None
+        if other is None or not other.success or not other.cost < solution.cost:
+            break
+        solution = other
+    for _ in range(halvings):
         if not solution.success:
             return solution
-        more = _find_broken_limits(stages, points, scheme, start)
-        if more is not None:
-            stages, nlp, multipliers = more, None, {}
-            continue
-        motions = _make_stage_motions(stages, points, scheme, Start(*start))
-        worst = 0.0
-        for motion, one in zip(motions, limits, strict=True):
-            worst = max(worst, one.tighten(problem, motion, margin))
-        if worst <= MISS:
-            return solution
-    status = f"limits are still missed by {worst:.2g} N between points"
-    return solution._replace(status=status, success=False)
+        every = [np.ones(stage.intervals, dtype=bool) for stage in solution.stages]
+        solution = search.solve(halve(solution.stages, search.scheme, every), solution)
+    return search.hold(solution) if solution.success else solution
 
 
-def _first_multipliers(nlp: TimeNLP, low: Array, high: Array) -> dict[str, Array]:
-    """Multipliers of one size for all inequalities."""
-    bounded = np.isfinite(high).astype(float) - np.isfinite(low)
-    return {"lam_x0": _MU * bounded, "lam_g0": np.where(nlp.high > nlp.low, -_MU, 0.0)}
-
-
-def _split(stages: Sequence[Stage], x: Array) -> list[StagePoints]:
-    points, position = [], 0
-    for stage in stages:
-        n_c = stage.formation.n_contacts
-        size = 1 + (len(stage.z) - 1) * (17 + n_c)
-        points.append(StagePoints.unpack(x[position : position + size], n_c))
-        position += size
-    return points
-
-
-def _make_stage_motions(
-    stages: Sequence[Stage], points: Sequence[StagePoints], scheme: Scheme, start: Start
-) -> list[StageMotion]:
+def make_motions(stages: Sequence[Stage], scheme: Scheme) -> list[StageMotion]:
+    """The stages' guesses as functions of time."""
     motions = []
-    for stage, part in zip(stages, points, strict=True):
-        motions.append(StageMotion(stage.formation, stage.directions, scheme, start, part))
-        start = Start(part.z[-1], part.v[-1])
+    slip, phase = np.zeros(0), -1
+    for stage in stages:
+        if stage.phase != phase:
+            slip, phase = stage.formation.evaluate_slip(stage.guess.nodes[0, :1])[0], stage.phase
+        motions.append(StageMotion(stage.formation, stage.directions, scheme, stage.guess, slip))
     return motions
-
-
-def _make_motions(
-    stages: Sequence[Stage], points: Sequence[StagePoints], scheme: Scheme, start: Start
-) -> dict[int, TimeMotion]:
-    """Motion of each phase, by index."""
-    parts = _make_stage_motions(stages, points, scheme, start)
-    motions = {}
-    for index in dict.fromkeys(stage.phase for stage in stages):
-        mine = [part for part, stage in zip(parts, stages, strict=True) if stage.phase == index]
-        motions[index] = TimeMotion(mine)
-    return motions
-
-
-def _find_broken_limits(
-    stages: Sequence[Stage],
-    points: Sequence[StagePoints],
-    scheme: Scheme,
-    start: tuple[Array, Array],
-) -> list[Stage] | None:
-    """Stages that also watch the limits which the solution breaks, or None if it breaks none."""
-    changed, found = [], False
-    rho = stages[0].formation.scene.polygon.gyration_radius
-    for stage, part in zip(stages, points, strict=True):
-        values = stage.formation.evaluate_limits(part.z)
-        broken = set(np.flatnonzero(values.min(axis=0) < -1e-6 * rho).tolist())
-        new = broken - set(stage.watched)
-        found = found or bool(new)
-        changed.append(replace(stage, watched=tuple(sorted({*stage.watched, *new}))))
-    return changed if found else None
 
 
 def _summarise(
-    problem: Problem, motion: TimeMotion, options: PlanOptions, solution: _Solution
+    problem: Problem, motion: TimeMotion, options: PlanOptions, solution: Solution
 ) -> PhasePlan[TimeMotion]:
     torque = motion.torque
     value = {
         Objective.TIME: motion.duration,
         Objective.EFFORT: options.time_weight * motion.duration + torque.integrate_squares(),
-        Objective.MARGIN: problem.epsilon - solution.cost,
+        Objective.MARGIN: problem.epsilon + solution.margin,
     }[options.goal]
     return PhasePlan(motion, torque, value, 0, 0, 0.0, 0.0)
 
 
 def _explain(
-    problem: Problem, phases: Sequence[Phase], stages: Sequence[Stage], solution: _Solution
+    problem: Problem, phases: Sequence[Phase], solution: Solution
 ) -> InfeasibleError | SolverError:
-    """Say what the solver's last point misses, the worst first."""
     numbers = " and ".join(str(phase.number) for phase in phases)
-    misses = []
-    start = 0.0
-    for stage, part in zip(stages, solution.points, strict=True):
-        times = start + (np.arange(len(part.z)) + 1) / len(part.z) * part.duration
-        start += part.duration
-        names = [
-            f"c_n of {name} >= epsilon = {problem.epsilon:g} N" for name in stage.formation.names
-        ]
-        names += [
-            f"torque limit of finger {k + 1} = {finger.torque_limit:g} N m"
-            for k, finger in enumerate(problem.scene.fingers)
-        ]
-        units = ["N"] * stage.formation.n_contacts + ["N m"] * 2
-        over = np.abs(part.tau) - problem.scene.torque_limit
-        short = np.hstack([problem.epsilon - part.c_n, over])
-        for row, name in enumerate(names):
-            worst = int(short[:, row].argmax())
-            if short[worst, row] > 1e-4:
-                misses.append(
-                    (
-                        float(short[worst, row]),
-                        f"{name} is {short[worst, row]:.3g} {units[row]} short at "
-                        f"t = {times[worst]:.4f} s, phase {stage.phase + 1}",
-                    )
-                )
-    stopped = f"no plan for phases {numbers}: Ipopt stopped with {solution.status}"
-    if not misses:
-        return SolverError(f"{stopped}; try other time_intervals")
-    ranked = "; ".join(text for _, text in sorted(misses, reverse=True))
-    return InfeasibleError(f"{stopped}; at its last point {ranked}")
+    return SolverError(f"no plan for phases {numbers}: {solution.status}")

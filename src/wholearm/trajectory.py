@@ -108,6 +108,14 @@ class Trajectory:
         return np.append(self.t[first], self.t[-1])
 
     @property
+    def rolling(self) -> NDArray[np.bool_]:
+        """Which contacts roll, shape (n, m), as `meta` names them phase by phase."""
+        mask = np.zeros(self.c_t.shape, dtype=bool)
+        for index, names in enumerate(self.meta.get("rolling", [])):
+            mask[self.phase == index] = [name in names for name in self.contacts]
+        return mask
+
+    @property
     def z(self) -> Array:
         """Degrees of freedom (q, theta), shape (n, 5)."""
         return np.hstack([self.q, self.theta])

@@ -24,6 +24,7 @@ STANDING = 1e-9
 may give it either sign."""
 _OUTCOMES = {
     Obstacle.PULL: OutcomeKind.CONTACT_LOST,
+    Obstacle.SLIP: OutcomeKind.SLIPS,
     Obstacle.CLOSING: OutcomeKind.LIMIT_REACHED,
     Obstacle.HELD: OutcomeKind.HELD,
 }
@@ -49,6 +50,7 @@ def enter(run: Replay, phase: Phase, following: Phase | None) -> None:
     run.limits = [limit.text for limit in open_limits(phase.formation, until)]
     run.releasable = find_releasable(phase, following)
     run.stepper.inputs[run.stepper.at.tolerance] = run.tolerance
+    run.stepper.inputs[run.stepper.at.slip] = phase.formation.evaluate_slip(run.y[None, :5])[0]
     run.load_piece()
 
 
@@ -66,7 +68,8 @@ def collide(run: Replay, following: Phase) -> Outcome | None:
     impact = strike(run.phase.formation, following.formation, z, run.y[5:10])
     name, least = impact.least
     names = following.formation.names
-    impulses = ", ".join(f"{p:.4g} on {n}" for n, p in zip(names, impact.p, strict=True))
+    normal = impact.p[: len(names)]
+    impulses = ", ".join(f"{p:.4g} on {n}" for n, p in zip(names, normal, strict=True))
     run.note(EventKind.IMPACT, f"impact {run.when()}, in N s {impulses}", name, least)
     if impact.hindrances:
         worst = impact.hindrances[0]
@@ -89,9 +92,9 @@ def find_releasable(phase: Phase, following: Phase | None) -> tuple[str, ...]:
 
 
 def project_velocity(formation: Formation, z: Array, v: Array) -> Array:
-    """Velocity nearest to `v` in the metric M5 that keeps every contact, shape (5,)."""
-    A = formation.evaluate(z[None], v[None]).A[0]
-    return transfer(formation.scene.mass_diagonal, A, A, v)[0]
+    """Velocity nearest to `v` in the metric M5 that keeps every constraint, shape (5,)."""
+    P = formation.evaluate(z[None], v[None]).P[0]
+    return transfer(formation.scene.mass_diagonal, P, P, v)[0]
 
 
 def set_off(run: Replay, departure: Departure) -> None:
@@ -115,7 +118,8 @@ def go_on(run: Replay) -> Ending | None:
     s.inputs[s.at.heading] = v / np.sqrt(mass @ v**2)
     rates = np.concatenate([formation.evaluate(y[None, :5], v[None]).A_t[0] @ v, v[3:]])
     signs = np.where(rates < 0, -1.0, 1.0)
-    still = np.flatnonzero(np.abs(rates) < STANDING).tolist()
+    signs[list(formation.rolling_rows)] = 0.0
+    still = np.flatnonzero((np.abs(rates) < STANDING) & (signs != 0)).tolist()
     rows = [s.rows.slide.start + k for k in still]
     choices = product((1.0, -1.0), repeat=len(still))
     _point(run, signs)

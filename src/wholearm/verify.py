@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
+from .cones import slip_margins
 from .errors import InputError
 from .events import Event, EventKind, OutcomeKind, Simulation
 from .jumps import SETTLING
@@ -18,6 +20,7 @@ from .report import (
     LeastImpulse,
     PhaseReport,
     Report,
+    SlipMargin,
 )
 from .simulate import simulate
 from .torque import TorqueProfile
@@ -124,6 +127,7 @@ def _report_phase(
             least, time = lost[name].value, lost[name].time
         contacts.append(ContactMargin(name, least, time, least - problem.epsilon))
     impacts = [e for e in simulation.find(EventKind.IMPACT) if e.phase == index]
+    rolling = _report_rolling(phase, simulation, rows, torque)
     end = worst = None
     if plan is not None:
         # A motion that goes on is compared when its phase was planned to end, not when it did.
@@ -134,12 +138,33 @@ def _report_phase(
         end=phase.end.value,
         start=float(simulation.t[rows[0]]),
         contacts=tuple(contacts),
+        rolling=rolling,
         arrival=arrivals[0].time if arrivals else None,
         arrival_rate=arrivals[0].value if arrivals and not phase.until.is_release else None,
         impact=LeastImpulse(impacts[0].contact, impacts[0].value) if impacts else None,
         end_deviation=end,
         deviation=worst,
     )
+
+
+def _report_rolling(
+    phase: Phase, simulation: Simulation, rows: NDArray[np.int64], torque: TorqueProfile
+) -> tuple[SlipMargin, ...]:
+    """Least margins to slipping in a phase, which the simulation has at `rows`."""
+    formation = phase.formation
+    columns = [simulation.contacts.index(name) for name in formation.names]
+    c_n, c_t = simulation.c_n[rows][:, columns], simulation.c_t[rows][:, columns]
+    slipped = {e.contact: e for e in simulation.find(EventKind.SLIP) if e.phase == phase.index}
+    margins = []
+    for row, values in zip(
+        formation.rolling_rows, slip_margins(formation, c_n, c_t).T, strict=True
+    ):
+        name = formation.names[row]
+        least, time = find_least(simulation.t[rows], values, torque.breaks)
+        if name in slipped and not least <= slipped[name].value:
+            least, time = slipped[name].value, slipped[name].time
+        margins.append(SlipMargin(name, least, time))
+    return tuple(margins)
 
 
 def find_least(t: Array, values: Array, breaks: Array) -> tuple[float, float]:
@@ -239,7 +264,7 @@ def _describe_stops(problem: Problem, simulation: Simulation) -> list[str]:
         phase = problem.phases[event.phase]
         last = int(np.flatnonzero(simulation.phase == event.phase)[-1])
         speed = float(np.abs(simulation.z_dot[last]).max())
-        free = phase.formation.n_contacts < 4 and phase.end is End.REST
+        free = phase.formation.n_constraints < 4 and phase.end is End.REST
         if free and speed > STOPPED:
             texts.append(
                 f"{phase.until} is reached while the object or a finger still moves, at up to "

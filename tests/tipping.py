@@ -1,0 +1,78 @@
+"""A box tipped over a vertex that rolls on the palm: the problem file, and a falling box alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from plane import make_formation, make_scene, rotate
+from timed import fastest
+from wholearm.curve import Curve
+from wholearm.formation import Formation
+from wholearm.model import Array, Friction, Scene
+from wholearm.outline import load
+from wholearm.path import trace_phases
+from wholearm.problem import Phase, Problem, Until
+from wholearm.torque import TorqueProfile
+from wholearm.trajectory import Trajectory
+
+BOX = Path(__file__).parents[1] / "problems" / "box_rolling.toml"
+POINTS = [[-0.02, -0.05], [0.02, -0.05], [0.02, 0.05], [-0.02, 0.05]]
+"""A slender box; fallen over vertex 1, its centroid is ever farther right of it."""
+
+
+@lru_cache(maxsize=1)
+def box() -> Problem:
+    return load(str(BOX))
+
+
+def tipped() -> Trajectory:
+    """The plan of the box for least time."""
+    return fastest(BOX)
+
+
+def tip() -> Curve:
+    """The curve of the phase in which the box tips over vertex 1."""
+    return trace_phases(box())[1]
+
+
+def roll(formation: Formation, *names: str) -> Formation:
+    """The formation with some of its contacts rolling."""
+    rolling = tuple(contact for contact in formation.contacts if contact.name in names)
+    assert len(rolling) == len(names)
+    return replace(formation, rolling=rolling)
+
+
+def falling(mu: float, lean: float) -> Problem:
+    """A box that falls over vertex 1, with both fingers far away and without friction.
+
+    Parameters
+    ----------
+    mu : float
+        Friction with the palm.
+    lean : float, [rad]
+        Of the line from vertex 1 to the centroid, to the right of upright, at the start.
+    """
+    scene = make_scene(POINTS, base=0.4)
+    free = [replace(link, viscous=0.0, dry=0.0) for link in scene.fingers]
+    scene = Scene(scene.polygon, (free[0], free[1]), Friction(mu, 0.1, 0.1))
+    phi = -lean - np.arctan2(0.02, 0.05)
+    start = np.array([*-rotate(phi, POINTS[1]), phi, np.pi / 2, np.pi / 2])
+    formation = roll(make_formation(scene, "v1-palm"), "v1-palm")
+    phase = Phase(0, formation, Until(coordinate="phi", value=phi - 1.4))
+    return Problem("falling box", scene, 0.0, start, (phase,))
+
+
+def constant(tau: tuple[float, float], duration: float) -> TorqueProfile:
+    return TorqueProfile(np.array([0.0, duration]), np.array([[[tau[0]], [tau[1]]]]))
+
+
+def ramp(start: tuple[float, float], rate: tuple[float, float], duration: float) -> TorqueProfile:
+    """Torques that start and rise evenly [N m, N m/s]."""
+    half: Array = np.array(rate) * duration / 2
+    return TorqueProfile(
+        np.array([0.0, duration]), np.column_stack([np.array(start) + half, half])[None]
+    )
