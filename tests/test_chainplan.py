@@ -12,7 +12,7 @@ from plane import measure_gaps, measure_slip, unbalance
 from wholearm.chain import make_chain
 from wholearm.chainplan import add_up
 from wholearm.curve import metric_weights
-from wholearm.errors import InputError
+from wholearm.errors import InfeasibleError, InputError
 from wholearm.impact import strike
 from wholearm.model import Array
 from wholearm.outline import load
@@ -131,6 +131,20 @@ def test_an_impact_raises_the_margin(plans: dict[str, Trajectory]) -> None:
         stopped = solve(build_problem(table), "margin", duration=allowed)
         gained = min(trajectory.meta["phase_values"][:3]) - stopped.meta["value"]
         assert row["saves"] == pytest.approx(gained, abs=1e-6) and gained > 0.01
+
+
+def test_no_plan_with_a_stop_leaves_the_saving_open(
+    problem: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is short at rest need not be at speed."""
+
+    def fail(*_: object) -> None:
+        raise InfeasibleError("nothing holds at rest")
+
+    monkeypatch.setattr("wholearm.chainplan.plan_chain", fail)
+    rows = solve(problem, intervals=20).meta["transitions"]
+    assert [row["saves"] for row in rows] == 4 * [None]
+    assert [row["speed"] > 0 for row in rows] == [True, True, False, False]
 
 
 def test_without_an_impact_the_plan_is_that_of_stops(heptagon: Problem) -> None:

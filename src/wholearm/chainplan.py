@@ -11,6 +11,7 @@ import numpy as np
 
 from .chain import Chain, Join
 from .curve import Curve, metric_weights
+from .errors import InfeasibleError, SolverError
 from .options import Objective, PlanOptions
 from .pathmotion import PathMotion
 from .pathplan import plan_curves
@@ -29,8 +30,8 @@ class Transition(NamedTuple):
         Along the curve that ends; zero if the motion stops there.
     saves : float, [s], [(N m)^2 s] or [N]
         How much better the objective is than with a stop instead, of the phases that are planned
-        together: less time or effort, or more margin. NaN if the impact is not possible, or if
-        with a stop there is no plan.
+        together: less time or effort, or more margin. NaN if the impact is not possible, or there
+        is no plan with a stop.
     """
 
     join: Join
@@ -117,7 +118,10 @@ def assess(
             for k, join in enumerate(part.joins):
                 report(f"phase {join.phase.number}: what its impact saves")
                 limit = add_up(part.phases, allowed)
-                stopped = _plan_stop(part, k + 1, epsilon, options, limit)
+                try:
+                    stopped = _plan_stop(part, k + 1, epsilon, options, limit)
+                except (InfeasibleError, SolverError):
+                    stopped = math.nan
                 gain = value - stopped if options.goal is Objective.MARGIN else stopped - value
                 found.append(Transition(join, _speed_at_end(part.curves[k], own[k].motion), gain))
     return sorted(found, key=lambda transition: transition.join.phase.index)
@@ -132,7 +136,7 @@ def _speed_at_end(curve: Curve, motion: Motion) -> float:
 def _plan_stop(
     chain: Chain, at: int, epsilon: float, options: PlanOptions, duration: float | None
 ) -> float:
-    """Value of a chain whose motion stops before its phase `at`; NaN if there is no such plan."""
+    """Value of a chain whose motion stops before its phase `at`; NaN if it cannot in `duration`."""
     halves = chain.part(0, at), chain.part(at, len(chain.phases))
     limits: list[float | None] = [None, None]
     if options.goal is Objective.MARGIN and duration is not None:

@@ -186,7 +186,7 @@ def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
 
 
 def join(parts: Sequence[PhaseData]) -> PhaseData:
-    """Put phases of sliding contacts, with as many and as many nodes each, one after the other.
+    """Put phases one after the other, each with as many nodes and as many sliding contacts.
 
     Where two meet, the grid has an interval of length zero, as where a direction reverses.
     """
@@ -195,7 +195,8 @@ def join(parts: Sequence[PhaseData]) -> PhaseData:
     nodes = np.cumsum([0, *(len(part.grid.s) for part in parts)])
 
     def chain(arrays: Iterable[NDArray[Any]], firsts: NDArray[Any]) -> Any:
-        return np.concatenate([a + first for a, first in zip(arrays, firsts, strict=False)])
+        pairs = zip(arrays, firsts[:-1], strict=True)
+        return np.concatenate([array + first for array, first in pairs])
 
     def stack(places: Sequence[Places]) -> Places:
         columns = zip(*(own.forces for own in places), strict=True)

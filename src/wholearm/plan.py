@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import casadi as ca
@@ -72,6 +73,7 @@ def solve_with(
     started = time.perf_counter()
     report = progress or (lambda _: None)
     report("tracing the phases")
+    _check_impacts(problem, options)
     trace_phases(problem)
     traced = time.perf_counter()
     least: list[PhasePlan[Motion]] = []
@@ -153,7 +155,7 @@ def _plan_blocks(
     for block in split_blocks(problem):
         numbers = "-".join(str(phase.number) for phase in block)
         report(f"phase {numbers} of {len(problem.phases)}: {options.goal.value}")
-        if options.transcription == "auto" and _run_on_curves(block):
+        if _run_on_curves(block, options):
             own = []
             for phase in block:
                 known = phase.index < len(curves)
@@ -166,22 +168,23 @@ def _plan_blocks(
         else:
             from .timeplan import plan_phases
 
-            _refuse_impacts(problem, block)
             plans += plan_phases(problem, block, z, options, add_up(block, allowed))
             motion = plans[-1].motion
             z = motion.evaluate(np.array([motion.duration])).z[0]
     return plans, chains
 
 
-def _run_on_curves(block: Sequence[Phase]) -> bool:
+def _run_on_curves(block: Sequence[Phase], options: PlanOptions) -> bool:
     """Whether phases are planned along their curves: a single one, or several that slide."""
-    rolls = any(phase.formation.rolling for phase in block)
-    return all(map(runs_on_curve, block)) and not (rolls and len(block) > 1)
+    if options.transcription != "auto" or not all(map(runs_on_curve, block)):
+        return False
+    return len(block) == 1 or not any(phase.formation.rolling for phase in block)
 
 
-def _refuse_impacts(problem: Problem, block: Sequence[Phase]) -> None:
+def _check_impacts(problem: Problem, options: PlanOptions) -> None:
     """Raise an error for an impact that would have to be planned in the time domain."""
-    for phase in block:
+    others = (block for block in split_blocks(problem) if not _run_on_curves(block, options))
+    for phase in chain.from_iterable(others):
         if phase.end is End.IMPACT:
             raise InputError(
                 problem.source,
