@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .contact import Contact
 from .curve import Curve, metric_weights
 from .dynamics import Directions
 from .errors import InputError
@@ -109,9 +108,9 @@ def outline_phase(problem: Problem, phase: Phase, z: Array) -> list[Outline]:
 
 
 def count_freedoms(formation: Formation, z: Array) -> int:
-    """Freedoms that a formation leaves at `z`: 5 less the rank of A."""
-    A = formation.evaluate(z[None], np.zeros((1, 5))).A[0]
-    values = np.linalg.svd(A / np.sqrt(metric_weights(formation.scene)))[1]
+    """Freedoms that a formation leaves at `z`: 5 less the rank of P."""
+    P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
+    values = np.linalg.svd(P / np.sqrt(metric_weights(formation.scene)))[1]
     return 5 - int((values > 1e-9 * values[0]).sum())
 
 
@@ -121,14 +120,16 @@ def _find_goal(problem: Problem, phase: Phase, z: Array) -> Array:
     key = f"phases[{phase.number}].until"
     fixed = None
     if until.contact is not None:
-        formation = Formation(formation.scene, (*formation.contacts, until.contact))
+        contacts = (*formation.contacts, until.contact)
+        formation = Formation(formation.scene, contacts, formation.rolling)
     elif until.value is not None:
         fixed = (0 if until.coordinate == "x" else 2, until.value)
     else:
         raise InputError(problem.source, key, "is missing; only one freedom needs none")
     active: tuple[int, ...] = ()
     reason = ""
-    goal = close(formation, z, fixed)
+    slip = formation.evaluate_slip(z[None])[0]
+    goal = close(formation, z, slip, fixed)
     while goal is not None:
         limits = formation.evaluate_limits(goal[None])[0]
         if limits.min() > -TOUCHING:
@@ -138,7 +139,7 @@ def _find_goal(problem: Problem, phase: Phase, z: Array) -> Array:
         if worst in active or len(active) == _MOST_ACTIVE:
             break
         active = (*active, worst)
-        goal = close(formation, goal, fixed, active)
+        goal = close(formation, goal, slip, fixed, active)
     text = f"{until} cannot be reached with these contacts{reason}"
     raise InputError(problem.source, key, text)
 
@@ -146,6 +147,7 @@ def _find_goal(problem: Problem, phase: Phase, z: Array) -> Array:
 def close(
     formation: Formation,
     z: Array,
+    slip: Array,
     fixed: tuple[int, float] | None = None,
     active: tuple[int, ...] = (),
 ) -> Array | None:
@@ -156,6 +158,8 @@ def close(
     formation : Formation
     z : ndarray, shape (5,)
         Where to start.
+    slip : ndarray, shape (R,), [m]
+        Slip coordinates that rolling contacts keep.
     fixed : (int, float), optional
         Row of z and the value that it has to take.
     active : tuple of int
@@ -164,7 +168,8 @@ def close(
     metric = metric_weights(formation.scene)
     for _ in range(50):
         kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
-        residual, rows = kinematics.C[0], kinematics.A[0]
+        slipped = formation.evaluate_slip(z[None])[0] - slip
+        residual, rows = np.append(kinematics.C[0], slipped), kinematics.P[0]
         if fixed is not None:
             residual = np.append(residual, z[fixed[0]] - fixed[1])
             rows = np.vstack([rows, np.eye(5)[fixed[0]]])
@@ -185,9 +190,9 @@ def close(
 
 def _connect(formation: Formation, start: Array, goal: Array) -> Outline:
     """A straight line, pulled onto the contacts, with the directions of its middle."""
-    points = [start]
+    points, slip = [start], formation.evaluate_slip(start[None])[0]
     for x in np.linspace(0.0, 1.0, POINTS)[1:]:
-        point = close(formation, start + x * (goal - start))
+        point = close(formation, start + x * (goal - start), slip)
         points.append(points[-1] if point is None else point)
     z = np.array(points)
     speed = np.gradient(z, axis=0)
@@ -195,10 +200,3 @@ def _connect(formation: Formation, start: Array, goal: Array) -> Outline:
     rates = np.hstack([slip, speed[:, 3:]]).sum(axis=0)
     signs = np.where(rates < 0, -1.0, 1.0)
     return Outline(formation, z, Directions(signs[:-2], signs[-2:]))
-
-
-def released_contacts(phase: Phase, following: Phase | None) -> tuple[Contact, ...]:
-    """Contacts of a phase that the next one does not have."""
-    if following is None:
-        return ()
-    return tuple(c for c in phase.formation.contacts if c not in following.formation.contacts)
