@@ -20,6 +20,7 @@ from wholearm.path import trace_phases
 from wholearm.plan import solve
 from wholearm.problem import Problem, build_problem
 from wholearm.trajectory import Samples, Trajectory, load_trajectory
+from wholearm.verify import verify
 
 IMPACTS = HEPTAGON.with_name("heptagon_impact.toml")
 OBJECTIVES = ["time", "effort", "margin"]
@@ -108,6 +109,20 @@ def test_every_sample_obeys_newton_and_euler(
         np.testing.assert_allclose(row.c_t[moving], law[moving], rtol=1e-12)
         assert row.c_n.min() >= problem.epsilon - 1e-6
         assert np.abs(row.tau).max() <= LIMIT + 1e-6
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_the_simulator_follows(
+    problem: Problem, plans: dict[str, Trajectory], objective: str
+) -> None:
+    report = verify(problem, plans[objective])
+    assert report.ok and abs(report.missed_by) < 1e-5
+    for phase in report.phases:
+        assert phase.end_deviation is not None
+        # What is asked of a phase: 1e-5.
+        assert max(phase.end_deviation.position, phase.end_deviation.angle) < 1e-5
+    impulses = [phase.impact.impulse for phase in report.phases if phase.impact is not None]
+    assert len(impulses) == 2 and min(impulses) > 0
 
 
 @pytest.mark.parametrize("objective", ["time", "effort"])

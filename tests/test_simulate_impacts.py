@@ -23,9 +23,11 @@ from wholearm.impact import strike
 from wholearm.model import Array
 from wholearm.outline import load
 from wholearm.path import trace_phases
-from wholearm.problem import Phase, Problem, build_problem
+from wholearm.plan import solve
+from wholearm.problem import End, Phase, Problem, build_problem
 from wholearm.simulate import simulate
-from wholearm.trajectory import Trajectory, assemble
+from wholearm.torque import TorqueProfile
+from wholearm.trajectory import Trajectory
 from wholearm.verify import verify
 
 IMPACTS = HEPTAGON.with_name("heptagon_impact.toml")
@@ -47,21 +49,27 @@ def replayed(problem: Problem, planned: Trajectory) -> Simulation:
 
 
 @lru_cache(maxsize=4)
-def bumping(speed: float) -> tuple[Problem, Trajectory]:
-    """The heptagon with low friction runs into its second formation at a speed along the curve."""
+def bumping(speed: float, beyond: float = 0.0) -> tuple[Problem, TorqueProfile]:
+    """The heptagon with low friction runs into its second formation at a speed along the curve.
+
+    The torques go on for a distance `beyond` the impact [m], and then step.
+    """
     table: dict[str, Any] = copy.deepcopy(tomllib.loads(HEPTAGON.read_text(encoding="utf-8")))
     table["phases"] = table["phases"][:2]
     table["phases"][0]["end"] = "impact"
     problem = build_problem(table)
     curve = trace_phases(problem)[0]
-    duration = min(0.3, 2 * curve.length / speed)
+    # Beyond, a motion that slows; otherwise as slow a start as the speed allows.
+    duration = (1.2 if beyond else 2.0) * curve.length / max(speed, 0.1)
     tries = (
-        DepartingMotion(curve, duration, float(squeeze), place=curve.length, speed=speed)
+        DepartingMotion(curve, duration, float(squeeze), place=curve.length + beyond, speed=speed)
         for squeeze in SQUEEZES
     )
     t = np.linspace(0.0, duration, 101)
     motion = next(motion for motion in tries if motion.evaluate(t).c_n.min() > 0.1)
-    return problem, assemble([motion], motion.fit(60, 7), {"epsilon": problem.epsilon}, 201)
+    torque = motion.fit(60, 7)
+    after = TorqueProfile(np.array([0.0, 0.01]), np.array([[[1.0], [-1.0]]]))
+    return problem, TorqueProfile.chain([torque, after]) if beyond else torque
 
 
 def joints(simulation: Simulation, index: int) -> tuple[int, int]:
@@ -144,18 +152,18 @@ def test_contacts_stay_closed_after_an_impact(problem: Problem, replayed: Simula
 
 @pytest.mark.parametrize("speed", [0.05, 0.3])
 def test_an_impulse_that_pulls_is_a_lost_contact(speed: float) -> None:
-    problem, trajectory = bumping(speed)
-    simulation = simulate(problem, trajectory.torque)
+    problem, torque = bumping(speed)
+    simulation = simulate(problem, torque)
     assert simulation.outcome.kind is OutcomeKind.CONTACT_LOST
     (impact,) = simulation.find(EventKind.IMPACT)
-    assert impact.time == pytest.approx(trajectory.duration, abs=1e-6) and impact.phase == 0
+    assert impact.time == pytest.approx(torque.duration, abs=1e-6) and impact.phase == 0
     assert impact.contact == "v1-palm"
     assert impact.value == pytest.approx(-0.0413993711 * speed, rel=1e-5)
     assert simulation.outcome.text == (
         f"impulse on v1-palm would be {impact.value:.3g} N s in the impact "
         f"at t = {impact.time:.5g} s, phase 1"
     )
-    report = verify(problem, trajectory.torque)
+    report = verify(problem, torque)
     assert not report.ok and report.exit_status == 1
     assert report.failures == (simulation.outcome.text,)
     (phase,) = report.phases
@@ -165,12 +173,37 @@ def test_an_impulse_that_pulls_is_a_lost_contact(speed: float) -> None:
 
 def test_next_to_no_speed_is_a_stop() -> None:
     """By rounding a planned stop arrives with some."""
-    problem, trajectory = bumping(1e-5)
-    simulation = simulate(problem, trajectory.torque)
+    problem, torque = bumping(1e-5)
+    simulation = simulate(problem, torque)
     assert not simulation.find(EventKind.IMPACT)
     assert simulation.phase[-1] == 1 and simulation.find(EventKind.ARRIVAL)
     last, first = joints(simulation, 0)
     assert simulation.z_dot[last].any() and not simulation.z_dot[first].any()
+
+
+def test_a_planned_stop_is_that_of_a_phase_that_ends_at_rest(problem: Problem) -> None:
+    """Linear torques between rows bring it there a little early, and not quite at rest."""
+    rows = solve(problem, "margin").torque.rows(8)
+    torque = TorqueProfile.join_rows(rows[:, 0], rows[:, 1:])
+    first, second, *others = problem.phases
+    stops = [dataclasses.replace(phase, end=End.REST) for phase in others]
+    resting = dataclasses.replace(problem, phases=(first, second, *stops))
+    one, other = (simulate(p, torque) for p in (problem, resting))
+    assert [(e.time, e.text) for e in one.events] == [(e.time, e.text) for e in other.events]
+    stop = next(e for e in one.find(EventKind.ARRIVAL) if e.phase == 2)
+    assert stop.value > 1e-4
+
+
+def test_no_torque_break_is_waited_for() -> None:
+    """A slowing motion comes half a millisecond early: its impact is then, not at the break."""
+    problem, torque = bumping(0.15, 7.5e-5)
+    simulation = simulate(problem, torque)
+    (impact,) = simulation.find(EventKind.IMPACT)
+    assert 3e-4 < torque.breaks[-2] - impact.time < 7e-4
+    gained = problem.phases[0].until.contact
+    assert gained is not None
+    gap = problem.phases[0].formation.evaluate_gap(gained, simulation.z[-1:])
+    assert abs(gap[0]) < 1e-12
 
 
 @pytest.mark.parametrize("scale", [1.002, 1.01])
