@@ -1,7 +1,8 @@
 """Planning a problem, phase by phase.
 
-Phases joined at rest are problems of their own; those joined smoothly are one. A phase with one
-freedom between two rests is planned along its curve, anything else in the time domain.
+Phases joined at rest are problems of their own; those joined smoothly or by impacts are one. Phases
+with one freedom are planned along their curves, unless they pass smoothly into another, and
+anything else in the time domain.
 """
 
 from __future__ import annotations
@@ -10,16 +11,18 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from . import __version__
-from .errors import InfeasibleError
+from .chain import Chain, make_chain
+from .chainplan import add_up, assess, combine, plan_chain
+from .errors import InfeasibleError, InputError
 from .options import Objective, PlanOptions
 from .path import runs_on_curve, trace_phase, trace_phases
-from .pathplan import plan_path
 from .phaseplan import PhasePlan
 from .problem import End, Phase, Problem
 from .torque import TorqueProfile
@@ -70,17 +73,19 @@ def solve_with(
     started = time.perf_counter()
     report = progress or (lambda _: None)
     report("tracing the phases")
+    _check_impacts(problem, options)
     trace_phases(problem)
     traced = time.perf_counter()
-    blocks = split_blocks(problem)
     least: list[PhasePlan[Motion]] = []
-    allowed: list[float | None] = [None] * len(blocks)
+    allowed: list[float | None] = [None] * len(problem.phases)
     if options.goal is Objective.MARGIN:
         fastest = replace(options, objective=Objective.TIME, duration=None)
-        least = _plan_blocks(problem, blocks, fastest, allowed, report)
-        allowed = _share_duration(blocks, least, options.duration)
-    plans = _plan_blocks(problem, blocks, options, allowed, report)
+        least, _ = _plan_blocks(problem, fastest, allowed, report)
+        allowed = _share_duration(least, options.duration)
+    plans, chains = _plan_blocks(problem, options, allowed, report)
     planned = time.perf_counter()
+    transitions = assess(chains, plans, problem.epsilon, options, allowed, report)
+    assessed = time.perf_counter()
     motions = [plan.motion for plan in plans]
     values = [plan.value for plan in plans]
     every = [*least, *plans]
@@ -89,12 +94,13 @@ def solve_with(
         "status": "solved",
         "name": problem.name,
         "objective": options.goal.value,
-        "value": min(values) if options.goal is Objective.MARGIN else sum(values),
+        "value": combine(options.goal, values),
         "value_unit": UNITS[options.goal],
         "epsilon": problem.epsilon,
         "phase_values": values,
         "rolling": [[c.name for c in phase.formation.rolling] for phase in problem.phases],
         "phase_durations": [motion.duration for motion in motions],
+        "transitions": [transition.to_dict() for transition in transitions],
         "intervals": options.intervals,
         "transcription": options.transcription,
         "time_weight": options.time_weight,
@@ -103,6 +109,7 @@ def solve_with(
             "build": sum(nlps),
             "solve": sum(plan.solve_time for plan in every),
             "plan": planned - started,
+            "assess": assessed - planned,
         },
         "iterations": [plan.iterations for plan in plans],
         "solves": [plan.solves for plan in plans],
@@ -121,7 +128,7 @@ def solve_with(
 
 
 def split_blocks(problem: Problem) -> list[tuple[Phase, ...]]:
-    """Phases that have to be planned together: those joined smoothly."""
+    """Phases that have to be planned together: those joined smoothly or by impacts."""
     blocks: list[tuple[Phase, ...]] = []
     block: tuple[Phase, ...] = ()
     for phase in problem.phases:
@@ -134,37 +141,64 @@ def split_blocks(problem: Problem) -> list[tuple[Phase, ...]]:
 
 def _plan_blocks(
     problem: Problem,
-    blocks: Sequence[tuple[Phase, ...]],
     options: PlanOptions,
     allowed: Sequence[float | None],
     report: Callable[[str], None],
-) -> list[PhasePlan[Motion]]:
-    """Plan block after block, each from where the one before ends."""
+) -> tuple[list[PhasePlan[Motion]], list[Chain]]:
+    """Plan block after block, each from where the one before ends; also what ran along curves.
+
+    `allowed` holds the longest duration of each phase [s].
+    """
     plans: list[PhasePlan[Motion]] = []
+    chains: list[Chain] = []
     curves, z = trace_phases(problem), problem.start
-    for block, duration in zip(blocks, allowed, strict=True):
+    for block in split_blocks(problem):
         numbers = "-".join(str(phase.number) for phase in block)
         report(f"phase {numbers} of {len(problem.phases)}: {options.goal.value}")
-        phase = block[0]
-        if runs_on_curve(phase) and options.transcription == "auto":
-            known = phase.index < len(curves)
-            curve = curves[phase.index] if known else trace_phase(problem, phase, z)
-            plans.append(plan_path(curve, problem.epsilon, options, phase.number, duration))
-            z = curve.end
+        if _run_on_curves(block, options):
+            own = []
+            for phase in block:
+                known = phase.index < len(curves)
+                own.append(curves[phase.index] if known else trace_phase(problem, phase, z))
+                z = own[-1].end
+            chains.append(make_chain(block, own))
+            for part in chains[-1].split():
+                duration = add_up(part.phases, allowed)
+                plans += plan_chain(part, problem.epsilon, options, duration)
         else:
             from .timeplan import plan_phases
 
-            plans += plan_phases(problem, block, z, options, duration)
+            plans += plan_phases(problem, block, z, options, add_up(block, allowed))
             motion = plans[-1].motion
             z = motion.evaluate(np.array([motion.duration])).z[0]
-    return plans
+    return plans, chains
+
+
+def _run_on_curves(block: Sequence[Phase], options: PlanOptions) -> bool:
+    """Whether phases are planned along their curves: a single one, or several that slide."""
+    if options.transcription != "auto" or not all(map(runs_on_curve, block)):
+        return False
+    return len(block) == 1 or not any(phase.formation.rolling for phase in block)
+
+
+def _check_impacts(problem: Problem, options: PlanOptions) -> None:
+    """Raise an error for an impact that would have to be planned in the time domain."""
+    others = (block for block in split_blocks(problem) if not _run_on_curves(block, options))
+    for phase in chain.from_iterable(others):
+        if phase.end is End.IMPACT:
+            raise InputError(
+                problem.source,
+                f"phases[{phase.number}].end",
+                "'impact' given, but impacts are planned only along curves: between phases with "
+                "four sliding contacts, none of them joined smoothly to another",
+            )
 
 
 def _share_duration(
-    blocks: Sequence[tuple[Phase, ...]], least: Sequence[PhasePlan[Motion]], duration: float | None
+    least: Sequence[PhasePlan[Motion]], duration: float | None
 ) -> list[float | None]:
-    """Longest duration of each block [s]: the whole, shared in proportion to the least times."""
-    times = [sum(least[phase.index].motion.duration for phase in block) for block in blocks]
+    """Longest duration of each phase [s]: the whole, shared in proportion to the least times."""
+    times = [plan.motion.duration for plan in least]
     total = 2 * sum(times) if duration is None else duration
     if total <= sum(times):
         raise InfeasibleError(
