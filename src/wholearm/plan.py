@@ -11,7 +11,6 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import chain
 from typing import Any
 
 import casadi as ca
@@ -20,7 +19,8 @@ import numpy as np
 from . import __version__
 from .chain import Chain, make_chain
 from .chainplan import add_up, assess, combine, plan_chain
-from .errors import InfeasibleError, InputError
+from .errors import InfeasibleError
+from .model import Array
 from .options import Objective, PlanOptions
 from .path import runs_on_curve, trace_phase, trace_phases
 from .phaseplan import PhasePlan
@@ -28,6 +28,8 @@ from .problem import End, Phase, Problem
 from .torque import TorqueProfile
 from .trajectory import Motion, Trajectory, assemble
 
+MOVED = 1e-9
+"""Distance from which on a block starts somewhere else [m or rad]."""
 UNITS = {Objective.TIME: "s", Objective.EFFORT: "(N m)^2 s", Objective.MARGIN: "N"}
 
 
@@ -73,16 +75,16 @@ def solve_with(
     started = time.perf_counter()
     report = progress or (lambda _: None)
     report("tracing the phases")
-    _check_impacts(problem, options)
     trace_phases(problem)
     traced = time.perf_counter()
     least: list[PhasePlan[Motion]] = []
     allowed: list[float | None] = [None] * len(problem.phases)
     if options.goal is Objective.MARGIN:
-        fastest = replace(options, objective=Objective.TIME, duration=None)
-        least, _ = _plan_blocks(problem, fastest, allowed, report)
+        least, _ = _plan_blocks(problem, _for_time(options), allowed, [], report)
         allowed = _share_duration(least, options.duration)
-    plans, chains = _plan_blocks(problem, options, allowed, report)
+    plans, chains = _plan_blocks(problem, options, allowed, least, report)
+    if options.goal is Objective.MARGIN:
+        _require_margin(problem, plans, allowed)
     planned = time.perf_counter()
     transitions = assess(chains, plans, problem.epsilon, options, allowed, report)
     assessed = time.perf_counter()
@@ -142,36 +144,98 @@ def split_blocks(problem: Problem) -> list[tuple[Phase, ...]]:
 def _plan_blocks(
     problem: Problem,
     options: PlanOptions,
-    allowed: Sequence[float | None],
+    allowed: list[float | None],
+    least: Sequence[PhasePlan[Motion]],
     report: Callable[[str], None],
 ) -> tuple[list[PhasePlan[Motion]], list[Chain]]:
     """Plan block after block, each from where the one before ends; also what ran along curves.
 
-    `allowed` holds the longest duration of each phase [s].
+    `allowed` holds the longest duration of each phase [s], in proportion to the plans of `least`
+    duration. Where a block starts from somewhere else than there it is shared out again.
     """
     plans: list[PhasePlan[Motion]] = []
     chains: list[Chain] = []
-    curves, z = trace_phases(problem), problem.start
+    z = problem.start
     for block in split_blocks(problem):
         numbers = "-".join(str(phase.number) for phase in block)
         report(f"phase {numbers} of {len(problem.phases)}: {options.goal.value}")
-        if _run_on_curves(block, options):
-            own = []
-            for phase in block:
-                known = phase.index < len(curves)
-                own.append(curves[phase.index] if known else trace_phase(problem, phase, z))
-                z = own[-1].end
-            chains.append(make_chain(block, own))
-            for part in chains[-1].split():
-                duration = add_up(part.phases, allowed)
-                plans += plan_chain(part, problem.epsilon, options, duration)
-        else:
-            from .timeplan import plan_phases
-
-            plans += plan_phases(problem, block, z, options, add_up(block, allowed))
-            motion = plans[-1].motion
-            z = motion.evaluate(np.array([motion.duration])).z[0]
+        if least and _distance(least[block[0].index].motion, z) > MOVED:
+            fastest, _ = _plan_block(problem, block, z, _for_time(options), allowed)
+            _share_again(allowed, block, least, fastest)
+        own, chain = _plan_block(problem, block, z, options, allowed)
+        plans += own
+        chains += [chain] if chain else []
+        motion = plans[-1].motion
+        z = chain.curves[-1].end if chain else motion.evaluate(np.array([motion.duration])).z[0]
     return plans, chains
+
+
+def _plan_block(
+    problem: Problem,
+    block: Sequence[Phase],
+    z: Array,
+    options: PlanOptions,
+    allowed: Sequence[float | None],
+) -> tuple[list[PhasePlan[Motion]], Chain | None]:
+    """Plan a block from `z`, along its curves or in the time domain; also its curves."""
+    plans: list[PhasePlan[Motion]] = []
+    if not _run_on_curves(block, options):
+        from .timeplan import plan_phases
+
+        plans += plan_phases(problem, block, z, options, add_up(block, allowed))
+        return plans, None
+    curves, known = [], trace_phases(problem)
+    for phase in block:
+        traced = phase.index < len(known)
+        curves.append(known[phase.index] if traced else trace_phase(problem, phase, z))
+        z = curves[-1].end
+    chain = make_chain(block, curves)
+    for part in chain.split():
+        plans += plan_chain(part, problem.epsilon, options, add_up(part.phases, allowed))
+    return plans, chain
+
+
+def _require_margin(
+    problem: Problem, plans: Sequence[PhasePlan[Motion]], allowed: Sequence[float | None]
+) -> None:
+    """Raise an error for a phase that cannot keep epsilon in its duration."""
+    for phase, plan in zip(problem.phases, plans, strict=True):
+        if plan.value < problem.epsilon - 1e-6:
+            raise InfeasibleError(
+                f"phase {phase.number}: in its share of the duration, {allowed[phase.index]:.5g} s,"
+                f" the largest least c_n is {plan.value:.4g} N, below epsilon = "
+                f"{problem.epsilon:g} N; allow a longer duration"
+            )
+
+
+def _for_time(options: PlanOptions) -> PlanOptions:
+    return replace(options, objective=Objective.TIME, duration=None)
+
+
+def _distance(motion: Motion, z: Array) -> float:
+    """How far from `z` a motion starts [m or rad]."""
+    return float(np.abs(motion.evaluate(np.zeros(1)).z[0] - z).max())
+
+
+def _share_again(
+    allowed: list[float | None],
+    block: Sequence[Phase],
+    least: Sequence[PhasePlan[Motion]],
+    fastest: Sequence[PhasePlan[Motion]],
+) -> None:
+    """Give a block its share for another least duration, at the cost of the phases after it."""
+    gain = 0.0
+    for phase, plan in zip(block, fastest, strict=True):
+        own = allowed[phase.index]
+        if own is not None:
+            ratio = plan.motion.duration / least[phase.index].motion.duration
+            gain += own * (ratio - 1)
+            allowed[phase.index] = own * ratio
+    later = range(block[-1].index + 1, len(allowed))
+    rest = sum(allowed[k] or 0.0 for k in later)
+    for k in later:
+        own = allowed[k]
+        allowed[k] = None if own is None else own * (1 - gain / rest)
 
 
 def _run_on_curves(block: Sequence[Phase], options: PlanOptions) -> bool:
@@ -179,19 +243,6 @@ def _run_on_curves(block: Sequence[Phase], options: PlanOptions) -> bool:
     if options.transcription != "auto" or not all(map(runs_on_curve, block)):
         return False
     return len(block) == 1 or not any(phase.formation.rolling for phase in block)
-
-
-def _check_impacts(problem: Problem, options: PlanOptions) -> None:
-    """Raise an error for an impact that would have to be planned in the time domain."""
-    others = (block for block in split_blocks(problem) if not _run_on_curves(block, options))
-    for phase in chain.from_iterable(others):
-        if phase.end is End.IMPACT:
-            raise InputError(
-                problem.source,
-                f"phases[{phase.number}].end",
-                "'impact' given, but impacts are planned only along curves: between phases with "
-                "four sliding contacts, none of them joined smoothly to another",
-            )
 
 
 def _share_duration(
