@@ -48,8 +48,8 @@ class PlanOptions:
     samples : int
         Rows per phase of the trajectory file, at least 2.
     transcription : str
-        ``"auto"`` plans phases with one freedom that end at rest along their curve and others in
-        the time domain; ``"time"`` plans all in the time domain.
+        ``"auto"`` plans phases with one freedom that are joined at rest or by impacts along their
+        curves and others in the time domain; ``"time"`` plans all in the time domain.
     time_intervals : int, optional
         Intervals of each phase in the time domain, at least 4; when left out, 32 for a phase with
         one freedom that is planned alone and 16 for others.

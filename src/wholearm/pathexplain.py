@@ -1,4 +1,4 @@
-"""Why a phase along a curve has no plan, and which single limit would have to give way.
+"""Why phases along curves have no plan, and which single limit would have to give way.
 
 All limits are made soft and their shortfalls ranked. Then each limit alone is relaxed as little as
 the others allow, and a plan with that limit is asked for: only what was planned is advised.
@@ -6,7 +6,7 @@ the others allow, and a plan with that limit is asked for: only what was planned
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from .curve import Curve, describe_pose
 from .errors import InfeasibleError, JammingError, SolverError
 from .model import Array
 from .options import Objective
-from .pathdata import PhaseData, Relaxation
+from .pathdata import PhaseData, Relaxation, cut, join, name_phases
 from .pathmotion import PathMotion, Profile
 from .pathnlp import (
     Scales,
@@ -35,8 +35,8 @@ _SHORT = 1e-4
 _FORCE = 10.0
 """Largest unit of force when a limit is relaxed [N]."""
 
-Replan = Callable[[Curve, float], object]
-"""Plans the phase along a curve with a least normal force [N]; raises if there is no plan."""
+Replan = Callable[[Sequence[Curve], float], object]
+"""Plans the phases along curves with a least normal force [N]; raises if there is no plan."""
 
 
 class _Candidate(NamedTuple):
@@ -54,39 +54,46 @@ class _Candidate(NamedTuple):
         power = 1.0 if self.key == "torque_limit" else 0.5
         return float(self.limit.value * (1 + relaxed) ** power)
 
-    def apply(self, data: PhaseData, value: float) -> tuple[Curve, float]:
-        """Curve and epsilon with another value of the limit."""
+    def apply(self, parts: Sequence[PhaseData], value: float) -> tuple[list[Curve], float]:
+        """Curves and epsilon with another value of the limit."""
+        curves = [part.curve for part in parts]
         if self.finger is None:
-            return data.curve, value
-        return with_limit(data.curve, self.finger, self.key, value), data.epsilon
+            return curves, value
+        changed = [with_limit(curve, self.finger, self.key, value) for curve in curves]
+        return changed, parts[0].epsilon
 
 
 def explain(
-    data: PhaseData,
+    parts: Sequence[PhaseData],
     profile: Profile,
     scales: Scales,
-    phase: int,
+    phases: Sequence[int],
     stopped: str,
     replan: Replan,
 ) -> InfeasibleError | SolverError:
-    """Say why a phase has no plan and what would change that.
+    """Say why phases have no plan and what would change that.
 
     Parameters
     ----------
-    data : PhaseData
+    parts : sequence of PhaseData
     profile : Profile
-        A guess of the motion.
+        A guess of the motion through all of them.
     scales : Scales
-    phase : int
-        The phase's number.
+    phases : sequence of int
+        Their numbers.
     stopped : str
         How the solver ended, in words.
     replan : callable
     """
+    data = join(parts)
     eased = _ease(data, profile, scales)
     if eased is None:
         return SolverError(stopped)
-    shortfalls = _list_shortfalls(data, eased)
+    shortfalls = [
+        short
+        for part, own, phase in zip(parts, cut(parts, eased), phases, strict=True)
+        for short in _list_shortfalls(part, own, f", phase {phase}" if len(phases) > 1 else "")
+    ]
     if not shortfalls:
         return SolverError(f"{stopped} although limits can be kept")
     scales = _quicken(data, scales)
@@ -97,7 +104,7 @@ def explain(
 
     def can_plan(index: int, value: float) -> bool:
         try:
-            replan(*candidates[index].apply(data, value))
+            replan(*candidates[index].apply(parts, value))
         except (InfeasibleError, SolverError, JammingError):
             return False
         return True
@@ -105,7 +112,8 @@ def explain(
     limits = [candidate.limit for candidate in candidates]
     changes = find_changes(limits, find_least, can_plan)
     return InfeasibleError(
-        f"phase {phase} is infeasible: {rank_shortfalls(shortfalls)}; {describe_changes(changes)}"
+        f"{name_phases(phases, 'infeasible')}: {rank_shortfalls(shortfalls)}; "
+        f"{describe_changes(changes)}"
     )
 
 
@@ -115,7 +123,7 @@ def _quicken(data: PhaseData, scales: Scales) -> Scales:
     In units of a slow motion, or of an absurd epsilon, the small costs that choose among equals
     would outweigh what is relaxed.
     """
-    length, gravity = data.curve.length, data.curve.formation.scene.gravity
+    length, gravity = float(data.grid.s[-1]), data.curve.formation.scene.gravity
     pace = np.sqrt(length / max(gravity, 1e-9))
     return scales._replace(time=min(scales.time, pace), force=min(scales.force, _FORCE))
 
@@ -143,7 +151,7 @@ def _shortfalls(data: PhaseData, profile: Profile) -> Array:
     return -np.hstack([held, torque])
 
 
-def _list_shortfalls(data: PhaseData, profile: Profile) -> list[Shortfall]:
+def _list_shortfalls(data: PhaseData, profile: Profile, suffix: str) -> list[Shortfall]:
     short = _shortfalls(data, profile)
     names = name_holds(data.curve.formation, data.epsilon)
     units = ["N"] * len(names) + ["N m"] * 2
@@ -154,7 +162,7 @@ def _list_shortfalls(data: PhaseData, profile: Profile) -> list[Shortfall]:
     for row, (name, unit) in enumerate(zip(names, units, strict=True)):
         worst = int(short[:, row].argmax())
         if short[worst, row] > _SHORT:
-            where = f"t = {times[worst]:.4f} s ({describe_pose(z[worst])})"
+            where = f"t = {times[worst]:.4f} s ({describe_pose(z[worst])}){suffix}"
             found.append(Shortfall(name, float(short[worst, row]), unit, where))
     return found
 

@@ -1,7 +1,8 @@
 """The planning NLP of one-freedom phases in the path domain: building, bounds, packing.
 
 `wholearm.pathterms` has its expressions. Built once for some contacts, intervals and an objective,
-it serves every phase: grid, coefficients and limits are its parameters and bounds.
+it serves every phase: grid, coefficients and limits are its parameters and bounds. Phases that
+impacts join have an interval of length zero between them (`wholearm.chain`).
 """
 
 from __future__ import annotations
@@ -272,6 +273,8 @@ def unpack(nlp: PathNLP, grid: Grid, x: Array, scales: Scales) -> tuple[Profile,
     steps = grid.steps
     a = a - np.dot(steps, a[1:] + a[:-1]) / (2 * grid.s[-1])
     b = np.concatenate([[0.0], np.cumsum(steps * (a[1:] + a[:-1]))])
+    # Where phases are joined at next to no speed, rounding can take b below zero.
+    b = np.maximum(b, 0.0)
     b[-1] = 0.0
     margin = x[-1] * _margin_unit(nlp, scales) if nlp.objective in CHAINED else 0.0
     return Profile(a, b, squeeze), float(margin)

@@ -1,4 +1,4 @@
-"""Planning a one-freedom phase: first guess, NLP, and limits that hold between nodes too.
+"""Planning one-freedom phases: first guess, NLP, and limits that hold between nodes too.
 
 The NLP of `wholearm.pathnlp` keeps the limits at its nodes. Once solved, the grid is drawn together
 where they are missed most between nodes (where the plan switches from one limit to another). Then
@@ -8,6 +8,7 @@ misses more than `MISS`.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -18,8 +19,8 @@ from .errors import InfeasibleError, SolverError, WholearmError
 from .model import Array
 from .nodechain import StagedSolver
 from .options import Objective, PlanOptions
-from .pathdata import PhaseData, fit_torque, prepare
-from .pathmotion import PathMotion, Profile, draw_together, make_grid
+from .pathdata import PhaseData, cut, fit_torque, join, name_phases, prepare
+from .pathmotion import Grid, PathMotion, Profile, draw_together, make_grid
 from .pathnlp import (
     PathNLP,
     Scales,
@@ -54,11 +55,15 @@ class _Solution(NamedTuple):
     seconds: float
 
 
-class _StuckError(SolverError):
-    """A solve that failed, with the data that it failed for."""
+class _StoppedError(Exception):
+    """The solver has stopped without an answer."""
 
-    def __init__(self, data: PhaseData, message: str) -> None:
-        self.data = data
+
+class _StuckError(SolverError):
+    """A solve that failed, with the phases that it failed for."""
+
+    def __init__(self, parts: Sequence[PhaseData], message: str) -> None:
+        self.parts = parts
         super().__init__(message)
 
 
@@ -69,18 +74,33 @@ def plan_path(
     phase: int,
     duration: float | None = None,
 ) -> PhasePlan[PathMotion]:
-    """Plan one phase along a curve, from rest to rest.
+    """Plan one phase along a curve, from rest to rest; see `plan_curves`."""
+    return plan_curves((curve,), epsilon, options, (phase,), duration)[0]
+
+
+def plan_curves(
+    curves: Sequence[Curve],
+    epsilon: float,
+    options: PlanOptions,
+    phases: Sequence[int],
+    duration: float | None = None,
+    explained: bool = True,
+) -> list[PhasePlan[PathMotion]]:
+    """Plan phases along curves that are run through one after the other, from rest to rest.
 
     Parameters
     ----------
-    curve : Curve
+    curves : sequence of Curve
+        At such paces that the speed is the same on both sides of where two of them meet.
     epsilon : float, [N]
         Least normal force.
     options : PlanOptions
-    phase : int
-        The phase's number, for messages.
+    phases : sequence of int
+        The phases' numbers, for messages.
     duration : float, optional, [s]
-        Longest duration, for the objective `margin`.
+        Longest duration of all, for the objective `margin`.
+    explained : bool
+        Whether to find out why there is no plan, which takes longer than planning.
 
     Raises
     ------
@@ -88,33 +108,40 @@ def plan_path(
         If no motion keeps the limits; names what is short, where and by how much, and each single
         limit with which there would be a plan.
     JammingError
-        If friction jams the formation somewhere on the curve.
+        If friction jams a formation somewhere on its curve.
     SolverError
         If the solver stops without an answer.
     """
+    where = name_phases(phases)
     try:
-        plan = _plan(curve, epsilon, options, phase, duration)
+        plans = _plan(curves, epsilon, options, phases, duration)
     except _StuckError as stuck:
+        if not explained:
+            raise
         from .pathexplain import explain
 
-        late = _explain_duration(curve, epsilon, options, phase, duration)
+        late = _explain_duration(curves, epsilon, options, phases, duration)
         # Advice is about the problem: it does not depend on the solver.
         robust = replace(options, solver="ipopt")
         raise late or explain(
-            stuck.data,
-            *guess_slowly(stuck.data),
-            phase,
+            stuck.parts,
+            *guess_slowly(join(stuck.parts)),
+            phases,
             str(stuck),
-            lambda changed, least: _plan(changed, least, robust, phase, duration),
+            lambda changed, least: _plan(changed, least, robust, phases, duration),
         ) from None
-    if options.goal is Objective.MARGIN and plan.value < epsilon - MISS:
-        late = _explain_duration(curve, epsilon, options, phase, duration)
-        raise late or SolverError(f"phase {phase}: the margin found is below epsilon")
-    return plan
+    if options.goal is Objective.MARGIN and plans[0].value < epsilon - MISS:
+        late = _explain_duration(curves, epsilon, options, phases, duration)
+        raise late or SolverError(f"{where}: the margin found is below epsilon")
+    return plans
 
 
 def _explain_duration(
-    curve: Curve, epsilon: float, options: PlanOptions, phase: int, duration: float | None
+    curves: Sequence[Curve],
+    epsilon: float,
+    options: PlanOptions,
+    phases: Sequence[int],
+    duration: float | None,
 ) -> InfeasibleError | None:
     """Say so if the duration is shorter than the least time, and which one would do."""
     from .advice import Limit, describe_changes, find_changes
@@ -123,7 +150,7 @@ def _explain_duration(
         return None
     fastest = replace(options, objective=Objective.TIME, duration=None)
     try:
-        least = _plan(curve, epsilon, fastest, phase, None).value
+        least = sum(plan.value for plan in _plan(curves, epsilon, fastest, phases, None))
     except WholearmError:
         return None
     if least <= duration:
@@ -131,42 +158,62 @@ def _explain_duration(
 
     def can_plan(_: int, value: float) -> bool:
         try:
-            return _plan(curve, epsilon, options, phase, value).value >= epsilon
+            return _plan(curves, epsilon, options, phases, value)[0].value >= epsilon
         except SolverError:
             return False
 
     changes = find_changes([Limit("duration", duration, "s", 1)], lambda _: least, can_plan)
     return InfeasibleError(
-        f"phase {phase} is infeasible: duration = {duration:g} s is {least - duration:.3g} s "
-        f"shorter than the least time; {describe_changes(changes)}"
+        f"{name_phases(phases, 'infeasible')}: duration = {duration:g} s is "
+        f"{least - duration:.3g} s shorter than the least time; {describe_changes(changes)}"
     )
 
 
 def _plan(
-    curve: Curve, epsilon: float, options: PlanOptions, phase: int, duration: float | None
-) -> PhasePlan[PathMotion]:
-    n_contacts, n_rolling = curve.formation.n_contacts, curve.formation.n_rolling
-    nlp = build_path_nlp(n_contacts, options.intervals, options.goal, n_rolling, options.solver)
-    data = prepare(curve, epsilon, make_grid(curve, options.intervals), phase)
+    curves: Sequence[Curve],
+    epsilon: float,
+    options: PlanOptions,
+    phases: Sequence[int],
+    duration: float | None,
+) -> list[PhasePlan[PathMotion]]:
+    def prepare_all(grids: Iterable[Grid]) -> list[PhaseData]:
+        given = zip(curves, grids, phases, strict=True)
+        return [prepare(curve, epsilon, grid, phase) for curve, grid, phase in given]
+
+    parts = prepare_all(make_grid(curve, options.intervals) for curve in curves)
+    data = join(parts)
+    first, intervals = curves[0].formation, len(data.grid.steps)
+    nlp = build_path_nlp(first.n_contacts, intervals, options.goal, first.n_rolling, options.solver)
     profile, scales = guess(data)
     tightening = Tightening.none(data, duration)
     solution = _Solution(profile, 0.0, first_multipliers(nlp, data, profile, scales), 0, 0.0)
     for solves in range(1, ROUNDS + 1):
-        solution = _solve(nlp, data, scales, tightening, solution, options.time_weight, phase)
+        try:
+            solution = _solve(nlp, data, scales, tightening, solution, options.time_weight)
+        except _StoppedError as stop:
+            raise _StuckError(parts, f"{name_phases(phases)}: {stop}") from None
         profile, margin = solution.profile, solution.margin
-        motion = PathMotion(curve, data.grid, profile)
+        motions = [
+            PathMotion(part.curve, part.grid, own)
+            for part, own in zip(parts, cut(parts, profile), strict=True)
+        ]
         short, speeding = data.misses(profile, margin)
-        late = max(0.0, motion.duration / duration - 1) if duration else 0.0
+        total = sum(motion.duration for motion in motions)
+        late = max(0.0, total / duration - 1) if duration else 0.0
         if max(short.max(), speeding.max(), late) <= MISS:
             break
         coarse = short.max(axis=1) / (_COARSE * scales.force)
         if solves == 1 and coarse.max() > 1:
             old = data.grid
-            grid = draw_together(old, data.solid, coarse)
-            data = prepare(curve, epsilon, grid, phase)
+            shares = np.split(coarse, np.cumsum([len(part.solid) for part in parts])[:-1])
+            parts = prepare_all(
+                draw_together(part.grid, part.solid, share)
+                for part, share in zip(parts, shares, strict=True)
+            )
+            data = join(parts)
             solution = solution._replace(
-                profile=Profile(*(np.interp(grid.s, old.s, part) for part in profile)),
-                multipliers=move_multipliers(nlp, solution.multipliers, old, grid),
+                profile=Profile(*(np.interp(data.grid.s, old.s, part) for part in profile)),
+                multipliers=move_multipliers(nlp, solution.multipliers, old, data.grid),
             )
         else:
             reach = data.beside(data.slack_beside(profile, margin, short))
@@ -174,18 +221,22 @@ def _plan(
             tightening = tightening.by(reach, _OVER * short, _OVER * speeding, _OVER * late)
     else:
         raise SolverError(
-            f"phase {phase}: after {ROUNDS} solves limits are still missed by {short.max():.2g} N "
-            "between nodes; plan with more intervals"
+            f"{name_phases(phases)}: after {ROUNDS} solves limits are still missed by "
+            f"{short.max():.2g} N between nodes; plan with more intervals"
         )
-    torque, squares = fit_torque(data, motion)
-    value = {
-        Objective.TIME: motion.duration,
-        Objective.EFFORT: squares + options.time_weight * motion.duration,
-        Objective.MARGIN: epsilon + margin,
-    }[options.goal]
-    return PhasePlan(
-        motion, torque, value, solution.iterations, solves, nlp.build_time, solution.seconds
-    )
+    plans: list[PhasePlan[PathMotion]] = []
+    for part, motion in zip(parts, motions, strict=True):
+        torque, squares = fit_torque(part, motion)
+        value = {
+            Objective.TIME: motion.duration,
+            Objective.EFFORT: squares + options.time_weight * motion.duration,
+            Objective.MARGIN: epsilon + margin,
+        }[options.goal]
+        costs = (0, 0, 0.0, 0.0)
+        if not plans:
+            costs = (solution.iterations, solves, nlp.build_time, solution.seconds)
+        plans.append(PhasePlan(motion, torque, value, *costs))
+    return plans
 
 
 def _solve(
@@ -195,7 +246,6 @@ def _solve(
     tightening: Tightening,
     start: _Solution,
     time_weight: float,
-    phase: int,
 ) -> _Solution:
     result = nlp.solver(
         x0=pack(nlp, start.profile, scales, start.margin),
@@ -206,8 +256,7 @@ def _solve(
     stats = nlp.solver.stats()
     if not stats["success"]:
         name = "fatrop" if isinstance(nlp.solver, StagedSolver) else "Ipopt"
-        status = f"phase {phase}: {name} stopped with {stats['return_status']}"
-        raise _StuckError(data, status)
+        raise _StoppedError(f"{name} stopped with {stats['return_status']}")
     profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], scales)
     multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
     iterations = start.iterations + stats["iter_count"]
@@ -248,13 +297,14 @@ def guess_slowly(data: PhaseData) -> tuple[Profile, Scales]:
 
 def _fall(data: PhaseData) -> float:
     """The b of a fall over the length of the curve [m^2/s^2]."""
-    return 2 * data.curve.formation.scene.gravity * data.curve.length + 1e-9
+    return 2 * data.curve.formation.scene.gravity * float(data.grid.s[-1]) + 1e-9
 
 
 def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
     """The a and b of a parabola in s of this height."""
-    x = data.grid.s / data.curve.length
-    return height * 2 * (1 - 2 * x) / data.curve.length, height * 4 * x * (1 - x)
+    length = data.grid.s[-1]
+    x = data.grid.s / length
+    return height * 2 * (1 - 2 * x) / length, height * 4 * x * (1 - x)
 
 
 def _squeeze_range(data: PhaseData, height: float) -> tuple[Array, Array]:
@@ -273,7 +323,8 @@ def _squeeze_range(data: PhaseData, height: float) -> tuple[Array, Array]:
 def _guess_at(data: PhaseData, height: float) -> tuple[Profile, Scales]:
     low, high = _squeeze_range(data, height)
     middle = np.where(np.isfinite(low + high) & (low <= high), (low + high) / 2, 0.0)
-    duration = np.pi / 2 * data.curve.length / np.sqrt(height)
+    length = float(data.grid.s[-1])
+    duration = np.pi / 2 * length / np.sqrt(height)
     force = max(1.0, data.epsilon, float(np.abs(middle).mean()))
-    scales = Scales(data.curve.length, 0.6 * duration, force)
+    scales = Scales(length, 0.6 * duration, force)
     return Profile(*_parabola(data, height), middle), scales
