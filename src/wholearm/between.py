@@ -62,23 +62,23 @@ class Limits(NamedTuple):
         return np.asarray((np.hstack([self.c_n, self.cone]) > COARSE).any(axis=1))
 
 
-def find_misses(stage: Stage, motion: StageMotion, least: float) -> Limits:
+def find_misses(stage: Stage, motion: StageMotion, epsilon: float, margin: float = 0.0) -> Limits:
     """By how much limits are missed in each interval, at worst.
 
     Parameters
     ----------
-    least : float, [N]
-        Least c_n.
+    epsilon, margin : float, [N]
+        Least c_n, and what it has to be more.
     """
     formation, inner = stage.formation, np.linspace(1e-9, 1 - 1e-9, LOOKS)
     places = stage.guess.places(inner).ravel()
     samples = motion.evaluate(places * motion.duration)
-    over = np.abs(samples.c_t) - formation.friction * samples.c_n
+    over = np.abs(samples.c_t) - formation.friction * (samples.c_n - epsilon)
     gaps = formation.evaluate_limits(samples.z)[:, list(stage.watched)]
     clear = CLEAR / 2 * np.isin(stage.watched, stage.released)
     later = (not stage.opens) | (places > 1 / 2)
     tables = (
-        least - samples.c_n,
+        epsilon + margin - samples.c_n,
         over[:, list(formation.rolling_rows)],
         np.outer(later, clear) - gaps,
     )
@@ -110,6 +110,9 @@ def raise_bounds(
             low_x[c_n] = floor[:, None]
         low[own.presses] = floor[:, None]
         cones = own.points.shape[2] - 2 * formation.n_rolling
-        low[own.points[..., cones:]] = np.tile(raised.cone, 2)[:, None]
+        rolling = list(formation.rolling_rows)
+        # As if the contact pressed with epsilon less: it slips no sooner than it is lost.
+        cone = epsilon * formation.friction[rolling] + raised.cone
+        low[own.points[..., cones:]] = np.tile(cone, 2)[:, None]
         low[own.watches] += raised.gap[:, None] / formation.scene.polygon.gyration_radius
     return low, high
