@@ -65,6 +65,11 @@ def stages_of(plans: list[PhasePlan[TimeMotion]]) -> list[StageMotion]:
     return [stage for plan in plans for stage in plan.motion.stages]
 
 
+def tables(part: StagePoints) -> list[Array]:
+    """All that a stage consists of, as arrays."""
+    return [np.asarray(value, dtype=float) for value in part]
+
+
 def instants(stage: StageMotion, per_interval: int) -> Array:
     """Times inside the intervals of a stage, shape (n,) [s]: none where its torque may step."""
     inside = (np.arange(per_interval) + 0.5) / per_interval
@@ -93,7 +98,9 @@ def integrate(stage: StageMotion, z: Array, v: Array) -> tuple[Array, Array]:
 Sampler = Callable[[Scheme, int], StagePoints]
 
 
-def drive(formation: Formation, z: Array, tau: Array, signs: Directions, duration: float) -> Sampler:
+def drive(
+    formation: Formation, z: Array, tau: Array, signs: Directions, duration: float
+) -> Sampler:
     """Motion from rest at `z` under a torque that is linear in time, by plain Newton and Euler.
 
     Parameters
