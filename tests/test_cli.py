@@ -3,6 +3,7 @@ from __future__ import annotations
 import copy
 import json
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -15,6 +16,7 @@ import pytest
 
 import wholearm
 from conftest import HEPTAGON
+from tipping import BOX, scale, tipped
 from wholearm.cli import build_parser, main
 from wholearm.trajectory import Trajectory, load_trajectory
 
@@ -102,6 +104,51 @@ def test_solve_writes_the_plan(folder: Path, capsys: pytest.CaptureFixture[str])
 def test_solve_names_its_output_after_the_problem(folder: Path) -> None:
     assert main(["solve", str(HEPTAGON), "--intervals", "20"]) == 0
     assert [path.name for path in folder.iterdir()] == ["heptagon_four_contacts.npz"]
+
+
+def test_solve_lists_the_impacts(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    impacts = str(HEPTAGON.with_name("heptagon_impact.toml"))
+    assert main(["solve", impacts, "-o", "a.npz", "--intervals", "40"]) == 0
+    out, err = capsys.readouterr()
+    lines = out.splitlines()
+    assert err == "" and lines[6] == lines[12] == ""
+    assert lines[7].split("  ")[0].strip() == "after phase" and lines[7].endswith("saves [s]")
+    rows = load_trajectory("a.npz").meta["transitions"]
+    for line, row in zip(lines[8:12], rows, strict=True):
+        cells = line.split()
+        assert int(cells[0]) == row["phase"]
+        assert float(cells[1]) == pytest.approx(row["velocity_ratio"], abs=5e-7)
+        assert float(cells[2]) == pytest.approx(row["least_impulse"], abs=5e-7)
+        assert cells[3] == row["least_impulse_contact"]
+        assert float(cells[4]) == pytest.approx(row["speed"], abs=5e-7)
+        if row["possible"]:
+            assert float(cells[5]) == pytest.approx(row["saves"], abs=5e-7)
+        else:
+            assert cells[5] == "-" and line.endswith(f"stops: {row['reason']}")
+    assert main(["verify", impacts, "a.npz"]) == 0
+    assert "least impulse [N s]" in capsys.readouterr().out
+
+
+def test_an_impulse_that_pulls_has_exit_status_1(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Torques that the rough finger would make good, on the smooth one."""
+    impacts = HEPTAGON.with_name("heptagon_impact.toml")
+    assert main(["solve", str(impacts), "-o", "a.npz", "--objective", "effort"]) == 0
+    text = impacts.read_text(encoding="utf-8").replace("finger1 = 0.4", "finger1 = 0.33")
+    Path("smooth.toml").write_text(text)
+    capsys.readouterr()
+    assert main(["verify", "smooth.toml", "a.npz"]) == 1
+    assert re.search(
+        r"impulse on v1-palm would be -\S+ N s in the impact at t = \S+ s, phase 2",
+        capsys.readouterr().out,
+    )
+
+
+def test_impacts_are_for_curves(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    impacts = str(HEPTAGON.with_name("heptagon_impact.toml"))
+    text = fails(capsys, 2, "solve", impacts, "--transcription", "time")
+    assert text.startswith(f"{impacts}: phases[1].end: 'impact' given, but impacts are planned")
 
 
 @pytest.mark.parametrize("objective", ["time", "effort", "margin"])
@@ -323,6 +370,25 @@ def test_verify_names_a_missed_goal(folder: Path, capsys: pytest.CaptureFixture[
     assert "the torques end at t = 0.5 s, phase 1, 0.0236 m short of v3-finger1" in out
 
 
+def test_verify_names_a_slip(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    starts = tipped().phase_starts
+    torque = scale(0, 0.95, starts[1], starts[2])
+    rows = "\n".join(",".join(map(repr, row)) for row in torque.rows(40).tolist())
+    Path("weak.csv").write_text(f"t,tau1,tau2\n{rows}\n")
+    assert main(["verify", str(BOX), "weak.csv"]) == 1
+    out, err = capsys.readouterr()
+    assert err == "" and "FAILED\n" in out and "v1-palm slips: |c_t| = " in out
+
+
+def test_bench_refuses_what_its_baselines_do_not_know(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", str(BOX), "-o", "results"]) == 2
+    error = capsys.readouterr().err
+    assert "phases[2].contacts: v1-palm rolls; bench measures sliding only" in error
+    assert not Path("results").exists()
+
+
 BAD_TORQUES = {
     "missing column": ("t,tau1\n0,0\n1,0\n", "tau2: column is missing; t,tau1 given"),
     "empty": ("", "t: column is missing; an empty file given"),
@@ -390,7 +456,7 @@ def test_interrupting_leaves_nothing(
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("wholearm.plan.plan_path", interrupt)
+    monkeypatch.setattr("wholearm.plan.plan_chain", interrupt)
     assert main(["solve", str(HEPTAGON)]) == 130
     assert capsys.readouterr().err == "wholearm: interrupted\n"
     assert list(folder.iterdir()) == []

@@ -325,3 +325,22 @@ def test_viscous_joints(drag: float) -> None:
     errors, order = observe(Toy(constant(1.0, 0.0, drag)), start + brake_time(start))
     # Viscous torque grows with the root of s at rest, which linear a meets at the nodes only.
     assert (errors > 0).all() and errors[2] < 1e-3 and order > 1.5
+
+
+def test_no_speed_comes_out_imaginary(data: PhaseData, profile: Profile) -> None:
+    """Where a motion all but stops, b integrated again from a may fall below zero by rounding."""
+    nlp = build_path_nlp(4, INTERVALS, Objective.TIME)
+    s, steps = data.grid.s, data.grid.steps
+    middle = len(s) // 2
+
+    def integrate(a: Array) -> Array:
+        return np.concatenate([[0.0], np.cumsum(steps * (a[1:] + a[:-1]))])
+
+    # Twice up and down from rest to rest, less a hair in the middle.
+    shapes = np.array([np.sin(4 * np.pi * s / s[-1]), np.ones_like(s), s / s[-1]])
+    reached = np.array([integrate(shape)[[middle, -1]] for shape in shapes])
+    shares = np.linalg.solve(reached[1:].T, [-1e-9, 0.0] - reached[0])
+    a = shapes[0] + shares @ shapes[1:]
+    assert integrate(a)[middle] == pytest.approx(-1e-9, abs=1e-12)
+    found, _ = unpack(nlp, data.grid, pack(nlp, profile._replace(a=a), SCALES, 0.0), SCALES)
+    assert found.b[middle] == 0.0 and found.b.min() == 0.0

@@ -34,10 +34,13 @@ class Arrival:
         How fast the distance to the phase's end closes.
     window : float, [s]
         If the next break of the torques is no further off, the arrival belongs to it.
+    strikes : bool
+        Whether it takes an impact to go on.
     """
 
     rate: float
     window: float
+    strikes: bool = False
 
 
 @dataclass(frozen=True)
@@ -104,12 +107,14 @@ def let_go(run: Replay, contacts: Sequence[int]) -> Released | Outcome:
     return run.lose(name, min(0.0, forces[name]))
 
 
-def slip(run: Replay) -> Outcome:
-    """End because the rolling contact that is nearest to it slips, or beyond."""
+def slip(run: Replay) -> Released | Outcome:
+    """End because a rolling contact slips, or starts to part where its release is planned."""
     s = run.stepper
     formation = s.formation
     cones = s.outputs[s.to.events][s.rows.cone]
     row = formation.rolling_rows[int(cones.argmin()) % formation.n_rolling]
+    if formation.names[row] in run.releasable:
+        return let_go(run, [row])
     return run.slip(row, float(s.outputs[s.to.c_n][row]), float(s.outputs[s.to.c_t][row]))
 
 

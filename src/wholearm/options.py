@@ -20,9 +20,13 @@ class Objective(Enum):
     """Largest least normal force within a given duration."""
     ELASTIC = "elastic"
     """Least shortfall of the limits; used to explain why there is no plan."""
+    RELAX = "relax"
+    """Least relaxation of one limit; used to say what would make a plan possible."""
 
 
-CHOICES = tuple(choice.value for choice in Objective if choice is not Objective.ELASTIC)
+CHOICES = tuple(
+    choice.value for choice in Objective if choice not in (Objective.ELASTIC, Objective.RELAX)
+)
 """Objectives that a user can ask for."""
 
 
@@ -43,8 +47,8 @@ class PlanOptions:
     samples : int
         Rows per phase of the trajectory file, at least 2.
     transcription : str
-        ``"auto"`` plans phases with one freedom that end at rest along their curve and others in
-        the time domain; ``"time"`` plans all in the time domain.
+        ``"auto"`` plans phases with one freedom that are joined at rest or by impacts along their
+        curves and others in the time domain; ``"time"`` plans all in the time domain.
     time_intervals : int, optional
         Intervals of each phase in the time domain, at least 4; when left out, 32 for a phase with
         one freedom that is planned alone and 16 for others.

@@ -1,4 +1,4 @@
-"""What one phase gives the planner: forces along its curve, at nodes and between them.
+"""What phases give the planner: forces along their curves, at nodes and between them.
 
 Forces are evaluated at the nodes and at a few places of every interval, the knots. They are smooth
 there, so polynomials through the knots carry them to all places where limits are looked at.
@@ -6,6 +6,7 @@ there, so polynomials through the knots carry them to all places where limits ar
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,11 +48,12 @@ class Places(NamedTuple):
 
 
 class PhaseData(NamedTuple):
-    """What one phase gives the NLP.
+    """What one phase, or several that are joined, gives the NLP.
 
     Attributes
     ----------
     curve : Curve
+        The first one's where phases are joined.
     epsilon : float, [N]
     grid : Grid
     nodes : Places
@@ -181,6 +183,43 @@ def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
     looks = Places(PathForces(*(carry(part) for part in knots.forces)), carry(knots.rates))
     nodes = every.pick(slice(None, len(grid.s)))
     return PhaseData(curve, epsilon, grid, nodes, fine, knots, looks, solid)
+
+
+def join(parts: Sequence[PhaseData]) -> PhaseData:
+    """Put phases one after the other, each with as many nodes and as many sliding contacts.
+
+    Where two meet, the grid has an interval of length zero, as where a direction reverses.
+    """
+    starts = np.cumsum([0.0, *(part.grid.s[-1] for part in parts)])
+    segments = np.cumsum([0, *(part.grid.segment[-1] + 1 for part in parts)])
+    nodes = np.cumsum([0, *(len(part.grid.s) for part in parts)])
+
+    def chain(arrays: Iterable[NDArray[Any]], firsts: NDArray[Any]) -> Any:
+        pairs = zip(arrays, firsts[:-1], strict=True)
+        return np.concatenate([array + first for array, first in pairs])
+
+    def stack(places: Sequence[Places]) -> Places:
+        columns = zip(*(own.forces for own in places), strict=True)
+        forces = PathForces(*(np.concatenate(column) for column in columns))
+        return Places(forces, np.concatenate([own.rates for own in places]))
+
+    return parts[0]._replace(
+        grid=Grid(
+            chain((part.grid.s for part in parts), starts),
+            chain((part.grid.segment for part in parts), segments),
+        ),
+        nodes=stack([part.nodes for part in parts]),
+        knots=stack([part.knots for part in parts]),
+        looks=stack([part.looks for part in parts]),
+        solid=chain((part.solid for part in parts), nodes),
+    )
+
+
+def cut(parts: Sequence[PhaseData], profile: Profile) -> list[Profile]:
+    """Return the profile of each of several joined phases."""
+    ends = np.cumsum([len(part.grid.s) for part in parts])[:-1]
+    columns = (np.split(values, ends) for values in profile)
+    return [Profile(*own) for own in zip(*columns, strict=True)]
 
 
 def choose_fineness(nodes: int) -> Fineness:

@@ -12,7 +12,8 @@ H c are the normal forces, and the friction cones of contacts that roll (`wholea
 
 Where a direction reverses, the grid has an interval of length zero: b is the same on its two sides,
 a and lambda may jump. So one NLP, built once for some contacts, intervals and an objective, serves
-every phase: grid, coefficients and limits are its parameters and bounds.
+every phase: grid, coefficients and limits are its parameters and bounds. Phases that impacts join
+have such an interval between them, too (`wholearm.chain`).
 """
 
 from __future__ import annotations
@@ -295,6 +296,8 @@ def unpack(nlp: PathNLP, grid: Grid, x: Array, scales: Scales) -> tuple[Profile,
     steps = grid.steps
     a = a - np.dot(steps, a[1:] + a[:-1]) / (2 * grid.s[-1])
     b = np.concatenate([[0.0], np.cumsum(steps * (a[1:] + a[:-1]))])
+    # Where phases are joined at next to no speed, rounding can take b below zero.
+    b = np.maximum(b, 0.0)
     b[-1] = 0.0
     margin = x[-1] * scales.force if nlp.objective is Objective.MARGIN else 0.0
     return Profile(a, b, squeeze), float(margin)

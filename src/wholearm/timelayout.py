@@ -102,6 +102,7 @@ def pack(points: Sequence[StagePoints], layouts: Sequence[StageLayout], margin: 
         duration = part.duration
         x[layout.z], x[layout.w], x[layout.u] = part.z, duration * part.v, duration**2 * part.a
         x[layout.forces], x[layout.tau] = part.forces, part.tau.reshape(-1, 4)
+        x[layout.short] = 1.0
         x[layout.nodes[:, Z]], x[layout.nodes[:, W]] = part.nodes[:, 0], duration * part.nodes[:, 1]
         x[layout.ends] = x[layout.nodes[1:, :T]]
         x[layout.nodes[:, T]] = duration
