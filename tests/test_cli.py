@@ -15,6 +15,7 @@ import pytest
 
 import wholearm
 from conftest import HEPTAGON
+from tipping import BOX, scale, tipped
 from wholearm.cli import build_parser, main
 from wholearm.trajectory import Trajectory, load_trajectory
 
@@ -321,6 +322,25 @@ def test_verify_names_a_missed_goal(folder: Path, capsys: pytest.CaptureFixture[
     out, err = capsys.readouterr()
     assert err == "" and "FAILED\n" in out
     assert "the torques end at t = 0.5 s, phase 1, 0.0236 m short of v3-finger1" in out
+
+
+def test_verify_names_a_slip(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    starts = tipped().phase_starts
+    torque = scale(0, 0.95, starts[1], starts[2])
+    rows = "\n".join(",".join(map(repr, row)) for row in torque.rows(40).tolist())
+    Path("weak.csv").write_text(f"t,tau1,tau2\n{rows}\n")
+    assert main(["verify", str(BOX), "weak.csv"]) == 1
+    out, err = capsys.readouterr()
+    assert err == "" and "FAILED\n" in out and "v1-palm slips: |c_t| = " in out
+
+
+def test_bench_refuses_what_its_baselines_do_not_know(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", str(BOX), "-o", "results"]) == 2
+    error = capsys.readouterr().err
+    assert "phases[2].contacts: v1-palm rolls; bench measures sliding only" in error
+    assert not Path("results").exists()
 
 
 BAD_TORQUES = {

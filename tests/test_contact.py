@@ -22,7 +22,6 @@ from wholearm.contact import (
     build_features,
     build_geometry,
     build_limits,
-    build_slip,
     candidate_contacts,
     parse_contact,
 )
@@ -140,24 +139,6 @@ def test_normal_and_point_are_those_measured(scene: Scene, name: str) -> None:
         found = [part.full()[:, 0] for part in function(z)]
         np.testing.assert_allclose(found[0], point, atol=1e-15)
         np.testing.assert_allclose(found[1], normal, atol=1e-13)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_slip_coordinate_integrates_the_sliding_velocity(scene: Scene, name: str) -> None:
-    """Where a contact touches, the gradient of its slip is A_t, by derivative and difference."""
-    formation = make_formation(scene, name)
-    slip, z_symbol = build_slip(formation.contacts[0], scene), build_features(scene).z
-    function = ca.Function("slip", [z_symbol], [slip, ca.jacobian(slip, z_symbol)])
-    rng = np.random.default_rng(6)
-    for z in configurations(6, 8):
-        gap, _, normal = measure_gap(scene, formation.contacts[0], z)
-        z[:2] -= gap * normal
-        v = rng.uniform(-1, 1, 5)
-        A_t = formation.evaluate(z[None], v[None]).A_t[0]
-        np.testing.assert_allclose(function(z)[1].full(), A_t, atol=1e-14)
-        rise = float(function(z + STEP * v)[0] - function(z - STEP * v)[0])
-        # On a tip's arc truncation is (STEP / radius)^2.
-        assert rise / (2 * STEP) == pytest.approx(A_t[0] @ v, abs=(STEP / 0.005) ** 2)
 
 
 @pytest.mark.parametrize("name", NAMES)

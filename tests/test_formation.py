@@ -259,6 +259,12 @@ def test_slip_coordinates_are_in_the_order_of_the_contacts() -> None:
     np.testing.assert_allclose(formation.evaluate_slip(z), [[-0.02, 0.04]], atol=ROUNDING)
 
 
+def test_only_contacts_roll() -> None:
+    contacts = make_formation(make_scene(SQUARE), "v0-palm v1-palm v2-palm").contacts
+    with pytest.raises(ValueError, match="v2-palm roll, which are no contacts"):
+        Formation(make_scene(SQUARE), contacts[:2], contacts[1:])
+
+
 def limits_at(scene: Scene, names: str, z: Array) -> dict[str, float]:
     formation = make_formation(scene, names)
     values = formation.evaluate_limits(z[None])[0]

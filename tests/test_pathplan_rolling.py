@@ -83,6 +83,18 @@ def test_planned_forces_balance_every_body(objective: str) -> None:
         np.testing.assert_allclose(row.c_t[1:], -mu * np.sign(slip[1:]) * row.c_n[1:], rtol=1e-12)
 
 
+def test_velocities_and_accelerations_are_derivatives() -> None:
+    motion, h = plan().motion, 1e-6
+    # Between the nodes, at which accelerations have kinks.
+    times = (motion.times[1:] + motion.times[:-1])[motion.grid.steps > 0] / 2
+    before, here, after = (motion.evaluate(times + k) for k in (-h, 0.0, h))
+    for rate, value in (("z_dot", "z"), ("z_ddot", "z_dot")):
+        expected = (getattr(after, value) - getattr(before, value)) / (2 * h)
+        found = getattr(here, rate)
+        # Rounding 1e-16 over h, and the third derivatives times h^2.
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7 * np.abs(found).max())
+
+
 def test_least_time_agrees_with_the_phase_plane() -> None:
     coarse, fine = (PhasePlane(tip_on(0.5), EPSILON, n).least_time() for n in (300, 600))
     assert plan("time", 0.5, 320).value == pytest.approx(2 * fine - coarse, rel=2e-4)

@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import trapezoid
 
 from plane import measure_gaps, measure_slip, unbalance
+from tipping import tipped
 from wholearm.errors import InfeasibleError, InputError
 from wholearm.model import Array
 from wholearm.plan import solve
@@ -271,3 +272,8 @@ def test_bad_options(heptagon: Problem, options: dict[str, Any], key: str) -> No
 def test_unknown_option(heptagon: Problem) -> None:
     with pytest.raises(TypeError, match="colour"):
         solve(heptagon, colour="red")
+
+
+def test_meta_names_what_rolls(trajectory: Trajectory) -> None:
+    assert tipped().meta["rolling"] == [[], ["v1-palm"], []]
+    assert trajectory.meta["rolling"] == [[]] * 5

@@ -18,6 +18,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.text import Text
 
+import tipping
 import wholearm
 from wholearm import plots
 from wholearm.errors import InputError
@@ -411,3 +412,46 @@ def test_settings_of_matplotlib_are_left_alone_and_pyplot_is_not_imported(
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_friction_cones_have_a_panel_of_their_own(figure: Figure) -> None:
+    plan = tipping.tipped()
+    drawn = plots.force_margins(plan)
+    check_layout(drawn)
+    assert len(drawn.axes) == len(figure.axes) + 1
+    margins, torques, cones = drawn.axes[-3:]
+    assert margins.get_position().y0 > cones.get_position().y1
+    assert cones.get_position().y0 > torques.get_position().y1
+    t, shares = data_of(line_of(cones, "v1-palm"))
+    known = ~np.isnan(t)
+    column = plan.contacts.index("v1-palm")
+    expected = np.where(plan.phase == 1, plan.c_t[:, column] / (0.5 * plan.c_n[:, column]), np.nan)
+    np.testing.assert_allclose(shares[known], expected, rtol=1e-12)
+    assert np.nanmax(np.abs(shares)) < 1 and levels(cones) == [-1.0, 1.0, 0.0]
+    margin_line = line_of(margins, "v1-palm")
+    assert line_of(cones, "v1-palm").get_color() == margin_line.get_color()
+
+
+def test_rolling_friction_passes_zero_without_a_step() -> None:
+    plan = tipping.tipped()
+    column = plan.contacts.index("v1-palm")
+    c_t = np.where(plan.phase == 1, plan.c_t[:, column], np.nan)
+    passes = np.flatnonzero(c_t[1:] * c_t[:-1] < 0) + 1
+    assert len(passes) and not set(passes) & set(find_steps(plan))
+
+
+def test_simulation_is_drawn_over_a_plan_that_rolls() -> None:
+    plan = tipping.tipped()
+    simulation = wholearm.simulate(tipping.box(), plan.torque)
+    drawn = plots.force_margins(plan, simulation=simulation)
+    check_layout(drawn)
+    dotted = [
+        line for line in drawn.axes[-1].lines if line.get_linestyle() == ":" or line.is_dashed()
+    ]
+    column = plan.contacts.index("v1-palm")
+    rows = simulation.phase == 1
+    share = simulation.c_t[rows, column] / (0.5 * simulation.c_n[rows, column])
+    curves = [data_of(line)[1] for line in dotted if len(data_of(line)[0]) == len(simulation.t)]
+    (curve,) = [values for values in curves if not np.isnan(values).all()]
+    np.testing.assert_allclose(curve[rows], share, rtol=1e-12)
+    assert np.isnan(curve[~rows]).all()

@@ -13,7 +13,7 @@ from wholearm.dynamics import energy
 from wholearm.events import EventKind, OutcomeKind
 from wholearm.formation import close_finger, place_flush
 from wholearm.model import Array, Friction, Scene
-from wholearm.problem import Phase, Problem, Until
+from wholearm.problem import End, Phase, Problem, Until
 from wholearm.simulate import simulate
 from wholearm.trajectory import Samples
 from wholearm.transitions import project_velocity
@@ -193,6 +193,27 @@ def test_entering_a_rolling_formation_at_speed_is_a_plastic_impact() -> None:
     assert np.linalg.lstsq(P.T, impulse)[1] == pytest.approx(0.0, abs=1e-20)
     lost = 0.5 * mass @ (v**2 - kept**2)
     assert lost == pytest.approx(0.5 * mass @ (v - kept) ** 2) and lost > 0
+
+
+def test_a_sliding_vertex_is_stopped_where_the_next_phase_lets_it_roll() -> None:
+    """What the impact takes is the difference of both kinetic energies; the cone then decides."""
+    problem = falling(0.1, 0.2)
+    scene, (last,) = problem.scene, problem.phases
+    slides = dataclasses.replace(last.formation, rolling=())
+    until = Until(coordinate="phi", value=float(problem.start[2]) - 0.4)
+    phases = Phase(0, slides, until, End.SMOOTH), dataclasses.replace(last, index=1)
+    two = dataclasses.replace(problem, phases=phases)
+    simulation = simulate(two, constant((-0.01, 0.01), 1.0), tolerance=1e-11)
+    before = int(np.flatnonzero(simulation.phase == 0)[-1])
+    z, v = simulation.z[before], simulation.z_dot[before]
+    assert measure_slip(slides, z, v)[0] < -0.1
+    after = simulation.z_dot[before + 1]
+    assert abs(measure_slip(slides, z, after)[0]) < 1e-14
+    lost = 0.5 * scene.mass_diagonal @ (v**2 - after**2)
+    assert simulation.energies.impact[-1] == pytest.approx(lost) and lost > 1e-4
+    assert simulation.energies.residual == pytest.approx(0.0, abs=1e-9)
+    assert simulation.outcome.kind is OutcomeKind.SLIPS and simulation.events[-1].phase == 1
+    assert simulation.events[-1].time == simulation.t[before]
 
 
 def test_a_rolling_contact_may_slide_in_the_next_phase() -> None:

@@ -1,13 +1,14 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tipping import tipped
 from wholearm.errors import InputError
 from wholearm.model import Array
 from wholearm.torque import TorqueProfile
@@ -257,3 +258,32 @@ def test_unwritable_place_leaves_nothing(trajectory: Trajectory, tmp_path: Path)
     with pytest.raises(InputError, match="cannot be written"):
         trajectory.save(tmp_path / "absent" / "a.npz")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_rolling_contacts_are_known_and_their_friction_is_interpolated(tmp_path: Path) -> None:
+    plan = tipped()
+    plan.save(tmp_path / "box.npz")
+    loaded = load_trajectory(tmp_path / "box.npz")
+    assert loaded.meta["rolling"] == [[], ["v1-palm"], []]
+    column = plan.contacts.index("v1-palm")
+    expected = np.zeros(plan.c_t.shape, dtype=bool)
+    expected[plan.phase == 1, column] = True
+    for trajectory in (plan, loaded):
+        np.testing.assert_array_equal(trajectory.rolling, expected)
+    t = np.linspace(0.01, plan.motions[1].duration - 0.01, 50)
+    exact, interpolated = (one.motions[1].evaluate(t).c_t[:, 0] for one in (plan, loaded))
+    assert np.ptp(exact) > 0.3
+    np.testing.assert_allclose(interpolated, exact, atol=2e-3)
+
+
+@pytest.mark.parametrize("given", [3, "v1-palm", ["v1-palm"], {"1": []}])
+def test_bad_names_of_rolling_contacts(trajectory: Trajectory, tmp_path: Path, given: Any) -> None:
+    changed = replace(trajectory, meta={**trajectory.meta, "rolling": given})
+    changed.save(tmp_path / "plan.npz")
+    with pytest.raises(InputError, match="not a list of names") as caught:
+        load_trajectory(tmp_path / "plan.npz")
+    assert caught.value.key == "meta.rolling"
+
+
+def test_nothing_rolls_unless_it_is_said(trajectory: Trajectory) -> None:
+    assert trajectory.rolling.shape == trajectory.c_t.shape and not trajectory.rolling.any()

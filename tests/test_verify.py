@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from planned import change, plan
+from tipping import box, scale, tipped
 from wholearm.errors import InputError
 from wholearm.model import Array
 from wholearm.torque import TorqueProfile
@@ -170,3 +171,38 @@ def test_no_parabola_crosses_a_kink_or_a_jump() -> None:
     # Inside the second stretch the parabola through its three points has its least at its start.
     assert find_least(t, values, np.array([0.0, 0.3]))[0] == pytest.approx(0.2, abs=0.01)
     assert all(math.isnan(x) for x in find_least(t, np.full(5, np.nan), t))
+
+
+def test_margins_to_slipping_are_those_of_inverse_dynamics() -> None:
+    report = verify(box(), tipped())
+    assert report.ok and [len(phase.rolling) for phase in report.phases] == [0, 1, 0]
+    (margin,) = report.phases[1].rolling
+    motion = tipped().motions[1]
+    t = np.linspace(0, motion.duration, 20001)
+    samples = motion.evaluate(t)
+    expected = 0.5 * samples.c_n[:, 0] - np.abs(samples.c_t[:, 0])
+    assert margin.contact == "v1-palm"
+    assert margin.least == pytest.approx(expected.min(), abs=1e-5)
+    near = np.abs(t + report.phases[1].start - margin.time).argmin()
+    assert expected[near] == pytest.approx(margin.least, abs=1e-4)
+    text = report.to_text()
+    assert "rolling  least mu c_n - |c_t| [N]" in text and "2  v1-palm" in text
+    plain = json.loads(json.dumps(report.to_dict()))
+    assert plain["phases"][1]["rolling"] == [
+        {"contact": "v1-palm", "least": margin.least, "time": margin.time}
+    ]
+    assert "rolling" not in verify(*plan()).to_text()
+
+
+@pytest.mark.parametrize("later", [0.0, 0.5])
+def test_a_slip_fails(later: float) -> None:
+    """A finger that pushes harder than planned, from rest or while the box tips."""
+    starts = tipped().phase_starts
+    start = starts[1] + later * (starts[2] - starts[1])
+    report = verify(box(), scale(0, 0.9 if later else 0.95, start, starts[2]))
+    assert report.exit_status == 1 and not report.reached and len(report.phases) == 2
+    (text,) = report.failures
+    (margin,) = report.phases[1].rolling
+    assert text.startswith("v1-palm slips: |c_t| = ") and " mu c_n = " in text
+    assert text.endswith(f"at t = {margin.time:.5g} s, phase 2")
+    assert margin.least < 1e-9 and start - 1e-5 <= margin.time < starts[2]

@@ -66,6 +66,15 @@ def falling(mu: float, lean: float) -> Problem:
     return Problem("falling box", scene, 0.0, start, (phase,))
 
 
+def scale(joint: int, factor: float, start: float, stop: float) -> TorqueProfile:
+    """The plan's torques with those of one joint multiplied from `start` to `stop` [s]."""
+    torque = tipped().torque
+    coefficients = torque.coefficients.copy()
+    first = torque.breaks[:-1]
+    coefficients[(first >= start - 1e-9) & (first < stop - 1e-9), joint] *= factor
+    return TorqueProfile(torque.breaks, coefficients)
+
+
 def constant(tau: tuple[float, float], duration: float) -> TorqueProfile:
     return TorqueProfile(np.array([0.0, duration]), np.array([[[tau[0]], [tau[1]]]]))
 

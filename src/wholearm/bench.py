@@ -64,8 +64,12 @@ def run_bench(
     Raises
     ------
     InputError
-        If the folder cannot be made or written to.
+        If contacts roll, which the baselines do not know, or the folder cannot be made or written.
     """
+    for phase in problem.phases:
+        for contact in phase.formation.rolling:
+            key = f"phases[{phase.number}].contacts"
+            raise InputError(problem.source, key, f"{contact} rolls; bench measures sliding only")
     try:
         os.makedirs(folder, exist_ok=True)
     except OSError as error:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .model import Array
+from .pathdata import find_least
 from .stage import Stage
 from .timemotion import StageMotion
 from .timenlp import CLEAR, TimeNLP
@@ -73,21 +74,18 @@ def find_misses(stage: Stage, motion: StageMotion, least: float) -> Limits:
     formation, inner = stage.formation, np.linspace(1e-9, 1 - 1e-9, LOOKS)
     places = stage.guess.places(inner).ravel()
     samples = motion.evaluate(places * motion.duration)
-    over = np.abs(samples.c_t) - formation.friction * samples.c_n
+    grip = formation.friction * samples.c_n - np.abs(samples.c_t)
     gaps = formation.evaluate_limits(samples.z)[:, list(stage.watched)]
     clear = CLEAR / 2 * np.isin(stage.watched, stage.released)
     later = (not stage.opens) | (places > 1 / 2)
     tables = (
-        least - samples.c_n,
-        over[:, list(formation.rolling_rows)],
-        np.outer(later, clear) - gaps,
+        samples.c_n - least,
+        grip[:, list(formation.rolling_rows)],
+        gaps - np.outer(later, clear),
     )
-    return Limits(
-        *(
-            np.maximum(table.reshape(stage.intervals, LOOKS, table.shape[1]).max(axis=1), 0.0)
-            for table in tables
-        )
-    )
+    shape = (stage.intervals, LOOKS)
+    slack = (find_least(table.reshape(*shape, table.shape[1])) for table in tables)
+    return Limits(*(np.maximum(-part, 0.0) for part in slack))
 
 
 def raise_bounds(
@@ -105,11 +103,10 @@ def raise_bounds(
         formation, own = stage.formation, nlp.rows_of[k]
         floor = epsilon + raised.c_n
         c_n = nlp.layouts[k].forces[:, :, : formation.n_contacts]
-        # With a margin the rows alone hold c_n.
-        if nlp.lasts < 0:
+        # Where rows hold c_n at the points too, its own bounds must not.
+        if own.limits.presses.shape[1] <= 2:
             low_x[c_n] = floor[:, None]
-        low[own.presses] = floor[:, None]
-        cones = own.points.shape[2] - 2 * formation.n_rolling
-        low[own.points[..., cones:]] = np.tile(raised.cone, 2)[:, None]
+        low[own.limits.presses] = floor[:, None]
+        low[own.limits.cones] = np.tile(raised.cone, 2)[:, None]
         low[own.watches] += raised.gap[:, None] / formation.scene.polygon.gyration_radius
     return low, high

@@ -7,7 +7,7 @@ A z'' + A' z' = 0. A contact that rolls has v_t = 0 as well, so with R of them t
     P z' = 0,  P z'' + P' z' = 0,  P = [A; A_t(rolling)],
 
 n_c + R = 2R + S rows for S sliding contacts. Rolling is holonomic here: v_t is the rate of a slip
-coordinate (`wholearm.contact.build_slip`), which keeps its value from where the rolling begins.
+coordinate (`wholearm.slip`), which keeps its value from where the rolling begins.
 
 For four sliding contacts, Eqs. (6)-(9) split A by the columns of (q, theta_2) and
 theta_1,
@@ -36,11 +36,11 @@ from .contact import (
     build_gap,
     build_geometry,
     build_limits,
-    build_slip,
     candidate_contacts,
 )
 from .errors import InputError
 from .model import Array, Scene
+from .slip import build_slip
 
 TOUCHING = 1e-7
 """Gap [m] below which features count as touching: above rounding, below any real clearance."""
@@ -85,6 +85,10 @@ class Formation:
     scene: Scene
     contacts: tuple[Contact, ...]
     rolling: tuple[Contact, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not set(self.rolling) <= set(self.contacts):
+            raise ValueError(f"{describe(self.rolling)} roll, which are no contacts")
 
     @property
     def n_contacts(self) -> int:

@@ -104,12 +104,14 @@ def let_go(run: Replay, contacts: Sequence[int]) -> Released | Outcome:
     return run.lose(name, min(0.0, forces[name]))
 
 
-def slip(run: Replay) -> Outcome:
-    """End because the rolling contact that is nearest to it slips, or beyond."""
+def slip(run: Replay) -> Released | Outcome:
+    """End because a rolling contact slips, or starts to part where its release is planned."""
     s = run.stepper
     formation = s.formation
     cones = s.outputs[s.to.events][s.rows.cone]
     row = formation.rolling_rows[int(cones.argmin()) % formation.n_rolling]
+    if formation.names[row] in run.releasable:
+        return let_go(run, [row])
     return run.slip(row, float(s.outputs[s.to.c_n][row]), float(s.outputs[s.to.c_t][row]))
 
 

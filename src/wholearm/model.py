@@ -15,7 +15,9 @@ c_n, c_t  normal and tangential wrench intensities                 (n_c,) N
 U, Xi     friction coefficients; sliding directions (+1 or -1)     (n_c,)
 tau       joint torques                                            (2,) N m
 A, A_t    [W_n^T, -J_n] and [W_t^T, -J_t]                          (n_c, 5)
-G         A - U Xi A_t                                             (n_c, 5)
+c         contact forces: c_n, then c_t of the R rolling contacts  (n_c + R,) N
+P         constraints: A, then A_t of rolling contacts             (n_c + R, 5)
+G         forces: A - U Xi A_t, then A_t of rolling contacts       (n_c + R, 5)
 M5        diag(m, m, I, J_1, J_2)                                  (5, 5)
 ========  =======================================================  ============
 

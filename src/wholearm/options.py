@@ -20,9 +20,13 @@ class Objective(Enum):
     """Largest least normal force within a given duration."""
     ELASTIC = "elastic"
     """Least shortfall of the limits; used to explain why there is no plan."""
+    RELAX = "relax"
+    """Least relaxation of one limit; used to say what would make a plan possible."""
 
 
-CHOICES = tuple(choice.value for choice in Objective if choice is not Objective.ELASTIC)
+CHOICES = tuple(
+    choice.value for choice in Objective if choice not in (Objective.ELASTIC, Objective.RELAX)
+)
 """Objectives that a user can ask for."""
 
 

@@ -57,10 +57,9 @@ def sample_torques(torque: TorqueProfile, least: int = 2000) -> tuple[Array, Arr
     return (middle[:, None] + half[:, None] * x).ravel(), tau.reshape(-1, 2)
 
 
-def cone_shares(trajectory: Trajectory, friction: Array) -> Array:
+def cone_shares(rolling: NDArray[np.bool_], friction: Array, c_n: Array, c_t: Array) -> Array:
     """How much of its friction cone each rolling contact uses, c_t / (mu c_n), shape (n, m).
 
-    NaN where a contact does not roll. `friction` has shape (m,).
+    NaN where a contact does not roll. `friction` has shape (m,), everything else (n, m).
     """
-    bound = np.where(trajectory.rolling, friction * trajectory.c_n, np.nan)
-    return np.asarray(trajectory.c_t / bound)
+    return np.asarray(c_t / np.where(rolling, friction * c_n, np.nan))

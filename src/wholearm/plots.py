@@ -56,6 +56,7 @@ _STYLE: Any = {
     "ytick.labelsize": 9.0, "legend.handlelength": 1.6, "legend.borderpad": 0.0,
     "pdf.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "wholearm",
 }  # fmt: skip
+_SIMULATED: Any = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 1.0, "zorder": 5}
 _LEFT, _RIGHT, _BOTTOM, _TOP = 0.80, 1.30, 0.55, 0.40  # margins [in]; parts of the figure [in]:
 _TORQUES, _CONES, _GAP, _CAPTION, _STRIP = 1.75, 0.85, 0.22, 0.77, 1.75
 
@@ -117,7 +118,7 @@ def force_margins(trajectory: Trajectory, *, simulation: Simulation | None = Non
         panels = [margins, torques]
         if rolls:
             panels.append(figure.add_axes(_place(_LEFT, cones_at, width, _CONES), sharex=margins))
-            draw_cones(panels[-1], trajectory, problem.scene, styles)
+            draw_cones(panels[-1], trajectory, problem.scene, styles, simulation)
         for axes in panels:
             draw_phases(axes, trajectory.phase_starts, labels=axes is margins)
             spacing = 0.5 if len(trajectory.contacts) < 14 else 0.1
@@ -260,13 +261,20 @@ def _scale_margins(axes: Axes, margins: Array, epsilon: float) -> None:
     axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:.6g}".replace("-", "\u2212")))
 
 
-def draw_cones(axes: Axes, trajectory: Trajectory, scene: Scene, styles: Styles) -> list[Line2D]:
+def draw_cones(
+    axes: Axes,
+    trajectory: Trajectory,
+    scene: Scene,
+    styles: Styles,
+    simulation: Simulation | None = None,
+) -> list[Line2D]:
     """Draw c_t / (mu c_n) of every contact while it rolls; at +1 and -1 it would slip.
 
     Returns one line per contact that rolls, labelled with its name.
     """
     fingers = [parse_contact(name, scene).finger for name in trajectory.contacts]
-    shares = cone_shares(trajectory, np.array([scene.friction.of(finger) for finger in fingers]))
+    mu = np.array([scene.friction.of(finger) for finger in fingers])
+    shares = cone_shares(trajectory.rolling, mu, trajectory.c_n, trajectory.c_t)
     steps = find_steps(trajectory)
     t, lines = np.insert(trajectory.t, steps, np.nan), []
     for index in np.flatnonzero(trajectory.rolling.any(axis=0)):
@@ -279,6 +287,11 @@ def draw_cones(axes: Axes, trajectory: Trajectory, scene: Scene, styles: Styles)
         axes.axhspan(edge, 1.25 * edge, color=_LOST, linewidth=0, zorder=1.5)
     axes.axhline(0.0, color=_GRID, linewidth=0.5, zorder=1.6)
     axes.set(ylim=(-1.25, 1.25), yticks=[-1, 0, 1], ylabel="rolling\n$c_t / (\\mu c_n)$")
+    if simulation is not None:
+        first = np.flatnonzero(np.diff(trajectory.phase, prepend=-1))
+        rolls = trajectory.rolling[first][simulation.phase]
+        values = cone_shares(rolls, mu, simulation.c_n, simulation.c_t)
+        axes.plot(simulation.t, values, **_SIMULATED)
     return lines
 
 
@@ -310,9 +323,8 @@ def draw_simulation(
     t = simulation.t
     gaps = np.flatnonzero((np.diff(t) <= 0) | (np.diff(simulation.phase) != 0)) + 1
     c_n = np.insert(simulation.c_n, gaps, np.nan, axis=0)
-    look: Any = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 1.0, "zorder": 5}
-    lines = margins.plot(np.insert(t, gaps, np.nan), c_n - epsilon, **look)
-    lines += torques.plot(t, simulation.tau, **look)
+    lines = margins.plot(np.insert(t, gaps, np.nan), c_n - epsilon, **_SIMULATED)
+    lines += torques.plot(t, simulation.tau, **_SIMULATED)
     for line in (lines[0], lines[-1]):
         line.set_label("simulated")
     return lines

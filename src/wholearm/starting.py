@@ -49,8 +49,8 @@ class Way(Protocol):
     """One way in which a formation at rest could start to move."""
 
     @property
-    def held(self) -> Array:
-        """What has to be positive for the contacts to hold, H c, is held @ (1, tau_1, tau_2).
+    def holds(self) -> Array:
+        """What has to be positive for the contacts to hold, H c, is holds @ (1, tau_1, tau_2).
 
         Shape (n_c + 2 R, 3) [N]; the first n_c are the normal forces.
         """
@@ -87,7 +87,7 @@ class Pattern:
         Diagonal of M5.
     acceleration : ndarray, shape (5, 3)
         z''.
-    held : ndarray, shape (n_c + 2 R, 3), [N]
+    holds : ndarray, shape (n_c + 2 R, 3), [N]
         What has to be positive for the contacts to hold, H c (`wholearm.cones`).
     slips : ndarray, shape (n_c + 2, 3)
         Accelerations of the contacts' sliding and of the joints, along `directions`.
@@ -99,7 +99,7 @@ class Pattern:
     directions: Directions
     mass: Array
     acceleration: Array
-    held: Array
+    holds: Array
     slips: Array
     openings: Array
     ratio: float
@@ -107,7 +107,7 @@ class Pattern:
     @property
     def margins(self) -> list[tuple[Array, float]]:
         """Rows r and offsets d with r @ (1, tau_1, tau_2) + d >= 0 while it moves this way."""
-        kinds = (self.slips, STILL), (self.openings, CLOSING), (self.held, SLACK_FORCE)
+        kinds = (self.slips, STILL), (self.openings, CLOSING), (self.holds, SLACK_FORCE)
         return [(row, slack) for rows, slack in kinds for row in rows]
 
     def drive(self, tau: Array) -> float:
@@ -131,7 +131,7 @@ class Pattern:
 
     def moves(self, tau: Array) -> bool:
         """Whether it slides this way and every contact presses."""
-        return bool((self.held @ [1.0, *tau] >= -SLACK_FORCE).all()) and self.slides(tau)
+        return bool((self.holds @ [1.0, *tau] >= -SLACK_FORCE).all()) and self.slides(tau)
 
     def depart(self, x: float, tau: Array) -> Departure:
         """Start this way at `x` of a piece, where the torques are `tau`."""
@@ -188,14 +188,14 @@ def solve_at_rest(
 def _build_pattern(
     formation: Formation, directions: Directions, kinematics: Kinematics, gradient: Array
 ) -> Pattern:
-    acceleration, held, ratio = solve_at_rest(formation, directions, kinematics)
+    acceleration, holds, ratio = solve_at_rest(formation, directions, kinematics)
     rates = np.concatenate([kinematics.A_t[0] @ acceleration, acceleration[3:]])
     signs = np.concatenate(directions)
     return Pattern(
         directions=directions,
         mass=formation.scene.mass_diagonal,
         acceleration=acceleration,
-        held=held,
+        holds=holds,
         slips=signs[:, None] * rates,
         openings=gradient @ acceleration,
         ratio=ratio,

@@ -311,7 +311,8 @@ class _Model:
         rates, c, v_t, tau, K, P = self.dynamics(y, t)
         c_n = c[: formation.n_contacts]
         c_t = -ca.DM(formation.sliding_friction) * self.Xi * c_n
-        c_t[list(formation.rolling_rows)] = c[formation.n_contacts :]
+        if formation.rolling:
+            c_t[list(formation.rolling_rows)] = c[formation.n_contacts :]
         mass = formation.scene.mass_diagonal
         frictionless = P @ (ca.DM(1 / mass) * P.T)
         v = y[5:10]

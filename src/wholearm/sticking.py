@@ -43,7 +43,7 @@ class RestDirection:
         The friction that opposes it.
     acceleration : ndarray, shape (3,)
         Acceleration along `heading` is acceleration @ (1, tau_1, tau_2).
-    held : ndarray, shape (n_c + 2 R, 3)
+    holds : ndarray, shape (n_c + 2 R, 3)
         Likewise what has to be positive for the contacts to hold, H c [N] (`wholearm.cones`).
     ratio : float
         Reduced inertia over that without friction; jammed at zero and below.
@@ -54,14 +54,14 @@ class RestDirection:
     heading: Array
     directions: Directions
     acceleration: Array
-    held: Array
+    holds: Array
     ratio: float
     closes: bool
 
     @property
     def margins(self) -> list[tuple[Array, float]]:
         """Rows r and offsets d with r @ (1, tau_1, tau_2) + d >= 0 while it moves this way."""
-        return [(self.acceleration, -STILL), *((row, SLACK_FORCE) for row in self.held)]
+        return [(self.acceleration, -STILL), *((row, SLACK_FORCE) for row in self.holds)]
 
     def drive(self, tau: Array) -> float:
         """How strongly it accelerates this way, in the metric M5."""
@@ -73,8 +73,8 @@ class RestDirection:
 
     def moves(self, tau: Array) -> bool:
         """Whether the formation starts to move this way under torques `tau`, shape (2,)."""
-        holds = float((self.held @ [1.0, *tau]).min()) >= -SLACK_FORCE
-        return self.ratio > 0 and holds and self.slides(tau)
+        keeps = float((self.holds @ [1.0, *tau]).min()) >= -SLACK_FORCE
+        return self.ratio > 0 and keeps and self.slides(tau)
 
     def depart(self, x: float, tau: Array) -> Departure:
         """Start this way at `x` of a piece; the torques do not matter."""
@@ -92,10 +92,10 @@ class Collapse:
         The contact that would have to pull most, that cannot start to slide, or that slips.
     c_n : float, [N]
         NaN if the contact cannot start to slide.
-    c_t : float or None, [N]
-        Of a rolling contact that slips; `c_n` then keeps it from pulling but not from slipping.
     jammed : bool
         Whether friction jams one of the ways.
+    c_t : float or None, [N]
+        Of a rolling contact that slips, although it presses with `c_n`.
     """
 
     x: float
@@ -190,11 +190,10 @@ class Rest:
         load = np.array([1.0, *tau])
         pulls = find_pulls(self.formation.scene, self.touching, self.z, tau)
         if free or np.isinf(pulls).all():
-            held = min((way.held @ load for way in free or self.ways), key=np.min)
-            row, least, c_t = find_weakest(self.formation, held)
+            weakest = min((way.holds @ load for way in free or self.ways), key=np.min)
+            row, least, c_t = find_weakest(self.formation, weakest)
             return Collapse(high, self.formation.names[row], least, self._jams, c_t)
-        else:
-            name, least = self.touching[int(pulls.argmax())].name, -float(pulls.max())
+        name, least = self.touching[int(pulls.argmax())].name, -float(pulls.max())
         return Collapse(high, name, least, self._jams)
 
     @property
@@ -206,7 +205,7 @@ class Rest:
     def _find_held(self, tau: Array) -> str:
         """The contact or joint that stays, by the choice of directions with fewest that do."""
         patterns = [way for way in self.ways if isinstance(way, Pattern)]
-        pressing = [p for p in patterns if (p.held @ [1.0, *tau] >= -SLACK_FORCE).all()]
+        pressing = [p for p in patterns if (p.holds @ [1.0, *tau] >= -SLACK_FORCE).all()]
         found = [p.find_held(tau) for p in pressing or patterns]
         names = (*self.formation.names, "joint 1", "joint 2")
         fewest = min((held for held in found if len(held)), key=len, default=np.zeros(1, int))
@@ -270,9 +269,9 @@ def _build_way(
     kinematics: Kinematics,
     closes: bool,
 ) -> RestDirection:
-    acceleration, held, ratio = solve_at_rest(formation, directions, kinematics)
+    acceleration, holds, ratio = solve_at_rest(formation, directions, kinematics)
     drive = heading * formation.scene.mass_diagonal @ acceleration
-    return RestDirection(heading, directions, drive, held, ratio, closes)
+    return RestDirection(heading, directions, drive, holds, ratio, closes)
 
 
 def _rates(formation: Formation, z: Array, step: float, heading: Array) -> Array:

@@ -29,7 +29,7 @@ def point_kernel(formation: Formation) -> Kernel:
     the interval if a contact rolls. p is (Xi, sigma, the point's place in the interval, the least
     rate [rad/s], a unit of time [s]). y is the contacts' constraints, in position, velocity and
     acceleration, the five equations of motion, and what must not be negative: the senses of
-    friction, for each sliding contact, and two friction cones for each rolling one.
+    friction of the sliding contacts.
     """
     scene, n_c, n_p = formation.scene, formation.n_contacts, formation.n_constraints
     rho = scene.polygon.gyration_radius
@@ -51,10 +51,7 @@ def point_kernel(formation: Formation) -> Kernel:
     balance = moving / unit**2 / ca.DM([1.0, 1.0, rho, LEVER, LEVER])
     sliding = [k for k in range(n_c) if k not in formation.rolling_rows]
     senses = (Xi * (A_t @ w) / rho - least * T)[sliding]
-    rolling = list(formation.rolling_rows)
-    grip = ca.DM(formation.friction)[rolling] * forces[rolling]
-    cones = ca.vertcat(grip - forces[n_c:], grip + forces[n_c:])
-    y = ca.vertcat(gaps / rho, P @ w / rho, (P @ u + P_dot_w) / rho, balance, senses, cones)
+    y = ca.vertcat(gaps / rho, P @ w / rho, (P @ u + P_dot_w) / rho, balance, senses)
     return build_kernel(
         ca.vertcat(z, w, u, forces, tau, T, first), ca.vertcat(Xi, sigma, place, least, unit), y
     )

@@ -31,6 +31,8 @@ class StageLayout:
     forces : ndarray of int, shape (K, d, n_f)
     ends : ndarray of int, shape (K, 10)
         z and w at the end of each interval: those of its last point, if that is there.
+    short : ndarray of int, shape (K, n_c + 2 + R) or (K, 0)
+        Shortfalls of c_n [N], of tau [N m] and of rolling contacts' cones [N] in each interval.
     following : ndarray of int
         T of the next stage and, if an impact leads there, its impulses; empty in the last stage.
     """
@@ -42,6 +44,7 @@ class StageLayout:
     u: Indices
     forces: Indices
     ends: Indices
+    short: Indices
     following: Indices
 
     @property
@@ -50,19 +53,35 @@ class StageLayout:
         return int(self.nodes[-1, -1]) + 1 + len(self.following)
 
 
-def lay_out(stages: Sequence[Stage], scheme: Scheme, with_margin: bool) -> list[StageLayout]:
-    """Lay out the unknowns of stages that follow one another."""
+def lay_out(
+    stages: Sequence[Stage], scheme: Scheme, with_margin: bool = False, elastic: bool = False
+) -> list[StageLayout]:
+    """Lay out the unknowns of stages that follow one another.
+
+    Parameters
+    ----------
+    stages : sequence of Stage
+    scheme : Scheme
+    with_margin : bool
+        Whether nodes have a margin, and the time before.
+    elastic : bool
+        Whether limits have shortfalls.
+    """
     layouts: list[StageLayout] = []
     first, state = 0, 13 if with_margin else 11
     for stage, coming in zip(stages, [*stages[1:], None], strict=True):
         n_f = stage.formation.n_constraints
         inner = scheme.degree * (15 + n_f)
-        stride = state + 4 + inner + (0 if scheme.ends else 10)
+        n_short = (stage.formation.n_contacts + 2 + stage.formation.n_rolling) if elastic else 0
+        stride = state + 4 + inner + (0 if scheme.ends else 10) + n_short
         starts = first + stride * np.arange(stage.intervals + 1)
         points = (starts[:-1, None] + state + 4 + np.arange(inner)).reshape(
             stage.intervals, scheme.degree, -1
         )
-        ends = points[:, -1, :10] if scheme.ends else starts[1:, None] - 10 + np.arange(10)
+        short = starts[1:, None] - n_short + np.arange(n_short)
+        ends = (
+            points[:, -1, :10] if scheme.ends else starts[1:, None] - n_short - 10 + np.arange(10)
+        )
         nodes = starts[:, None] + np.arange(state)
         extra = 0
         if coming is not None:
@@ -70,7 +89,7 @@ def lay_out(stages: Sequence[Stage], scheme: Scheme, with_margin: bool) -> list[
         z, w, u, forces = np.split(points, [5, 10, 15], axis=2)
         tau = starts[:-1, None] + state + np.arange(4)
         following = nodes[-1, -1] + 1 + np.arange(extra)
-        layouts.append(StageLayout(nodes, tau, z, w, u, forces, ends, following))
+        layouts.append(StageLayout(nodes, tau, z, w, u, forces, ends, short, following))
         first = layouts[-1].stop
     return layouts
 
@@ -83,6 +102,7 @@ def pack(points: Sequence[StagePoints], layouts: Sequence[StageLayout], margin: 
         duration = part.duration
         x[layout.z], x[layout.w], x[layout.u] = part.z, duration * part.v, duration**2 * part.a
         x[layout.forces], x[layout.tau] = part.forces, part.tau.reshape(-1, 4)
+        x[layout.short] = 1.0
         x[layout.nodes[:, Z]], x[layout.nodes[:, W]] = part.nodes[:, 0], duration * part.nodes[:, 1]
         x[layout.ends] = x[layout.nodes[1:, :T]]
         x[layout.nodes[:, T]] = duration

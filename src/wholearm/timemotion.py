@@ -14,7 +14,7 @@ from .curve import metric_weights
 from .dynamics import Directions, build_forward, split_forces
 from .formation import Formation
 from .model import Array
-from .stage import StagePoints
+from .stage import Stage, StagePoints
 from .torque import TorqueProfile
 from .trajectory import Samples
 
@@ -191,3 +191,14 @@ class TimeMotion:
             for table, values in zip(tables, part, strict=True):
                 table[mine] = values
         return Samples(*tables)
+
+
+def make_motions(stages: Sequence[Stage], scheme: Scheme) -> list[StageMotion]:
+    """The stages' guesses as functions of time."""
+    motions = []
+    slip, phase = np.zeros(0), -1
+    for stage in stages:
+        if stage.phase != phase:
+            slip, phase = stage.formation.evaluate_slip(stage.guess.nodes[0, :1])[0], stage.phase
+        motions.append(StageMotion(stage.formation, stage.directions, scheme, stage.guess, slip))
+    return motions

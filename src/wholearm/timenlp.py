@@ -27,6 +27,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .blocknlp import Indices, assemble_nlp
 from .collocation import Scheme
@@ -48,6 +49,7 @@ from .timekernels import (
     watch_kernel,
 )
 from .timelayout import BEFORE, MARGIN, StageLayout, T, W, Z, lay_out
+from .timelimits import Give, LimitRows, add_limits
 from .timerows import Rows
 
 OPENING = 0.1
@@ -59,6 +61,8 @@ SLIDING = 0.05
 would be held by friction."""
 SHORTEST, LONGEST = 1e-4, 20.0
 """Least and largest duration of a stage [s]."""
+_HURRY = 1e-2
+"""Weight of time against shortfalls [N/s]: keeps a motion that is short of something brisk."""
 PUSH = 1e-6
 """How far the first guess is kept from its bounds."""
 
@@ -72,17 +76,21 @@ class StageRows:
     states : ndarray of int, shape (K, m)
         How z, w and T go on.
     points : ndarray of int, shape (K, d, m)
-        What holds at the points; the last 2 R are the friction cones of rolling contacts.
-    presses : ndarray of int, shape (K, m, n_c)
-        What has to exceed the least c_n of its interval and contact.
+        What holds at the points.
+    limits : LimitRows
     watches : ndarray of int, shape (K, d, m)
         Limits of the formation.
     """
 
     states: Indices
     points: Indices
-    presses: Indices
+    limits: LimitRows
     watches: Indices
+
+    @property
+    def groups(self) -> tuple[Indices, ...]:
+        """All of them."""
+        return (self.states, self.points, *self.limits, self.watches)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +104,9 @@ class TimeNLP:
     rows : Rows
     rows_of : list of StageRows
     lasts : int
-        Row of the whole duration, for `margin`; otherwise -1.
+        Row of the whole duration, if something gives way; otherwise -1.
+    soft : ndarray of bool, shape (2,)
+        Which torque limits are rows and not bounds.
     build_time : float, [s]
     """
 
@@ -105,6 +115,7 @@ class TimeNLP:
     rows: Rows
     rows_of: list[StageRows]
     lasts: int
+    soft: NDArray[np.bool_]
     build_time: float
 
 
@@ -114,6 +125,8 @@ def build_time_nlp(
     objective: Objective,
     time_weight: float,
     max_iter: int,
+    give: Give | None = None,
+    solver_name: str = "ipopt",
 ) -> TimeNLP:
     """Build the NLP of stages that follow one another and end at rest.
 
@@ -126,35 +139,51 @@ def build_time_nlp(
         For `effort`.
     max_iter : int
         Most iterations of the solver.
+    give : Give, optional
+        Which limits give way, for `relax`; for `margin` it is every c_n.
+    solver_name : {"ipopt", "fatrop"}
     """
     started = time.perf_counter()
-    with_margin = objective is Objective.MARGIN
-    layouts = lay_out(stages, scheme, with_margin)
+    if objective is Objective.MARGIN:
+        give = Give(-1.0)
+    layouts = lay_out(stages, scheme, give is not None, objective is Objective.ELASTIC)
     rows, cost = Rows(), np.zeros(layouts[-1].stop)
     _start(rows, layouts[0].nodes[0], stages[0].guess.nodes[0])
+    weights = {Objective.TIME: 1.0, Objective.EFFORT: time_weight, Objective.ELASTIC: _HURRY}
     rows_of = []
     for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True)):
-        rows_of.append(_add_stage(rows, stage, layout, scheme, stage is stages[-1]))
+        rows_of.append(_add_stage(rows, stage, layout, scheme, stage is stages[-1], give))
         if k + 1 < len(stages):
             _join(rows, stage, stages[k + 1], layout, layouts[k + 1].nodes[0])
         if objective is Objective.EFFORT:
             columns = np.hstack([layout.tau, layout.nodes[:-1, T, None]])
             rows.charge(effort_kernel(), columns, stage.guess.fractions[:, None])
-        if not with_margin:
-            cost[layout.nodes[-1, T]] = 1.0 if objective is Objective.TIME else time_weight
+        cost[layout.nodes[-1, T]] = weights.get(objective, 0.0)
+        cost[layout.short] = 1 / stage.intervals
     lasts, last, end = -1, stages[-1], layouts[-1].nodes[-1]
-    if with_margin:
-        cost[end[MARGIN]] = -1.0
+    if give is not None:
+        cost[end[MARGIN]] = -1.0 if objective is Objective.MARGIN else 1.0
         total = rows.linear(1, high=np.inf)
         rows.put(total, end[[T, BEFORE]], 1.0)
         lasts = int(total[0])
     N = tangent_basis(last.formation, last.guess.nodes[-1, 0])
     rest = rows.linear(N.shape[1])
     rows.put(rest[:, None], end[W], N.T)
-    built = assemble_nlp(len(cost), rows.triplets, rows.linear_rows, rows.blocks, cost)
-    solver = build_solver("time_nlp", built.nlp, PUSH, built.derivatives, max_iter=max_iter)
+    solver = _build_solver(solver_name, rows, layouts, cost, max_iter)
+    soft = np.array(give.tau if give else (0.0, 0.0)) + (objective is Objective.ELASTIC) > 0
     seconds = time.perf_counter() - started
-    return TimeNLP(solver, layouts, rows, rows_of, lasts, seconds)
+    return TimeNLP(solver, layouts, rows, rows_of, lasts, soft, seconds)
+
+
+def _build_solver(
+    name: str, rows: Rows, layouts: list[StageLayout], cost: Array, max_iter: int
+) -> Expression:
+    if name == "fatrop":
+        from .timestaged import build_staged_solver
+
+        return build_staged_solver(rows, layouts, cost, max_iter)
+    built = assemble_nlp(len(cost), rows.triplets, rows.linear_rows, rows.blocks, cost)
+    return build_solver("time_nlp", built.nlp, PUSH, built.derivatives, max_iter=max_iter)
 
 
 def _start(rows: Rows, node: Indices, state: Array) -> None:
@@ -166,7 +195,12 @@ def _start(rows: Rows, node: Indices, state: Array) -> None:
 
 
 def _add_stage(
-    rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool
+    rows: Rows,
+    stage: Stage,
+    layout: StageLayout,
+    scheme: Scheme,
+    last: bool,
+    give: Give | None,
 ) -> StageRows:
     """What holds in a stage."""
     formation = stage.formation
@@ -199,7 +233,8 @@ def _add_stage(
     goal = goal_kernel(formation, stage.until, stage.turns, stage.gained)
     if goal is not None:
         rows.repeat(goal, layout.nodes[-1:, :T], rows.nonlinear(1, goal.outputs))
-    return StageRows(states, points, _press(rows, stage, layout, scheme), watches)
+    limits = add_limits(rows, stage, layout, scheme, give)
+    return StageRows(states, points, limits, watches)
 
 
 def _collocate(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
@@ -240,7 +275,7 @@ def _balance(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last
     parameters[..., n_c + 4] = stage.guess.duration
     sliding = [k for k in range(n_c) if k not in formation.rolling_rows]
     still = _find_still(stage, last) if scheme.ends else set()
-    senses = kernel.outputs - len(sliding) - 2 * formation.n_rolling
+    senses = kernel.outputs - len(sliding)
     high = np.where(np.arange(kernel.outputs) < senses, 0.0, np.inf)
     low = np.zeros((*shape, kernel.outputs))
     low[-1, -1, [senses + i for i, k in enumerate(sliding) if k in still]] = -np.inf
@@ -285,25 +320,6 @@ def _watch(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Ind
     return own
 
 
-def _press(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
-    """c_n where the torques may step; with a margin, at the points too."""
-    c_n = layout.forces[:, :, : stage.formation.n_contacts]
-    # A bound does at the points without a margin.
-    margin = layout.nodes.shape[1] > MARGIN
-    places = np.zeros(1) if scheme.ends else np.array([0.0, 1.0])
-    if margin:
-        places = np.append(places, scheme.points)
-    own = rows.linear(len(c_n), len(places), c_n.shape[2], high=np.inf)
-    table = scheme.interpolate(places)
-    # Entries of points not at their own place are left out.
-    for i, row in enumerate(table):
-        for j in np.flatnonzero(np.abs(row) > 1e-12):
-            rows.put(own[:, i], c_n[:, j], row[j])
-    if margin:
-        rows.put(own, layout.nodes[:-1, MARGIN, None, None], -1.0)
-    return own
-
-
 def _join(rows: Rows, stage: Stage, coming: Stage, layout: StageLayout, first: Indices) -> None:
     """Position and velocity go on from one stage to the next; an impact changes the velocity."""
     last, following = layout.nodes[-1], layout.following
@@ -341,7 +357,10 @@ def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tup
     low, high = np.full(size, -np.inf), np.full(size, np.inf)
     for stage, layout in zip(stages, nlp.layouts, strict=True):
         limit = np.tile(stage.formation.scene.torque_limit, 2)
-        low[layout.tau], high[layout.tau] = -limit, limit
+        soft = np.tile(nlp.soft, 2)
+        low[layout.tau] = np.where(soft, -np.inf, -limit)
+        high[layout.tau] = np.where(soft, np.inf, limit)
+        low[layout.short] = 0.0
         low[layout.nodes[:, T]], high[layout.nodes[:, T]] = SHORTEST, LONGEST
         still = _find_still(stage, stage is stages[-1]) if scheme.ends else set()
         rate = least_rates(stage, scheme) * stage.guess.duration

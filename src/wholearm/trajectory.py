@@ -307,6 +307,9 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
         raise InputError(source, "meta", f"is not JSON: {error}") from None
     if not isinstance(meta, dict):
         raise InputError(source, "meta", "is not a JSON object")
+    named = meta.get("rolling", [])
+    if not isinstance(named, list) or not all(isinstance(names, list) for names in named):
+        raise InputError(source, "meta.rolling", "is not a list of names for each phase")
     contacts = tuple(str(name) for name in arrays["contacts"])
     known = {name: arrays[name] for name in _ARRAYS}
     torque = TorqueProfile(arrays["torque_breaks"], arrays["torque_coefficients"])

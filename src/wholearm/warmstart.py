@@ -52,8 +52,7 @@ def carry_multipliers(
             mine, theirs = getattr(new.layouts[k], name), getattr(old.layouts[k], name)
             values = on_x[theirs[parent]]
             lam_x[mine] = values * share.reshape(-1, *[1] * (values.ndim - 1))
-        for name in ("states", "points", "presses", "watches"):
-            mine, theirs = getattr(new.rows_of[k], name), getattr(old.rows_of[k], name)
+        for mine, theirs in zip(new.rows_of[k].groups, old.rows_of[k].groups, strict=True):
             values = on_g[theirs[parent]]
             lam_g[mine] = values * share.reshape(-1, *[1] * (values.ndim - 1))
     return {"lam_x0": lam_x, "lam_g0": lam_g}

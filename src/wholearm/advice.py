@@ -1,0 +1,127 @@
+"""Why there is no plan, and which single change would make one possible: ranking and wording.
+
+Nothing here depends on how plans are made. A planner says what its limits miss, which limits could
+give way, how far each would have to, and whether it can plan with that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+DIGITS = 3
+"""Significant digits of what is advised."""
+_BEYOND = (0.0, 0.005, 0.015)
+"""How far beyond the least change to try, relatively; a plan needs some room."""
+
+
+class Shortfall(NamedTuple):
+    """A limit that cannot be kept.
+
+    Attributes
+    ----------
+    limit : str
+        The limit in words, with its value.
+    amount : float
+        By how much it is missed at worst.
+    unit : str
+    where : str
+        Time, and place or phase, of that.
+    """
+
+    limit: str
+    amount: float
+    unit: str
+    where: str
+
+    def __str__(self) -> str:
+        return f"{self.limit} is {self.amount:.3g} {self.unit} short at {self.where}"
+
+
+class Limit(NamedTuple):
+    """A limit that could give way.
+
+    Attributes
+    ----------
+    name : str
+    value : float
+        As it is.
+    unit : str
+    sign : int
+        1 if it gives way by growing, -1 if by falling (not below zero).
+    """
+
+    name: str
+    value: float
+    unit: str
+    sign: int
+
+
+class Change(NamedTuple):
+    """A limit and a value of it that a plan was found with."""
+
+    limit: Limit
+    value: float
+
+    def __str__(self) -> str:
+        limit = self.limit
+        return f"{limit.name} = {self.value:g} {limit.unit} instead of {limit.value:g}"
+
+
+def rank_shortfalls(shortfalls: Iterable[Shortfall]) -> str:
+    """All shortfalls in one line, the worst first."""
+    return "; ".join(map(str, sorted(shortfalls, key=lambda short: -short.amount)))
+
+
+def find_changes(
+    limits: Sequence[Limit],
+    find_least: Callable[[int], float | None],
+    can_plan: Callable[[int, float], bool],
+) -> list[Change]:
+    """Find the changes of a single limit with which there is a plan.
+
+    Parameters
+    ----------
+    limits : sequence of Limit
+    find_least : callable
+        The value at which the i-th limit just lets the others be kept, or None if none does.
+    can_plan : callable
+        Whether there is a plan with this value of the i-th limit.
+
+    Returns
+    -------
+    list of Change
+        Each with a value, rounded outwards, that `can_plan` has confirmed.
+    """
+    changes = []
+    for index, limit in enumerate(limits):
+        least = find_least(index)
+        if least is None:
+            continue
+        tried = dict.fromkeys(
+            round_outwards(least * (1 + limit.sign * beyond), limit.sign) for beyond in _BEYOND
+        )
+        for value in tried:
+            if value >= 0 and can_plan(index, value):
+                changes.append(Change(limit, value))
+                break
+    return changes
+
+
+def describe_changes(changes: Sequence[Change]) -> str:
+    """All changes in one line."""
+    if not changes:
+        return "no single limit makes it feasible"
+    return f"feasible with {', or '.join(map(str, changes))}"
+
+
+def round_outwards(value: float, sign: int, digits: int = DIGITS) -> float:
+    """Round to significant digits, up for the sign 1 and down for -1."""
+    if value == 0 or not math.isfinite(value):
+        return value
+    place = digits - 1 - math.floor(math.log10(abs(value)))
+    # What already has so few digits stays, whatever its last bits are.
+    scaled = round(value * 10.0**place, 6)
+    whole = math.ceil(scaled) if sign > 0 else math.floor(scaled)
+    return float(f"{whole}e{-place}")
