@@ -64,23 +64,23 @@ class Limits(NamedTuple):
         return np.asarray((np.hstack([self.c_n, self.cone]) > COARSE).any(axis=1))
 
 
-def find_misses(stage: Stage, motion: StageMotion, least: float) -> Limits:
+def find_misses(stage: Stage, motion: StageMotion, epsilon: float, margin: float = 0.0) -> Limits:
     """By how much limits are missed in each interval, at worst.
 
     Parameters
     ----------
-    least : float, [N]
-        Least c_n.
+    epsilon, margin : float, [N]
+        Least c_n, and what c_n but no friction cone has to exceed it by.
     """
     formation, inner = stage.formation, np.linspace(1e-9, 1 - 1e-9, LOOKS)
     places = stage.guess.places(inner).ravel()
     samples = motion.evaluate(places * motion.duration)
-    grip = slip_margins(formation, samples.c_n - least, samples.c_t)
+    grip = slip_margins(formation, samples.c_n - epsilon, samples.c_t)
     gaps = formation.evaluate_limits(samples.z)[:, list(stage.watched)]
     clear = CLEAR / 2 * np.isin(stage.watched, stage.released)
     later = (not stage.opens) | (places > 1 / 2)
     tables = (
-        samples.c_n - least,
+        samples.c_n - (epsilon + margin),
         grip,
         gaps - np.outer(later, clear),
     )
