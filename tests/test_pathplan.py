@@ -91,6 +91,19 @@ def test_least_time_agrees_with_the_phase_plane(curves: tuple[Curve, ...], phase
     assert plan(curves[phase]).value == pytest.approx(fine, rel=2e-3)
 
 
+@pytest.mark.parametrize("epsilon", [0.6, 0.8])
+def test_a_phase_that_only_a_quick_motion_carries(
+    curves: tuple[Curve, ...], epsilon: float
+) -> None:
+    """Slow motions cannot press v1 on the palm so hard in phase 3."""
+    slow = with_speed_limit(curves[2], (0.3, 0.3))
+    with pytest.raises(InfeasibleError):
+        plan_path(slow, epsilon, PlanOptions(), 3)
+    coarse, fine = (PhasePlane(curves[2], epsilon, n).least_time() for n in (300, 600))
+    chosen = plan_path(curves[2], epsilon, PlanOptions(intervals=320), 3)
+    assert chosen.value == pytest.approx(2 * fine - coarse, rel=2e-4)
+
+
 # Phases that are run through one after the other.
 
 

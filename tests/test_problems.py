@@ -15,9 +15,17 @@ import numpy as np
 import pytest
 
 from timed import fastest
+from wholearm.outline import load
+from wholearm.plan import solve
+from wholearm.verify import verify
 
 FOLDER = Path(__file__).parents[1] / "problems"
 FILES = sorted(FOLDER.glob("*.toml"))
+OBJECTIVES = ("time", "effort", "margin")
+FLIPS = ("heptagon", "hexagon", "square", "triangle")
+"""Problems that end on edge 1."""
+GOAL = 1e-5
+"""Distance between plan and replay at the end of a phase [m or rad]."""
 FIGURES = ("status", "objective", "phase_durations", "least_margin")
 
 
@@ -52,6 +60,41 @@ def test_plans_have_their_reference_figures(path: Path) -> None:
     # Least time presses no harder than it has to, so the margin is zero but for discretisation.
     assert got["least_margin"] == pytest.approx(expected["least_margin"], abs=1e-3)
     assert got["least_margin"] > -2e-6
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_plans_hold_in_simulation(path: Path, objective: str) -> None:
+    problem = load(str(path))
+    plan = fastest(path) if objective == "time" else solve(problem, objective)
+    report = verify(problem, plan)
+    assert report.ok, report.to_text()
+    assert abs(report.missed_by) < GOAL
+    assert len(report.phases) == len(problem.phases)
+    for phase in report.phases:
+        assert phase.end_deviation is not None
+        assert max(phase.end_deviation.position, phase.end_deviation.angle) < GOAL
+
+
+@pytest.mark.parametrize("name", FLIPS)
+def test_flips_land_on_the_next_edge(name: str) -> None:
+    path = FOLDER / f"{name}.toml"
+    plan, corners = fastest(path), load(str(path)).scene.polygon.vertices
+    heights = []
+    for _, y, phi in plan.q:
+        heights.append(y + np.sin(phi) * corners[:, 0] + np.cos(phi) * corners[:, 1])
+    low = np.array(heights)
+    assert low.min() > -1e-9
+    # The palm carries edge 0 at first, vertex 1 alone in between, and edge 1 at last.
+    assert np.abs(low[0, :2]).max() < 1e-9 and low[0, 2:].min() > 1e-2
+    assert np.abs(low[-1, 1:3]).max() < 1e-9 and np.delete(low[-1], [1, 2]).min() > 1e-2
+    assert np.abs(low[:, 1]).max() < 1e-9
+    (x_1, y_1), (x_2, y_2) = corners[1] - corners[0], corners[2] - corners[1]
+    turn = np.arctan2(x_1 * y_2 - y_1 * x_2, x_1 * x_2 + y_1 * y_2)
+    assert plan.q[-1, 2] - plan.q[0, 2] == pytest.approx(-turn, abs=1e-9)
+    sliding = low[:, 0] < 1e-9
+    assert np.diff(plan.q[sliding, 0]).max() < 1e-9 and np.ptp(plan.q[sliding, 0]) > 0.02
+    assert max(np.abs(plan.q_dot[-1]).max(), np.abs(plan.theta_dot[-1]).max()) < 1e-9
 
 
 def test_every_reference_has_its_problem() -> None:

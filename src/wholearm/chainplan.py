@@ -59,7 +59,11 @@ class Transition(NamedTuple):
 
 
 def plan_chain(
-    chain: Chain, epsilon: float, options: PlanOptions, duration: float | None = None
+    chain: Chain,
+    epsilon: float,
+    options: PlanOptions,
+    duration: float | None = None,
+    explained: bool = True,
 ) -> list[PhasePlan[PathMotion]]:
     """Plan phases that possible impacts join, from rest to rest.
 
@@ -70,9 +74,11 @@ def plan_chain(
     options : PlanOptions
     duration : float, optional, [s]
         Longest duration of all, for the objective `margin`; the phases share it as is best.
+    explained : bool
+        Whether to find out why there is no plan.
     """
     phases = [phase.number for phase in chain.phases]
-    return plan_curves(chain.paced, epsilon, options, phases, duration)
+    return plan_curves(chain.paced, epsilon, options, phases, duration, explained)
 
 
 def add_up(phases: Sequence[Phase], allowed: Sequence[float | None]) -> float | None:
@@ -142,7 +148,8 @@ def _plan_stop(
     if options.goal is Objective.MARGIN and duration is not None:
         fastest = replace(options, objective=Objective.TIME, duration=None)
         times = [
-            sum(plan.value for plan in plan_chain(half, epsilon, fastest, None)) for half in halves
+            sum(plan.value for plan in plan_chain(half, epsilon, fastest, None, False))
+            for half in halves
         ]
         if duration <= sum(times):
             return math.nan
@@ -150,6 +157,6 @@ def _plan_stop(
     plans = [
         plan
         for half, limit in zip(halves, limits, strict=True)
-        for plan in plan_chain(half, epsilon, options, limit)
+        for plan in plan_chain(half, epsilon, options, limit, False)
     ]
     return combine(options.goal, [plan.value for plan in plans])

@@ -66,6 +66,7 @@ def build_parser() -> argparse.ArgumentParser:
     solve.add_argument("--time-intervals", type=int, help="intervals of a phase in the time domain")
     solve.add_argument("--degree", type=int, help="collocation points of an interval there")
     solve.add_argument("--scheme", help="radau (the default) or legendre points")
+    solve.add_argument("--solver", help="ipopt or, for time and effort along curves, fatrop")
     solve.add_argument("--json", action="store_true", help="print the summary as JSON")
 
     verify = _command(commands, "verify", _verify, "replay torques open loop and check the motion")

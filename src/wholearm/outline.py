@@ -20,6 +20,8 @@ RELEASE_AT = 0.8
 """Where on a curve without an end of its own a release is guessed."""
 _MOST_ACTIVE = 2
 """Most limits that a phase's end may be right on."""
+_TURNS = np.linspace(-1.0, 1.0, 21)
+"""How far the object is turned to look for an end that is not the nearest [rad]."""
 _STEP = 1e-6
 """Step of the differences that give the gradients of limits [m or rad]."""
 
@@ -140,8 +142,25 @@ def _find_goal(problem: Problem, phase: Phase, z: Array) -> Array:
             break
         active = (*active, worst)
         goal = close(formation, goal, slip, fixed, active)
+    goal = _look_around(phase.formation, formation, z, slip) if fixed is None else None
+    if goal is not None:
+        return goal
     text = f"{until} cannot be reached with these contacts{reason}"
     raise InputError(problem.source, key, text)
+
+
+def _look_around(formation: Formation, ending: Formation, z: Array, slip: Array) -> Array | None:
+    """Nearest end inside all limits that is found from `z` turned by some angle, if any."""
+    metric, best, least = metric_weights(formation.scene), None, np.inf
+    for turn in _TURNS:
+        turned = close(formation, z, slip, (2, z[2] + turn))
+        goal = None if turned is None else close(ending, turned, slip)
+        if goal is None or ending.evaluate_limits(goal[None]).min() <= -TOUCHING:
+            continue
+        distance = float(metric @ (goal - z) ** 2)
+        if distance < least:
+            best, least = goal, distance
+    return best
 
 
 def close(

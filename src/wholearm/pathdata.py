@@ -47,6 +47,22 @@ class Places(NamedTuple):
         return Places(PathForces(*(part[rows] for part in self.forces)), self.rates[rows])
 
 
+class Relaxation(NamedTuple):
+    """Which limit gives way when the relaxation grows, and how fast.
+
+    Attributes
+    ----------
+    worth : ndarray, shape (n_h + 3,), [N, N m, 1]
+        By how much H c >= least and |tau| <= limit give way per unit of it, and the square of a
+        speed limit, relative to that square.
+    finger : int or None
+        Whose speed limit that is.
+    """
+
+    worth: Array
+    finger: int | None = None
+
+
 class PhaseData(NamedTuple):
     """What one phase, or several that are joined, gives the NLP.
 
@@ -96,12 +112,24 @@ class PhaseData(NamedTuple):
         spare[: self.curve.formation.n_contacts] += margin
         return np.hstack([held - spare, tau + limit, limit - tau])
 
-    def largest_b(self, places: Places) -> Array:
-        """Largest b that the joints' speed limits allow, shape (n,) [m^2/s^2]."""
+    def largest_b(self, places: Places, spared: int | None = None) -> Array:
+        """Largest b that the joints' speed limits allow, shape (n,) [m^2/s^2].
+
+        Without that of the joint `spared`, if one is given.
+        """
         limit = self.curve.formation.scene.speed_limit
+        if spared is not None:
+            limit[spared] = np.inf
         if np.isinf(limit).all():
             return np.full(len(places.rates), np.inf)
         return np.asarray(((limit / np.maximum(np.abs(places.rates), 1e-12)) ** 2).min(axis=1))
+
+    def relative_rates(self, places: Places, finger: int | None) -> Array:
+        """Rate of a joint over its speed limit, shape (n,) [s/m]; zero without a joint."""
+        if finger is None:
+            return np.zeros(len(places.rates))
+        limit = self.curve.formation.scene.speed_limit[finger]
+        return np.asarray(places.rates[:, finger] / limit)
 
     def spread(self, profile: Profile, fractions: Array) -> Profile:
         """The profile at `fractions` of every solid interval, interval by interval."""
@@ -213,6 +241,14 @@ def join(parts: Sequence[PhaseData]) -> PhaseData:
         looks=stack([part.looks for part in parts]),
         solid=chain((part.solid for part in parts), nodes),
     )
+
+
+def name_phases(phases: Sequence[int], what: str = "") -> str:
+    """One phase or several, for messages, and that they are `what`."""
+    if len(phases) == 1:
+        return f"phase {phases[0]} is {what}" if what else f"phase {phases[0]}"
+    several = f"phases {phases[0]} to {phases[-1]}"
+    return f"{several} are {what}" if what else several
 
 
 def cut(parts: Sequence[PhaseData], profile: Profile) -> list[Profile]:

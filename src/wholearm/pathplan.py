@@ -9,16 +9,17 @@ misses more than `MISS`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from .cones import name_holds
-from .curve import Curve, describe_pose
-from .errors import InfeasibleError, SolverError
+from .curve import Curve
+from .errors import InfeasibleError, SolverError, WholearmError
 from .model import Array
+from .nodechain import StagedSolver
 from .options import Objective, PlanOptions
-from .pathdata import PhaseData, cut, fit_torque, join, prepare
+from .pathdata import PhaseData, cut, fit_torque, join, name_phases, prepare
 from .pathmotion import Grid, PathMotion, Profile, draw_together, make_grid
 from .pathnlp import (
     PathNLP,
@@ -40,12 +41,10 @@ ROUNDS = 40
 """Most times that the NLP is solved for one phase."""
 _COARSE = 1.5e-4
 """Miss, over the typical force, above which the grid is drawn together."""
+_SLOW = -12
+"""Height of the slowest guess, as a power of two times that of a fall."""
 _OVER = 1.05
 """How much more than the miss a limit is tightened."""
-
-
-class _StoppedError(Exception):
-    """Ipopt has stopped without an answer."""
 
 
 class _Solution(NamedTuple):
@@ -54,6 +53,18 @@ class _Solution(NamedTuple):
     multipliers: dict[str, Array]
     iterations: int
     seconds: float
+
+
+class _StoppedError(Exception):
+    """The solver has stopped without an answer."""
+
+
+class _StuckError(SolverError):
+    """A solve that failed, with the phases that it failed for."""
+
+    def __init__(self, parts: Sequence[PhaseData], message: str) -> None:
+        self.parts = parts
+        super().__init__(message)
 
 
 def plan_path(
@@ -73,6 +84,7 @@ def plan_curves(
     options: PlanOptions,
     phases: Sequence[int],
     duration: float | None = None,
+    explained: bool = True,
 ) -> list[PhasePlan[PathMotion]]:
     """Plan phases along curves that are run through one after the other, from rest to rest.
 
@@ -87,17 +99,83 @@ def plan_curves(
         The phases' numbers, for messages.
     duration : float, optional, [s]
         Longest duration of all, for the objective `margin`.
+    explained : bool
+        Whether to find out why there is no plan, which takes longer than planning.
 
     Raises
     ------
     InfeasibleError
-        If no motion keeps the limits; names what is short, where and by how much.
+        If no motion keeps the limits; names what is short, where and by how much, and each single
+        limit with which there would be a plan.
     JammingError
         If friction jams a formation somewhere on its curve.
     SolverError
-        If Ipopt stops without an answer.
+        If the solver stops without an answer.
     """
+    where = name_phases(phases)
+    try:
+        plans = _plan(curves, epsilon, options, phases, duration)
+    except _StuckError as stuck:
+        if not explained:
+            raise
+        from .pathexplain import explain
 
+        late = _explain_duration(curves, epsilon, options, phases, duration)
+        # Advice is about the problem: it does not depend on the solver.
+        robust = replace(options, solver="ipopt")
+        raise late or explain(
+            stuck.parts,
+            *guess_slowly(join(stuck.parts)),
+            phases,
+            str(stuck),
+            lambda changed, least: _plan(changed, least, robust, phases, duration),
+        ) from None
+    if options.goal is Objective.MARGIN and plans[0].value < epsilon - MISS:
+        late = _explain_duration(curves, epsilon, options, phases, duration)
+        raise late or SolverError(f"{where}: the margin found is below epsilon")
+    return plans
+
+
+def _explain_duration(
+    curves: Sequence[Curve],
+    epsilon: float,
+    options: PlanOptions,
+    phases: Sequence[int],
+    duration: float | None,
+) -> InfeasibleError | None:
+    """Say so if the duration is shorter than the least time, and which one would do."""
+    from .advice import Limit, describe_changes, find_changes
+
+    if duration is None:
+        return None
+    fastest = replace(options, objective=Objective.TIME, duration=None)
+    try:
+        least = sum(plan.value for plan in _plan(curves, epsilon, fastest, phases, None))
+    except WholearmError:
+        return None
+    if least <= duration:
+        return None
+
+    def can_plan(_: int, value: float) -> bool:
+        try:
+            return _plan(curves, epsilon, options, phases, value)[0].value >= epsilon
+        except SolverError:
+            return False
+
+    changes = find_changes([Limit("duration", duration, "s", 1)], lambda _: least, can_plan)
+    return InfeasibleError(
+        f"{name_phases(phases, 'infeasible')}: duration = {duration:g} s is "
+        f"{least - duration:.3g} s shorter than the least time; {describe_changes(changes)}"
+    )
+
+
+def _plan(
+    curves: Sequence[Curve],
+    epsilon: float,
+    options: PlanOptions,
+    phases: Sequence[int],
+    duration: float | None,
+) -> list[PhasePlan[PathMotion]]:
     def prepare_all(grids: Iterable[Grid]) -> list[PhaseData]:
         given = zip(curves, grids, phases, strict=True)
         return [prepare(curve, epsilon, grid, phase) for curve, grid, phase in given]
@@ -105,7 +183,7 @@ def plan_curves(
     parts = prepare_all(make_grid(curve, options.intervals) for curve in curves)
     data = join(parts)
     first, intervals = curves[0].formation, len(data.grid.steps)
-    nlp = build_path_nlp(first.n_contacts, intervals, options.goal, first.n_rolling)
+    nlp = build_path_nlp(first.n_contacts, intervals, options.goal, first.n_rolling, options.solver)
     profile, scales = guess(data)
     tightening = Tightening.none(data, duration)
     solution = _Solution(profile, 0.0, first_multipliers(nlp, data, profile, scales), 0, 0.0)
@@ -113,7 +191,7 @@ def plan_curves(
         try:
             solution = _solve(nlp, data, scales, tightening, solution, options.time_weight)
         except _StoppedError as stop:
-            raise explain(parts, phases, str(stop)) from None
+            raise _StuckError(parts, f"{name_phases(phases)}: {stop}") from None
         profile, margin = solution.profile, solution.margin
         motions = [
             PathMotion(part.curve, part.grid, own)
@@ -143,7 +221,7 @@ def plan_curves(
             tightening = tightening.by(reach, _OVER * short, _OVER * speeding, _OVER * late)
     else:
         raise SolverError(
-            f"{_name(phases)}: after {ROUNDS} solves limits are still missed by "
+            f"{name_phases(phases)}: after {ROUNDS} solves limits are still missed by "
             f"{short.max():.2g} N between nodes; plan with more intervals"
         )
     plans: list[PhasePlan[PathMotion]] = []
@@ -177,7 +255,8 @@ def _solve(
     )
     stats = nlp.solver.stats()
     if not stats["success"]:
-        raise _StoppedError(stats["return_status"])
+        name = "fatrop" if isinstance(nlp.solver, StagedSolver) else "Ipopt"
+        raise _StoppedError(f"{name} stopped with {stats['return_status']}")
     profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], scales)
     multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
     iterations = start.iterations + stats["iter_count"]
@@ -186,98 +265,66 @@ def _solve(
 
 
 def guess(data: PhaseData) -> tuple[Profile, Scales]:
-    """Guess a motion: b a parabola in s as high as limits allow, the squeeze amid its range."""
-    length, s = float(data.grid.s[-1]), data.grid.s
-    shape, slope = 4 * s / length * (1 - s / length), 2 * (1 - 2 * s / length) / length
+    """Guess a motion: b a parabola in s as high as limits allow, the squeeze amid its range.
 
+    Where limits forbid even a slow one, it is as quick as a fall: a plan, if there is one, is not
+    slow, and in units of a slow one the costs that choose among equals would weigh too much.
+    """
     b_max = data.largest_b(data.nodes)
-
-    def squeeze_range(height: float) -> tuple[Array, Array]:
-        profile = Profile(height * slope, height * shape, 0.0 * s)
-        slack = data.slack(data.nodes, profile)
-        forces = data.nodes.forces
-        rate = np.hstack([forces.Cl, forces.Tl, -forces.Tl])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            bound = -slack / rate
-        low = np.where(rate > 0, bound, -np.inf).max(axis=1)
-        high = np.where(rate < 0, bound, np.inf).min(axis=1)
-        return low, high
+    fall = _fall(data)
 
     def possible(height: float) -> bool:
-        low, high = squeeze_range(height)
-        return bool((low <= high).all() and (height * shape <= b_max).all())
+        low, high = _squeeze_range(data, height)
+        b = _parabola(data, height)[1]
+        return bool((low <= high).all() and (b <= b_max).all())
 
     # Bisection over heights from 2^-12 to 2^8 times that of a fall over this length.
-    low_power, high_power = -12.0, 8.0
-    fall = 2 * data.curve.formation.scene.gravity * length + 1e-9
+    low_power, high_power = float(_SLOW), 8.0
     for _ in range(7):
         power = (low_power + high_power) / 2
         if possible(fall * 2**power):
             low_power = power
         else:
             high_power = power
-    height = 0.7 * fall * 2**low_power
-    low, high = squeeze_range(height)
+    none = low_power == _SLOW
+    return _guess_at(data, 0.7 * fall * (1.0 if none else 2**low_power))
+
+
+def guess_slowly(data: PhaseData) -> tuple[Profile, Scales]:
+    """Guess a slow motion, whatever limits say."""
+    return _guess_at(data, 0.7 * _fall(data) * 2.0**_SLOW)
+
+
+def _fall(data: PhaseData) -> float:
+    """The b of a fall over the length of the curve [m^2/s^2]."""
+    return 2 * data.curve.formation.scene.gravity * float(data.grid.s[-1]) + 1e-9
+
+
+def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
+    """The a and b of a parabola in s of this height."""
+    length = data.grid.s[-1]
+    x = data.grid.s / length
+    return height * 2 * (1 - 2 * x) / length, height * 4 * x * (1 - x)
+
+
+def _squeeze_range(data: PhaseData, height: float) -> tuple[Array, Array]:
+    """Least and largest squeeze that limits allow at each node."""
+    a, b = _parabola(data, height)
+    slack = data.slack(data.nodes, Profile(a, b, np.zeros_like(a)))
+    forces = data.nodes.forces
+    rate = np.hstack([forces.Cl, forces.Tl, -forces.Tl])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        bound = -slack / rate
+    low = np.where(rate > 0, bound, -np.inf).max(axis=1)
+    high = np.where(rate < 0, bound, np.inf).min(axis=1)
+    return low, high
+
+
+def _guess_at(data: PhaseData, height: float) -> tuple[Profile, Scales]:
+    low, high = _squeeze_range(data, height)
     middle = np.where(np.isfinite(low + high) & (low <= high), (low + high) / 2, 0.0)
+    length = float(data.grid.s[-1])
     duration = np.pi / 2 * length / np.sqrt(height)
     force = max(1.0, data.epsilon, float(np.abs(middle).mean()))
     scales = Scales(length, 0.6 * duration, force)
-    return Profile(height * slope, height * shape, middle), scales
-
-
-def explain(
-    parts: Sequence[PhaseData], phases: Sequence[int], status: str
-) -> InfeasibleError | SolverError:
-    """Say why phases have no plan: re-solve with every limit soft and rank the shortfalls."""
-    data, where = join(parts), _name(phases)
-    first, intervals = data.curve.formation, len(data.grid.steps)
-    nlp = build_path_nlp(first.n_contacts, intervals, Objective.ELASTIC, first.n_rolling)
-    profile, scales = guess(data)
-    bounds = make_bounds(nlp, data, scales, Tightening.none(data, None))
-    short = np.maximum(_shortfalls(data, profile), 0.0) + 0.1
-    start = pack(nlp, profile, scales, 0.0, short)
-    result = nlp.solver(x0=start, p=parameters(nlp, data, scales, 1.0), **bounds)
-    if not nlp.solver.stats()["success"]:
-        return SolverError(f"{where}: Ipopt stopped with {status}")
-    profile, _ = unpack(nlp, data.grid, result["x"].full()[:, 0], scales)
-    if _shortfalls(data, profile).max() < 1e-4:
-        return SolverError(f"{where}: Ipopt stopped with {status} although limits can be kept")
-    texts: list[tuple[float, str]] = []
-    for part, own, phase in zip(parts, cut(parts, profile), phases, strict=True):
-        suffix = f", phase {phase}" if len(phases) > 1 else ""
-        texts += [(short, text + suffix) for short, text in _describe_shortfalls(part, own)]
-    texts.sort(key=lambda pair: -pair[0])
-    verb = "is" if len(phases) == 1 else "are"
-    return InfeasibleError(f"{where} {verb} infeasible: {'; '.join(text for _, text in texts)}")
-
-
-def _describe_shortfalls(data: PhaseData, profile: Profile) -> list[tuple[float, str]]:
-    """What is short on one phase, by how much [N, N m] and in words, the worst first."""
-    short, formation = _shortfalls(data, profile), data.curve.formation
-    names = name_holds(formation, data.epsilon)
-    units = ["N"] * len(names) + ["N m"] * 2
-    names += [f"torque limit of finger {i + 1} = {data.torque_limit[i]:g} N m" for i in range(2)]
-    times = PathMotion(data.curve, data.grid, profile).times
-    z = data.curve.evaluate(data.grid.s).z
-    texts = []
-    for row in np.argsort(-short.max(axis=0)):
-        worst = int(short[:, row].argmax())
-        if short[worst, row] > 1e-4:
-            text = (
-                f"{names[row]} is {short[worst, row]:.3g} {units[row]} short at "
-                f"t = {times[worst]:.4f} s ({describe_pose(z[worst])})"
-            )
-            texts.append((float(short[worst, row]), text))
-    return texts
-
-
-def _name(phases: Sequence[int]) -> str:
-    """One phase or several, for messages."""
-    return f"phase {phases[0]}" if len(phases) == 1 else f"phases {phases[0]} to {phases[-1]}"
-
-
-def _shortfalls(data: PhaseData, profile: Profile) -> Array:
-    """By how much H c and tau miss their limits at the nodes, shape (n, n_h + 2) [N, N m]."""
-    slack = data.slack(data.nodes, profile)
-    held, torque = slack[:, :-4], np.minimum(slack[:, -4:-2], slack[:, -2:])
-    return -np.hstack([held, torque])
+    return Profile(*_parabola(data, height), middle), scales

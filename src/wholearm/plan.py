@@ -105,6 +105,7 @@ def solve_with(
         "transitions": [transition.to_dict() for transition in transitions],
         "intervals": options.intervals,
         "transcription": options.transcription,
+        "solver": options.solver,
         "time_weight": options.time_weight,
         "timings": {
             "trace": traced - started,
@@ -252,7 +253,12 @@ def _share_duration(
     times = [plan.motion.duration for plan in least]
     total = 2 * sum(times) if duration is None else duration
     if total <= sum(times):
+        from .advice import Change, Limit, describe_changes, round_outwards
+
+        # The least-time plan shows it; a little more leaves something to choose.
+        enough = Change(Limit("duration", total, "s", 1), round_outwards(1.005 * sum(times), 1))
         raise InfeasibleError(
-            f"duration = {total:g} s is not longer than the least time, {sum(times):.6g} s"
+            f"duration = {total:g} s is not longer than the least time, {sum(times):.6g} s; "
+            f"{describe_changes([enough])}"
         )
     return [total / sum(times) * own for own in times]
