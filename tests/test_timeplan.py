@@ -108,7 +108,7 @@ def test_schemes_and_degrees_agree(
     above = total(plans) / trajectory.meta["phase_durations"][3] - 1
     assert above == pytest.approx(1.45e-3, abs=2.5e-4)
     stage = plans[0].motion.stages[0]
-    z, v = integrate(stage, *stage.points.nodes[0])
+    z, _ = integrate(stage, *stage.points.nodes[0])
     error = np.abs(z - stage.points.nodes[-1, 0]).max()
     # What collocation misses over the phase [m, rad], falling with the order.
     assert error < {3: 1e-4, 4: 1e-5}.get(stage.scheme.order, 1e-6)
@@ -176,7 +176,7 @@ def test_what_moves_by_itself_takes_its_time(
     assert report.ok, report.to_text()
     motion = plan.motions[1]
     samples = motion.evaluate(np.linspace(0.0, motion.duration, 50))
-    x, y, phi = samples.z[:, :3].T
+    y, phi = samples.z[:, 1], samples.z[:, 2]
     if throw is shove:
         # Weight and friction, whose moment the two forces share: closed form.
         weight = problem.scene.polygon.mass * 9.81
@@ -191,10 +191,9 @@ def test_what_moves_by_itself_takes_its_time(
         energy = kinetic + body.mass * 9.81 * y
         # Nothing takes energy away; the potential energy changes by millijoules.
         assert np.ptp(energy) < 1e-7
-    if throw is lift:
-        np.testing.assert_allclose(rates[:, 0], 0.0, atol=1e-7)
-    assert phi[-1] == pytest.approx(problem.phases[1].until.value or 0.0, abs=1e-8) or throw is shove
-    assert x.shape == (50,)
+        if throw is lift:
+            np.testing.assert_allclose(rates[:, 0], 0.0, atol=1e-7)
+        assert phi[-1] == pytest.approx(problem.phases[1].until.value, abs=1e-8)
 
 
 @pytest.mark.parametrize("objective", ["effort", "margin"])
@@ -219,7 +218,6 @@ def test_the_landing_is_carried_out_by_its_torques(objective: str) -> None:
     plan = solve(landing(), objective, time_intervals=8)
     report = verify(landing(), plan)
     assert report.ok, report.to_text()
-    assert all(f"{phase.number}" for phase in landing().phases)
 
 
 def test_friction_never_pushes_the_wrong_way(stages: list[StageMotion]) -> None:
@@ -351,7 +349,7 @@ def test_a_motion_that_limits_forbid_is_no_plan() -> None:
         for phase in problem.phases
     ]
     feeble = replace(problem, scene=scene, phases=tuple(phases))
-    with pytest.raises(InfeasibleError):
+    with pytest.raises(InfeasibleError, match=r"phases 1 and 2 are infeasible: .* short"):
         plan_phases(feeble, phases, feeble.start, PlanOptions(time_intervals=COARSE))
 
 
