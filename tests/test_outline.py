@@ -189,7 +189,8 @@ def test_closing_keeps_what_has_rolled_by(landing: Problem, released: Array) -> 
         return float(z[0] + rotate(z[2], vertex)[0])
 
     slip = formation.evaluate_slip(released[None])[0]
-    z = close(formation, released + [0.0, 0.0, -0.1, 0.0, 0.0], slip)
+    tipped = released - 0.1 * np.eye(5)[2]
+    z = close(formation, tipped, slip)
     assert z is not None and np.abs(measure_gaps(formation, z)).max() < 1e-12
     # The vertex on the palm stays where it was, and the object turns about it.
     assert place(z) == pytest.approx(place(released), abs=1e-12)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -37,7 +39,7 @@ def test_stages_are_those_of_the_outlines(stages: list[Stage]) -> None:
 
 
 def test_directions_change_where_a_stage_says_that_they_turn(stages: list[Stage]) -> None:
-    for before, after in zip(stages[:-1], stages[1:], strict=True):
+    for before, after in pairwise(stages):
         signs = np.concatenate(before.directions)
         names = [*before.formation.names, "joint 1", "joint 2"]
         turned = {names[row] for row in before.turns}
@@ -63,7 +65,7 @@ def test_guesses_follow_the_outlines_in_one_sweep(stages: list[Stage]) -> None:
         step = np.diff(part.z[:, :2], axis=1)[:, 0] / np.diff(t[:, :2], axis=1)
         middle = (part.v[:, 0] + part.v[:, 1]) / 2
         assert np.abs(step - middle).max() < 0.15 * np.abs(part.v).max()
-    for before, after in zip(parts[:-1], parts[1:], strict=True):
+    for before, after in pairwise(parts):
         np.testing.assert_allclose(before.nodes[-1, 0], after.nodes[0, 0], atol=1e-12)
     for node in (parts[0].nodes[0, 1], parts[-1].nodes[-1, 1]):
         np.testing.assert_allclose(node, 0.0, atol=1e-12)

@@ -9,8 +9,8 @@ import pytest
 
 from plane import make_formation, measure_gaps, with_speed_limit
 from planned import HEPTAGON, CosineMotion
-from tipping import roll
 from timed import drive
+from tipping import roll
 from wholearm.between import Limits, raise_bounds
 from wholearm.collocation import Scheme, make_scheme
 from wholearm.curve import Curve, metric_weights

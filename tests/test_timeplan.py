@@ -1,27 +1,45 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+
 import numpy as np
 import pytest
 
-from plane import measure_gaps, measure_slip
-from timed import fastest_landing, instants, integrate, landing, plan_landing
+from plane import make_formation, measure_gaps, measure_slip
+from thrown import heave, lift, shove
+from timed import (
+    fastest_landing,
+    instants,
+    integrate,
+    landing,
+    plan_landing,
+    stages_of,
+    tables,
+    total,
+)
+from tipping import box
 from wholearm.contact import parse_contact
 from wholearm.curve import Curve
+from wholearm.errors import InfeasibleError
 from wholearm.formation import Formation
-from wholearm.model import Array
 from wholearm.options import PlanOptions
-from wholearm.outline import released_contacts
+from wholearm.path import trace_phases
 from wholearm.phaseplan import PhasePlan
 from wholearm.plan import solve
 from wholearm.problem import Problem
 from wholearm.timemotion import StageMotion, TimeMotion
 from wholearm.timeplan import plan_phases
 from wholearm.trajectory import Trajectory
+from wholearm.verify import verify
 
 SLACK = 1e-6
 """What a limit may be missed by between the places that the planner looks at [N or N m]."""
 COARSE = 6
 """Intervals where only what a plan is for is looked at, not how good it is."""
+SCHEMES = [("radau", 2), ("radau", 3), ("radau", 4), ("radau", 5)]
+SCHEMES += [("legendre", degree) for degree in (2, 3, 4, 5)]
 
 
 @pytest.fixture(scope="module")
@@ -44,37 +62,162 @@ def gentle() -> list[PhasePlan[TimeMotion]]:
     return plan_landing(objective="effort", time_intervals=COARSE)
 
 
+@lru_cache(maxsize=1)
+def in_time(problem: Problem) -> Trajectory:
+    return solve(problem, transcription="time")
+
+
 def effort(plans: list[PhasePlan[TimeMotion]]) -> float:
     return sum(plan.torque.integrate_squares() + plan.motion.duration for plan in plans)
 
 
-@pytest.mark.parametrize("phase", [0, 1, 3])
+@pytest.mark.parametrize("phase", range(5))
 def test_least_times_agree_with_those_along_the_curve(
     heptagon: Problem, curves: tuple[Curve, ...], trajectory: Trajectory, phase: int
 ) -> None:
-    start = heptagon.start if phase == 0 else curves[phase - 1].end
-    options = PlanOptions(transcription="time", time_intervals=30)
-    (plan,) = plan_phases(heptagon, (heptagon.phases[phase],), start, options)
-    # Two discretisations of one problem. Torques that jump inside an interval cost the coarser.
-    expected = trajectory.meta["phase_durations"][phase]
-    assert plan.motion.duration == pytest.approx(expected, rel=1e-3)
-    assert plan.value == plan.motion.duration
-    assert plan.motion.stages[0].directions.Xi.tolist() == curves[phase].segments[0].Xi.tolist()
-    np.testing.assert_allclose(plan.motion.end.z, curves[phase].end, atol=1e-8)
-    np.testing.assert_allclose(plan.motion.end.v, 0.0, atol=1e-8)
+    plan = in_time(heptagon)
+    motion, expected = plan.motions[phase], trajectory.meta["phase_durations"][phase]
+    assert isinstance(motion, TimeMotion)
+    # Two discretisations of one problem: measured 0.08, 0.04, 0.07, 0.03 and 0.03 %. Torques are
+    # linear over a 32nd of the phase here, so that it takes longer.
+    assert -1e-4 < motion.duration / expected - 1 < 1e-3
+    end = motion.stages[-1].points.nodes[-1]
+    np.testing.assert_allclose(end[0], curves[phase].end, atol=1e-8)
+    np.testing.assert_allclose(end[1], 0.0, atol=1e-6)
+    for stage, segment in zip(motion.stages, curves[phase].segments, strict=True):
+        np.testing.assert_array_equal(stage.directions.Xi, segment.Xi)
+        np.testing.assert_array_equal(stage.directions.sigma, segment.sigma)
 
 
-def test_the_whole_problem_can_be_planned_in_the_time_domain(
-    heptagon: Problem, trajectory: Trajectory
-) -> None:
-    plan = solve(heptagon, transcription="time", time_intervals=8)
-    assert all(isinstance(motion, TimeMotion) for motion in plan.motions)
+def test_the_whole_problem_planned_in_the_time_domain_is_carried_out(heptagon: Problem) -> None:
+    plan = in_time(heptagon)
     assert plan.meta["transcription"] == "time"
-    # Coarse, so slower: never faster than the least time but by what both miss.
-    ratio = np.array(plan.meta["phase_durations"]) / trajectory.meta["phase_durations"]
-    assert (ratio > 0.998).all() and (ratio < 1.03).all()
+    report = verify(heptagon, plan)
+    assert report.ok, report.to_text()
     assert np.nanmin(plan.c_n) > heptagon.epsilon - SLACK
     assert np.abs(plan.tau).max() < 2.0 + SLACK
+
+
+@pytest.mark.parametrize("name, degree", SCHEMES)
+def test_schemes_and_degrees_agree(
+    heptagon: Problem, curves: tuple[Curve, ...], trajectory: Trajectory, name: str, degree: int
+) -> None:
+    options = PlanOptions(scheme=name, degree=degree, time_intervals=16)
+    plans = plan_phases(heptagon, (heptagon.phases[3],), curves[2].end, options)
+    # Torques that are linear over a 16th of the phase cost 0.136 to 0.157 % with every scheme.
+    above = total(plans) / trajectory.meta["phase_durations"][3] - 1
+    assert above == pytest.approx(1.45e-3, abs=2.5e-4)
+    stage = plans[0].motion.stages[0]
+    z, _ = integrate(stage, *stage.points.nodes[0])
+    error = np.abs(z - stage.points.nodes[-1, 0]).max()
+    # What collocation misses over the phase [m, rad], falling with the order.
+    assert error < {3: 1e-4, 4: 1e-5}.get(stage.scheme.order, 1e-6)
+
+
+@pytest.mark.parametrize("name, degree", SCHEMES)
+def test_landings_of_other_schemes_take_as_long(name: str, degree: int) -> None:
+    plans = plan_landing(scheme=name, degree=degree, time_intervals=8)
+    # Measured 118.5 to 120.4 ms: on 8 intervals, halved or not, limits between points are raised
+    # by different amounts.
+    assert total(plans) == pytest.approx(0.1192, rel=0.015)
+
+
+@pytest.mark.parametrize("phase", range(3))
+def test_rolling_contacts_are_planned_like_along_the_curve(phase: int) -> None:
+    problem = box()
+    along, within = solve(problem), in_time(problem)
+    ratio = within.meta["phase_durations"][phase] / along.meta["phase_durations"][phase]
+    # Measured 0.57, 0.77 and 0.45 % on 32 intervals, half of that on 64.
+    assert -1e-4 < ratio - 1 < 1e-2
+    rolls = problem.phases[phase].formation.rolling
+    motion = within.motions[phase]
+    assert isinstance(motion, TimeMotion)
+    for stage in motion.stages:
+        samples = stage.evaluate(instants(stage, 25))
+        for k, contact in enumerate(stage.formation.contacts):
+            if contact in rolls:
+                grip = 0.5 * (samples.c_n[:, k] - problem.epsilon) - np.abs(samples.c_t[:, k])
+                assert grip.min() > -SLACK
+                slip = [
+                    measure_slip(stage.formation, z, v)[k]
+                    for z, v in zip(samples.z, samples.z_dot, strict=True)
+                ]
+                assert np.abs(slip).max() < 1e-12
+    if phase == 1:
+        assert verify(problem, within).ok
+
+
+def test_margins_with_rolling_contacts_are_those_along_the_curve() -> None:
+    problem = box()
+    options = {"objective": "margin", "duration": 1.0}
+    along = solve(problem, **options)  # type: ignore[arg-type]
+    within = solve(problem, transcription="time", time_intervals=8, **options)  # type: ignore[arg-type]
+    got, expected = within.meta["phase_values"], along.meta["phase_values"]
+    # Forces on an eighth of the phase cannot follow as closely.
+    assert (np.array(got) < np.array(expected) * (1 + 1e-3)).all()
+    np.testing.assert_allclose(got, expected, rtol=0.02)
+
+
+@pytest.mark.parametrize("name", ["radau", "legendre"])
+@pytest.mark.parametrize("throw", [shove, heave, lift])
+def test_what_moves_by_itself_takes_its_time(
+    throw: Callable[[], tuple[Problem, float]], name: str
+) -> None:
+    problem, expected = throw()
+    plan = solve(problem, time_intervals=8, scheme=name)
+    # One or two contacts are left, and with them four or three freedoms.
+    formation = problem.phases[1].formation
+    assert formation.n_constraints == 2 - (throw is lift)
+    # Collocation misses a falling body by powers of an eighth of its time; a sliding one, whose
+    # acceleration is constant, not at all.
+    accuracy = 1e-12 if throw is shove else 2e-8
+    assert plan.meta["phase_durations"][1] == pytest.approx(expected, rel=accuracy)
+    report = verify(problem, plan)
+    assert report.ok, report.to_text()
+    motion = plan.motions[1]
+    samples = motion.evaluate(np.linspace(0.0, motion.duration, 50))
+    y, phi = samples.z[:, 1], samples.z[:, 2]
+    if throw is shove:
+        # Weight and friction, whose moment the two forces share: closed form.
+        weight = problem.scene.polygon.mass * 9.81
+        lean = 0.3 * 0.03 / 0.06
+        shares = np.array([0.5 + lean, 0.5 - lean]) * weight
+        np.testing.assert_allclose(samples.c_n, np.tile(shares, (50, 1)), rtol=1e-9)
+        np.testing.assert_allclose(samples.z_ddot[:, 0], 0.3 * 9.81, rtol=1e-9)
+    else:
+        body = problem.scene.polygon
+        rates = samples.z_dot[:, :3]
+        kinetic = 0.5 * rates**2 @ np.array([body.mass, body.mass, body.inertia or 0.0])
+        energy = kinetic + body.mass * 9.81 * y
+        # Nothing takes energy away; the potential energy changes by millijoules.
+        assert np.ptp(energy) < 1e-7
+        if throw is lift:
+            np.testing.assert_allclose(rates[:, 0], 0.0, atol=1e-7)
+        assert phi[-1] == pytest.approx(problem.phases[1].until.value, abs=1e-8)
+
+
+@pytest.mark.parametrize("objective", ["effort", "margin"])
+@pytest.mark.parametrize("throw", [shove, heave, lift])
+def test_one_and_two_contacts_are_planned_for_every_objective(
+    throw: Callable[[], tuple[Problem, float]], objective: str
+) -> None:
+    problem, expected = throw()
+    fastest = solve(problem, time_intervals=COARSE)
+    plan = solve(problem, objective, time_intervals=COARSE)
+    # The second phase has no choice; the first one has.
+    assert plan.meta["phase_durations"][1] == pytest.approx(expected, rel=1e-6)
+    assert plan.meta["phase_durations"][0] > fastest.meta["phase_durations"][0]
+    least = [float(np.nanmin(trajectory.c_n)) for trajectory in (fastest, plan)]
+    assert min(least) > problem.epsilon - SLACK
+    if objective == "margin":
+        assert least[1] > least[0]
+
+
+@pytest.mark.parametrize("objective", ["time", "effort", "margin"])
+def test_the_landing_is_carried_out_by_its_torques(objective: str) -> None:
+    plan = solve(landing(), objective, time_intervals=8)
+    report = verify(landing(), plan)
+    assert report.ok, report.to_text()
 
 
 def test_friction_never_pushes_the_wrong_way(stages: list[StageMotion]) -> None:
@@ -110,67 +253,50 @@ def test_some_limit_is_used_all_along(stages: list[StageMotion]) -> None:
         samples = stage.evaluate(instants(stage, 12))
         room = np.abs(problem.scene.torque_limit - np.abs(samples.tau)).min(axis=1)
         used.append(np.minimum(room, samples.c_n.min(axis=1) - problem.epsilon))
-    # Least time: the torque or the force of one finger is at its limit nearly everywhere.
-    assert np.mean(np.concatenate(used) < 0.02) > 0.75
+    # Least time: the torque or the force of one finger is near its limit nearly everywhere.
+    assert np.mean(np.concatenate(used) < 0.05) > 0.75
 
 
 def test_the_released_contact_opens(motions: list[TimeMotion]) -> None:
-    problem = landing()
-    (released,) = released_contacts(*problem.phases[4:])
-    assert released.name == "v3-finger1"
-    gaps = Formation(problem.scene, (released,))
+    gaps = make_formation(landing().scene, "v3-finger1")
     before, after = motions
     t = np.linspace(0.0, after.duration, 200)
     opening = np.array([measure_gaps(gaps, z)[0] for z in after.evaluate(t).z])
     assert abs(opening[0]) < 1e-9 and opening.min() > -1e-9
     assert opening[-1] > 1e-4
     # Held before, so it opens from zero speed, and it does not touch again.
-    assert (opening[20:] > 1e-6).all()
+    assert (opening[100:] > 1e-5).all() and (opening[20:] > 1e-7).all()
     held = [measure_gaps(gaps, z)[0] for z in before.evaluate(np.linspace(0, before.duration, 9)).z]
-    assert np.abs(held).max() < 1e-12
+    assert np.abs(held).max() < 1e-9
 
 
 def test_the_object_lands_at_rest_on_its_next_edge(motions: list[TimeMotion]) -> None:
-    problem, end = landing(), motions[-1].end
+    problem, (z, v) = landing(), motions[-1].stages[-1].points.nodes[-1]
     scene = problem.scene
     edge = Formation(scene, tuple(parse_contact(f"v{k}-palm", scene) for k in (1, 2)))
-    assert np.abs(measure_gaps(edge, end.z)).max() < 1e-9
-    assert end.z[2] == pytest.approx(scene.polygon.flush_angle(1), abs=1e-8)
+    assert np.abs(measure_gaps(edge, z)).max() < 1e-9
+    assert z[2] == pytest.approx(scene.polygon.flush_angle(1), abs=1e-8)
     # The solver's tolerance of 1e-8, of speeds of up to 20 rad/s.
-    np.testing.assert_allclose(end.v, 0.0, atol=1e-6)
+    np.testing.assert_allclose(v, 0.0, atol=1e-6)
     last = motions[-1].evaluate(motions[-1].duration - np.array([2e-3, 1e-3, 0.0]))
     heights = [measure_gaps(edge, z)[1] for z in last.z]
     assert heights[0] > heights[1] > 0
 
 
 def test_phases_are_joined_while_moving(motions: list[TimeMotion]) -> None:
-    before, after = motions
-    np.testing.assert_array_equal(before.end.z, after.stages[0].start.z)
-    np.testing.assert_array_equal(before.end.v, after.stages[0].start.v)
-    assert np.abs(before.end.v).max() > 1.0
+    before, after = (motion.stages for motion in motions)
+    end, start = before[-1].points.nodes[-1], after[0].points.nodes[0]
+    np.testing.assert_allclose(start, end, atol=1e-7)
+    assert np.abs(end[1]).max() > 1.0
 
 
 def test_the_torques_alone_carry_the_object_to_its_goal(stages: list[StageMotion]) -> None:
-    z, v = stages[0].start
+    z, v = stages[0].points.nodes[0]
     for stage in stages:
         z, v = integrate(stage, z, v)
         # The error of every stage so far, for a motion that nothing holds to its plan [m, rad].
-        np.testing.assert_allclose(z, stage.points.z[-1], atol=1e-5)
+        np.testing.assert_allclose(z, stage.points.nodes[-1, 0], atol=1e-5)
     np.testing.assert_allclose(v, 0.0, atol=1e-3)
-
-
-def test_finer_plans_are_replayed_more_exactly(coarse: list[PhasePlan[TimeMotion]]) -> None:
-    def miss(motions: list[TimeMotion]) -> float:
-        errors = [
-            np.abs(integrate(stage, *stage.start)[0] - stage.points.z[-1]).max()
-            for motion in motions
-            for stage in motion.stages
-        ]
-        return float(max(errors))
-
-    finer = miss(fastest_landing())
-    # From 6 intervals to the default, with another solution each time: no clean order.
-    assert finer < 0.3 * miss([plan.motion for plan in coarse])
 
 
 @pytest.mark.parametrize("which", ["time", "effort", "margin"])
@@ -183,11 +309,11 @@ def test_values_are_those_of_the_objective(
     if which == "effort":
         assert sum(plan.value for plan in gentle) == pytest.approx(effort(gentle), rel=1e-12)
         return
-    allowed = 2.0 * sum(plan.motion.duration for plan in coarse)
+    allowed = 2.0 * total(coarse)
     plans = plan_landing(objective="margin", time_intervals=COARSE, duration=allowed)
-    assert sum(plan.motion.duration for plan in plans) < allowed * (1 + 1e-8)
-    stages = [stage for plan in plans for stage in plan.motion.stages]
-    least = min(stage.evaluate(instants(stage, 12)).c_n.min() for stage in stages)
+    assert total(plans) < allowed * (1 + 1e-8)
+    samples = [stage.evaluate(instants(stage, 12)) for stage in stages_of(plans)]
+    least = min(part.c_n.min() for part in samples)
     assert plans[0].value == plans[1].value
     # Forces keep to it between points too, where limits are tightened a little too much.
     assert plans[0].value < least + SLACK
@@ -199,24 +325,37 @@ def test_the_effort_of_a_gentle_plan_is_least(
     coarse: list[PhasePlan[TimeMotion]], gentle: list[PhasePlan[TimeMotion]]
 ) -> None:
     assert effort(gentle) < 0.9 * effort(coarse)
-    times = [sum(plan.motion.duration for plan in plans) for plans in (coarse, gentle)]
-    assert times[0] < times[1]
-    stages = [stage for plan in gentle for stage in plan.motion.stages]
-    least = min(stage.evaluate(instants(stage, 12)).c_n.min() for stage in stages)
+    assert total(coarse) < total(gentle)
+    least = min(stage.evaluate(instants(stage, 12)).c_n.min() for stage in stages_of(gentle))
     assert least > landing().epsilon - SLACK
 
 
 def test_plans_are_the_same_every_time(coarse: list[PhasePlan[TimeMotion]]) -> None:
+    plan_landing.cache_clear()
     again = plan_landing(time_intervals=COARSE)
-
-    def tables(plans: list[PhasePlan[TimeMotion]]) -> list[Array]:
-        return [
-            table
-            for plan in plans
-            for stage in plan.motion.stages
-            for table in (*stage.points[1:], np.array([stage.duration]))
-        ]
-
-    for one, other in zip(tables(coarse), tables(again), strict=True):
-        np.testing.assert_array_equal(one, other)
+    assert again is not coarse
+    for one, other in zip(stages_of(coarse), stages_of(again), strict=True):
+        for before, after in zip(tables(one.points), tables(other.points), strict=True):
+            np.testing.assert_array_equal(before, after)
     assert [plan.iterations for plan in coarse] == [plan.iterations for plan in again]
+
+
+def test_a_motion_that_limits_forbid_is_no_plan() -> None:
+    problem, _ = shove()
+    weak = [replace(link, torque_limit=0.3) for link in problem.scene.fingers]
+    scene = replace(problem.scene, fingers=(weak[0], weak[1]))
+    phases = [
+        replace(phase, formation=Formation(scene, phase.formation.contacts))
+        for phase in problem.phases
+    ]
+    feeble = replace(problem, scene=scene, phases=tuple(phases))
+    with pytest.raises(InfeasibleError, match=r"phases 1 and 2 are infeasible: .* short"):
+        plan_phases(feeble, phases, feeble.start, PlanOptions(time_intervals=COARSE))
+
+
+def test_guesses_in_the_time_domain_start_where_curves_end() -> None:
+    problem = landing()
+    start = trace_phases(problem)[-1].end
+    plans = plan_landing(time_intervals=COARSE)
+    np.testing.assert_allclose(plans[0].motion.stages[0].points.nodes[0, 0], start, atol=1e-9)
+    np.testing.assert_allclose(plans[0].motion.stages[0].points.nodes[0, 1], 0.0, atol=1e-9)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from .advice import Limit, Shortfall, describe_changes, find_changes, rank_short
 from .errors import InfeasibleError, InputError, SolverError
 from .model import Array
 from .options import Objective
-from .problem import Phase, Problem, build_problem
+from .problem import Phase, Problem
 from .stage import Stage
 from .timelimits import Give
 from .timesearch import Search
@@ -133,9 +132,12 @@ def _list_of_stage(problem: Problem, stage: Stage, passed: float) -> list[Shortf
 
 def change_limit(problem: Problem, index: int, value: float) -> Problem:
     """The problem with another torque limit of finger 1 or 2 (index 0 or 1), or epsilon (2)."""
-    table: dict[str, Any] = copy.deepcopy(dict(problem.table))
     if index == 2:
-        table["epsilon"] = value
-    else:
-        table["fingers"][str(index + 1)]["torque_limit"] = value
-    return build_problem(table, problem.source)
+        return replace(problem, epsilon=value)
+    right, left = (
+        replace(link, torque_limit=value) if k == index else link
+        for k, link in enumerate(problem.scene.fingers)
+    )
+    scene = replace(problem.scene, fingers=(right, left))
+    phases = [replace(p, formation=replace(p.formation, scene=scene)) for p in problem.phases]
+    return replace(problem, scene=scene, phases=tuple(phases))
