@@ -43,6 +43,7 @@ def plan_phases(
     duration: float | None = None,
     *,
     explained: bool = True,
+    patient: bool = True,
 ) -> list[PhasePlan[TimeMotion]]:
     """Plan phases that are one NLP, from rest at `z` to rest.
 
@@ -57,6 +58,8 @@ def plan_phases(
         Longest duration of all these phases, for the objective `margin`.
     explained : bool
         Whether to look for a change that would make a plan possible, where there is none.
+    patient : bool
+        Whether to try further guesses where the first one leads nowhere.
 
     Raises
     ------
@@ -75,6 +78,12 @@ def plan_phases(
         return outline_stages(problem, phases, z, scheme, count, pace)
 
     first = outline(halvings, _PACES[0])
+    if options.solver != "ipopt":
+        search.solver = options.solver
+        solution = _solve(search, first, halvings)
+        if solution.success:
+            return _summarise(search, phases, solution)
+        search.solver = "ipopt"
     solution = _solve(search, first, halvings)
     if solution.success:
         return _summarise(search, phases, solution)
@@ -92,12 +101,12 @@ def plan_phases(
             solution = _solve(search, eased, times)
         if solution.success:
             return _summarise(search, phases, solution)
-        if not explained:
+        if not patient:
             break
 
     def replan(other: Problem) -> object:
         own = [other.phases[phase.index] for phase in phases]
-        return plan_phases(other, own, z, options, explained=False)
+        return plan_phases(other, own, z, options, explained=False, patient=False)
 
     raise explain(search, phases, eased, status, replan if explained else None)
 
@@ -138,7 +147,7 @@ def _summarise(
             Objective.EFFORT: options.time_weight * motion.duration + torque.integrate_squares(),
             Objective.MARGIN: search.problem.epsilon + solution.margin,
         }[search.goal]
-        plans.append(PhasePlan(motion, torque, value, 0, 0, 0.0, 0.0))
+        plans.append(PhasePlan(motion, torque, value, 0, 0, 0.0, 0.0, search.solver))
     plans[0] = plans[0]._replace(
         iterations=effort.iterations,
         solves=effort.solves,
