@@ -115,25 +115,27 @@ def assess_struck(
     duration : float or None, [s]
         Longest duration of the block, for the objective `margin`.
     """
+    ends = [k + 1 for k, phase in enumerate(block) if phase.end is End.IMPACT]
+    metric = metric_weights(problem.scene)
+    speeds = {k: float(np.sqrt(metric @ _last_state(plans[k - 1])[1] ** 2)) for k in ends}
+    stops = [k for k in ends if speeds[k] < AT_REST]
     found = []
-    start = plans[0].motion.evaluate(np.zeros(1)).z[0]
-    for k, phase in enumerate(block):
-        if phase.end is not End.IMPACT:
+    for k in ends:
+        phase, following = block[k - 1], block[k]
+        if k in stops:
+            found.append(_describe_stop(phase, following, plans[k - 1]))
             continue
-        z, v = _last_state(plans[k])
-        metric = metric_weights(problem.scene)
-        speed = float(np.sqrt(metric @ v**2))
-        if speed < AT_REST:
-            found.append(_describe_stop(phase, block[k + 1], plans[k]))
-            continue
-        impact = strike(phase.formation, block[k + 1].formation, z, v / speed)
+        z, v = _last_state(plans[k - 1])
+        impact = strike(phase.formation, following.formation, z, v / speeds[k])
         contact, impulse = impact.least
         ratio = float(np.sqrt(metric @ impact.v**2))
-        saves = _find_saving(problem, block, k + 1, start, plans, options, duration)
+        begin = max((stop for stop in stops if stop < k), default=0)
+        end = min((stop for stop in stops if stop > k), default=len(block))
+        share = None if duration is None else duration * (end - begin) / len(block)
+        saves = _find_saving(problem, block[begin:end], k - begin, plans[begin:end], options, share)
+        until = str(phase.until)
         found.append(
-            Transition(
-                phase.number, str(phase.until), True, "", ratio, impulse, contact, speed, saves
-            )
+            Transition(phase.number, until, True, "", ratio, impulse, contact, speeds[k], saves)
         )
     return found
 
@@ -153,12 +155,12 @@ def _find_saving(
     problem: Problem,
     block: Sequence[Phase],
     at: int,
-    z: Array,
     plans: Sequence[PhasePlan[Motion]],
     options: PlanOptions,
     duration: float | None,
 ) -> float:
-    """What a stop before phase `at` of a block would cost; NaN if it has no plan."""
+    """What a stop before phase `at` of phases in motion would cost; NaN if it has no plan."""
+    z = plans[0].motion.evaluate(np.zeros(1)).z[0]
     try:
         stopped = _plan_stops(problem, block, z, options, duration, [at], explained=False)
     except (InfeasibleError, SolverError):
