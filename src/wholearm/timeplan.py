@@ -70,12 +70,16 @@ def plan_phases(
     wanted = options.time_intervals or _choose_intervals(phases)
     halvings = max(0, math.ceil(math.log2(wanted / FIRST)))
 
-    def outline(times: int, pace: float) -> list[Stage]:
+    def outline(times: int, pace: float, onwards: bool = False) -> list[Stage]:
         count = math.ceil(wanted / 2**times)
-        return outline_stages(problem, phases, z, scheme, count, pace)
+        return outline_stages(problem, phases, z, scheme, count, pace, onwards)
 
     first = outline(halvings, _PACES[0])
     solution = _solve(search, first, halvings)
+    ahead = [] if solution.success else outline(halvings, _PACES[0], onwards=True)
+    if 0 < len(ahead) < len(first):
+        other = _solve(search, ahead, halvings)
+        solution = other if other.success else solution
     if solution.success:
         return _summarise(search, phases, solution)
     from .timeexplain import ease, explain, list_shortfalls
