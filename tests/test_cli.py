@@ -3,6 +3,7 @@ from __future__ import annotations
 import copy
 import json
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -103,6 +104,62 @@ def test_solve_writes_the_plan(folder: Path, capsys: pytest.CaptureFixture[str])
 def test_solve_names_its_output_after_the_problem(folder: Path) -> None:
     assert main(["solve", str(HEPTAGON), "--intervals", "20"]) == 0
     assert [path.name for path in folder.iterdir()] == ["heptagon_four_contacts.npz"]
+
+
+def test_solve_with_fatrop(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["-o", "a.npz", "--json", "--intervals", "40"]
+    metas = []
+    for solver in ("ipopt", "fatrop"):
+        assert main(["solve", str(HEPTAGON), "--solver", solver, *options]) == 0
+        metas.append(json.loads(capsys.readouterr().out))
+        assert metas[-1]["solver"] == solver and load_trajectory("a.npz").meta["solver"] == solver
+    # Both tighten limits until they are kept to 5e-7 between nodes, not by the same.
+    assert metas[1]["value"] == pytest.approx(metas[0]["value"], rel=2e-6)
+
+
+def test_solve_lists_the_impacts(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    impacts = str(HEPTAGON.with_name("heptagon_impact.toml"))
+    assert main(["solve", impacts, "-o", "a.npz", "--intervals", "40"]) == 0
+    out, err = capsys.readouterr()
+    lines = out.splitlines()
+    assert err == "" and lines[6] == lines[12] == ""
+    assert lines[7].split("  ")[0].strip() == "after phase" and lines[7].endswith("saves [s]")
+    rows = load_trajectory("a.npz").meta["transitions"]
+    for line, row in zip(lines[8:12], rows, strict=True):
+        cells = line.split()
+        assert int(cells[0]) == row["phase"]
+        assert float(cells[1]) == pytest.approx(row["velocity_ratio"], abs=5e-7)
+        assert float(cells[2]) == pytest.approx(row["least_impulse"], abs=5e-7)
+        assert cells[3] == row["least_impulse_contact"]
+        assert float(cells[4]) == pytest.approx(row["speed"], abs=5e-7)
+        if row["possible"]:
+            assert float(cells[5]) == pytest.approx(row["saves"], abs=5e-7)
+        else:
+            assert cells[5] == "-" and line.endswith(f"stops: {row['reason']}")
+    assert main(["verify", impacts, "a.npz"]) == 0
+    assert "least impulse [N s]" in capsys.readouterr().out
+
+
+def test_an_impulse_that_pulls_has_exit_status_1(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Torques that the rough finger would make good, on the smooth one."""
+    impacts = HEPTAGON.with_name("heptagon_impact.toml")
+    assert main(["solve", str(impacts), "-o", "a.npz", "--objective", "effort"]) == 0
+    text = impacts.read_text(encoding="utf-8").replace("finger1 = 0.4", "finger1 = 0.33")
+    Path("smooth.toml").write_text(text)
+    capsys.readouterr()
+    assert main(["verify", "smooth.toml", "a.npz"]) == 1
+    assert re.search(
+        r"impulse on v1-palm would be -\S+ N s in the impact at t = \S+ s, phase 2",
+        capsys.readouterr().out,
+    )
+
+
+def test_impacts_are_for_curves(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    impacts = str(HEPTAGON.with_name("heptagon_impact.toml"))
+    text = fails(capsys, 2, "solve", impacts, "--transcription", "time")
+    assert text.startswith(f"{impacts}: phases[1].end: 'impact' given, but impacts are planned")
 
 
 @pytest.mark.parametrize("objective", ["time", "effort", "margin"])
@@ -277,6 +334,11 @@ def test_output_that_is_a_device(capsys: pytest.CaptureFixture[str]) -> None:
         (["slove"], "invalid choice: 'slove'"),
         (["solve"], "problem"),
         (["solve", str(HEPTAGON), "--speed", "3"], "unrecognized arguments: --speed 3"),
+        (["solve", str(HEPTAGON), "--solver", "snopt"], "solver: 'snopt' given; allowed are ipopt"),
+        (
+            ["solve", str(HEPTAGON), "--solver", "fatrop", "--objective", "margin"],
+            "solver: 'fatrop' is for time and effort; margin needs ipopt",
+        ),
         (["solve", str(HEPTAGON), "--intervals", "ten"], "invalid int value: 'ten'"),
         (["solve", str(HEPTAGON), "--intervals", "5"], "intervals: 5 is not a whole number of 10"),
         (["solve", str(HEPTAGON), "--objective", "fun"], "objective: 'fun' given; allowed are"),
@@ -296,7 +358,9 @@ def test_bad_arguments(
 
 def test_a_duration_below_the_least_time(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["solve", str(HEPTAGON), "--objective", "margin", "--duration", "0.3"]
-    assert "duration = 0.3 s is not longer than the least time" in fails(capsys, 1, *arguments)
+    message = fails(capsys, 1, *arguments)
+    assert "duration = 0.3 s is not longer than the least time" in message
+    assert "; feasible with duration = 0.50" in message
     assert list(folder.iterdir()) == []
 
 
@@ -410,7 +474,7 @@ def test_interrupting_leaves_nothing(
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("wholearm.plan.plan_path", interrupt)
+    monkeypatch.setattr("wholearm.plan.plan_chain", interrupt)
     assert main(["solve", str(HEPTAGON)]) == 130
     assert capsys.readouterr().err == "wholearm: interrupted\n"
     assert list(folder.iterdir()) == []

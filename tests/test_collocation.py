@@ -4,48 +4,68 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from wholearm.collocation import radau
+from wholearm.collocation import make_scheme
 
+NAMES = ["radau", "legendre"]
 DEGREES = [1, 2, 3, 4, 5, 6]
 ROOT = np.sqrt(6.0)
 
 
 @pytest.mark.parametrize(
-    "degree, points",
+    "name, degree, points",
     [
-        (1, [1.0]),
-        (2, [1 / 3, 1.0]),
-        (3, [(4 - ROOT) / 10, (4 + ROOT) / 10, 1.0]),
+        ("radau", 1, [1.0]),
+        ("radau", 2, [1 / 3, 1.0]),
+        ("radau", 3, [(4 - ROOT) / 10, (4 + ROOT) / 10, 1.0]),
         # To the six digits that tables of the nodes on [-1, 1] print.
-        (4, [(1 - 0.822824) / 2, (1 - 0.181066) / 2, (1 + 0.575319) / 2, 1.0]),
+        ("radau", 4, [(1 - 0.822824) / 2, (1 - 0.181066) / 2, (1 + 0.575319) / 2, 1.0]),
+        ("legendre", 1, [0.5]),
+        ("legendre", 2, [0.5 - np.sqrt(3) / 6, 0.5 + np.sqrt(3) / 6]),
+        ("legendre", 3, [0.5 - np.sqrt(15) / 10, 0.5, 0.5 + np.sqrt(15) / 10]),
     ],
 )
-def test_points_are_the_tabulated_ones(degree: int, points: list[float]) -> None:
-    np.testing.assert_allclose(radau(degree).points, points, atol=3e-7 if degree > 3 else 1e-14)
+def test_points_are_the_tabulated_ones(name: str, degree: int, points: list[float]) -> None:
+    got = make_scheme(name, degree).points
+    np.testing.assert_allclose(got, points, atol=3e-7 if degree > 3 else 1e-14)
 
 
-def test_two_and_three_stages_have_butchers_coefficients() -> None:
+@pytest.mark.parametrize("degree", DEGREES)
+def test_legendre_points_and_weights_are_those_of_gauss(degree: int) -> None:
+    x, weights = np.polynomial.legendre.leggauss(degree)
+    scheme = make_scheme("legendre", degree)
+    np.testing.assert_allclose(scheme.points, (x + 1) / 2, atol=1e-14)
+    # Inverting the powers enlarges rounding a little.
+    np.testing.assert_allclose(scheme.weights, weights / 2, atol=1e-13)
+
+
+def test_schemes_have_butchers_coefficients() -> None:
     two = [[5 / 12, -1 / 12], [3 / 4, 1 / 4]]
-    np.testing.assert_allclose(radau(2).integrals, two, atol=1e-15)
+    np.testing.assert_allclose(make_scheme("radau", 2).integrals, two, atol=1e-15)
     three = [
         [(88 - 7 * ROOT) / 360, (296 - 169 * ROOT) / 1800, (-2 + 3 * ROOT) / 225],
         [(296 + 169 * ROOT) / 1800, (88 + 7 * ROOT) / 360, (-2 - 3 * ROOT) / 225],
         [(16 - ROOT) / 36, (16 + ROOT) / 36, 1 / 9],
     ]
-    np.testing.assert_allclose(radau(3).integrals, three, atol=1e-14)
+    np.testing.assert_allclose(make_scheme("radau", 3).integrals, three, atol=1e-14)
+    gauss = [[1 / 4, 1 / 4 - np.sqrt(3) / 6], [1 / 4 + np.sqrt(3) / 6, 1 / 4]]
+    np.testing.assert_allclose(make_scheme("legendre", 2).integrals, gauss, atol=1e-15)
 
 
 @pytest.mark.parametrize("degree", DEGREES)
-def test_points_increase_and_end_at_one(degree: int) -> None:
-    scheme = radau(degree)
-    assert scheme.degree == degree == len(scheme.points)
-    assert scheme.points[0] > 0 and (np.diff(scheme.points) > 0).all() and scheme.points[-1] == 1.0
-    assert radau(degree) is scheme
+@pytest.mark.parametrize("name", NAMES)
+def test_points_increase_and_radau_ends_at_one(name: str, degree: int) -> None:
+    scheme = make_scheme(name, degree)
+    assert scheme.name == name and scheme.degree == degree == len(scheme.points)
+    assert scheme.points[0] > 0 and (np.diff(scheme.points) > 0).all()
+    assert scheme.ends == (name == "radau") == bool(scheme.points[-1] == 1.0)
+    assert scheme.points[-1] <= 1.0
+    assert make_scheme(name, degree) is scheme
 
 
 @pytest.mark.parametrize("degree", DEGREES)
-def test_integrals_are_exact_up_to_the_degree(degree: int) -> None:
-    scheme = radau(degree)
+@pytest.mark.parametrize("name", NAMES)
+def test_integrals_are_exact_up_to_the_degree(name: str, degree: int) -> None:
+    scheme = make_scheme(name, degree)
     for power in range(degree):
         exact = scheme.points ** (power + 1) / (power + 1)
         # Rounding, which inverting the powers enlarges a little.
@@ -55,40 +75,47 @@ def test_integrals_are_exact_up_to_the_degree(degree: int) -> None:
 
 
 @pytest.mark.parametrize("degree", DEGREES)
-def test_the_whole_interval_is_integrated_to_order_2d_minus_1(degree: int) -> None:
-    scheme = radau(degree)
-    weights = scheme.integrals[-1]
-    assert (weights > 0).all()
-    for power in range(2 * degree - 1):
-        assert weights @ scheme.points**power == pytest.approx(1 / (power + 1), abs=1e-13)
-    power = 2 * degree - 1
-    assert abs(weights @ scheme.points**power - 1 / (power + 1)) > 1e-7
+@pytest.mark.parametrize("name", NAMES)
+def test_the_whole_interval_is_integrated_to_the_order(name: str, degree: int) -> None:
+    scheme = make_scheme(name, degree)
+    assert scheme.order == {"radau": 2 * degree - 1, "legendre": 2 * degree}[name]
+    assert (scheme.weights > 0).all()
+    for power in range(scheme.order):
+        assert scheme.weights @ scheme.points**power == pytest.approx(1 / (power + 1), abs=1e-13)
+    power = scheme.order
+    assert abs(scheme.weights @ scheme.points**power - 1 / (power + 1)) > 1e-8
+    if scheme.ends:
+        np.testing.assert_allclose(scheme.integrals[-1], scheme.weights, atol=1e-14)
 
 
 @pytest.mark.parametrize("degree", DEGREES)
-def test_values_between_points_are_those_of_the_polynomial(degree: int) -> None:
-    scheme = radau(degree)
+@pytest.mark.parametrize("name", NAMES)
+def test_values_between_points_are_those_of_the_polynomial(name: str, degree: int) -> None:
+    scheme = make_scheme(name, degree)
     rng = np.random.default_rng(degree)
     polynomial = np.polynomial.Polynomial(rng.normal(size=degree))
-    places = [0.0, *(scheme.points[1:] + scheme.points[:-1]) / 2]
-    values = scheme.between @ polynomial(scheme.points)
-    np.testing.assert_allclose(values, polynomial(np.array(places)), atol=1e-12)
+    places = rng.uniform(0, 1, 9)
+    values = scheme.interpolate(places) @ polynomial(scheme.points)
+    np.testing.assert_allclose(values, polynomial(places), atol=1e-11)
+    np.testing.assert_allclose(scheme.interpolate(scheme.points), np.eye(degree), atol=1e-11)
 
 
-@pytest.mark.parametrize("degree, counts", [(1, (64, 128)), (2, (8, 16)), (3, (4, 8)), (4, (3, 6))])
-def test_a_linear_equation_is_integrated_with_order_2d_minus_1(
-    degree: int, counts: tuple[int, int]
+@pytest.mark.parametrize("degree, counts", [(1, (64, 128)), (2, (8, 16)), (3, (4, 8)), (4, (2, 4))])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_linear_equation_is_integrated_to_the_order(
+    name: str, degree: int, counts: tuple[int, int]
 ) -> None:
     rate = np.array([[-0.4, 2.0], [-2.0, -0.1]])
-    scheme = radau(degree)
+    scheme = make_scheme(name, degree)
     errors = []
     for count in counts:
         h, x = 1.0 / count, np.array([1.0, 0.5])
         system = np.eye(2 * degree) - h * np.kron(scheme.integrals, rate)
         for _ in range(count):
-            x = np.linalg.solve(system, np.tile(x, degree)).reshape(degree, 2)[-1]
+            points = np.linalg.solve(system, np.tile(x, degree)).reshape(degree, 2)
+            x = x + h * scheme.weights @ points @ rate.T
         errors.append(np.abs(x - expm(rate) @ [1.0, 0.5]).max())
     slope = np.log2(errors[0] / errors[1])
     # Two step sizes only, so the next term of the error still shows.
-    assert slope == pytest.approx(2 * degree - 1, abs=0.3)
+    assert slope == pytest.approx(scheme.order, abs=0.3)
     assert errors[1] < 2e-2

@@ -64,6 +64,11 @@ def test_the_grid_in_the_time_domain_is_kept(transcription: str, degree: int) ->
         ("transcription", "path"),
         ("transcription", ""),
         ("transcription", None),
+        ("solver", "snopt"),
+        ("solver", "Ipopt"),
+        ("solver", None),
+        # Margins need Ipopt.
+        ("solver", "fatrop"),
     ],
 )
 def test_bad_options_are_named(key: str, given: Any) -> None:
@@ -72,6 +77,14 @@ def test_bad_options_are_named(key: str, given: Any) -> None:
         PlanOptions(**options)
     assert caught.value.key == key and caught.value.exit_status == 2
     assert repr(given) in str(caught.value)
+
+
+def test_fatrop_is_for_time_and_effort_along_curves() -> None:
+    for objective in ("time", "effort"):
+        assert PlanOptions(objective, solver="fatrop").solver == "fatrop"
+    assert PlanOptions().solver == "ipopt"
+    with pytest.raises(InputError, match=r"solver: 'fatrop' .*; the time domain needs ipopt"):
+        PlanOptions(solver="fatrop", transcription="time")
 
 
 @pytest.mark.parametrize("objective", ["time", "effort"])

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plane import make_formation, measure_gaps, measure_slip
+from plane import make_formation, measure_gaps, measure_slip, rotate
+from tipping import roll
 from wholearm.contact import parse_contact
 from wholearm.curve import Curve
 from wholearm.errors import InputError
@@ -21,7 +22,6 @@ from wholearm.outline import (
     load,
     outline_curve,
     outline_phase,
-    released_contacts,
 )
 from wholearm.path import trace_phase, until_distance
 from wholearm.problem import End, Phase, Problem, Until
@@ -155,14 +155,6 @@ def test_a_release_is_guessed_before_the_curve_ends(
     assert length == pytest.approx(RELEASE_AT * whole.length, rel=1e-3)
 
 
-def test_released_contacts_are_those_that_the_next_phase_lacks(landing: Problem) -> None:
-    names = [
-        [contact.name for contact in released_contacts(*pair)]
-        for pair in zip(landing.phases, [*landing.phases[1:], None], strict=True)
-    ]
-    assert names[3:] == [["v0-finger2"], ["v3-finger1"], []]
-
-
 @pytest.mark.parametrize("row, value", [(0, 0.02), (2, -0.9)])
 def test_a_coordinate_can_be_what_ends_a_phase(
     landing: Problem, released: Array, row: int, value: float
@@ -179,7 +171,7 @@ def test_closing_moves_as_little_as_possible(landing: Problem, released: Array) 
     rng = np.random.default_rng(4)
     for _ in range(5):
         away = released + 1e-4 * rng.normal(size=5)
-        z = close(formation, away)
+        z = close(formation, away, np.zeros(0))
         assert z is not None and np.abs(measure_gaps(formation, z)).max() < 1e-12
         kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
         scale = formation.scene.polygon.gyration_radius ** np.array([0, 0, 1, 1, 1])
@@ -189,8 +181,25 @@ def test_closing_moves_as_little_as_possible(landing: Problem, released: Array) 
         assert np.abs(free @ moved).max() < 1e-2 * np.linalg.norm(moved)
 
 
+def test_closing_keeps_what_has_rolled_by(landing: Problem, released: Array) -> None:
+    formation = roll(landing.phases[5].formation, "v1-palm")
+    vertex = formation.scene.polygon.vertices[1]
+
+    def place(z: Array) -> float:
+        return float(z[0] + rotate(z[2], vertex)[0])
+
+    slip = formation.evaluate_slip(released[None])[0]
+    z = close(formation, released + [0.0, 0.0, -0.1, 0.0, 0.0], slip)
+    assert z is not None and np.abs(measure_gaps(formation, z)).max() < 1e-12
+    # The vertex on the palm stays where it was, and the object turns about it.
+    assert place(z) == pytest.approx(place(released), abs=1e-12)
+    assert z[2] < released[2] - 0.01
+    part = outline_phase(landing, Phase(5, formation, landing.phases[5].until), released)[-1]
+    assert max(abs(place(z) - place(released)) for z in part.z) < 1e-12
+
+
 def test_closing_what_cannot_touch_gives_nothing(landing: Problem, released: Array) -> None:
-    assert close(landing.phases[5].formation, released, (1, 1.0)) is None
+    assert close(landing.phases[5].formation, released, np.zeros(0), (1, 1.0)) is None
 
 
 @pytest.mark.parametrize(

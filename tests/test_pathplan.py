@@ -16,19 +16,23 @@ from conftest import HEPTAGON
 from plane import with_speed_limit
 from topp import PhasePlane
 from toys import Toy, constant
+from wholearm.chain import Chain, make_chain
+from wholearm.chainplan import plan_chain
 from wholearm.curve import Curve
 from wholearm.dynamics import inverse
 from wholearm.errors import InfeasibleError, JammingError, SolverError
 from wholearm.model import Array
 from wholearm.options import PlanOptions
+from wholearm.outline import load
 from wholearm.path import trace_phases
 from wholearm.pathmotion import PathMotion, directions_of
 from wholearm.pathnlp import build_path_nlp
-from wholearm.pathplan import plan_path
+from wholearm.pathplan import plan_curves, plan_path
 from wholearm.phaseplan import PhasePlan
 from wholearm.plan import solve
 from wholearm.problem import Problem, build_problem
 
+IMPACTS = HEPTAGON.with_name("heptagon_impact.toml")
 PHASES = range(5)
 OBJECTIVES = ["time", "effort", "margin"]
 EPSILON = 0.05
@@ -85,6 +89,100 @@ def test_least_time_agrees_with_the_phase_plane(curves: tuple[Curve, ...], phase
     # Its own error is of first order; extrapolation leaves some 1e-5.
     assert plan(curves[phase], "time", 320).value == pytest.approx(2 * fine - coarse, rel=2e-4)
     assert plan(curves[phase]).value == pytest.approx(fine, rel=2e-3)
+
+
+@pytest.mark.parametrize("epsilon", [0.6, 0.8])
+def test_a_phase_that_only_a_quick_motion_carries(
+    curves: tuple[Curve, ...], epsilon: float
+) -> None:
+    """Slow motions cannot press v1 on the palm so hard in phase 3."""
+    slow = with_speed_limit(curves[2], (0.3, 0.3))
+    with pytest.raises(InfeasibleError):
+        plan_path(slow, epsilon, PlanOptions(), 3)
+    coarse, fine = (PhasePlane(curves[2], epsilon, n).least_time() for n in (300, 600))
+    chosen = plan_path(curves[2], epsilon, PlanOptions(intervals=320), 3)
+    assert chosen.value == pytest.approx(2 * fine - coarse, rel=2e-4)
+
+
+# Phases that are run through one after the other.
+
+
+@pytest.fixture(scope="module")
+def chain() -> Chain:
+    """Three phases that impacts join."""
+    problem = load(str(IMPACTS))
+    return make_chain(problem.phases, trace_phases(problem)).split()[0]
+
+
+@cache
+def plan_joined(chain: Chain, objective: str, intervals: int) -> list[PhasePlan[PathMotion]]:
+    options = PlanOptions(objective=objective, intervals=intervals)
+    return plan_chain(chain, EPSILON, options, 0.5 if objective == "margin" else None)
+
+
+@pytest.mark.parametrize("intervals", [12, 80])
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_limits_hold_along_a_chain(chain: Chain, objective: str, intervals: int) -> None:
+    plans = plan_joined(chain, objective, intervals)
+    fractions = np.random.default_rng(6).uniform(0, 1, 50)
+    for chosen in plans:
+        samples = chosen.motion.evaluate(inner_times(chosen, fractions))
+        assert samples.c_n.min() >= EPSILON - 1e-6
+        assert np.abs(samples.tau).max() <= LIMIT + 1e-6
+        if objective == "margin":
+            assert samples.c_n.min() >= chosen.value - 1e-6
+    if objective == "margin":
+        assert sum(chosen.motion.duration for chosen in plans) <= 0.5 * (1 + 1e-6)
+
+
+def test_a_chain_is_one_problem(chain: Chain) -> None:
+    plans = plan_joined(chain, "time", 80)
+    assert [plan.solves > 0 for plan in plans] == [True, False, False]
+    assert all(plan.value == plan.motion.duration for plan in plans)
+    motions = [plan.motion for plan in plans]
+    speeds = [np.sqrt(motion.profile.b[[0, -1]]) for motion in motions]
+    assert speeds[0][0] == speeds[2][1] == 0.0
+    for before, after in pairwise(speeds):
+        assert before[1] == after[0] > 0.1
+    for one, other in pairwise(motions):
+        end, start = one.evaluate(np.array([one.duration])), other.evaluate(np.zeros(1))
+        np.testing.assert_allclose(start.z, end.z, rtol=0, atol=1e-12)
+
+
+def test_least_time_of_a_chain_agrees_with_the_phase_plane(chain: Chain) -> None:
+    coarse, fine = (PhasePlane(chain.paced, EPSILON, n).least_time() for n in (150, 300))
+    planned = sum(plan.value for plan in plan_joined(chain, "time", 320))
+    assert planned == pytest.approx(2 * fine - coarse, rel=2e-4)
+    assert sum(plan.value for plan in plan_joined(chain, "time", 80)) == pytest.approx(
+        planned, rel=5e-4
+    )
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_two_halves_are_one_whole(objective: str) -> None:
+    half, whole = Toy(constant(1.0, 0.5, 0.2)), Toy(constant(1.0, 0.5, 0.2), length=2.0)
+    options = PlanOptions(objective=objective, intervals=160)
+    duration = 6.0 if objective == "margin" else None
+    with half.in_place():
+        parts = plan_curves((half.curve, half.curve), half.epsilon, options, (1, 2), duration)
+    one = whole.plan(duration, objective=objective, intervals=320)
+    values = [part.value for part in parts]
+    value = values[0] if objective == "margin" else sum(values)
+    assert value == pytest.approx(one.value, rel=1e-4)
+    middle = float(np.sqrt(np.interp(1.0, one.motion.grid.s, one.motion.profile.b)))
+    assert np.sqrt(parts[0].motion.profile.b[-1]) == pytest.approx(middle, rel=1e-2)
+
+
+def test_a_chain_without_a_plan_names_the_phase(chain: Chain) -> None:
+    with pytest.raises(InfeasibleError) as caught:
+        plan_chain(chain, 1.0, PlanOptions(intervals=20))
+    found = re.match(
+        r"phases 1 to 3 are infeasible: c_n of (\S+) >= epsilon = 1 N is \S+ N short at "
+        r"t = \d\.\d{4} s \(x = .*? mm, phi = .*? deg\), phase ([123])",
+        str(caught.value),
+    )
+    assert found is not None, str(caught.value)
+    assert found[1] in chain.phases[int(found[2]) - 1].formation.names
 
 
 @pytest.mark.parametrize("phase", PHASES)

@@ -13,7 +13,7 @@ from conftest import HEPTAGON
 from plane import finger_gap, place_corners
 from wholearm.errors import InputError
 from wholearm.outline import load
-from wholearm.problem import Problem, build_problem, read_problem
+from wholearm.problem import End, Problem, build_problem, read_problem
 
 TEXT = HEPTAGON.read_text(encoding="utf-8")
 Edit = Callable[[dict[str, Any]], object]
@@ -203,6 +203,47 @@ def test_bad_input_names_the_key(edit: Edit, key: str, text: str) -> None:
         read_edited(edit)
     assert caught.value.key == key
     assert text in caught.value.problem
+
+
+def test_ends_are_read() -> None:
+    def edit(table: dict[str, Any]) -> None:
+        table["phases"][0]["end"], table["phases"][1]["end"] = "impact", "rest"
+
+    ends = [phase.end for phase in read_edited(edit).phases]
+    assert ends == [End.IMPACT, *4 * [End.REST]]
+
+
+@pytest.mark.parametrize(
+    "index, until, end, key, text",
+    [
+        (0, "v3-finger1", "bang", "end", "'bang' given; allowed are 'rest', 'smooth', 'impact'"),
+        (4, {"phi_deg": -50.0}, "impact", "end", "'impact' given, but the last phase ends at rest"),
+        (4, {"phi_deg": -50.0}, "smooth", "end", "'smooth' given, but the last phase ends at rest"),
+        (0, {"x": 0.02}, "impact", "end", "but until is x = 0.02 m, not a contact that is gained"),
+        (0, "v3-palm", "impact", "end", "but phase 2 does not have v3-palm"),
+        (2, "v3-palm", "smooth", "end", "'smooth' given, but phase 4 has v0-finger2 too"),
+        (0, None, "impact", "until", "is missing; only a phase with end = 'smooth' has none"),
+    ],
+)
+def test_bad_ends_name_the_key(index: int, until: object, end: str, key: str, text: str) -> None:
+    def edit(table: dict[str, Any]) -> None:
+        table["phases"][index] |= {"until": until, "end": end}
+        if until is None:
+            del table["phases"][index]["until"]
+
+    with pytest.raises(InputError) as caught:
+        read_edited(edit)
+    assert caught.value.key == f"phases[{index + 1}].{key}"
+    assert text in caught.value.problem and "\n" not in str(caught.value)
+
+
+def test_an_impact_adds_only_the_contact_gained() -> None:
+    def edit(table: dict[str, Any]) -> None:
+        table["phases"][0]["end"] = "impact"
+        table["phases"][1]["contacts"] = ["v0-palm", "v4-finger1", "v3-finger1", "v5-finger2"]
+
+    with pytest.raises(InputError, match="'impact' given, but phase 2 has v4-finger1 too"):
+        read_edited(edit)
 
 
 @pytest.mark.parametrize(

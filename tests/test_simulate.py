@@ -57,6 +57,8 @@ def test_imports_nothing_of_the_planner() -> None:
     planner = {
         "path",
         "curve",
+        "chain",
+        "chainplan",
         "pathmotion",
         "collocation",
         "pathplan",

@@ -1,7 +1,8 @@
-"""Plans made in the time domain, each of them once."""
+"""Plans made in the time domain, each of them once, and stages of motions that are known."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -11,6 +12,9 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from plane import accelerate
+from wholearm.collocation import Scheme
+from wholearm.dynamics import Directions
+from wholearm.formation import Formation
 from wholearm.model import Array
 from wholearm.options import PlanOptions
 from wholearm.outline import load
@@ -18,6 +22,7 @@ from wholearm.path import trace_phases
 from wholearm.phaseplan import PhasePlan
 from wholearm.plan import solve
 from wholearm.problem import Problem
+from wholearm.stage import StagePoints
 from wholearm.timemotion import StageMotion, TimeMotion
 from wholearm.timeplan import plan_phases
 from wholearm.trajectory import Trajectory
@@ -31,6 +36,7 @@ def landing() -> Problem:
     return load(str(HEPTAGON))
 
 
+@lru_cache(maxsize=32)
 def plan_landing(**options: Any) -> list[PhasePlan[TimeMotion]]:
     """Plan the flip's last formation and the landing, from rest to rest."""
     problem, duration = landing(), options.pop("duration", None)
@@ -50,26 +56,99 @@ def fastest_landing() -> list[TimeMotion]:
     return [motion for motion in motions if isinstance(motion, TimeMotion)]
 
 
+def total(plans: list[PhasePlan[TimeMotion]]) -> float:
+    """Duration of all phases [s]."""
+    return sum(plan.motion.duration for plan in plans)
+
+
+def stages_of(plans: list[PhasePlan[TimeMotion]]) -> list[StageMotion]:
+    return [stage for plan in plans for stage in plan.motion.stages]
+
+
+def tables(part: StagePoints) -> list[Array]:
+    """All that a stage consists of, as arrays."""
+    return [np.asarray(value, dtype=float) for value in part]
+
+
 def instants(stage: StageMotion, per_interval: int) -> Array:
     """Times inside the intervals of a stage, shape (n,) [s]: none where its torque may step."""
     inside = (np.arange(per_interval) + 0.5) / per_interval
-    places = np.arange(stage.intervals)[:, None] + inside
-    return np.asarray(places.ravel() * stage.duration / stage.intervals)
+    return np.asarray(stage.duration * stage.points.places(inside).ravel())
 
 
 def integrate(stage: StageMotion, z: Array, v: Array) -> tuple[Array, Array]:
     """Where the torques of a stage carry z and z', by plain Newton and Euler."""
     formation, (Xi, sigma) = stage.formation, stage.directions
-    breaks = stage.torque.breaks
 
-    def rate(t: float, state: Array) -> Array:
+    def rate(t: float, state: Array, stop: float) -> Array:
         # Just inside the piece, so that the later torque never answers at its end.
         tau = stage.torque.at(np.array([min(t, stop * (1 - 1e-14))]))[0]
         return np.append(state[5:], accelerate(formation, state[:5], state[5:], tau, Xi, sigma)[0])
 
     state = np.append(z, v)
-    for start, stop in pairwise(breaks):
-        run = solve_ivp(rate, (start, stop), state, method="DOP853", rtol=1e-9, atol=1e-11)
+    for start, stop in pairwise(stage.torque.breaks):
+        run = solve_ivp(
+            rate, (start, stop), state, method="DOP853", rtol=1e-9, atol=1e-11, args=(stop,)
+        )
         assert run.success
         state = run.y[:, -1]
     return state[:5], state[5:]
+
+
+Sampler = Callable[[Scheme, int], StagePoints]
+
+
+def drive(
+    formation: Formation, z: Array, tau: Array, signs: Directions, duration: float
+) -> Sampler:
+    """Motion from rest at `z` under a torque that is linear in time, by plain Newton and Euler.
+
+    Parameters
+    ----------
+    tau : ndarray, shape (2, 2), [N m]
+        At the start and at the end.
+
+    Returns
+    -------
+    callable
+        (scheme, number of intervals) -> StagePoints.
+    """
+
+    def torque(t: float) -> Array:
+        return np.asarray(tau[0] + (tau[1] - tau[0]) * t / duration)
+
+    def move(t: float, state: Array) -> tuple[Array, Array]:
+        return accelerate(formation, state[:5], state[5:], torque(t), *signs)
+
+    run = solve_ivp(
+        lambda t, state: np.append(state[5:], move(t, state)[0]),
+        (0.0, duration),
+        np.append(z, np.zeros(5)),
+        method="DOP853",
+        rtol=1e-12,
+        atol=1e-14,
+        max_step=duration / 40,
+        dense_output=True,
+    )
+    assert run.success
+
+    def sample(scheme: Scheme, count: int) -> StagePoints:
+        breaks = duration * np.arange(count + 1) / count
+        t = (breaks[:-1, None] + duration / count * scheme.points).ravel()
+        states = run.sol(t).T
+        answers = [move(*pair) for pair in zip(t, states, strict=True)]
+        shape = (count, scheme.degree, -1)
+        ends = np.array([[torque(t) for t in pair] for pair in pairwise(breaks)])
+        return StagePoints(
+            duration,
+            np.full(count, 1 / count),
+            run.sol(breaks).T.reshape(-1, 2, 5),
+            states[:, :5].reshape(shape),
+            states[:, 5:].reshape(shape),
+            np.array([a for a, _ in answers]).reshape(shape),
+            np.array([c for _, c in answers]).reshape(shape),
+            ends,
+            np.zeros(0),
+        )
+
+    return sample

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from wholearm.curve import Curve
@@ -10,26 +12,36 @@ from wholearm.model import Array
 from wholearm.pathmotion import directions_of
 
 
+def _look(curve: Curve, steps: int) -> tuple[Array, PathForces]:
+    """Steps of a curve, and the forces at their middles."""
+    places, owners = [], []
+    for index, segment in enumerate(curve.segments):
+        count = max(2, round(steps * (segment.stop - segment.start) / curve.length))
+        places.append(np.linspace(segment.start, segment.stop, count + 1))
+        owners.append(np.full(count, index))
+    middle = np.concatenate([(s[1:] + s[:-1]) / 2 for s in places])
+    directions = directions_of(curve, np.concatenate(owners))
+    forces = inverse(curve.formation, *curve.evaluate(middle)[:3], directions)
+    return np.concatenate([np.diff(s) for s in places]), forces
+
+
 class PhasePlane:
     """A curve in steps of constant a, with the limits kept at the middle of each step.
+
+    Several curves are run through one after the other, with the speed going on.
 
     A step has rows p a + q squeeze >= r(b). Eliminating the squeeze between each pair of rows with
     q of opposite signs leaves bounds of a; the largest b from which the end can still be reached is
     found backwards, and then the largest a is taken forwards.
     """
 
-    def __init__(self, curve: Curve, epsilon: float, steps: int) -> None:
-        places, owners = [], []
-        for index, segment in enumerate(curve.segments):
-            count = max(2, round(steps * (segment.stop - segment.start) / curve.length))
-            places.append(np.linspace(segment.start, segment.stop, count + 1))
-            owners.append(np.full(count, index))
-        self.h = np.concatenate([np.diff(s) for s in places])
-        middle = np.concatenate([(s[1:] + s[:-1]) / 2 for s in places])
-        point = curve.evaluate(middle)
-        directions = directions_of(curve, np.concatenate(owners))
-        forces: PathForces = inverse(curve.formation, *point[:3], directions)
-        formation = curve.formation
+    def __init__(self, curve: Curve | Sequence[Curve], epsilon: float, steps: int) -> None:
+        curves = [curve] if isinstance(curve, Curve) else list(curve)
+        parts = [_look(part, steps) for part in curves]
+        self.h = np.concatenate([h for h, _ in parts])
+        columns = zip(*(forces for _, forces in parts), strict=True)
+        forces = PathForces(*(np.concatenate(column) for column in columns))
+        formation = curves[0].formation
         limit, n_c = formation.scene.torque_limit, formation.n_contacts
 
         def hold(c: Array) -> Array:

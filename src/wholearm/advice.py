@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 DIGITS = 3
 """Significant digits of what is advised."""
-_BEYOND = (0.0, 0.005, 0.015)
-"""How far beyond the least change to try, relatively; a plan needs some room."""
+_BEYOND = (0.0, 0.005, 0.015, 0.05, 0.15, 0.5)
+"""How far beyond the least change to try, relatively: plans keep limits between nodes too."""
+_CLOSE = 0.02
+"""How much more than needed is good enough, relatively."""
 
 
 class Shortfall(NamedTuple):
@@ -99,14 +102,31 @@ def find_changes(
         least = find_least(index)
         if least is None:
             continue
-        tried = dict.fromkeys(
-            round_outwards(least * (1 + limit.sign * beyond), limit.sign) for beyond in _BEYOND
-        )
-        for value in tried:
-            if value >= 0 and can_plan(index, value):
-                changes.append(Change(limit, value))
-                break
+        value = _find_enough(least, limit.sign, partial(can_plan, index))
+        if value is not None:
+            changes.append(Change(limit, value))
     return changes
+
+
+def _find_enough(least: float, sign: int, can_plan: Callable[[float], bool]) -> float | None:
+    """A rounded value that can be planned with, as little beyond `least` as plans allow."""
+    failed: float | None = None
+    tried = (round_outwards(least * (1 + sign * beyond), sign) for beyond in _BEYOND)
+    for value in dict.fromkeys(tried):
+        if value < 0:
+            return None
+        if can_plan(value):
+            break
+        failed = value
+    else:
+        return None
+    while failed is not None and abs(value - failed) > _CLOSE * abs(value):
+        middle = round_outwards((value + failed) / 2, sign)
+        if can_plan(middle):
+            value = middle
+        else:
+            failed = middle
+    return value
 
 
 def describe_changes(changes: Sequence[Change]) -> str:

@@ -18,6 +18,7 @@ import numpy as np
 from .baseline_opti import plan_with_opti
 from .baseline_simulation import simulate_with_scipy
 from .benchreport import Row, write_results
+from .benchsolvers import measure_solvers
 from .curve import Curve
 from .errors import InputError
 from .events import Simulation
@@ -79,6 +80,7 @@ def run_bench(
         measure_planner,
         measure_simulator,
         measure_baseline,
+        measure_solvers,
         measure_parts,
     ]
     rows: list[Row] = []

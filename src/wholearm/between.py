@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .cones import hold_least, slip_margins
 from .model import Array
 from .pathdata import find_least
 from .stage import Stage
@@ -63,24 +64,24 @@ class Limits(NamedTuple):
         return np.asarray((np.hstack([self.c_n, self.cone]) > COARSE).any(axis=1))
 
 
-def find_misses(stage: Stage, motion: StageMotion, least: float) -> Limits:
+def find_misses(stage: Stage, motion: StageMotion, epsilon: float, margin: float = 0.0) -> Limits:
     """By how much limits are missed in each interval, at worst.
 
     Parameters
     ----------
-    least : float, [N]
-        Least c_n.
+    epsilon, margin : float, [N]
+        Least c_n, and what c_n but no friction cone has to exceed it by.
     """
     formation, inner = stage.formation, np.linspace(1e-9, 1 - 1e-9, LOOKS)
     places = stage.guess.places(inner).ravel()
     samples = motion.evaluate(places * motion.duration)
-    grip = formation.friction * samples.c_n - np.abs(samples.c_t)
+    grip = slip_margins(formation, samples.c_n - epsilon, samples.c_t)
     gaps = formation.evaluate_limits(samples.z)[:, list(stage.watched)]
     clear = CLEAR / 2 * np.isin(stage.watched, stage.released)
     later = (not stage.opens) | (places > 1 / 2)
     tables = (
-        samples.c_n - least,
-        grip[:, list(formation.rolling_rows)],
+        samples.c_n - (epsilon + margin),
+        grip,
         gaps - np.outer(later, clear),
     )
     shape = (stage.intervals, LOOKS)
@@ -107,6 +108,7 @@ def raise_bounds(
         if own.limits.presses.shape[1] <= 2:
             low_x[c_n] = floor[:, None]
         low[own.limits.presses] = floor[:, None]
-        low[own.limits.cones] = np.tile(raised.cone, 2)[:, None]
+        cushion = hold_least(formation, epsilon)[formation.n_contacts :]
+        low[own.limits.cones] = cushion + np.tile(raised.cone, 2)[:, None]
         low[own.watches] += raised.gap[:, None] / formation.scene.polygon.gyration_radius
     return low, high

@@ -10,8 +10,8 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NoReturn
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from .errors import InputError, WholearmError
 
@@ -66,6 +66,7 @@ def build_parser() -> argparse.ArgumentParser:
     solve.add_argument("--time-intervals", type=int, help="intervals of a phase in the time domain")
     solve.add_argument("--degree", type=int, help="collocation points of an interval there")
     solve.add_argument("--scheme", help="radau (the default) or legendre points")
+    solve.add_argument("--solver", help="ipopt or, for time and effort along curves, fatrop")
     solve.add_argument("--json", action="store_true", help="print the summary as JSON")
 
     verify = _command(commands, "verify", _verify, "replay torques open loop and check the motion")
@@ -157,8 +158,35 @@ def _summarise(trajectory: Trajectory, output: str) -> str:
         least = c_n[c_n == c_n].min()
         torque = abs(trajectory.tau[rows]).max()
         lines.append(f"{index + 1:>5}  {duration:>12.6f}  {least:>13.6f}  {torque:>19.6f}")
+    lines += _list_transitions(meta)
     value = f"{meta['objective']} = {meta['value']:.6f} {meta['value_unit']}"
     return "\n".join([*lines, f"{value}, {trajectory.duration:.6f} s in all; wrote {output}"])
+
+
+def _list_transitions(meta: Mapping[str, Any]) -> list[str]:
+    """Table of the impacts that a problem asks for; empty if it has none."""
+    transitions = meta["transitions"]
+    if not transitions:
+        return []
+    saves = f"saves [{meta['value_unit']}]"
+    width = len(saves)
+    lines = [
+        "",
+        f"{'after phase':>11}  {'velocity ratio':>14}  {'least impulse [N s per m/s]':>27}  "
+        f"{'speed [m/s]':>11}  {saves}",
+    ]
+    for row in transitions:
+        impulse = f"{_show(row['least_impulse'])} {row['least_impulse_contact']}"
+        lines.append(
+            f"{row['phase']:>11}  {_show(row['velocity_ratio']):>14}  {impulse:>27}  "
+            f"{_show(row['speed']):>11}  {_show(row['saves']):>{width}}"
+            + ("" if row["possible"] else f"  stops: {row['reason']}")
+        )
+    return [*lines, ""]
+
+
+def _show(value: float | None) -> str:
+    return "-" if value is None else f"{value:.6f}"
 
 
 def _verify(options: argparse.Namespace) -> int:

@@ -4,13 +4,13 @@ The parameter is the arc length s in metres, in the metric
 
     ds^2 = dx^2 + dy^2 + rho^2 (dphi^2 + dtheta_1^2 + dtheta_2^2),
 
-rho being the object's radius of gyration.
+rho being the object's radius of gyration, unless the curve has a pace of its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ REFINE = 3
 
 
 class CurvePoint(NamedTuple):
-    """A curve at n places: z, its unit tangent z_s and its curvature z_ss, each (n, 5).
+    """A curve at n places: z, its tangent z_s and its curvature z_ss, each (n, 5).
 
     `kinematics` is the formation there.
     """
@@ -104,6 +104,8 @@ class Curve:
         What happens at the end, in words.
     reached : bool
         Whether that is what the curve was traced for.
+    pace : float
+        Arc length per unit of the parameter s, hence the length of its tangents.
     """
 
     formation: Formation
@@ -111,15 +113,16 @@ class Curve:
     length: float
     ending: str
     reached: bool
+    pace: float = 1.0
 
     def evaluate(self, s: Array) -> CurvePoint:
-        """Return z, the unit tangent z_s and the curvature z_ss at arc lengths `s`, shape (n,)."""
+        """Return z, its tangent z_s and its curvature z_ss at the places `s`, shape (n,)."""
         z, tangent = self._interpolate(np.asarray(s, dtype=float))
         formation = self.formation
         kinematics = formation.evaluate(z, tangent)
         metric = metric_weights(formation.scene)
         z_s, z_ss = _solve_tangent(kinematics.P, kinematics.P_dot_v, tangent, metric)
-        return CurvePoint(z, z_s, z_ss, kinematics)
+        return CurvePoint(z, z_s * self.pace, z_ss * self.pace**2, kinematics)
 
     def _interpolate(self, s: Array) -> tuple[Array, Array]:
         starts = np.array([panel.s[0] for panel in self.panels])
@@ -130,6 +133,12 @@ class Curve:
             if mine.any():
                 z[mine], tangent[mine] = panel.interpolate(s[mine])
         return z, tangent
+
+    def at_pace(self, pace: float) -> Curve:
+        """Return the same curve with a parameter that runs through it at another pace."""
+        share = self.pace / pace
+        panels = tuple(Panel(share * panel.s, panel.z, panel.z_s) for panel in self.panels)
+        return replace(self, panels=panels, length=share * self.length, pace=pace)
 
     @property
     def start(self) -> Array:

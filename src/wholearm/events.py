@@ -30,6 +30,8 @@ class EventKind(Enum):
     """The torques jump."""
     ARRIVAL = "arrival"
     """The end of the phase is reached, and the next formation taken."""
+    IMPACT = "impact"
+    """The velocity jumps onto the next formation, which is taken if every contact presses."""
     RELEASE = "release"
     """The contacts that the next phase does not have are let go, and its formation is taken."""
     HELD = "held"
@@ -61,7 +63,8 @@ class Event:
     value : float
         Arrival: rate at which the distance to the phase's end closes [m/s or rad/s]; contact lost
         and release: the c_n that the contact would need [N]; slip: its margin mu c_n - |c_t| [N];
-        end: the distance to the phase's end [m or rad], NaN if that is a release; NaN otherwise.
+        impact: the least impulse, that of `contact` [N s]; end: the distance to the phase's end [m
+        or rad], NaN if that is a release; NaN otherwise.
     """
 
     time: float

@@ -34,10 +34,13 @@ class Arrival:
         How fast the distance to the phase's end closes.
     window : float, [s]
         If the next break of the torques is no further off, the arrival belongs to it.
+    strikes : bool
+        Whether it takes an impact to go on.
     """
 
     rate: float
     window: float
+    strikes: bool = False
 
 
 @dataclass(frozen=True)

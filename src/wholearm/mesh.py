@@ -9,6 +9,9 @@ from .collocation import Scheme
 from .model import Array
 from .stage import StagePoints
 
+_HAIR = 1e-12
+"""Share of a duration that rounding may move a place by."""
+
 
 def resample(
     part: StagePoints, scheme: Scheme, breaks: Array, begin: float = 0.0, stop: float = 1.0
@@ -53,7 +56,8 @@ def bisect(part: StagePoints, scheme: Scheme, marked: NDArray[np.bool_]) -> Stag
 def _interpolate(part: StagePoints, scheme: Scheme, places: Array) -> tuple[Array, ...]:
     """z, z', z'' and forces at shares of the duration, by the polynomials of the intervals."""
     count, degree = len(part.fractions), scheme.degree
-    k = np.clip(np.searchsorted(part.breaks, places, side="right") - 1, 0, count - 1)
+    # An interval's last point is its own, and not the next one's start: z'' and forces may step.
+    k = np.clip(np.searchsorted(part.breaks, places - _HAIR) - 1, 0, count - 1)
     x = (places - part.breaks[k]) / part.fractions[k]
     known = np.append(0.0, scheme.points)
     powers = np.arange(degree + 1)

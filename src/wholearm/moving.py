@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from .events import EventKind, Outcome, OutcomeKind
@@ -87,7 +89,8 @@ def _is_there(run: Replay, t: float) -> bool:
     """Whether the step just tried ends at the end of the phase, and at a torque break.
 
     By rounding a planned motion ends a little beyond the end of its phase, or has just turned back.
-    It has to be at rest there, or to reach a contact softly; a coordinate is passed at any speed.
+    It has to be at rest there, or to reach a contact softly; a coordinate is passed at any speed,
+    and an impact comes at any, with the step of the torques that goes with it, or as they end.
     """
     s = run.stepper
     if t != run.breaks[run.piece + 1] or abs(run.value(s.rows.until)) >= REACHED:
@@ -95,6 +98,9 @@ def _is_there(run: Replay, t: float) -> bool:
     speed = abs(float(s.outputs[s.to.until_rate]))
     if run.phase.end is End.SMOOTH:
         speed = speed if run.phase.until.contact else 0.0
+    elif run.phase.end is End.IMPACT:
+        coming = run.piece + 1
+        speed = 0.0 if coming >= len(run.steps_at) or run.steps_at[coming] else speed
     elif s.is_free:
         speed = float(np.abs(s.outputs[s.to.y][5:10]).max())
     held = s.outputs[s.to.events][: s.rows.cone.stop]
@@ -105,10 +111,10 @@ def _pass_break(run: Replay) -> Ending | None:
     """Go on to the next piece of the torques."""
     s = run.stepper
     if _is_there(run, run.t):
-        rate = float(s.outputs[s.to.until_rate])
+        arrival = Arrival(-float(s.outputs[s.to.until_rate]), SETTLING, _strikes(run))
         if run.piece + 2 < len(run.breaks):
             run.next_piece()
-        return Arrival(-rate, SETTLING)
+        return arrival
     if run.t >= run.breaks[-1]:
         return run.run_out()
     if not run.next_piece():
@@ -124,7 +130,7 @@ def _stop_at_event(run: Replay, start: Array, h: float) -> Ending | None:
     kinds = find_first(run, start, h)
     run.accept(run.t + float(s.inputs[s.at.h]))
     if rows.until in kinds:
-        return _pass_on(run) if run.phase.end is End.SMOOTH else _reach(run)
+        return _pass_on(run) if run.phase.end is End.SMOOTH or _strikes(run) else _reach(run)
     if rows.speed in kinds:
         if abs(run.value(rows.until)) >= REACHED:
             run.note(EventKind.REST, f"the object comes to rest {run.when()}")
@@ -146,14 +152,31 @@ def _reach(run: Replay) -> Arrival:
     """The end of the phase is reached while moving."""
     s = run.stepper
     rate = -float(s.outputs[s.to.until_rate])
-    heading = run.problem.scene.mass_diagonal * s.outputs[s.to.heading]
-    slowing = -float(heading @ s.outputs[s.to.acceleration])
-    speed = float(heading @ s.outputs[s.to.y][5:10])
     # A planned motion that comes this early by its error would have stopped v / a later.
-    window = min(2 * speed / slowing, LONGEST_WINDOW) if slowing > 0 else 0.0
+    stopping = 2 * _time_to_stop(run)
+    window = min(stopping, LONGEST_WINDOW) if stopping < math.inf else 0.0
     if abs(rate) < SLOW:
         window = max(window, SETTLING)
     return Arrival(rate, window)
+
+
+def _time_to_stop(run: Replay) -> float:
+    """Time in which the motion would stop at its present deceleration [s]."""
+    s = run.stepper
+    heading = run.problem.scene.mass_diagonal * s.outputs[s.to.heading]
+    slowing = -float(heading @ s.outputs[s.to.acceleration])
+    speed = float(heading @ s.outputs[s.to.y][5:10])
+    return speed / slowing if slowing > 0 else math.inf
+
+
+def _strikes(run: Replay) -> bool:
+    """Whether the phase ends with an impact here, and not at rest but for an error of the motion.
+
+    Where impulses do not allow an impact a planned motion stops instead.
+    """
+    rate = -float(run.stepper.outputs[run.stepper.to.until_rate])
+    stops = rate < SLOW or rate * _time_to_stop(run) / 2 < REACHED
+    return run.phase.end is End.IMPACT and not stops
 
 
 def _pass_on(run: Replay) -> Arrival:
@@ -165,7 +188,8 @@ def _pass_on(run: Replay) -> Arrival:
     s = run.stepper
     s.inputs[s.at.t] = run.t
     rate, window = -float(s.outputs[s.to.until_rate]), SETTLING
-    if run.phase.until.contact is not None:
+    strikes = run.phase.end is End.IMPACT
+    if run.phase.until.contact is not None and not strikes:
         run.step_to(SETTLING)
         slowing = (float(s.outputs[s.to.until_rate]) + rate) / SETTLING
         if slowing > 0:
@@ -173,4 +197,4 @@ def _pass_on(run: Replay) -> Arrival:
     if steps_within(run, window):
         coast(run, run.breaks[run.piece + 1], hide=False)
         run.next_piece()
-    return Arrival(rate, window)
+    return Arrival(rate, window, strikes)

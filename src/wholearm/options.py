@@ -28,6 +28,7 @@ CHOICES = tuple(
     choice.value for choice in Objective if choice not in (Objective.ELASTIC, Objective.RELAX)
 )
 """Objectives that a user can ask for."""
+SOLVERS = ("ipopt", "fatrop")
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,8 @@ class PlanOptions:
     samples : int
         Rows per phase of the trajectory file, at least 2.
     transcription : str
-        ``"auto"`` plans phases with one freedom that end at rest along their curve and others in
-        the time domain; ``"time"`` plans all in the time domain.
+        ``"auto"`` plans phases with one freedom that are joined at rest or by impacts along their
+        curves and others in the time domain; ``"time"`` plans all in the time domain.
     time_intervals : int, optional
         Intervals of each phase in the time domain, at least 4; when left out, 32 for a phase with
         one freedom that is planned alone and 16 for others.
@@ -56,6 +57,9 @@ class PlanOptions:
         Collocation points per interval in the time domain, from 2 to 6.
     scheme : str
         Which points: ``"radau"`` or ``"legendre"``.
+    solver : str
+        ``"ipopt"``, or ``"fatrop"`` for `time` and `effort` along curves; phases in the time
+        domain use Ipopt.
 
     Raises
     ------
@@ -72,6 +76,7 @@ class PlanOptions:
     time_intervals: int | None = None
     degree: int = 3
     scheme: str = "radau"
+    solver: str = "ipopt"
 
     def __post_init__(self) -> None:
         given = self.objective
@@ -92,6 +97,13 @@ class PlanOptions:
         if self.transcription not in ("auto", "time"):
             given = self.transcription
             raise InputError("", "transcription", f"{given!r} given; allowed are auto and time")
+        if self.solver not in SOLVERS:
+            allowed = " and ".join(SOLVERS)
+            raise InputError("", "solver", f"{self.solver!r} given; allowed are {allowed}")
+        if self.solver == "fatrop" and self.objective is Objective.MARGIN:
+            raise InputError("", "solver", "'fatrop' is for time and effort; margin needs ipopt")
+        if self.solver == "fatrop" and self.transcription == "time":
+            raise InputError("", "solver", "'fatrop' is for curves; the time domain needs ipopt")
         weight = require_number(self.time_weight, "time_weight", positive=True)
         object.__setattr__(self, "time_weight", weight)
         if self.duration is not None:

@@ -35,7 +35,7 @@ def trace_phases(problem: Problem) -> tuple[Curve, ...]:
     """Trace the curve of every phase, each from the end of the one before.
 
     Only as far as geometry alone says where a phase ends: up to the first that has more than one
-    freedom or does not end at rest.
+    freedom or passes smoothly into the next.
 
     Raises
     ------
@@ -53,8 +53,8 @@ def trace_phases(problem: Problem) -> tuple[Curve, ...]:
 
 
 def runs_on_curve(phase: Phase) -> bool:
-    """Whether a phase has one freedom and ends at rest."""
-    return phase.formation.n_constraints == 4 and phase.end is End.REST
+    """Whether a phase has one freedom and ends at rest or with an impact."""
+    return phase.formation.n_constraints == 4 and phase.end is not End.SMOOTH
 
 
 def trace_phase(problem: Problem, phase: Phase, z: Array) -> Curve:

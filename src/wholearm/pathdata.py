@@ -1,4 +1,4 @@
-"""What one phase gives the planner: forces along its curve, at nodes and between them.
+"""What phases give the planner: forces along their curves, at nodes and between them.
 
 Forces are evaluated at the nodes and at a few places of every interval, the knots. They are smooth
 there, so polynomials through the knots carry them to all places where limits are looked at.
@@ -6,6 +6,7 @@ there, so polynomials through the knots carry them to all places where limits ar
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,12 +47,29 @@ class Places(NamedTuple):
         return Places(PathForces(*(part[rows] for part in self.forces)), self.rates[rows])
 
 
+class Relaxation(NamedTuple):
+    """Which limit gives way when the relaxation grows, and how fast.
+
+    Attributes
+    ----------
+    worth : ndarray, shape (n_h + 3,), [N, N m, 1]
+        By how much H c >= least and |tau| <= limit give way per unit of it, and the square of a
+        speed limit, relative to that square.
+    finger : int or None
+        Whose speed limit that is.
+    """
+
+    worth: Array
+    finger: int | None = None
+
+
 class PhaseData(NamedTuple):
-    """What one phase gives the NLP.
+    """What one phase, or several that are joined, gives the NLP.
 
     Attributes
     ----------
     curve : Curve
+        The first one's where phases are joined.
     epsilon : float, [N]
     grid : Grid
     nodes : Places
@@ -94,12 +112,24 @@ class PhaseData(NamedTuple):
         spare[: self.curve.formation.n_contacts] += margin
         return np.hstack([held - spare, tau + limit, limit - tau])
 
-    def largest_b(self, places: Places) -> Array:
-        """Largest b that the joints' speed limits allow, shape (n,) [m^2/s^2]."""
+    def largest_b(self, places: Places, spared: int | None = None) -> Array:
+        """Largest b that the joints' speed limits allow, shape (n,) [m^2/s^2].
+
+        Without that of the joint `spared`, if one is given.
+        """
         limit = self.curve.formation.scene.speed_limit
+        if spared is not None:
+            limit[spared] = np.inf
         if np.isinf(limit).all():
             return np.full(len(places.rates), np.inf)
         return np.asarray(((limit / np.maximum(np.abs(places.rates), 1e-12)) ** 2).min(axis=1))
+
+    def relative_rates(self, places: Places, finger: int | None) -> Array:
+        """Rate of a joint over its speed limit, shape (n,) [s/m]; zero without a joint."""
+        if finger is None:
+            return np.zeros(len(places.rates))
+        limit = self.curve.formation.scene.speed_limit[finger]
+        return np.asarray(places.rates[:, finger] / limit)
 
     def spread(self, profile: Profile, fractions: Array) -> Profile:
         """The profile at `fractions` of every solid interval, interval by interval."""
@@ -181,6 +211,51 @@ def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
     looks = Places(PathForces(*(carry(part) for part in knots.forces)), carry(knots.rates))
     nodes = every.pick(slice(None, len(grid.s)))
     return PhaseData(curve, epsilon, grid, nodes, fine, knots, looks, solid)
+
+
+def join(parts: Sequence[PhaseData]) -> PhaseData:
+    """Put phases one after the other, each with as many nodes and as many sliding contacts.
+
+    Where two meet, the grid has an interval of length zero, as where a direction reverses.
+    """
+    starts = np.cumsum([0.0, *(part.grid.s[-1] for part in parts)])
+    segments = np.cumsum([0, *(part.grid.segment[-1] + 1 for part in parts)])
+    nodes = np.cumsum([0, *(len(part.grid.s) for part in parts)])
+
+    def chain(arrays: Iterable[NDArray[Any]], firsts: NDArray[Any]) -> Any:
+        pairs = zip(arrays, firsts[:-1], strict=True)
+        return np.concatenate([array + first for array, first in pairs])
+
+    def stack(places: Sequence[Places]) -> Places:
+        columns = zip(*(own.forces for own in places), strict=True)
+        forces = PathForces(*(np.concatenate(column) for column in columns))
+        return Places(forces, np.concatenate([own.rates for own in places]))
+
+    return parts[0]._replace(
+        grid=Grid(
+            chain((part.grid.s for part in parts), starts),
+            chain((part.grid.segment for part in parts), segments),
+        ),
+        nodes=stack([part.nodes for part in parts]),
+        knots=stack([part.knots for part in parts]),
+        looks=stack([part.looks for part in parts]),
+        solid=chain((part.solid for part in parts), nodes),
+    )
+
+
+def name_phases(phases: Sequence[int], what: str = "") -> str:
+    """One phase or several, for messages, and that they are `what`."""
+    if len(phases) == 1:
+        return f"phase {phases[0]} is {what}" if what else f"phase {phases[0]}"
+    several = f"phases {phases[0]} to {phases[-1]}"
+    return f"{several} are {what}" if what else several
+
+
+def cut(parts: Sequence[PhaseData], profile: Profile) -> list[Profile]:
+    """Return the profile of each of several joined phases."""
+    ends = np.cumsum([len(part.grid.s) for part in parts])[:-1]
+    columns = (np.split(values, ends) for values in profile)
+    return [Profile(*own) for own in zip(*columns, strict=True)]
 
 
 def choose_fineness(nodes: int) -> Fineness:

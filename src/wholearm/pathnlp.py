@@ -1,18 +1,8 @@
-"""The planning NLP of one-freedom phases, in the path domain.
+"""The planning NLP of one-freedom phases in the path domain: building, bounds, packing.
 
-On a curve z(s) everything is affine in a = s'', b = s'^2 and the squeeze lambda, but for viscous
-friction (`wholearm.dynamics.PathForces`). At the nodes s_k of a grid the unknowns are a_k, b_k and
-lambda_k; between two nodes a and lambda are linear in s, and b' = 2 a (dash: d/ds) is then exact:
-
-    b_k+1 = b_k + (s_k+1 - s_k) (a_k + a_k+1),
-    H c >= least,  |tau| <= limit at every node,
-    T = sum of 2 (s_k+1 - s_k) / (sqrt(b_k) + sqrt(b_k+1)).
-
-H c are the normal forces, and the friction cones of contacts that roll (`wholearm.cones`).
-
-Where a direction reverses, the grid has an interval of length zero: b is the same on its two sides,
-a and lambda may jump. So one NLP, built once for some contacts, intervals and an objective, serves
-every phase: grid, coefficients and limits are its parameters and bounds.
+`wholearm.pathterms` has its expressions. Built once for some contacts, intervals and an objective,
+it serves every phase: grid, coefficients and limits are its parameters and bounds. Phases that
+impacts join have an interval of length zero between them (`wholearm.chain`).
 """
 
 from __future__ import annotations
@@ -29,17 +19,12 @@ from numpy.typing import NDArray
 from .contact import Expression
 from .ipopt import build_solver
 from .model import Array
+from .nodechain import stage
 from .options import Objective
-from .pathdata import PhaseData
+from .pathdata import PhaseData, Relaxation
 from .pathmotion import Grid, Profile
+from .pathterms import CHAINED, LEAST_B, Terms, count_extras, write_terms
 
-_CALM = 1e-4
-"""Weight of the squeeze against the objective: picks one among equally good ones."""
-_SMOOTH = 1e-5
-"""Weight of changes of a and lambda: rules out ripple that the objective does not see."""
-
-_LEAST_B = 1e-8
-"""Least b away from rest, in units of the typical one; keeps the square root differentiable."""
 _MU = 1e-2
 """Complementarity of the first guess's multipliers: the barrier parameter to start from."""
 
@@ -98,7 +83,7 @@ class PathNLP:
 
     Attributes
     ----------
-    solver : casadi.Function
+    solver : casadi.Function or wholearm.nodechain.StagedSolver
         Takes x0, p, bounds and multipliers; see `build_path_nlp` for their order.
     n_contacts, n_rolling, intervals : int
     objective : Objective
@@ -119,8 +104,18 @@ class PathNLP:
 
     @property
     def columns(self) -> int:
-        """Unknowns per node: b, a, squeeze, and one shortfall per limit when elastic."""
-        return 3 + (self.n_held + 2 if self.objective is Objective.ELASTIC else 0)
+        """Unknowns per node: b, a, squeeze, and what the objective adds."""
+        return 3 + count_extras(self.objective, self.n_held)
+
+    @property
+    def links(self) -> int:
+        """Equations per interval."""
+        return 2 if self.objective in CHAINED else 1
+
+    @property
+    def first(self) -> int:
+        """The first of the rows that belong to nodes."""
+        return self.links * self.intervals + 2
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
@@ -132,79 +127,45 @@ class PathNLP:
 
 @lru_cache(maxsize=16)
 def build_path_nlp(
-    n_contacts: int, intervals: int, objective: Objective, n_rolling: int = 0
+    n_contacts: int,
+    intervals: int,
+    objective: Objective,
+    n_rolling: int = 0,
+    solver: str = "ipopt",
 ) -> PathNLP:
     """Build the NLP for every phase of so many contacts, of which so many roll.
 
-    The unknowns are (b, a, squeeze, shortfalls) node by node, without b at the two ends, then the
-    least margin for the objective `margin`. The parameters are the speeds at the ends, the steps,
-    the weight of time, and the coefficients of `PathForces` but for C0 and T0, which are part of
-    the bounds. The constraints are the N rows of b' = 2 a, the changes of a over the first and the
-    last interval, H c and tau node by node, and T for `margin`.
+    See `wholearm.pathterms` for its unknowns, parameters and rows.
     """
     started = time.perf_counter()
-    n, n_held = intervals + 1, n_contacts + 2 * n_rolling
-    m = n_held + 2
-    elastic = objective is Objective.ELASTIC
-    b_inner, ends = ca.SX.sym("b", n - 2), ca.SX.sym("ends", 2)
-    a, squeeze = ca.SX.sym("a", n), ca.SX.sym("squeeze", n)
-    short = ca.SX.sym("short", n, m if elastic else 0)
-    margin = ca.SX.sym("margin", 1 if objective is Objective.MARGIN else 0)
-    h, weight = ca.SX.sym("h", intervals), ca.SX.sym("weight")
-    coefficients = [ca.SX.sym(name, n, m) for name in ("Pa", "Pb", "Pl")] + [ca.SX.sym("Tv", n, 2)]
-    b = ca.vertcat(ends[0] ** 2, b_inner, ends[1] ** 2)
-    speed = ca.vertcat(ends[0], ca.sqrt(b_inner), ends[1])
-
-    def spread(column: Expression) -> Expression:
-        return ca.repmat(column, 1, m)
-
-    Pa, Pb, Pl, Tv = coefficients
-    forces = Pa * spread(a) + Pb * spread(b) + Pl * spread(squeeze)
-    held, tau = forces[:, :n_held], forces[:, n_held:] + Tv * ca.repmat(speed, 1, 2)
-    interval_times = 2 * h / (speed[:-1] + speed[1:])
-    duration = ca.sum1(interval_times)
-    node_weights = ca.vertcat(0, h) + ca.vertcat(h, 0)
-    calm = _CALM * ca.dot(node_weights, squeeze**2) + _SMOOTH * (
-        ca.dot(h, (a[1:] - a[:-1]) ** 2) + ca.dot(h, (squeeze[1:] - squeeze[:-1]) ** 2)
-    )
-    c_rows, tau_rows, last = held, tau, []
-    if objective is Objective.TIME:
-        cost = duration
-    elif objective is Objective.EFFORT:
-        # The bounds hold T0, so the full torque is passed as a parameter for the integrand only.
-        T0 = ca.SX.sym("T0", n, 2)
-        coefficients.append(T0)
-        full = tau + T0
-        squares = full[:-1, :] ** 2 + full[:-1, :] * full[1:, :] + full[1:, :] ** 2
-        cost = ca.dot(interval_times, ca.sum2(squares)) / 3 + weight * duration
-    elif objective is Objective.MARGIN:
-        counted = ca.horzcat(ca.DM.ones(1, n_contacts), ca.DM(1, 2 * n_rolling))
-        c_rows = held - ca.repmat(margin, n, 1) @ counted
-        cost, last = -margin, [duration]
-    else:
-        # Every node counts alike: where intervals are short, being short must not be cheap.
-        cost = ca.sum1(ca.sum2(short)) / n + 1e-4 * duration
-        c_rows = held + short[:, :n_held]
-        tau_rows = ca.horzcat(tau + short[:, n_held:], tau - short[:, n_held:])
-    nodes = ca.horzcat(b, a, squeeze, short).T
-    x = ca.vertcat(nodes[1:, 0], ca.vec(nodes[:, 1:-1]), nodes[1:, -1], margin)
-    constraints = ca.vertcat(
-        b[1:] - b[:-1] - h * (a[1:] + a[:-1]),
-        a[1] - a[0],
-        a[-1] - a[-2],
-        ca.vec(ca.horzcat(c_rows, tau_rows).T),
-        *last,
-    )
-    parameters = ca.vertcat(ends, h, weight, *(ca.vec(block) for block in coefficients))
-    nlp = {"x": x, "p": parameters, "f": cost + calm, "g": constraints}
-    # Started from nowhere near its optimum, the elastic NLP needs the more robust strategy.
-    strategy: dict[str, Any] = {"mu_strategy": "monotone"} if elastic else {"mu_oracle": "probing"}
-    solver = build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
+    staged = solver == "fatrop"
+    terms = write_terms(n_contacts, intervals, objective, n_rolling, rough=staged)
+    built = stage("path_nlp", terms.chain) if staged else _build_ipopt(terms, objective)
     seconds = time.perf_counter() - started
-    return PathNLP(solver, n_contacts, n_rolling, intervals, objective, seconds)
+    return PathNLP(built, n_contacts, n_rolling, intervals, objective, seconds)
 
 
-def parameters(nlp: PathNLP, data: PhaseData, scales: Scales, time_weight: float) -> Array:
+def _build_ipopt(terms: Terms, objective: Objective) -> Expression:
+    chain = terms.chain
+    nlp = {
+        "x": chain.x,
+        "p": chain.p,
+        "f": ca.sum1(chain.link_costs) + ca.sum1(chain.node_costs),
+        "g": ca.vertcat(chain.links.values, ca.vec(chain.rows.T), *terms.last),
+    }
+    # Started from nowhere near their optimum, these need the more robust strategy.
+    robust = objective in (Objective.ELASTIC, Objective.RELAX)
+    strategy: dict[str, Any] = {"mu_strategy": "monotone"} if robust else {"mu_oracle": "probing"}
+    return build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
+
+
+def parameters(
+    nlp: PathNLP,
+    data: PhaseData,
+    scales: Scales,
+    time_weight: float,
+    relaxation: Relaxation | None = None,
+) -> Array:
     """Parameters of the NLP, in its units; see `build_path_nlp` for their order."""
     forces, (b_unit, a_unit, force) = data.nodes.forces, scales.profile
     blocks = [
@@ -215,6 +176,10 @@ def parameters(nlp: PathNLP, data: PhaseData, scales: Scales, time_weight: float
     ]
     if nlp.objective is Objective.EFFORT:
         blocks.append(forces.T0)
+    if relaxation is not None:
+        units = np.append(np.full(nlp.n_held, force), np.ones(3))
+        rates = data.relative_rates(data.nodes, relaxation.finger)
+        blocks += [relaxation.worth / units, rates**2 * b_unit]
     steps = data.grid.steps / scales.length
     return np.concatenate([[0.0, 0.0], steps, [time_weight], *(b.ravel("F") for b in blocks)])
 
@@ -224,30 +189,35 @@ def make_bounds(
     data: PhaseData,
     scales: Scales,
     tightening: Tightening,
+    relaxation: Relaxation | None = None,
 ) -> dict[str, Array]:
     """Bounds of the NLP, with every limit tightened."""
     tight, speed_share, duration = tightening
     n, n_h = len(data.grid.s), nlp.n_held
     b_unit = scales.profile[0]
     low, high = np.full((n, nlp.columns), -np.inf), np.full((n, nlp.columns), np.inf)
-    low[:, 0] = _LEAST_B
-    high[:, 0] = np.maximum(data.largest_b(data.nodes) * speed_share / b_unit, 2 * _LEAST_B)
-    low[:, 3:] = 0.0
+    low[:, 0] = LEAST_B
+    relaxed = None if relaxation is None else relaxation.finger
+    b_max = data.largest_b(data.nodes, relaxed)
+    high[:, 0] = np.maximum(b_max * speed_share / b_unit, 2 * LEAST_B)
+    low[:, 3:] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
     forces, limit = data.nodes.forces, data.torque_limit
     c_low = (data.least + tight[:, :n_h] - forces.C0) / scales.force
     t_low = tight[:, n_h : n_h + 2] - limit - forces.T0
     t_high = limit - tight[:, n_h + 2 :] - forces.T0
     free = np.full_like(t_low, np.inf)
-    if nlp.objective is Objective.ELASTIC:
+    if nlp.objective in (Objective.ELASTIC, Objective.RELAX):
         t_low, t_high = np.hstack([t_low, -free]), np.hstack([free, t_high])
-    equal = np.zeros(nlp.intervals + 2)
+    if nlp.objective is Objective.RELAX:
+        t_low, t_high = np.hstack([t_low, -free[:, :1]]), np.hstack([t_high, np.ones((n, 1))])
+    equal = np.zeros(nlp.first)
     rows_low, rows_high = np.hstack([c_low, t_low]), np.hstack([c_low * 0 + np.inf, t_high])
-    last_low, last_high, margin = [], [], []
+    last_low, last_high = [], []
     if nlp.objective is Objective.MARGIN:
-        last_low, last_high, margin = [-np.inf], [(duration or np.inf) / scales.time], [np.inf]
+        last_low, last_high = [-np.inf], [(duration or np.inf) / scales.time]
     return {
-        "lbx": np.concatenate([low[nlp.free], [-m for m in margin]]),
-        "ubx": np.concatenate([high[nlp.free], margin]),
+        "lbx": low[nlp.free],
+        "ubx": high[nlp.free],
         "lbg": np.concatenate([equal, rows_low.ravel(), last_low]),
         "ubg": np.concatenate([equal, rows_high.ravel(), last_high]),
     }
@@ -268,35 +238,45 @@ def first_multipliers(
     on_b[:, 0] = -_MU / np.maximum(profile.b / scales.profile[0], 1e-3)
     return {
         "lam_x0": on_b[nlp.free],
-        "lam_g0": np.concatenate([np.zeros(nlp.intervals + 2), rows.ravel()]),
+        "lam_g0": np.concatenate([np.zeros(nlp.first), rows.ravel()]),
     }
 
 
 def pack(
     nlp: PathNLP, profile: Profile, scales: Scales, margin: float, short: Array | None = None
 ) -> Array:
-    """Unknowns of the NLP, in its units, from a profile and (elastic) shortfalls [N, N m]."""
+    """Unknowns of the NLP, in its units, from a profile and what its objective adds.
+
+    That is the least margin [N], (elastic) shortfalls [N, N m], or the relaxation, given as margin.
+    """
     table = np.zeros((len(profile.a), nlp.columns))
     if short is not None:
         table[:, 3:] = short / np.repeat([scales.force, 1.0], [nlp.n_held, 2])
+    elif nlp.objective in CHAINED:
+        table[:, 3] = margin / _margin_unit(nlp, scales)
     table[:, :3] = np.column_stack([profile.b, profile.a, profile.squeeze]) / scales.profile
-    last = [margin / scales.force] if nlp.objective is Objective.MARGIN else []
-    return np.concatenate([table[nlp.free], last])
+    return np.asarray(table[nlp.free])
+
+
+def _margin_unit(nlp: PathNLP, scales: Scales) -> float:
+    return scales.force if nlp.objective is Objective.MARGIN else 1.0
 
 
 def unpack(nlp: PathNLP, grid: Grid, x: Array, scales: Scales) -> tuple[Profile, float]:
-    """Profile of a solution, and the least margin [N] if that is an unknown.
+    """Profile of a solution, and the least margin [N] or the relaxation if that is an unknown.
 
     b is integrated again from a, so that b' = 2 a holds to rounding and not to Ipopt's tolerance.
     """
     table = np.zeros((len(grid.s), nlp.columns))
-    table[nlp.free] = x[: int(nlp.free.sum())]
+    table[nlp.free] = x
     a, squeeze = table[:, 1] * scales.profile[1], table[:, 2] * scales.profile[2]
     steps = grid.steps
     a = a - np.dot(steps, a[1:] + a[:-1]) / (2 * grid.s[-1])
     b = np.concatenate([[0.0], np.cumsum(steps * (a[1:] + a[:-1]))])
+    # Where phases are joined at next to no speed, rounding can take b below zero.
+    b = np.maximum(b, 0.0)
     b[-1] = 0.0
-    margin = x[-1] * scales.force if nlp.objective is Objective.MARGIN else 0.0
+    margin = x[-1] * _margin_unit(nlp, scales) if nlp.objective in CHAINED else 0.0
     return Profile(a, b, squeeze), float(margin)
 
 
@@ -315,15 +295,16 @@ def move_multipliers(
         return np.column_stack(columns)
 
     on_x, on_g = multipliers["lam_x0"], multipliers["lam_g0"]
-    inner = int(nlp.free.sum())
     table = np.zeros(nlp.free.shape)
-    table[nlp.free] = on_x[:inner]
-    middles = (place[1:] + place[:-1]) / 2
-    defects = np.interp(middles, nodes[:-1] + 0.5, on_g[:intervals])
-    first = intervals + 2
-    stop = first + len(nodes) * (nlp.n_held + 2)
-    rows = carry(on_g[first:stop].reshape(len(nodes), -1)).ravel()
+    table[nlp.free] = on_x
+    middles, ends = (place[1:] + place[:-1]) / 2, nlp.links * intervals
+    links = [
+        np.interp(middles, nodes[:-1] + 0.5, column)
+        for column in on_g[:ends].reshape(nlp.links, intervals)
+    ]
+    stop = nlp.first + len(nodes) * (nlp.n_held + 2)
+    rows = carry(on_g[nlp.first : stop].reshape(len(nodes), -1)).ravel()
     return {
-        "lam_x0": np.concatenate([carry(table)[nlp.free], on_x[inner:]]),
-        "lam_g0": np.concatenate([defects, on_g[intervals:first], rows, on_g[stop:]]),
+        "lam_x0": carry(table)[nlp.free],
+        "lam_g0": np.concatenate([*links, on_g[ends : nlp.first], rows, on_g[stop:]]),
     }

@@ -45,6 +45,11 @@ class End(Enum):
     """Everything stops."""
     SMOOTH = "smooth"
     """Position and velocity are continuous: a contact is gained softly or released."""
+    IMPACT = "impact"
+    """A contact is gained at speed: the velocity jumps onto the next phase's contacts."""
+
+
+_ENDS = ", ".join(repr(end.value) for end in End)
 
 
 @dataclass(frozen=True)
@@ -236,11 +241,11 @@ def _read_phase(scene: Scene, index: int, entry: object) -> Phase:
     contacts = formation.contacts
     given = entry.get("end", End.REST.value)
     if given not in [end.value for end in End]:
-        raise InputError("", f"{key}.end", f"{given!r} given; allowed are 'rest' and 'smooth'")
+        raise InputError("", f"{key}.end", f"{given!r} given; allowed are {_ENDS}")
     until, end = Until(), End(given)
     if "until" in entry:
         until = _at(f"{key}.until", lambda: _read_until(scene, entry["until"]))
-    elif end is End.REST:
+    elif end is not End.SMOOTH:
         raise InputError(
             "", f"{key}.until", "is missing; only a phase with end = 'smooth' has none"
         )
@@ -302,18 +307,22 @@ def _check_end(phase: Phase, following: Phase | None) -> None:
     """Check that a phase passes into the next one as its `end` says."""
     if phase.end is End.REST:
         return
-    key = f"phases[{phase.number}].end"
+    key, until = f"phases[{phase.number}].end", phase.until
+    given = f"{phase.end.value!r} given"
     if following is None:
-        raise InputError("", key, "'smooth' given, but the last phase ends at rest")
-    before = {*phase.formation.contacts, phase.until.contact}
-    extra = [c.name for c in following.formation.contacts if c not in before]
+        raise InputError("", key, f"{given}, but the last phase ends at rest")
+    contacts = following.formation.contacts
+    if phase.end is End.IMPACT and until.contact is None:
+        raise InputError("", key, f"{given}, but until is {until}, not a contact that is gained")
+    if phase.end is End.IMPACT and until.contact not in contacts:
+        raise InputError("", key, f"{given}, but phase {following.number} does not have {until}")
+    before = {*phase.formation.contacts, until.contact}
+    extra = [c.name for c in contacts if c not in before]
     if extra:
         raise InputError(
-            "", key, f"'smooth' given, but phase {following.number} has {', '.join(extra)} too"
+            "", key, f"{given}, but phase {following.number} has {', '.join(extra)} too"
         )
-    if phase.until.is_release and set(following.formation.contacts) == set(
-        phase.formation.contacts
-    ):
+    if until.is_release and set(contacts) == set(phase.formation.contacts):
         raise InputError("", key, f"phase {following.number} releases no contact")
 
 

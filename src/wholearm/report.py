@@ -29,6 +29,14 @@ class ContactMargin:
 
 
 @dataclass(frozen=True)
+class LeastImpulse:
+    """The contact of the next phase with the least impulse in an impact, and that impulse [N s]."""
+
+    contact: str
+    impulse: float
+
+
+@dataclass(frozen=True)
 class SlipMargin:
     """The least margin to slipping of one rolling contact in one phase.
 
@@ -65,7 +73,7 @@ class PhaseReport:
     until : str
         What ends the phase.
     end : str
-        How it passes into the next one: at rest or smoothly.
+        How it passes into the next one: at rest, smoothly or with an impact.
     start : float, [s]
     contacts : tuple of ContactMargin
     rolling : tuple of SlipMargin
@@ -74,6 +82,8 @@ class PhaseReport:
         When its end was reached, None if it was not.
     arrival_rate : float or None, [m/s or rad/s]
         How fast the distance to the end was closing then; None for a release.
+    impact : LeastImpulse or None
+        None if there was no impact; one that is planned for may have been a stop.
     end_deviation, deviation : Deviation or None
         From the plan, at the end of the phase and at worst; None without a plan.
     """
@@ -86,6 +96,7 @@ class PhaseReport:
     rolling: tuple[SlipMargin, ...]
     arrival: float | None
     arrival_rate: float | None
+    impact: LeastImpulse | None
     end_deviation: Deviation | None
     deviation: Deviation | None
 
@@ -218,15 +229,19 @@ def _rolling_table(report: Report) -> list[str]:
 def _phase_table(report: Report) -> list[str]:
     header = ["phase", "until", "end", "arrival [s]", "rate [m/s, rad/s]"]
     planned = any(p.deviation is not None for p in report.phases)
+    impacts = any(p.end == "impact" for p in report.phases)
+    header += ["least impulse [N s]", "on"] if impacts else []
     header += ["end dev. [m]", "[rad]", "largest dev. [m]", "[rad]"] if planned else []
     rows = []
     for p in report.phases:
         row = [str(p.number), p.until, p.end, _show(p.arrival, ".5f"), _show(p.arrival_rate, ".1e")]
+        if impacts:
+            row += [_show(p.impact.impulse, ".4f"), p.impact.contact] if p.impact else ["-", "-"]
         for deviation in (p.end_deviation, p.deviation) if planned else ():
             pair = (deviation.position, deviation.angle) if deviation else (None, None)
             row += [_show(value, ".1e") for value in pair]
         rows.append(row)
-    return _table(header, rows, {1, 2})
+    return _table(header, rows, {1, 2, 6} if impacts else {1, 2})
 
 
 def _energy_table(report: Report) -> list[str]:

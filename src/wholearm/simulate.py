@@ -8,7 +8,8 @@ a step with another length. At rest the formation waits until it can start (`who
 When the end of a phase is reached the motion stops, if the phase ends at rest, and goes on from
 rest in the next phase's formation. If it ends smoothly the motion goes on with its velocity, less
 what the contacts of the next formation do not let through; contacts that this formation does not
-have are let go.
+have are let go. If it ends with an impact, impulses of the next formation's contacts change the
+velocity, and all of them have to press (`wholearm.impact`).
 
 Nothing here is shared with the planner but the contacts and the scene.
 """
@@ -30,7 +31,7 @@ from .replay import Replay
 from .starting import Departure
 from .sticking import Collapse, Rest, find_rest
 from .torque import TorqueProfile
-from .transitions import enter, go_on, set_off
+from .transitions import collide, enter, go_on, set_off
 
 
 def simulate(
@@ -107,26 +108,29 @@ def _play(run: Replay, phase: Phase, following: Phase | None) -> Outcome | None:
         if isinstance(ending, Outcome):
             return ending
         if isinstance(ending, Arrival):
-            _arrive(run, ending)
-            return None
+            return _arrive(run, ending, following)
         if isinstance(ending, Released):
             _release(run, ending)
             return None
 
 
-def _arrive(run: Replay, arrival: Arrival) -> None:
+def _arrive(run: Replay, arrival: Arrival, following: Phase | None) -> Outcome | None:
     """End the phase; if it ends at rest the motion stops, with a plastic impact if need be."""
     until, rate = run.phase.until, arrival.rate
     text = f"{until} reached {run.when()}"
     run.note(EventKind.ARRIVAL, text, str(until), rate)
+    if arrival.strikes and following is not None:
+        run.moving = True
+        return collide(run, following)
     run.moving = run.phase.end is End.SMOOTH
     if run.moving:
-        return
+        return None
     before = run.stored
     run.y[5:10] = 0.0
     run.impact += before - run.stored
     coming = next((b for b in run.breaks if b > run.t), math.inf)
     run.hold = coming if coming - run.t <= arrival.window else run.t
+    return None
 
 
 def _release(run: Replay, release: Released) -> None:

@@ -58,7 +58,7 @@ def outline_stages(
     for k, (phase, outline, last) in enumerate(parts):
         count = max(LEAST_INTERVALS, round(lengths[k] / longest[phase.index] * intervals))
         following = problem.phases[phase.index + 1] if phase is not phases[-1] and last else None
-        strikes = following is not None and phase.end.value == "impact"
+        strikes = following is not None and phase.end is End.IMPACT
         guess = _guess(
             outline, scheme, count, (clock[k], clock[k + 1]), (ends[k], ends[k + 1]), total
         )

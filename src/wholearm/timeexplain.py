@@ -104,11 +104,12 @@ def _list_of_stage(problem: Problem, stage: Stage, passed: float) -> list[Shortf
     n_c, count = formation.n_contacts, len(part.fractions)
     c_n, c_t = part.forces[..., :n_c], part.forces[..., n_c:]
     rolling = list(formation.rolling_rows)
-    grip = formation.friction[rolling] * c_n[..., rolling]
+    grip = formation.friction[rolling] * (c_n[..., rolling] - problem.epsilon)
     over = np.abs(part.tau) - problem.scene.torque_limit
     names = [f"c_n of {name} >= epsilon = {problem.epsilon:g} N" for name in formation.names]
     names += [
-        f"friction cone of {formation.names[k]}, |c_t| <= {formation.friction[k]:g} c_n,"
+        f"friction cone of {formation.names[k]}, "
+        f"|c_t| <= {formation.friction[k]:g} (c_n - {problem.epsilon:g} N),"
         for k in rolling
     ]
     names += [

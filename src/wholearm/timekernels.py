@@ -50,7 +50,8 @@ def point_kernel(formation: Formation) -> Kernel:
     moving = ca.DM(scene.mass_diagonal) * u + ca.DM(scene.viscous) * w * T - applied * T**2
     balance = moving / unit**2 / ca.DM([1.0, 1.0, rho, LEVER, LEVER])
     sliding = [k for k in range(n_c) if k not in formation.rolling_rows]
-    senses = (Xi * (A_t @ w) / rho - least * T)[sliding]
+    # With `:`, no rows of a single one are no rows, and not a row without columns.
+    senses = (Xi * (A_t @ w) / rho - least * T)[sliding, :]
     y = ca.vertcat(gaps / rho, P @ w / rho, (P @ u + P_dot_w) / rho, balance, senses)
     return build_kernel(
         ca.vertcat(z, w, u, forces, tau, T, first), ca.vertcat(Xi, sigma, place, least, unit), y
@@ -160,12 +161,12 @@ def impact_kernel(formation: Formation, following: Formation) -> Kernel:
     jump = jump / (mass * rho) / ca.DM([1.0, 1.0, rho, LEVER, LEVER])
     A = formation.function(z, after)[1]
     rolling = list(following.rolling_rows)
-    grip = ca.DM(following.friction)[rolling] * impulses[rolling]
+    grip = ca.DM(following.friction)[rolling, :] * impulses[rolling, :]
     y = ca.vertcat(
         jump,
         P @ after / rho,
         A[find_leaving(formation, following), :] @ after / rho,
-        grip - impulses[n_c:],
-        grip + impulses[n_c:],
+        grip - impulses[n_c:, :],
+        grip + impulses[n_c:, :],
     )
     return build_kernel(ca.vertcat(after, before, T, z, impulses), Xi, y)

@@ -7,7 +7,8 @@ forces c at every point, where
 
     C(z) = 0,  P w = 0,  P u + P'(w) w = 0,
     M5 u + T B w = T^2 (g - D sigma + S tau + G^T c),
-    c_n >= epsilon,  |tau| <= limit,  Xi A_t w >= 0,  sigma theta' >= 0,  |c_t| <= mu c_n (rolling).
+    c_n >= epsilon,  |tau| <= limit,  Xi A_t w >= 0,  sigma theta' >= 0,
+    |c_t| <= mu (c_n - epsilon) (rolling).
 
 So contacts hold at every point, without drift, and friction never pushes the wrong way. Along the
 contacts' tangent space alone, with an orthonormal basis N of the null space of P at a guess of

@@ -166,9 +166,8 @@ class Search:
         limits = [Limits.none(stage) for stage in solution.stages]
         for _ in range(ROUNDS):
             motions = make_motions(solution.stages, self.scheme)
-            least = self.problem.epsilon + solution.margin
             misses = [
-                find_misses(stage, motion, least)
+                find_misses(stage, motion, self.problem.epsilon, solution.margin)
                 for stage, motion in zip(solution.stages, motions, strict=True)
             ]
             worst = max(miss.worst for miss in misses)

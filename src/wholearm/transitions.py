@@ -7,9 +7,10 @@ from itertools import product
 
 import numpy as np
 
-from .errors import SimulationError
-from .events import Section
+from .errors import JammingError, SimulationError
+from .events import EventKind, Outcome, OutcomeKind, Section
 from .formation import Formation
+from .impact import Obstacle, strike, transfer
 from .jumps import REACHED, Ending, find_held, look_again
 from .model import Array
 from .problem import End, Phase
@@ -21,16 +22,19 @@ from .sticking import close_contacts
 STANDING = 1e-9
 """Speed that counts as none where a formation is entered [m/s or rad/s]: the integration's error
 may give it either sign."""
+_OUTCOMES = {
+    Obstacle.PULL: OutcomeKind.CONTACT_LOST,
+    Obstacle.SLIP: OutcomeKind.SLIPS,
+    Obstacle.CLOSING: OutcomeKind.LIMIT_REACHED,
+    Obstacle.HELD: OutcomeKind.HELD,
+}
 
 
 def enter(run: Replay, phase: Phase, following: Phase | None) -> None:
     """Take the formation of `phase`; what it does not let the motion keep is lost to impact."""
     run.phase = phase
     before = run.stored
-    try:
-        run.y[:5] = close_contacts(phase.formation, run.y[:5], 10 * REACHED)
-    except SimulationError as error:
-        raise SimulationError(f"{error} {run.where()}") from None
+    run.y[:5] = _close(run, phase.formation)
     if run.moving:
         run.y[5:10] = project_velocity(phase.formation, run.y[:5], run.y[5:10])
         run.moving = bool(np.abs(run.y[5:10]).max() > STANDING)
@@ -50,6 +54,35 @@ def enter(run: Replay, phase: Phase, following: Phase | None) -> None:
     run.load_piece()
 
 
+def _close(run: Replay, formation: Formation) -> Array:
+    """The present configuration with every contact of a formation closed."""
+    try:
+        return close_contacts(formation, run.y[:5], 10 * REACHED)
+    except SimulationError as error:
+        raise SimulationError(f"{error} {run.where()}") from None
+
+
+def collide(run: Replay, following: Phase) -> Outcome | None:
+    """Throw the velocity onto the next formation; what ends the motion if that is not possible."""
+    z = _close(run, following.formation)
+    impact = strike(run.phase.formation, following.formation, z, run.y[5:10])
+    name, least = impact.least
+    names = following.formation.names
+    normal = impact.p[: len(names)]
+    impulses = ", ".join(f"{p:.4g} on {n}" for n, p in zip(names, normal, strict=True))
+    run.note(EventKind.IMPACT, f"impact {run.when()}, in N s {impulses}", name, least)
+    if impact.hindrances:
+        worst = impact.hindrances[0]
+        text = f"{worst.describe()} in the impact {run.when()}"
+        if worst.kind is Obstacle.JAM:
+            raise JammingError(text)
+        return Outcome(_OUTCOMES[worst.kind], text)
+    before = run.stored
+    run.y[5:10] = impact.v
+    run.impact += before - run.stored
+    return None
+
+
 def find_releasable(phase: Phase, following: Phase | None) -> tuple[str, ...]:
     """Names of the contacts whose release ends the phase."""
     if phase.end is End.REST or following is None or not phase.until.is_release:
@@ -61,8 +94,7 @@ def find_releasable(phase: Phase, following: Phase | None) -> tuple[str, ...]:
 def project_velocity(formation: Formation, z: Array, v: Array) -> Array:
     """Velocity nearest to `v` in the metric M5 that keeps every constraint, shape (5,)."""
     P = formation.evaluate(z[None], v[None]).P[0]
-    lift = P.T / formation.scene.mass_diagonal[:, None]
-    return np.asarray(v - lift @ np.linalg.solve(P @ lift, P @ v))
+    return transfer(formation.scene.mass_diagonal, P, P, v)[0]
 
 
 def set_off(run: Replay, departure: Departure) -> None:

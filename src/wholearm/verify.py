@@ -13,7 +13,15 @@ from .events import Event, EventKind, OutcomeKind, Simulation
 from .jumps import SETTLING
 from .model import Array
 from .problem import End, Phase, Problem
-from .report import ContactMargin, Deviation, EnergyBalance, PhaseReport, Report, SlipMargin
+from .report import (
+    ContactMargin,
+    Deviation,
+    EnergyBalance,
+    LeastImpulse,
+    PhaseReport,
+    Report,
+    SlipMargin,
+)
 from .simulate import simulate
 from .torque import TorqueProfile
 from .trajectory import Trajectory
@@ -118,11 +126,12 @@ def _report_phase(
         if name in lost and not least <= lost[name].value:
             least, time = lost[name].value, lost[name].time
         contacts.append(ContactMargin(name, least, time, least - problem.epsilon))
+    impacts = [e for e in simulation.find(EventKind.IMPACT) if e.phase == index]
     rolling = _report_rolling(phase, simulation, rows, torque)
     end = worst = None
     if plan is not None:
         # A motion that goes on is compared when its phase was planned to end, not when it did.
-        end, worst = _compare(simulation, plan, index, bool(arrivals), phase.end is End.SMOOTH)
+        end, worst = _compare(simulation, plan, index, bool(arrivals), phase.end is not End.REST)
     return PhaseReport(
         number=phase.number,
         until=_describe_end(arrivals, phase),
@@ -132,6 +141,7 @@ def _report_phase(
         rolling=rolling,
         arrival=arrivals[0].time if arrivals else None,
         arrival_rate=arrivals[0].value if arrivals and not phase.until.is_release else None,
+        impact=LeastImpulse(impacts[0].contact, impacts[0].value) if impacts else None,
         end_deviation=end,
         deviation=worst,
     )

@@ -1,0 +1,139 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from plane import make_formation, measure_gaps
+from thrown import heave
+from timed import instants, landing, plan_landing, stages_of
+from wholearm.between import COARSE, GRAZE, MISS, Limits, find_misses
+from wholearm.collocation import make_scheme
+from wholearm.options import PlanOptions
+from wholearm.stage import Stage
+from wholearm.staging import outline_stages
+from wholearm.timemotion import StageMotion, make_motions
+from wholearm.timenlp import CLEAR
+from wholearm.timeplan import plan_phases
+from wholearm.timesearch import Search
+
+EPSILON = 0.05
+SCHEME = make_scheme("radau", 3)
+
+
+def as_stage(motion: StageMotion, **fields: object) -> Stage:
+    stage = Stage(0, motion.formation, motion.directions, motion.points)
+    return replace(stage, **fields)  # type: ignore[arg-type]
+
+
+@lru_cache(maxsize=1)
+def landed() -> list[StageMotion]:
+    return stages_of(plan_landing(time_intervals=6))
+
+
+@lru_cache(maxsize=1)
+def heaved() -> StageMotion:
+    """The first phase of a plan with a rolling contact."""
+    problem, _ = heave()
+    plans = plan_phases(problem, problem.phases, problem.start, PlanOptions(time_intervals=6))
+    return plans[0].motion.stages[0]
+
+
+def test_what_a_plan_misses_is_within_what_is_allowed() -> None:
+    for motion in landed():
+        misses = find_misses(as_stage(motion), motion, EPSILON)
+        assert misses.c_n.shape == (len(motion.points.fractions), motion.formation.n_contacts)
+        assert misses.worst <= 1 and not misses.coarse.any()
+
+
+def test_forces_are_missed_by_what_their_least_value_lacks() -> None:
+    inside = np.linspace(1e-9, 1 - 1e-9, 401)
+    for motion in landed():
+        stage = as_stage(motion)
+        t = motion.duration * motion.points.places(inside).ravel()
+        dense = motion.evaluate(t).c_n.reshape(stage.intervals, 401, -1)
+        asked = float(np.median(dense))
+        misses = find_misses(stage, motion, asked)
+        expected = np.maximum(asked - dense.min(axis=1), 0.0)
+        # Parabolas through 25 looks, of forces that are smooth inside an interval.
+        np.testing.assert_allclose(misses.c_n, expected, atol=1e-3 * np.ptp(dense))
+        assert misses.worst == pytest.approx(misses.c_n.max() / MISS) and misses.coarse.any()
+        # A margin asks for as much as a larger epsilon.
+        same = find_misses(stage, motion, EPSILON, asked - EPSILON)
+        np.testing.assert_allclose(same.c_n, misses.c_n, atol=1e-12 * asked)
+
+
+def test_cones_are_missed_by_what_epsilon_takes_from_them_but_the_margin_does_not() -> None:
+    motion = heaved()
+    stage = as_stage(motion)
+    row = motion.formation.rolling_rows[0]
+    mu = motion.formation.friction[row]
+    dense = motion.evaluate(instants(motion, 200))
+    grip = mu * dense.c_n[:, row] - np.abs(dense.c_t[:, row])
+    least = grip.reshape(stage.intervals, 200).min(axis=1)
+    assert not find_misses(stage, motion, EPSILON).cone.any()
+    large = 1.0 + least.min() / mu
+    misses = find_misses(stage, motion, large)
+    np.testing.assert_allclose(misses.cone[:, 0], np.maximum(mu * large - least, 0), atol=0.02)
+    assert misses.cone.max() > 1.0
+    assert not find_misses(stage, motion, EPSILON, large).cone.any()
+
+
+def test_released_contacts_have_to_be_clear_in_the_second_half() -> None:
+    motion = landed()[2]
+    formation = motion.formation
+    names = [limit.gained.name if limit.gained else "" for limit in formation.limits]
+    k = names.index("v3-finger1")
+    gaps = make_formation(formation.scene, "v3-finger1")
+    fields = {"watched": (k,), "released": (k,), "opens": True}
+    stage = as_stage(motion, **fields)
+    assert find_misses(stage, motion, EPSILON).gap.max() <= GRAZE
+    # Played backwards it is clear at first, and touches at the end.
+    part = motion.points
+    back = part._replace(
+        fractions=part.fractions[::-1],
+        nodes=part.nodes[::-1] * np.array([[1.0], [-1.0]]),
+        z=part.z[::-1],
+        v=-part.v[::-1],
+        a=part.a[::-1],
+        tau=part.tau[::-1, ::-1],
+    )
+    reverse = replace(motion, points=back)
+    misses = find_misses(as_stage(reverse, **fields), reverse, EPSILON).gap[:, 0]
+    end = measure_gaps(gaps, reverse.evaluate(np.array([motion.duration])).z[0])[0]
+    assert misses[-1] == pytest.approx(CLEAR / 2 - end, abs=1e-7)
+    assert misses[0] == 0.0
+
+
+def test_limits_rise_by_more_than_they_are_missed() -> None:
+    motion = heaved()
+    stage = as_stage(motion, watched=(0, 1))
+    plain = Limits.none(stage)
+    assert [table.shape[1] for table in plain] == [2, 1, 2] and plain.worst == 0.0
+    missed = Limits(*(table + k * 1e-3 for k, table in enumerate(plain)))
+    raised = missed.raised(missed)
+    for before, after in zip(missed, raised, strict=True):
+        assert (after >= 2 * before).all() and (after <= 3 * before).all()
+    assert not plain.coarse.any() and Limits(plain.c_n + 2 * COARSE, *plain[1:]).coarse.all()
+
+
+def test_tightening_holds_limits_that_points_alone_do_not() -> None:
+    problem = landing()
+    options = PlanOptions()
+    search = Search(problem, options, SCHEME, None, options.goal)
+    plans = plan_landing(time_intervals=6)
+    start = plans[0].motion.stages[0].points.nodes[0, 0]
+    stages = outline_stages(problem, problem.phases[4:], start, SCHEME, 6, 2.0)
+    loose = search.solve(stages)
+    held = search.hold(loose)
+    assert loose.success and held.success
+    worst = []
+    for solution in (loose, held):
+        motions = make_motions(solution.stages, SCHEME)
+        least = min(motion.evaluate(instants(motion, 41)).c_n.min() for motion in motions)
+        worst.append(EPSILON - least)
+    assert worst[0] > 100 * MISS and worst[1] < 2 * MISS
+    # Limits cost little, about as much as halved intervals gain.
+    assert held.cost == pytest.approx(loose.cost, rel=0.03)

@@ -1,0 +1,281 @@
+"""The simulation of phases that end with an impact."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import tomllib
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from conftest import HEPTAGON
+from plane import stack_rows
+from planned import SQUEEZES, DepartingMotion, change
+from timed import fastest
+from wholearm.contact import parse_contact
+from wholearm.dynamics import energy
+from wholearm.events import EventKind, OutcomeKind, Simulation
+from wholearm.formation import Formation
+from wholearm.impact import strike
+from wholearm.model import Array
+from wholearm.outline import load
+from wholearm.path import trace_phases
+from wholearm.plan import solve
+from wholearm.problem import End, Phase, Problem, build_problem
+from wholearm.simulate import simulate
+from wholearm.torque import TorqueProfile
+from wholearm.trajectory import Trajectory
+from wholearm.verify import verify
+
+IMPACTS = HEPTAGON.with_name("heptagon_impact.toml")
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    return load(str(IMPACTS))
+
+
+@pytest.fixture(scope="module")
+def planned() -> Trajectory:
+    return fastest(IMPACTS)
+
+
+@pytest.fixture(scope="module")
+def replayed(problem: Problem, planned: Trajectory) -> Simulation:
+    return simulate(problem, planned.torque, times=planned.t)
+
+
+@lru_cache(maxsize=4)
+def bumping(speed: float, beyond: float = 0.0) -> tuple[Problem, TorqueProfile]:
+    """The heptagon with low friction runs into its second formation at a speed along the curve.
+
+    The torques go on for a distance `beyond` the impact [m], and then step.
+    """
+    table: dict[str, Any] = copy.deepcopy(tomllib.loads(HEPTAGON.read_text(encoding="utf-8")))
+    table["phases"] = table["phases"][:2]
+    table["phases"][0]["end"] = "impact"
+    problem = build_problem(table)
+    curve = trace_phases(problem)[0]
+    # Beyond, a motion that slows; otherwise as slow a start as the speed allows.
+    duration = (1.2 if beyond else 2.0) * curve.length / max(speed, 0.1)
+    tries = (
+        DepartingMotion(curve, duration, float(squeeze), place=curve.length + beyond, speed=speed)
+        for squeeze in SQUEEZES
+    )
+    t = np.linspace(0.0, duration, 101)
+    motion = next(motion for motion in tries if motion.evaluate(t).c_n.min() > 0.1)
+    torque = motion.fit(60, 7)
+    after = TorqueProfile(np.array([0.0, 0.01]), np.array([[[1.0], [-1.0]]]))
+    return problem, TorqueProfile.chain([torque, after]) if beyond else torque
+
+
+def joints(simulation: Simulation, index: int) -> tuple[int, int]:
+    """Rows just before and after the end of a phase."""
+    last = int(np.flatnonzero(simulation.phase == index)[-1])
+    return last, last + 1
+
+
+def test_replays_the_plan_through_its_impacts(
+    problem: Problem, planned: Trajectory, replayed: Simulation
+) -> None:
+    assert replayed.outcome.kind is OutcomeKind.GOAL_REACHED
+    impacts = replayed.find(EventKind.IMPACT)
+    assert [event.phase for event in impacts] == [0, 1]
+    np.testing.assert_allclose(
+        [event.time for event in impacts], planned.phase_starts[1:3], rtol=0, atol=1e-8
+    )
+    for index, motion in enumerate(planned.motions):
+        start, stop = motion.evaluate(np.array([0.0, motion.duration])).z_dot
+        rows = np.flatnonzero(replayed.phase == index)
+        np.testing.assert_allclose(replayed.z_dot[rows[0]], start, rtol=0, atol=1e-7)
+        np.testing.assert_allclose(replayed.z_dot[rows[-1]], stop, rtol=0, atol=1e-4)
+
+
+def test_each_impact_is_that_of_the_law(problem: Problem, replayed: Simulation) -> None:
+    for event in replayed.find(EventKind.IMPACT):
+        last, first = joints(replayed, event.phase)
+        assert replayed.t[last] == replayed.t[first] == event.time
+        before, after = (p.formation for p in problem.phases[event.phase : event.phase + 2])
+        impact = strike(before, after, replayed.z[first], replayed.z_dot[last])
+        np.testing.assert_allclose(replayed.z_dot[first], impact.v, rtol=0, atol=1e-9)
+        name, least = impact.least
+        assert event.contact == name and event.value == pytest.approx(least)
+        assert event.text.startswith(f"impact at t = {event.time:.5g} s, phase {event.phase + 1}")
+        for name, p in zip(after.names, impact.p, strict=True):
+            assert f"{p:.4g} on {name}" in event.text
+
+
+def test_momentum_is_that_of_the_impulses(problem: Problem, replayed: Simulation) -> None:
+    """The jump lies in the span of the pushes, with friction against sliding."""
+    for event in replayed.find(EventKind.IMPACT):
+        last, first = joints(replayed, event.phase)
+        formation = problem.phases[event.phase + 1].formation
+        N, T = stack_rows(formation, replayed.z[first])
+        slips = np.sign(T @ replayed.z_dot[first])
+        pushes = N - (formation.friction * slips)[:, None] * T
+        body, fingers = problem.scene.polygon, problem.scene.fingers
+        assert body.inertia is not None
+        mass = np.array([body.mass, body.mass, body.inertia, *(f.inertia for f in fingers)])
+        jump = mass * (replayed.z_dot[first] - replayed.z_dot[last])
+        p, residual, *_ = np.linalg.lstsq(pushes.T, jump, rcond=None)
+        assert residual.max() < 1e-16 and p.min() == pytest.approx(event.value, rel=1e-6)
+        assert p.min() > 0
+
+
+def test_the_loss_goes_to_impact(problem: Problem, replayed: Simulation) -> None:
+    energies, formation = replayed.energies, problem.phases[0].formation
+    lost = np.diff(energies.impact)
+    assert (lost > -1e-12).all()
+    for event in replayed.find(EventKind.IMPACT):
+        last, first = joints(replayed, event.phase)
+        stored = energy(formation, replayed.z[[last, first]], replayed.z_dot[[last, first]])
+        assert lost[last] == pytest.approx(stored[0] - stored[1], rel=1e-9) and lost[last] > 1e-3
+    assert np.abs(energies.residual).max() < 1e-9 * energies.work[-1]
+
+
+def test_contacts_stay_closed_after_an_impact(problem: Problem, replayed: Simulation) -> None:
+    for index in (1, 2):
+        rows = replayed.phase == index
+        formation = problem.phases[index].formation
+        kinematics = formation.evaluate(replayed.z[rows], replayed.z_dot[rows])
+        assert np.abs(kinematics.C).max() < 1e-15
+        assert np.abs(np.einsum("nij,nj->ni", kinematics.A, replayed.z_dot[rows])).max() < 1e-13
+    # The contact given up opens.
+    start = replayed.t[replayed.phase == 1][0]
+    gone = problem.phases[0].formation.evaluate(replayed.z, replayed.z_dot).C[:, 2]
+    later = (replayed.t > start + 1e-4) & (replayed.phase == 1)
+    assert (gone[later] > 0).all() and gone[replayed.phase == 1].min() > -1e-12
+
+
+@pytest.mark.parametrize("speed", [0.05, 0.3])
+def test_an_impulse_that_pulls_is_a_lost_contact(speed: float) -> None:
+    problem, torque = bumping(speed)
+    simulation = simulate(problem, torque)
+    assert simulation.outcome.kind is OutcomeKind.CONTACT_LOST
+    (impact,) = simulation.find(EventKind.IMPACT)
+    assert impact.time == pytest.approx(torque.duration, abs=1e-6) and impact.phase == 0
+    assert impact.contact == "v1-palm"
+    assert impact.value == pytest.approx(-0.0413993711 * speed, rel=1e-5)
+    assert simulation.outcome.text == (
+        f"impulse on v1-palm would be {impact.value:.3g} N s in the impact "
+        f"at t = {impact.time:.5g} s, phase 1"
+    )
+    report = verify(problem, torque)
+    assert not report.ok and report.exit_status == 1
+    assert report.failures == (simulation.outcome.text,)
+    (phase,) = report.phases
+    assert phase.impact is not None and phase.impact.contact == "v1-palm"
+    assert phase.impact.impulse == pytest.approx(impact.value, rel=1e-6)
+
+
+def test_next_to_no_speed_is_a_stop() -> None:
+    """By rounding a planned stop arrives with some."""
+    problem, torque = bumping(1e-5)
+    simulation = simulate(problem, torque)
+    assert not simulation.find(EventKind.IMPACT)
+    assert simulation.phase[-1] == 1 and simulation.find(EventKind.ARRIVAL)
+    last, first = joints(simulation, 0)
+    assert simulation.z_dot[last].any() and not simulation.z_dot[first].any()
+
+
+def test_a_planned_stop_is_that_of_a_phase_that_ends_at_rest(problem: Problem) -> None:
+    """Linear torques between rows bring it there a little early, and not quite at rest."""
+    rows = solve(problem, "margin").torque.rows(8)
+    torque = TorqueProfile.join_rows(rows[:, 0], rows[:, 1:])
+    first, second, *others = problem.phases
+    stops = [dataclasses.replace(phase, end=End.REST) for phase in others]
+    resting = dataclasses.replace(problem, phases=(first, second, *stops))
+    one, other = (simulate(p, torque) for p in (problem, resting))
+    assert [(e.time, e.text) for e in one.events] == [(e.time, e.text) for e in other.events]
+    stop = next(e for e in one.find(EventKind.ARRIVAL) if e.phase == 2)
+    assert stop.value > 1e-4
+
+
+def test_no_torque_break_is_waited_for() -> None:
+    """A slowing motion comes half a millisecond early: its impact is then, not at the break."""
+    problem, torque = bumping(0.15, 7.5e-5)
+    simulation = simulate(problem, torque)
+    (impact,) = simulation.find(EventKind.IMPACT)
+    assert 3e-4 < torque.breaks[-2] - impact.time < 7e-4
+    gained = problem.phases[0].until.contact
+    assert gained is not None
+    gap = problem.phases[0].formation.evaluate_gap(gained, simulation.z[-1:])
+    assert abs(gap[0]) < 1e-12
+
+
+@pytest.mark.parametrize("scale", [1.002, 1.01])
+def test_an_impact_that_comes_early(problem: Problem, planned: Trajectory, scale: float) -> None:
+    """With torques that are a little off at the end of the first phase."""
+    ends = planned.phase_starts[1]
+
+    def edit(starts: Array, c: Array) -> Array:
+        c[(starts > 0.8 * ends) & (starts < ends - 1e-12)] *= scale
+        return c
+
+    simulation = simulate(problem, change(planned.torque, edit))
+    first = simulation.find(EventKind.IMPACT)[0]
+    assert 2e-6 < ends - first.time < 5e-3
+    last, after = joints(simulation, 0)
+    before, formation = (p.formation for p in problem.phases[:2])
+    impact = strike(before, formation, simulation.z[after], simulation.z_dot[last])
+    np.testing.assert_allclose(simulation.z_dot[after], impact.v, rtol=0, atol=1e-9)
+    assert np.abs(simulation.energies.residual).max() < 1e-8 * simulation.energies.work.max()
+
+
+def test_coarser_tolerances_still_find_the_impacts(
+    problem: Problem, planned: Trajectory, replayed: Simulation
+) -> None:
+    coarse = simulate(problem, planned.torque, tolerance=1e-6)
+    assert coarse.outcome.reached
+    times = [[e.time for e in s.find(EventKind.IMPACT)] for s in (replayed, coarse)]
+    np.testing.assert_allclose(times[0], times[1], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "names, kind, text",
+    [
+        ("v0-palm v5-finger2 v3-finger1", OutcomeKind.HELD, "friction would hold v3-finger1"),
+        ("v0-palm v1-palm v3-finger1", OutcomeKind.LIMIT_REACHED, "v5-finger2 would not part, at"),
+        ("v1-palm v2-finger1 v3-finger1", OutcomeKind.CONTACT_LOST, "impulse on v2-finger1 would"),
+    ],
+)
+def test_other_formations_that_an_impact_cannot_reach(
+    problem: Problem, planned: Trajectory, names: str, kind: OutcomeKind, text: str
+) -> None:
+    contacts = tuple(parse_contact(name, problem.scene) for name in names.split())
+    following = Phase(1, Formation(problem.scene, contacts), problem.phases[1].until)
+    passing = dataclasses.replace(problem, phases=(problem.phases[0], following))
+    simulation = simulate(passing, planned.torque)
+    assert simulation.outcome.kind is kind
+    (event,) = simulation.find(EventKind.IMPACT)
+    assert simulation.outcome.text.startswith(text)
+    assert simulation.outcome.text.endswith(f" in the impact at t = {event.time:.5g} s, phase 1")
+
+
+def test_verify_reports_the_impacts(problem: Problem, planned: Trajectory) -> None:
+    report = verify(problem, planned)
+    assert report.ok and report.failures == ()
+    assert [phase.end for phase in report.phases] == [*4 * ["impact"], "rest"]
+    rows = planned.meta["transitions"]
+    for phase, row in zip(report.phases[:2], rows[:2], strict=True):
+        assert phase.impact is not None and phase.impact.contact == row["least_impulse_contact"]
+        assert phase.impact.impulse == pytest.approx(row["least_impulse"] * row["speed"], rel=1e-6)
+        assert phase.arrival_rate is not None and phase.arrival_rate > 0.1
+    assert [phase.impact for phase in report.phases[2:]] == [None] * 3
+    for phase in report.phases:
+        assert phase.end_deviation is not None
+        # What is asked of every phase: 1e-5.
+        assert max(phase.end_deviation.position, phase.end_deviation.angle) < 1e-7
+    text = report.to_text()
+    assert "least impulse [N s]  on" in text
+    assert report.to_dict()["phases"][0]["impact"]["contact"] == "v1-palm"
+    assert report.to_dict()["phases"][2]["impact"] is None
+    assert report.energy.impact > 0.1 and report.energy.relative < 1e-9
+
+
+def test_reports_without_impacts_have_no_such_column(trajectory: Trajectory) -> None:
+    report = verify(load(str(HEPTAGON)), trajectory)
+    assert "least impulse" not in report.to_text()

@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from plane import measure_gaps
+from thrown import lift
+from timed import landing
+from wholearm.collocation import make_scheme
+from wholearm.outline import outline_phase
+from wholearm.path import trace_phases
+from wholearm.stage import Stage
+from wholearm.staging import LEAST_INTERVALS, outline_stages
+
+SCHEME = make_scheme("radau", 3)
+
+
+@pytest.fixture(scope="module")
+def stages() -> list[Stage]:
+    """Of the flip's last formation and the landing."""
+    problem = landing()
+    start = trace_phases(problem)[-1].end
+    return outline_stages(problem, problem.phases[4:], start, SCHEME, 12, 2.0)
+
+
+def test_stages_are_those_of_the_outlines(stages: list[Stage]) -> None:
+    problem = landing()
+    z, phases = trace_phases(problem)[-1].end, []
+    for phase in problem.phases[4:]:
+        for outline in outline_phase(problem, phase, z):
+            phases.append(phase.index)
+            z = outline.z[-1]
+    # What slides the other way after the release has to turn on its way, in one stage more.
+    assert [stage.phase for stage in stages] == [*phases, phases[-1]]
+    assert all(stage.formation is problem.phases[stage.phase].formation for stage in stages)
+    assert [stage.until is None for stage in stages] == [True, True, True, False]
+
+
+def test_directions_change_where_a_stage_says_that_they_turn(stages: list[Stage]) -> None:
+    for before, after in zip(stages[:-1], stages[1:], strict=True):
+        signs = np.concatenate(before.directions)
+        names = [*before.formation.names, "joint 1", "joint 2"]
+        turned = {names[row] for row in before.turns}
+        known = dict(zip(names, signs, strict=True))
+        names = [*after.formation.names, "joint 1", "joint 2"]
+        for name, sign in zip(names, np.concatenate(after.directions), strict=True):
+            assert (sign != known.get(name, sign)) == (name in turned)
+    assert stages[-1].turns == ()
+
+
+def test_guesses_follow_the_outlines_in_one_sweep(stages: list[Stage]) -> None:
+    parts = [stage.guess for stage in stages]
+    for stage, part in zip(stages, parts, strict=True):
+        assert stage.intervals >= LEAST_INTERVALS
+        np.testing.assert_allclose(part.fractions, 1 / stage.intervals)
+        # Points on straight lines between 25 closed configurations.
+        gaps = [measure_gaps(stage.formation, z) for z in part.z.reshape(-1, 5)]
+        assert np.abs(gaps).max() < 1e-4
+        np.testing.assert_allclose(part.nodes[1:, 0], part.z[:, -1], atol=1e-12)
+        assert (part.forces == 1.0).all() and not part.tau.any() and not part.a.any()
+        # Velocities are the slope of what is guessed.
+        t = part.duration * part.places(SCHEME.points)
+        step = np.diff(part.z[:, :2], axis=1)[:, 0] / np.diff(t[:, :2], axis=1)
+        middle = (part.v[:, 0] + part.v[:, 1]) / 2
+        assert np.abs(step - middle).max() < 0.15 * np.abs(part.v).max()
+    for before, after in zip(parts[:-1], parts[1:], strict=True):
+        np.testing.assert_allclose(before.nodes[-1, 0], after.nodes[0, 0], atol=1e-12)
+    for node in (parts[0].nodes[0, 1], parts[-1].nodes[-1, 1]):
+        np.testing.assert_allclose(node, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("pace", [1.0, 4.0])
+def test_the_duration_is_that_of_a_fall_times_the_pace(pace: float) -> None:
+    problem = landing()
+    start, phases = trace_phases(problem)[-1].end, problem.phases[4:]
+    stages = outline_stages(problem, phases, start, SCHEME, 12, pace)
+    z, length = start, 0.0
+    for phase in phases:
+        for outline in outline_phase(problem, phase, z):
+            length += outline.length
+            z = outline.z[-1]
+    whole = sum(stage.guess.duration for stage in stages)
+    # The outline that is split leaves out nothing but the rounding of its length.
+    assert whole == pytest.approx(pace * np.sqrt(length / 9.81), rel=1e-3)
+
+
+def test_releases_open_contacts_in_the_next_phase(stages: list[Stage]) -> None:
+    limits = stages[-1].formation.limits
+    names = [limit.gained.name if limit.gained else "" for limit in limits]
+    released = names.index("v3-finger1")
+    for stage in stages[2:]:
+        assert stage.released == (released,) and released in stage.watched
+    assert [stage.opens for stage in stages] == [False, False, True, False]
+    assert all(not stage.released for stage in stages[:2])
+    # What ends the landing is watched, so that it is not passed before.
+    assert all(names.index("v2-palm") in stage.watched for stage in stages[2:])
+    assert all(stage.gained is None and not stage.strikes for stage in stages)
+
+
+def test_joints_that_turn_after_a_release_have_stages_of_their_own() -> None:
+    problem, _ = lift()
+    stages = outline_stages(problem, problem.phases, problem.start, SCHEME, 8, 2.0)
+    assert [stage.phase for stage in stages] == [0, 1, 1]
+    # The outline of one contact moves finger 2 on, that before turns it back.
+    assert stages[1].turns == (2,)
+    assert [stage.directions.sigma[1] for stage in stages] == [-1.0, -1.0, 1.0]

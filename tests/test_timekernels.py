@@ -1,0 +1,260 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plane import make_formation, measure_gaps, measure_slip, unbalance
+from timed import landing
+from tipping import roll
+from wholearm.blocknlp import Kernel
+from wholearm.contact import parse_contact
+from wholearm.curve import Curve
+from wholearm.dynamics import split_forces
+from wholearm.formation import Formation
+from wholearm.model import Array, Scene
+from wholearm.problem import Until
+from wholearm.timekernels import (
+    LEVER,
+    effort_kernel,
+    end_kernel,
+    find_leaving,
+    goal_kernel,
+    impact_kernel,
+    join_kernel,
+    new_rows,
+    opening_kernel,
+    point_kernel,
+    watch_kernel,
+)
+from wholearm.trajectory import Samples
+
+STEP = 1e-4
+"""Of central differences along a motion; what they leave out is of the size of its square."""
+NAMES = ["v1-palm", "v1-palm v3-finger1", "v1-palm v4-finger1 v6-finger2"]
+NAMES += [
+    "v0-palm v1-palm v3-finger1 v6-finger2",
+    "v0-palm v1-palm v2-finger1 v3-finger1 v5-finger2",
+]
+ROLLING = {
+    "v1-palm": ["v1-palm"],
+    "v1-palm v3-finger1": ["v3-finger1"],
+    "v1-palm v4-finger1 v6-finger2": ["v1-palm", "v6-finger2"],
+}
+
+
+def formations() -> list[Formation]:
+    """One to five contacts, all of them sliding or some of them rolling."""
+    scene = landing().scene
+    sliding = [make_formation(scene, names) for names in NAMES]
+    return sliding + [roll(make_formation(scene, n), *rolls) for n, rolls in ROLLING.items()]
+
+
+FORMATIONS = formations()
+every = pytest.mark.parametrize(
+    "formation",
+    FORMATIONS,
+    ids=lambda f: " ".join(c.name + " rolls" * (c in f.rolling) for c in f.contacts),
+)
+
+
+def call(kernel: Kernel, x: list[Array], *p: Array) -> Array:
+    given = np.concatenate([np.zeros(0), *p])
+    return np.asarray(kernel.function(np.concatenate(x), given).full()[:, 0])
+
+
+def draw(rng: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Random z near the heptagon's start, w and u; contacts do not have to be closed."""
+    z = landing().start + 0.05 * rng.normal(size=5) * [0.2, 0.2, 1, 1, 1]
+    return z, 0.3 * rng.normal(size=5), rng.normal(size=5)
+
+
+def constraints(formation: Formation, z: Array, w: Array, u: Array) -> tuple[Array, Array]:
+    """First and second derivatives of the gaps, and v_t and its derivative where contacts roll."""
+    rolling = list(formation.rolling_rows)
+
+    def move(s: float) -> tuple[Array, Array]:
+        return z + s * w + s**2 / 2 * u, w + s * u
+
+    before, here, after = (measure_gaps(formation, move(k * STEP)[0]) for k in (-1, 0, 1))
+    slip = [measure_slip(formation, *move(k * STEP))[rolling] for k in (-1, 0, 1)]
+    first = np.append((after - before) / (2 * STEP), slip[1])
+    second = np.append((after - 2 * here + before) / STEP**2, (slip[2] - slip[0]) / (2 * STEP))
+    return first, second
+
+
+@every
+def test_points_have_newton_and_euler_and_closed_contacts(formation: Formation) -> None:
+    rng = np.random.default_rng(formation.n_constraints)
+    scene, n_c, n_p = formation.scene, formation.n_contacts, formation.n_constraints
+    rho = scene.polygon.gyration_radius
+    for _ in range(3):
+        z, w, u = draw(rng)
+        forces, tau = rng.normal(size=n_p), rng.normal(size=4)
+        T, place, unit = rng.uniform(0.1, 0.3, 3)
+        Xi, sigma = rng.choice([-1.0, 1.0], n_c), rng.choice([-1.0, 1.0], 2)
+        first, least = (z + 0.02 * rng.normal(size=5) if formation.rolling else z[:0]), 0.3
+        x = [z, w, u, forces, tau, np.array([T]), first]
+        y = call(point_kernel(formation), x, Xi, sigma, np.array([place, least, unit]))
+        gaps, rates, bends, balance, senses = np.split(y, np.cumsum([n_p, n_p, n_p, 5]))
+        np.testing.assert_allclose(rho * gaps[:n_c], measure_gaps(formation, z), atol=1e-15)
+        expected = constraints(formation, z, w, u)
+        for got, one, size in zip((rates, bends), expected, (1e-7, 1e-5), strict=True):
+            np.testing.assert_allclose(rho * got, one, atol=size)
+        now = tau[:2] * (1 - place) + tau[2:] * place
+        c_n, c_t = split_forces(formation, forces, Xi)
+        row = Samples(z, w / T, u / T**2, now, c_n, c_t)
+        missing, size_of = unbalance(formation, row, sigma)
+        scale = unit**2 * np.array([1.0, 1.0, rho, LEVER, LEVER])
+        # The kernel's rows are masses times accelerations less forces, in other units.
+        bound = 1e-12 * size_of.max() * T**2 / scale.min()
+        np.testing.assert_allclose(balance, -missing * T**2 / scale, atol=bound)
+        slip = measure_slip(formation, z, w / T)
+        sliding = [k for k in range(n_c) if k not in formation.rolling_rows]
+        np.testing.assert_allclose(senses / T, (Xi * slip / rho - least)[sliding], atol=1e-12)
+
+
+@every
+def test_rolling_contacts_keep_what_has_rolled_by(formation: Formation) -> None:
+    rng = np.random.default_rng(3)
+    scene, n_c = formation.scene, formation.n_contacts
+    z, w, _ = draw(rng)
+    first = draw(rng)[0] if formation.rolling else z[:0]
+    y = call(end_kernel(formation), [z, w, first]) * scene.polygon.gyration_radius
+    assert y.shape == (2 * formation.n_constraints,)
+    np.testing.assert_allclose(y[:n_c], measure_gaps(formation, z), atol=1e-15)
+    rates, _ = constraints(formation, z, w, 0 * w)
+    np.testing.assert_allclose(y[formation.n_constraints :], rates, atol=1e-7)
+    if formation.rolling:
+        # Sliding velocities add up to the slip coordinates' change, along any path.
+        places, weights = np.polynomial.legendre.leggauss(12)
+        run = z - first
+        rows = list(formation.rolling_rows)
+        speeds = [measure_slip(formation, first + (s + 1) / 2 * run, run)[rows] for s in places]
+        expected = weights / 2 @ np.array(speeds)
+        np.testing.assert_allclose(y[n_c : formation.n_constraints], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("until", [None, "v5-finger2", ("x", 0.01), ("phi", -0.3)])
+@pytest.mark.parametrize("turns", [(), (1, 4)])
+def test_ends_are_where_gaps_coordinates_and_rates_vanish(
+    until: str | tuple[str, float] | None, turns: tuple[int, ...]
+) -> None:
+    rng = np.random.default_rng(11)
+    scene = landing().scene
+    rho = scene.polygon.gyration_radius
+    formation = make_formation(scene, "v0-palm v1-palm v3-finger1")
+    gained = roll(make_formation(scene, "v0-palm v1-palm v5-finger2"), "v0-palm")
+    z, w, _ = draw(rng)
+    expected: list[float] = []
+    end = None
+    if isinstance(until, str):
+        end = Until(parse_contact(until, scene))
+        expected.append(measure_gaps(make_formation(scene, until), z)[0] / rho)
+    elif until is not None:
+        end = Until(None, *until)
+        expected.append((z[0] - 0.01) / rho if until[0] == "x" else z[2] + 0.3)
+    rates = [*measure_slip(formation, z, w) / rho, *w[3:]]
+    expected += [rates[row] for row in turns]
+    # A finger's contact comes up, and a contact with the palm stops sliding.
+    assert new_rows(formation, gained) == [2, 3]
+    one = make_formation(scene, "v5-finger2")
+    opening = constraints(one, z, w, 0 * w)[0][0]
+    expected += [opening / rho, measure_slip(formation, z, w)[0] / rho]
+    kernel = goal_kernel(formation, end, turns, gained)
+    assert kernel is not None
+    np.testing.assert_allclose(call(kernel, [z, w]), expected, atol=1e-6)
+
+
+def test_an_end_without_conditions_has_no_kernel() -> None:
+    formation = FORMATIONS[2]
+    assert goal_kernel(formation, None, (), None) is None
+    assert goal_kernel(formation, Until(), (), None) is None
+
+
+def test_gaps_open_with_their_second_derivative() -> None:
+    rng = np.random.default_rng(5)
+    formation = FORMATIONS[2]
+    for contact in formation.contacts:
+        z, w, u = draw(rng)
+        kernel = opening_kernel(formation, contact)
+        one = Formation(formation.scene, (contact,))
+        second = constraints(one, z, w, u)[1][0]
+        got = call(kernel, [z, w, u, np.array([0.2])])
+        np.testing.assert_allclose(got, second / 0.2**2, atol=1e-4)
+
+
+def test_limits_are_watched_in_radii_of_gyration() -> None:
+    rng = np.random.default_rng(6)
+    formation = make_formation(landing().scene, "v1-palm v4-finger1 v6-finger2")
+    texts = [limit.gained.name if limit.gained else "" for limit in formation.limits]
+    watched = tuple(texts.index(name) for name in ("v2-palm", "v0-palm", "v3-finger1"))
+    gaps = make_formation(formation.scene, "v2-palm v0-palm v3-finger1")
+    z, _, _ = draw(rng)
+    got = call(watch_kernel(formation, watched), [z]) * formation.scene.polygon.gyration_radius
+    np.testing.assert_allclose(got, measure_gaps(gaps, z), atol=1e-15)
+
+
+def test_velocities_go_on_over_another_unit_of_time() -> None:
+    rng = np.random.default_rng(7)
+    v, jump = rng.normal(size=(2, 5))
+    before, after = 0.3, 0.07
+    got = call(join_kernel(), [after * (v + jump), before * v, np.array([before, after])])
+    np.testing.assert_allclose(got, after * jump, atol=1e-15)
+
+
+def test_effort_is_the_integral_of_squares() -> None:
+    rng = np.random.default_rng(8)
+    tau, T, share = rng.normal(size=(2, 2)), 0.4, 0.05
+    places, weights = np.polynomial.legendre.leggauss(2)
+    values = tau[0] + (places[:, None] + 1) / 2 * (tau[1] - tau[0])
+    expected = T * share * weights / 2 @ (values**2).sum(axis=1)
+    got = call(effort_kernel(), [tau.ravel(), np.array([T])], np.array([share]))
+    np.testing.assert_allclose(got, expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("rolls", [(), ("v4-finger1",)])
+def test_impacts_balance_the_momentum_of_every_body(rolls: tuple[str, ...]) -> None:
+    rng = np.random.default_rng(9)
+    scene = landing().scene
+    before = make_formation(scene, "v1-palm v3-finger1 v6-finger2")
+    after = roll(make_formation(scene, "v1-palm v4-finger1 v6-finger2"), *rolls)
+    # An impact is over at once: what has no impulse is left out of the balance.
+    bare = [replace(link, viscous=0.0, dry=0.0) for link in scene.fingers]
+    still = Scene(scene.polygon, (bare[0], bare[1]), scene.friction, 0.0)
+    rho, n_p, n_c = scene.polygon.gyration_radius, after.n_constraints, after.n_contacts
+    assert find_leaving(before, after) == [1]
+    for _ in range(3):
+        z, v_after, v_before = draw(rng)
+        T = rng.uniform(0.1, 0.3, 2)
+        impulses, Xi = rng.normal(size=n_p), rng.choice([-1.0, 1.0], n_c)
+        x = [T[1] * v_after, T[0] * v_before, T, z, impulses]
+        y = call(impact_kernel(before, after), x, Xi)
+        jump, held, leaving, cones = np.split(y, np.cumsum([5, n_p, 1]))
+        p_n, p_t = split_forces(after, impulses, Xi)
+        row = Samples(z, v_before, v_after - v_before, np.zeros(2), p_n, p_t)
+        missing, _ = unbalance(replace(after, scene=still), row, np.ones(2))
+        scale = scene.polygon.mass * rho * np.array([1.0, 1.0, rho, LEVER, LEVER]) / T[1]
+        np.testing.assert_allclose(jump * scale, -missing, atol=1e-13 * np.abs(missing).max())
+        rates, _ = constraints(after, z, v_after, 0 * z)
+        np.testing.assert_allclose(held * rho / T[1], rates, atol=1e-6)
+        opening, _ = constraints(Formation(scene, before.contacts[1:2]), z, v_after, 0 * z)
+        np.testing.assert_allclose(leaving * rho / T[1], opening, atol=1e-6)
+        rows = list(after.rolling_rows)
+        grip = after.friction[rows] * p_n[rows]
+        np.testing.assert_allclose(cones, [*(grip - p_t[rows]), *(grip + p_t[rows])], atol=1e-14)
+
+
+@every
+def test_kernels_have_a_row_for_each_condition(formation: Formation) -> None:
+    n_p, rolls = formation.n_constraints, formation.n_rolling
+    assert point_kernel(formation).outputs == 3 * n_p + 5 + formation.n_contacts - rolls
+    before = make_formation(formation.scene, "v2-palm")
+    assert impact_kernel(before, formation).outputs == 5 + n_p + 1 + 2 * rolls
+
+
+def test_kernels_of_a_formation_are_built_once(curves: tuple[Curve, ...]) -> None:
+    formation = curves[0].formation
+    assert point_kernel(formation) is point_kernel(formation)
+    assert watch_kernel(formation, (0, 1)) is not watch_kernel(formation, (1, 0))
