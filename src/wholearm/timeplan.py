@@ -76,18 +76,14 @@ def plan_phases(
 
     first = outline(halvings, _PACES[0])
     solution = _solve(search, first, halvings)
-    ahead = [] if solution.success else outline(halvings, _PACES[0], onwards=True)
-    if 0 < len(ahead) < len(first):
-        other = _solve(search, ahead, halvings)
-        solution = other if other.success else solution
     if solution.success:
         return _summarise(search, phases, solution)
     from .timeexplain import ease, explain, list_shortfalls
 
     status, eased = solution.status, None
     for times, pace in [(t, p) for t in dict.fromkeys((halvings, 0)) for p in _PACES]:
-        guess = outline(times, pace)
-        if pace != _PACES[0] or times != halvings:
+        guess = outline(times, pace, onwards=True)
+        if pace != _PACES[0] or times != halvings or len(guess) < len(first):
             solution = _solve(search, guess, times)
         eased = None if solution.success else ease(search, guess)
         if eased is not None:
