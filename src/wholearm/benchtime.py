@@ -149,7 +149,7 @@ def measure_time_solvers(problem: Problem) -> list[Row]:
             costs: dict[str, float] = {}
             for solver in ("ipopt", "fatrop"):
                 options = PlanOptions(goal, solver=solver)
-                search = Search(problem, options, scheme, None, goal)
+                search = Search(problem, options, scheme, None, goal, solver=solver)
                 stages = outline_stages(problem, block, start, scheme, FIRST, _PACE)
                 solution = search.solve(stages)
                 note = f"{search.effort.iterations} iterations"

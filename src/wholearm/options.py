@@ -58,8 +58,8 @@ class PlanOptions:
     scheme : str
         Which points: ``"radau"`` or ``"legendre"``.
     solver : str
-        ``"ipopt"``, or ``"fatrop"`` for `time` and `effort` along curves; phases in the time
-        domain use Ipopt.
+        ``"ipopt"``, or ``"fatrop"`` for `time` and `effort`, with Ipopt where that stops without
+        an answer.
 
     Raises
     ------
@@ -102,8 +102,6 @@ class PlanOptions:
             raise InputError("", "solver", f"{self.solver!r} given; allowed are {allowed}")
         if self.solver == "fatrop" and self.objective is Objective.MARGIN:
             raise InputError("", "solver", "'fatrop' is for time and effort; margin needs ipopt")
-        if self.solver == "fatrop" and self.transcription == "time":
-            raise InputError("", "solver", "'fatrop' is for curves; the time domain needs ipopt")
         weight = require_number(self.time_weight, "time_weight", positive=True)
         object.__setattr__(self, "time_weight", weight)
         if self.duration is not None:

@@ -116,19 +116,20 @@ def plan_curves(
     try:
         plans = _plan(curves, epsilon, options, phases, duration)
     except _StuckError as stuck:
+        if options.solver != "ipopt":
+            robust = replace(options, solver="ipopt")
+            return plan_curves(curves, epsilon, robust, phases, duration, explained)
         if not explained:
             raise
         from .pathexplain import explain
 
         late = _explain_duration(curves, epsilon, options, phases, duration)
-        # Advice is about the problem: it does not depend on the solver.
-        robust = replace(options, solver="ipopt")
         raise late or explain(
             stuck.parts,
             *guess_slowly(join(stuck.parts)),
             phases,
             str(stuck),
-            lambda changed, least: _plan(changed, least, robust, phases, duration),
+            lambda changed, least: _plan(changed, least, options, phases, duration),
         ) from None
     if options.goal is Objective.MARGIN and plans[0].value < epsilon - MISS:
         late = _explain_duration(curves, epsilon, options, phases, duration)
@@ -235,7 +236,7 @@ def _plan(
         costs = (0, 0, 0.0, 0.0)
         if not plans:
             costs = (solution.iterations, solves, nlp.build_time, solution.seconds)
-        plans.append(PhasePlan(motion, torque, value, *costs))
+        plans.append(PhasePlan(motion, torque, value, *costs, options.solver))
     return plans
 
 

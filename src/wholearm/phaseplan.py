@@ -21,9 +21,11 @@ class PhasePlan(NamedTuple, Generic[M_co]):
     value : float
         The phase's share of the objective: s, (N m)^2 s or N.
     iterations, solves : int
-        Of Ipopt in all, and how often it ran. Of phases in one NLP only the first one counts.
+        Of the solver in all, and how often it ran. Of phases in one NLP only the first one counts.
     build_time, solve_time : float, [s]
         The same for them.
+    solver : str
+        The solver that found it.
     """
 
     motion: M_co
@@ -33,3 +35,4 @@ class PhasePlan(NamedTuple, Generic[M_co]):
     solves: int
     build_time: float
     solve_time: float
+    solver: str = "ipopt"

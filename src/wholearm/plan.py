@@ -106,6 +106,7 @@ def solve_with(
         "intervals": options.intervals,
         "transcription": options.transcription,
         "solver": options.solver,
+        "solvers": [plan.solver for plan in plans],
         "time_weight": options.time_weight,
         "timings": {
             "trace": traced - started,

@@ -85,6 +85,7 @@ class Search:
     goal : Objective
     give : Give or None
         Which limits give way, for the objective `relax`.
+    solver : {"ipopt", "fatrop"}
     effort : Effort
     """
 
@@ -94,11 +95,12 @@ class Search:
     duration: float | None
     goal: Objective
     give: Give | None = None
+    solver: str = "ipopt"
     effort: Effort = field(default_factory=Effort)
 
     def aiming(self, goal: Objective, give: Give | None = None) -> Search:
         """The same search with another objective."""
-        return replace(self, goal=goal, give=give, duration=None)
+        return replace(self, goal=goal, give=give, duration=None, solver="ipopt")
 
     def solve(self, stages: list[Stage], before: Solution | None = None) -> Solution:
         """Solve from the stages' guesses, until no limit is broken at the points."""
@@ -120,7 +122,9 @@ class Search:
     def build(self, stages: Sequence[Stage]) -> TimeNLP:
         """Build the NLP."""
         weight = self.options.time_weight
-        nlp = build_time_nlp(stages, self.scheme, self.goal, weight, _ITERATIONS, self.give)
+        nlp = build_time_nlp(
+            stages, self.scheme, self.goal, weight, _ITERATIONS, self.give, self.solver
+        )
         self.effort.build_time += nlp.build_time
         return nlp
 

@@ -88,7 +88,9 @@ def build_staged_solver(
     alone = np.bincount(begins[~links], minlength=count)
     equations = (low == high)[order]
     stages = Stages(states, sizes.tolist(), alone.tolist(), equations.tolist())
-    solver = build_solver("time_nlp", built.nlp | {"p": ca.MX(0, 1)}, stages, max_iter=max_iter)
+    # Guesses are rougher here than along curves.
+    rough = {"mu_init": 1e-2, "bound_push": 1e-2, "tolerance": 1e-8}
+    solver = build_solver("time_nlp", built.nlp, stages, max_iter=max_iter, **rough)
     return StagedSolver(solver, order)
 
 
