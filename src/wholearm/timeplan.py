@@ -73,9 +73,9 @@ def plan_phases(
     wanted = options.time_intervals or _choose_intervals(phases)
     halvings = max(0, math.ceil(math.log2(wanted / FIRST)))
 
-    def outline(times: int, pace: float) -> list[Stage]:
+    def outline(times: int, pace: float, onwards: bool = False) -> list[Stage]:
         count = math.ceil(wanted / 2**times)
-        return outline_stages(problem, phases, z, scheme, count, pace)
+        return outline_stages(problem, phases, z, scheme, count, pace, onwards)
 
     first = outline(halvings, _PACES[0])
     if options.solver != "ipopt":
@@ -91,8 +91,8 @@ def plan_phases(
 
     status, eased = solution.status, None
     for times, pace in [(t, p) for t in dict.fromkeys((halvings, 0)) for p in _PACES]:
-        guess = outline(times, pace)
-        if pace != _PACES[0] or times != halvings:
+        guess = outline(times, pace, onwards=True)
+        if pace != _PACES[0] or times != halvings or len(guess) < len(first):
             solution = _solve(search, guess, times)
         eased = None if solution.success else ease(search, guess)
         if eased is not None:
