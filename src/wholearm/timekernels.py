@@ -105,7 +105,7 @@ def goal_kernel(
     if turns:
         rates = ca.vertcat(formation.function(z, w)[2] @ w / rho, w[3:])
         # A flush edge has one rate, and equations said twice spoil the solver's steps.
-        parts += [rates[k] for k in dict.fromkeys(formation.turn_with(k)[0] for k in turns)]
+        parts += [rates[k] for k in {formation.turn_with(k): k for k in turns}.values()]
     if gained is not None:
         P = gained.build_constraints(z, w)[1]
         parts += [P[i, :] @ w / rho for i in new_rows(formation, gained)]
