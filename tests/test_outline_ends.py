@@ -5,21 +5,32 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plane import make_formation, measure_gaps
+from plane import make_formation, measure_gaps, measure_slip
 from wholearm.contact import parse_contact
 from wholearm.errors import InputError
 from wholearm.formation import Formation
-from wholearm.outline import close, load, outline_phase
+from wholearm.options import PlanOptions
+from wholearm.outline import close, load, outline_curve, outline_onwards, outline_phase
 from wholearm.path import trace_phases
+from wholearm.pathplan import plan_path
 from wholearm.problem import Phase, Problem, Until
+from wholearm.timeplan import plan_phases
 
 CLOSED = 1e-9
 """Gap [m] that counts as closed: what a trajectory file promises."""
 
 
+FOLDER = Path(__file__).parents[1] / "problems"
+
+
 @pytest.fixture(scope="module")
 def hexagon() -> Problem:
-    return load(str(Path(__file__).parents[1] / "problems" / "hexagon.toml"))
+    return load(str(FOLDER / "hexagon.toml"))
+
+
+@pytest.fixture(scope="module")
+def square() -> Problem:
+    return load(str(FOLDER / "square.toml"))
 
 
 def test_an_end_is_found_where_the_nearest_one_breaks_a_limit(hexagon: Problem) -> None:
@@ -44,3 +55,48 @@ def test_an_end_that_is_nowhere_is_named(hexagon: Problem) -> None:
     with pytest.raises(InputError, match="v5-finger1 cannot be reached") as caught:
         outline_phase(hexagon, Phase(5, formation, until), start)
     assert caught.value.key == "phases[6].until"
+
+
+def test_ends_ahead_lie_where_the_motion_goes(square: Problem) -> None:
+    before = outline_curve(trace_phases(square)[2])[-1]
+    landing, start = square.phases[3], before.z[-1]
+    (nearest,) = outline_phase(square, landing, start)
+    onwards = outline_onwards(landing, before)
+    assert onwards
+    heading = (start - before.z[-2])[0]
+    for part in onwards:
+        np.testing.assert_array_equal(part.z[0], start)
+        assert max(np.abs(measure_gaps(part.formation, z)).max() for z in part.z) < CLOSED
+        assert part.formation.evaluate_limits(part.z).min() > -CLOSED
+        # Edge 1 is down, farther the way that the object goes.
+        assert part.z[-1, 2] == pytest.approx(-np.pi / 2, abs=CLOSED)
+        assert (part.z[-1, 0] - nearest.z[-1, 0]) * heading > 0
+    assert outline_onwards(square.phases[2], before) == []
+
+
+def test_contacts_of_a_flush_edge_turn_as_one(square: Problem) -> None:
+    formation, rng = square.phases[2].formation, np.random.default_rng(7)
+    assert [formation.turn_with(row) for row in range(6)] == [
+        (0,),
+        (1, 2),
+        (1, 2),
+        (3,),
+        (4,),
+        (5,),
+    ]
+    z = trace_phases(square)[2].end
+    free = np.linalg.svd(formation.evaluate(z[None], np.zeros((1, 5))).P[0])[2][4]
+    slip = measure_slip(formation, z, rng.normal() * free)
+    assert slip[1] == pytest.approx(slip[2], rel=1e-9)
+    assert np.abs(slip[[0, 3]] - slip[1]).min() > 1e-3 * np.abs(slip).max()
+
+
+def test_a_flush_edge_that_turns_is_planned_in_the_time_domain_too(square: Problem) -> None:
+    curves, options = trace_phases(square), PlanOptions()
+    curve = curves[2]
+    turning = [part.Xi for part in curve.segments]
+    assert len(turning) == 2 and (turning[0] != turning[1]).tolist() == [False, True, True, False]
+    exact = plan_path(curve, square.epsilon, options, 3, None).motion.duration
+    (plan,) = plan_phases(square, square.phases[2:3], curves[1].end, options)
+    # Torques that are linear in each interval come a little behind the true least time.
+    assert exact * (1 - 1e-4) < plan.motion.duration < 1.02 * exact

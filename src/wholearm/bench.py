@@ -19,6 +19,7 @@ from .baseline_opti import plan_with_opti
 from .baseline_simulation import simulate_with_scipy
 from .benchreport import Row, write_results
 from .benchsolvers import measure_solvers
+from .benchtime import measure_blocks, measure_order, measure_time_solvers, measure_transcriptions
 from .curve import Curve
 from .errors import InputError
 from .events import Simulation
@@ -30,7 +31,7 @@ from .pathmotion import PathMotion, make_grid
 from .pathnlp import build_path_nlp
 from .pathplan import guess, plan_path
 from .plan import solve
-from .problem import Problem, read_problem
+from .problem import End, Problem, read_problem
 from .simulate import simulate
 from .torque import TorqueProfile
 from .verify import verify
@@ -65,30 +66,37 @@ def run_bench(
     Raises
     ------
     InputError
-        If contacts roll, which the baselines do not know, or the folder cannot be made or written.
+        If the folder cannot be made or written.
     """
-    for phase in problem.phases:
-        for contact in phase.formation.rolling:
-            key = f"phases[{phase.number}].contacts"
-            raise InputError(problem.source, key, f"{contact} rolls; bench measures sliding only")
     try:
         os.makedirs(folder, exist_ok=True)
     except OSError as error:
         raise InputError(folder, "", f"cannot be made: {error.strerror}") from None
     report = progress or (lambda _: None)
-    studies: list[Callable[[Problem], list[Row]]] = [
-        measure_planner,
-        measure_simulator,
-        measure_baseline,
-        measure_solvers,
-        measure_parts,
+    curves = keep_curves(problem)
+    studies: list[tuple[Callable[[Problem], list[Row]], Problem | None]] = [
+        *((study, curves) for study in ON_CURVES),
+        (measure_blocks, problem),
+        (measure_parts, problem),
     ]
     rows: list[Row] = []
-    for study in studies:
+    for study, what in studies:
         report(f"bench: {study.__name__.removeprefix('measure_')}")
-        rows += study(problem)
+        rows += study(what) if what is not None else []
     stem = os.path.splitext(os.path.basename(problem.source or problem.name))[0]
     return write_results(problem.name, rows, os.path.join(folder, f"bench_{stem}"))
+
+
+def keep_curves(problem: Problem) -> Problem | None:
+    """The first phases of a problem as far as each is a curve of four sliding contacts.
+
+    These are what the baselines know; None if already the first phase is not.
+    """
+    curves = trace_phases(problem)
+    rolling = [bool(phase.formation.rolling) for phase in problem.phases[: len(curves)]]
+    count = [*rolling, True].index(True)
+    kept = tuple(replace(phase, end=End.REST) for phase in problem.phases[:count])
+    return replace(problem, phases=kept) if kept else None
 
 
 def measure_planner(problem: Problem) -> list[Row]:
@@ -321,3 +329,15 @@ def measure_parts(problem: Problem) -> list[Row]:
 
 def _run(command: Sequence[str]) -> None:
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+
+
+ON_CURVES: tuple[Callable[[Problem], list[Row]], ...] = (
+    measure_planner,
+    measure_simulator,
+    measure_baseline,
+    measure_solvers,
+    measure_order,
+    measure_transcriptions,
+    measure_time_solvers,
+)
+"""Studies of phases that are curves of four sliding contacts."""

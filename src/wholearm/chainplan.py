@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,44 +17,7 @@ from .pathplan import plan_curves
 from .phaseplan import PhasePlan
 from .problem import Phase
 from .trajectory import Motion
-
-
-class Transition(NamedTuple):
-    """An impact that a problem asks for, and what became of it.
-
-    Attributes
-    ----------
-    join : Join
-    speed : float, [m/s]
-        Along the curve that ends; zero if the motion stops there.
-    saves : float, [s], [(N m)^2 s] or [N]
-        How much better the objective is than with a stop instead, of the phases that are planned
-        together: less time or effort, or more margin. NaN if the impact is not possible, or there
-        is no plan with a stop.
-    """
-
-    join: Join
-    speed: float
-    saves: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, with None where there is no number."""
-        join = self.join
-        contact, impulse = join.impact.least
-        numbers = {
-            "velocity_ratio": join.ratio,
-            "least_impulse": impulse,
-            "speed": self.speed,
-            "saves": self.saves,
-        }
-        return {
-            "phase": join.phase.number,
-            "gained": str(join.phase.until),
-            "possible": join.possible,
-            "reason": join.reason,
-            "least_impulse_contact": contact,
-            **{key: value if math.isfinite(value) else None for key, value in numbers.items()},
-        }
+from .transition import Transition
 
 
 def plan_chain(
@@ -117,7 +79,7 @@ def assess(
     """
     found = []
     for chain in chains:
-        found += [Transition(join, 0.0, math.nan) for join in chain.joins if not join.possible]
+        found += [_describe(join, 0.0, math.nan) for join in chain.joins if not join.possible]
         for part in chain.split():
             own = [plans[phase.index] for phase in part.phases]
             value = combine(options.goal, [plan.value for plan in own])
@@ -129,8 +91,16 @@ def assess(
                 except (InfeasibleError, SolverError):
                     stopped = math.nan
                 gain = value - stopped if options.goal is Objective.MARGIN else stopped - value
-                found.append(Transition(join, _speed_at_end(part.curves[k], own[k].motion), gain))
-    return sorted(found, key=lambda transition: transition.join.phase.index)
+                found.append(_describe(join, _speed_at_end(part.curves[k], own[k].motion), gain))
+    return found
+
+
+def _describe(join: Join, speed: float, saves: float) -> Transition:
+    contact, impulse = join.impact.least
+    possible, until = join.possible, str(join.phase.until)
+    return Transition(
+        join.phase.number, until, possible, join.reason, join.ratio, impulse, contact, speed, saves
+    )
 
 
 def _speed_at_end(curve: Curve, motion: Motion) -> float:

@@ -115,6 +115,14 @@ class Formation:
         """Names of the contacts."""
         return tuple(contact.name for contact in self.contacts)
 
+    def turn_with(self, row: int) -> tuple[int, ...]:
+        """Rows of (contacts, joints) that turn as one with a row: a flush edge's, or its own."""
+        if row >= self.n_contacts or self.contacts[row].surface == "tip":
+            return (row,)
+        own = self.contacts[row]
+        on_side = [(c.surface, c.finger) == (own.surface, own.finger) for c in self.contacts]
+        return tuple(np.flatnonzero(on_side).tolist())
+
     @cached_property
     def friction(self) -> Array:
         """Diagonal of U, shape (n_c,)."""

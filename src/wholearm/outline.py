@@ -20,6 +20,8 @@ RELEASE_AT = 0.8
 """Where on a curve without an end of its own a release is guessed."""
 _MOST_ACTIVE = 2
 """Most limits that a phase's end may be right on."""
+_AHEAD = (0.25, 0.5, 1.0, 2.0)
+"""How far ahead ends are looked for, over the distance to the nearest."""
 _TURNS = np.linspace(-1.0, 1.0, 21)
 """How far the object is turned to look for an end that is not the nearest [rad]."""
 _STEP = 1e-6
@@ -122,8 +124,7 @@ def _find_goal(problem: Problem, phase: Phase, z: Array) -> Array:
     key = f"phases[{phase.number}].until"
     fixed = None
     if until.contact is not None:
-        contacts = (*formation.contacts, until.contact)
-        formation = Formation(formation.scene, contacts, formation.rolling)
+        formation = _end_formation(phase)
     elif until.value is not None:
         fixed = (0 if until.coordinate == "x" else 2, until.value)
     else:
@@ -147,6 +148,37 @@ def _find_goal(problem: Problem, phase: Phase, z: Array) -> Array:
         return goal
     text = f"{until} cannot be reached with these contacts{reason}"
     raise InputError(problem.source, key, text)
+
+
+def outline_onwards(phase: Phase, before: Outline) -> list[Outline]:
+    """Outline a phase that goes on from another outline, to ends that lie ahead of it.
+
+    Where a contact may be gained in many places, the nearest is often beside the motion so far:
+    these are nearest to places ahead. There are none for a phase with one freedom.
+    """
+    formation, z = phase.formation, before.z[-1]
+    if phase.until.contact is None or count_freedoms(formation, z) < 2:
+        return []
+    ending, slip = _end_formation(phase), formation.evaluate_slip(z[None])[0]
+    step = z - before.z[-2]
+    metric, outlines = metric_weights(formation.scene), []
+    nearest = close(ending, z, slip)
+    if nearest is None:
+        return []
+    far = np.sqrt((metric @ (nearest - z) ** 2) / (metric @ step**2))
+    for share in _AHEAD:
+        goal = close(ending, z + share * far * step, slip)
+        if goal is not None and ending.evaluate_limits(goal[None]).min() > -TOUCHING:
+            outlines.append(_connect(formation, z, goal))
+    return outlines
+
+
+def _end_formation(phase: Phase) -> Formation:
+    """A phase's formation with the contact that is gained at the end."""
+    formation, gained = phase.formation, phase.until.contact
+    if gained is None:
+        return formation
+    return Formation(formation.scene, (*formation.contacts, gained), formation.rolling)
 
 
 def _look_around(formation: Formation, ending: Formation, z: Array, slip: Array) -> Array | None:

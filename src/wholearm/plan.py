@@ -27,6 +27,7 @@ from .phaseplan import PhasePlan
 from .problem import End, Phase, Problem
 from .torque import TorqueProfile
 from .trajectory import Motion, Trajectory, assemble
+from .transition import Transition
 
 MOVED = 1e-9
 """Distance from which on a block starts somewhere else [m or rad]."""
@@ -87,6 +88,8 @@ def solve_with(
         _require_margin(problem, plans, allowed)
     planned = time.perf_counter()
     transitions = assess(chains, plans, problem.epsilon, options, allowed, report)
+    transitions += _assess_struck(problem, plans, options, allowed, report)
+    transitions.sort(key=lambda transition: transition.phase)
     assessed = time.perf_counter()
     motions = [plan.motion for plan in plans]
     values = [plan.value for plan in plans]
@@ -182,9 +185,9 @@ def _plan_block(
     """Plan a block from `z`, along its curves or in the time domain; also its curves."""
     plans: list[PhasePlan[Motion]] = []
     if not _run_on_curves(block, options):
-        from .timeplan import plan_phases
+        from .timeimpacts import plan_struck
 
-        plans += plan_phases(problem, block, z, options, add_up(block, allowed))
+        plans += plan_struck(problem, block, z, options, add_up(block, allowed))
         return plans, None
     curves, known = [], trace_phases(problem)
     for phase in block:
@@ -195,6 +198,25 @@ def _plan_block(
     for part in chain.split():
         plans += plan_chain(part, problem.epsilon, options, add_up(part.phases, allowed))
     return plans, chain
+
+
+def _assess_struck(
+    problem: Problem,
+    plans: Sequence[PhasePlan[Motion]],
+    options: PlanOptions,
+    allowed: Sequence[float | None],
+    report: Callable[[str], None],
+) -> list[Transition]:
+    """Assess the impacts of blocks that were planned in the time domain."""
+    found: list[Transition] = []
+    for block in split_blocks(problem):
+        if len(block) > 1 and not _run_on_curves(block, options):
+            from .timeimpacts import assess_struck
+
+            report(f"phase {block[0].number}: what impacts save")
+            own = [plans[phase.index] for phase in block]
+            found += assess_struck(problem, block, own, options, add_up(block, allowed))
+    return found
 
 
 def _require_margin(
@@ -226,6 +248,10 @@ def _share_again(
     fastest: Sequence[PhasePlan[Motion]],
 ) -> None:
     """Give a block its share for another least duration, at the cost of the phases after it."""
+    later = range(block[-1].index + 1, len(allowed))
+    rest = sum(allowed[k] or 0.0 for k in later)
+    if not rest:
+        return
     gain = 0.0
     for phase, plan in zip(block, fastest, strict=True):
         own = allowed[phase.index]
@@ -233,8 +259,6 @@ def _share_again(
             ratio = plan.motion.duration / least[phase.index].motion.duration
             gain += own * (ratio - 1)
             allowed[phase.index] = own * ratio
-    later = range(block[-1].index + 1, len(allowed))
-    rest = sum(allowed[k] or 0.0 for k in later)
     for k in later:
         own = allowed[k]
         allowed[k] = None if own is None else own * (1 - gain / rest)

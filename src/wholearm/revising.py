@@ -61,7 +61,8 @@ def turn_friction(stages: Sequence[Stage], scheme: Scheme) -> list[Stage] | None
             continue
         begin, stop = first // scheme.degree, -(-last // scheme.degree)
         signs = np.concatenate(stage.directions)
-        signs[row] *= -1
+        rows = stage.formation.turn_with(row)
+        signs[list(rows)] *= -1
         other = Directions(signs[:-2], signs[-2:])
         cuts = [(0, begin, stage.directions), (begin, stop, other)]
         cuts.append((stop, stage.intervals, stage.directions))
@@ -69,7 +70,7 @@ def turn_friction(stages: Sequence[Stage], scheme: Scheme) -> list[Stage] | None
         for start, end, directions in cuts:
             if end > start:
                 guess = _cut(stage.guess, scheme, start, end)
-                piece = replace(stage, directions=directions, guess=guess, turns=(row,))
+                piece = replace(stage, directions=directions, guess=guess, turns=rows)
                 opens = stage.opens and not pieces
                 pieces.append(replace(piece, until=None, gained=None, strikes=False, opens=opens))
         ending = {name: getattr(stage, name) for name in ("until", "gained", "strikes", "turns")}

@@ -12,7 +12,7 @@ from .collocation import Scheme
 from .dynamics import Directions
 from .formation import TOUCHING, Formation
 from .model import Array
-from .outline import Outline, outline_phase
+from .outline import Outline, outline_onwards, outline_phase
 from .problem import End, Phase, Problem
 from .stage import Stage, StagePoints
 from .timekernels import new_rows
@@ -30,16 +30,20 @@ def outline_stages(
     scheme: Scheme,
     intervals: int,
     pace: float,
+    onwards: bool = False,
 ) -> list[Stage]:
     """Stages of phases that are planned as one, with a first guess.
 
-    The guessed duration is `pace` times that of a fall over the length of the outlines.
+    The guessed duration is `pace` times that of a fall over the length of the outlines. With
+    `onwards`, phases that go on in motion may end farther away where that takes fewer reversals.
     """
     parts: list[tuple[Phase, Outline, bool]] = []
     for phase in phases:
         outlines = outline_phase(problem, phase, z)
         if parts and parts[-1][0].end is End.SMOOTH:
             outlines = [*_turn_first(outlines[0], parts[-1][1]), *outlines[1:]]
+            if onwards:
+                outlines = _go_straight(phase, outlines, parts[-1][1])
         parts += [(phase, outline, outline is outlines[-1]) for outline in outlines]
         z = outlines[-1].z[-1]
     lengths = np.array([outline.length for _, outline, _ in parts])
@@ -131,6 +135,12 @@ def _guess(
     )
 
 
+def _go_straight(phase: Phase, nearest: list[Outline], before: Outline) -> list[Outline]:
+    """Of outlines to the nearest end and to ends ahead, those with the fewest reversals."""
+    ahead = [_turn_first(other, before) for other in outline_onwards(phase, before)]
+    return min([nearest, *ahead], key=lambda way: (len(way), sum(part.length for part in way)))
+
+
 def _turn_first(outline: Outline, before: Outline) -> list[Outline]:
     """Split an outline so that it starts with the directions of the one that it goes on from.
 
@@ -138,23 +148,25 @@ def _turn_first(outline: Outline, before: Outline) -> list[Outline]:
     """
     names = before.formation.names
     known = dict(zip(names, before.directions.Xi, strict=True))
-    own = np.concatenate(outline.directions)
-    n_c = outline.formation.n_contacts
+    own, formation = np.concatenate(outline.directions), outline.formation
+    n_c = formation.n_contacts
     signs = own.copy()
     signs[n_c:] = before.directions.sigma
-    for k, name in enumerate(outline.formation.names):
-        if k not in outline.formation.rolling_rows:
-            signs[k] = known.get(name, signs[k])
-    turns = np.flatnonzero(signs != own).tolist()
+    for k in range(n_c):
+        if k not in formation.rolling_rows:
+            together = [formation.names[i] for i in formation.turn_with(k)]
+            signs[k] = next((known[name] for name in together if name in known), signs[k])
+    differing = np.flatnonzero(signs != own).tolist()
+    turns = list(dict.fromkeys(formation.turn_with(k) for k in differing))
     pieces = []
     cuts = np.linspace(0, len(outline.z) - 1, len(turns) + 2).astype(int)
     for k, (begin, stop) in enumerate(pairwise(cuts)):
-        turn = (turns[k],) if k < len(turns) else outline.turns
+        turn = turns[k] if k < len(turns) else outline.turns
         directions = Directions(signs[:n_c].copy(), signs[n_c:].copy())
         z = outline.z[begin : stop + 1]
         pieces.append(replace(outline, z=z, directions=directions, turns=turn))
         if k < len(turns):
-            signs[turns[k]] = own[turns[k]]
+            signs[list(turns[k])] = own[list(turns[k])]
     return pieces
 
 

@@ -27,6 +27,9 @@ SLACK_FORCE = 1e-9
 """How far below zero c_n counts as rounding [N]."""
 SLACK_LIMIT = 1e-9
 """How far below zero a limit counts as rounding [m]: the contact just given up starts at zero."""
+SHORT = 1e-6
+"""How far below zero a limit may start [m]: a phase may end at rest this much short of the place
+where the next one's formation begins."""
 SLACK_SPEED = 1e-13
 """How far below zero a speed counts as rounding [m/s, rad/s]."""
 
@@ -206,7 +209,7 @@ def build_stepper(formation: Formation, until: Until, side: float, degree: int) 
 def _slack(rows: EventRows) -> Array:
     slack = np.full(rows.size, SLACK_SPEED)
     slack[rows.force] = slack[rows.cone] = SLACK_FORCE
-    slack[rows.limit] = SLACK_LIMIT
+    slack[rows.limit] = SHORT
     slack[rows.until] = 0.0
     return slack
 

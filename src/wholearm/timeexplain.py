@@ -52,12 +52,12 @@ def explain(
     numbers = " and ".join(str(phase.number) for phase in phases)
     what = f"phase{'s' if len(phases) > 1 else ''} {numbers}"
     if eased is None:
-        return SolverError(f"no plan for {what}: Ipopt stopped with {status}")
+        return SolverError(f"no plan for {what}: {status}; try other time_intervals")
     problem = search.problem
     shortfalls = list_shortfalls(problem, eased)
     if not shortfalls:
         return SolverError(
-            f"no plan for {what}: Ipopt stopped with {status} although limits can be kept"
+            f"no plan for {what}: {status}, although limits can be kept; try other time_intervals"
         )
     are = "are" if len(phases) > 1 else "is"
     text = f"{what} {are} infeasible: {rank_shortfalls(shortfalls)}"

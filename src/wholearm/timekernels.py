@@ -104,7 +104,8 @@ def goal_kernel(
         parts.append((z[0] - until.value) / rho if x else z[2] - until.value)
     if turns:
         rates = ca.vertcat(formation.function(z, w)[2] @ w / rho, w[3:])
-        parts += [rates[k] for k in turns]
+        # A flush edge has one rate, and equations said twice spoil the solver's steps.
+        parts += [rates[k] for k in {formation.turn_with(k): k for k in turns}.values()]
     if gained is not None:
         P = gained.build_constraints(z, w)[1]
         parts += [P[i, :] @ w / rho for i in new_rows(formation, gained)]

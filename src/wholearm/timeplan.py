@@ -43,6 +43,7 @@ def plan_phases(
     duration: float | None = None,
     *,
     explained: bool = True,
+    patient: bool = True,
 ) -> list[PhasePlan[TimeMotion]]:
     """Plan phases that are one NLP, from rest at `z` to rest.
 
@@ -57,6 +58,8 @@ def plan_phases(
         Longest duration of all these phases, for the objective `margin`.
     explained : bool
         Whether to look for a change that would make a plan possible, where there is none.
+    patient : bool
+        Whether to try further guesses where the first one leads nowhere.
 
     Raises
     ------
@@ -70,9 +73,9 @@ def plan_phases(
     wanted = options.time_intervals or _choose_intervals(phases)
     halvings = max(0, math.ceil(math.log2(wanted / FIRST)))
 
-    def outline(times: int, pace: float) -> list[Stage]:
+    def outline(times: int, pace: float, onwards: bool = False) -> list[Stage]:
         count = math.ceil(wanted / 2**times)
-        return outline_stages(problem, phases, z, scheme, count, pace)
+        return outline_stages(problem, phases, z, scheme, count, pace, onwards)
 
     first = outline(halvings, _PACES[0])
     if options.solver != "ipopt":
@@ -88,8 +91,8 @@ def plan_phases(
 
     status, eased = solution.status, None
     for times, pace in [(t, p) for t in dict.fromkeys((halvings, 0)) for p in _PACES]:
-        guess = outline(times, pace)
-        if pace != _PACES[0] or times != halvings:
+        guess = outline(times, pace, onwards=True)
+        if pace != _PACES[0] or times != halvings or len(guess) < len(first):
             solution = _solve(search, guess, times)
         eased = None if solution.success else ease(search, guess)
         if eased is not None:
@@ -98,12 +101,12 @@ def plan_phases(
             solution = _solve(search, eased, times)
         if solution.success:
             return _summarise(search, phases, solution)
-        if not explained:
+        if not patient:
             break
 
     def replan(other: Problem) -> object:
         own = [other.phases[phase.index] for phase in phases]
-        return plan_phases(other, own, z, options, explained=False)
+        return plan_phases(other, own, z, options, explained=False, patient=False)
 
     raise explain(search, phases, eased, status, replan if explained else None)
 

@@ -24,6 +24,7 @@ REFINEMENTS = 1
 """Most times that intervals are halved because of misses."""
 _ITERATIONS = 150
 """Most iterations of one solve."""
+_NAMES = {"ipopt": "Ipopt", "fatrop": "fatrop"}
 _DEARER = 0.2
 """How much dearer, relatively, a plan may get by tightening before it counts as lost."""
 
@@ -49,7 +50,7 @@ class Solution(NamedTuple):
     margin : float, [N]
         Least c_n over epsilon, if that is an unknown.
     status : str
-        The solver's word for how it ended.
+        How it ended, in words.
     success : bool
     nlp : TimeNLP
         What was solved.
@@ -158,7 +159,7 @@ class Search:
             adopt(stages, unpack(stages, x, nlp.layouts)),
             cost,
             -cost if self.goal is Objective.MARGIN else 0.0,
-            stats["return_status"],
+            f"{_NAMES[self.solver]} stopped with {stats['return_status']}",
             stats["success"],
             nlp,
             {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")},
@@ -189,9 +190,11 @@ class Search:
             tighter = self.run(
                 solution.nlp, solution.stages, limits, solution.multipliers, solution.margin
             )
-            dearer = tighter.cost - solution.cost > _DEARER * abs(solution.cost)
-            if not tighter.success or dearer:
-                return tighter._replace(success=False)
+            if not tighter.success:
+                return tighter
+            if tighter.cost - solution.cost > _DEARER * abs(solution.cost):
+                status = "a plan that keeps limits between points is much dearer"
+                return tighter._replace(status=status, success=False)
             solution = tighter
         status = f"limits are still missed {worst:.2g} times what is allowed between points"
         return solution._replace(status=status, success=False)
