@@ -78,7 +78,8 @@ def plan_phases(
         return outline_stages(problem, phases, z, scheme, count, pace, onwards)
 
     first = outline(halvings, _PACES[0])
-    if options.solver != "ipopt":
+    # The rows of an impact are not of the form that fatrop asks for.
+    if options.solver != "ipopt" and not any(stage.strikes for stage in first):
         search.solver = options.solver
         solution = _solve(search, first, halvings)
         if solution.success:
