@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from conftest import HEPTAGON
-from timed import landing
+from timed import flip, landing
 from tipping import box
 from wholearm import fatrop, timenlp, timestaged
 from wholearm.cli import main
@@ -24,7 +24,7 @@ from wholearm.options import Objective, PlanOptions
 from wholearm.outline import load
 from wholearm.path import trace_phases
 from wholearm.plan import solve
-from wholearm.problem import End, Problem
+from wholearm.problem import End
 from wholearm.staging import outline_stages
 from wholearm.timelayout import pack
 from wholearm.timenlp import TimeNLP, build_time_nlp
@@ -32,14 +32,6 @@ from wholearm.timesearch import Search, Solution
 
 IMPACTS = HEPTAGON.with_name("heptagon_impact.toml")
 GOALS = [Objective.TIME, Objective.EFFORT]
-
-
-@lru_cache(maxsize=1)
-def flip() -> Problem:
-    """Phase 4 of the heptagon alone."""
-    problem = load(str(HEPTAGON))
-    phase = replace(problem.phases[3], index=0, end=End.REST)
-    return replace(problem, start=trace_phases(problem)[2].end, phases=(phase,))
 
 
 @lru_cache(maxsize=8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -34,6 +35,14 @@ HEPTAGON = Path(__file__).parents[1] / "problems" / "heptagon.toml"
 def landing() -> Problem:
     """A slide, a flip and a landing; its last two phases are joined smoothly."""
     return load(str(HEPTAGON))
+
+
+@lru_cache(maxsize=1)
+def flip() -> Problem:
+    """Phase 4 of the slide and the flip alone, in which nothing reverses."""
+    problem = load(str(HEPTAGON))
+    phase = replace(problem.phases[3], index=0)
+    return replace(problem, start=trace_phases(problem)[2].end, phases=(phase,))
 
 
 @lru_cache(maxsize=32)
