@@ -72,7 +72,9 @@ def _measure(problem: Problem, curve: Curve, phase: int, options: PlanOptions) -
         started = time.perf_counter()
         try:
             plan = plan_path(curve, problem.epsilon, options, phase)
-            note = f"{plan.iterations} iterations in {plan.solves} solves"
+            note, solved = f"{plan.iterations} iterations in {plan.solves} solves", True
+            if plan.solver != options.solver:
+                note, solved = f"does not converge: {plan.solver} plans instead", False
         except SolverError as error:
             note, solved = f"does not converge: {error}", False
         seconds.append(time.perf_counter() - started)
