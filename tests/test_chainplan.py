@@ -12,7 +12,7 @@ from plane import measure_gaps, measure_slip, unbalance
 from wholearm.chain import make_chain
 from wholearm.chainplan import add_up
 from wholearm.curve import metric_weights
-from wholearm.errors import InfeasibleError, InputError
+from wholearm.errors import InfeasibleError
 from wholearm.impact import strike
 from wholearm.model import Array
 from wholearm.outline import load
@@ -197,31 +197,6 @@ def test_durations_add_up(problem: Problem) -> None:
     chain = make_chain(problem.phases, trace_phases(problem)).split()[0]
     assert add_up(chain.phases, [0.1, 0.2, 0.3, 9.0, 9.0]) == pytest.approx(0.6)
     assert add_up(chain.phases, [None] * 5) is None
-
-
-def test_impacts_are_refused_in_the_time_domain(problem: Problem) -> None:
-    with pytest.raises(InputError, match="impacts are planned only along curves") as caught:
-        solve(problem, transcription="time")
-    assert (caught.value.source, caught.value.key) == (str(IMPACTS), "phases[1].end")
-
-
-def test_impacts_next_to_a_landing_are_refused() -> None:
-    landing = HEPTAGON.with_name("heptagon.toml")
-    table: dict[str, Any] = tomllib.loads(landing.read_text(encoding="utf-8"))
-    table["phases"][3]["end"] = "impact"
-    with pytest.raises(InputError) as caught:
-        solve(build_problem(table))
-    assert caught.value.key == "phases[4].end"
-
-
-def test_impacts_between_rolling_contacts_are_refused(problem: Problem) -> None:
-    """Known to the law and the simulator, but not planned yet."""
-    table: dict[str, Any] = copy.deepcopy(dict(problem.table))
-    table["phases"] = table["phases"][:2]
-    table["phases"][1]["contacts"] = ["v1-palm", "v3-finger1 rolling", "v5-finger2"]
-    table["phases"][1] |= {"until": {"phi_deg": -5.0}, "end": "rest"}
-    with pytest.raises(InputError, match="four sliding contacts"):
-        solve(build_problem(table))
 
 
 def unit(values: Array) -> Array:

@@ -156,10 +156,21 @@ def test_an_impulse_that_pulls_has_exit_status_1(
     )
 
 
-def test_impacts_are_for_curves(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    impacts = str(HEPTAGON.with_name("heptagon_impact.toml"))
-    text = fails(capsys, 2, "solve", impacts, "--transcription", "time")
-    assert text.startswith(f"{impacts}: phases[1].end: 'impact' given, but impacts are planned")
+def test_impacts_are_listed_in_the_time_domain_too(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = HEPTAGON.with_name("heptagon_impact.toml").read_text(encoding="utf-8")
+    two = "[[phases]]".join(whole.split("[[phases]]")[:3])
+    text = two.replace('until = "v6-finger2"\nend = "impact"', 'until = "v6-finger2"')
+    Path("two.toml").write_text(text, encoding="utf-8")
+    options = ["-o", "a.npz", "--transcription", "time", "--time-intervals", "8"]
+    assert main(["solve", "two.toml", *options]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    (head,) = (k for k, line in enumerate(lines) if "least impulse [N s per m/s]" in line)
+    phase, ratio, impulse, contact, speed, saves = lines[head + 1].split()
+    assert (phase, contact) == ("1", "v1-palm") and lines[head + 2] == ""
+    assert min(map(float, (ratio, impulse, speed, saves))) > 0.01
+    assert main(["verify", "two.toml", "a.npz"]) == 0
 
 
 @pytest.mark.parametrize("objective", ["time", "effort", "margin"])

@@ -79,12 +79,12 @@ def test_bad_options_are_named(key: str, given: Any) -> None:
     assert repr(given) in str(caught.value)
 
 
-def test_fatrop_is_for_time_and_effort_along_curves() -> None:
+@pytest.mark.parametrize("transcription", ["auto", "time"])
+def test_fatrop_is_for_time_and_effort(transcription: str) -> None:
     for objective in ("time", "effort"):
-        assert PlanOptions(objective, solver="fatrop").solver == "fatrop"
-    assert PlanOptions().solver == "ipopt"
-    with pytest.raises(InputError, match=r"solver: 'fatrop' .*; the time domain needs ipopt"):
-        PlanOptions(solver="fatrop", transcription="time")
+        options = PlanOptions(objective, solver="fatrop", transcription=transcription)
+        assert options.solver == "fatrop"
+    assert PlanOptions(transcription=transcription).solver == "ipopt"
 
 
 @pytest.mark.parametrize("objective", ["time", "effort"])
