@@ -32,7 +32,7 @@ def ease(search: Search, stages: Sequence[Stage]) -> list[Stage] | None:
 def explain(
     search: Search,
     phases: Sequence[Phase],
-    eased: list[Stage] | None,
+    short: Sequence[list[Stage]],
     status: str,
     replan: Replan | None,
 ) -> InfeasibleError | SolverError:
@@ -42,8 +42,8 @@ def explain(
     ----------
     search : Search
     phases : sequence of Phase
-    eased : list of Stage or None
-        What `ease` found.
+    short : sequence of list of Stage
+        What `ease` found from different guesses, where that is short of something.
     status : str
         How the solver ended, in words.
     replan : callable, optional
@@ -51,14 +51,15 @@ def explain(
     """
     numbers = " and ".join(str(phase.number) for phase in phases)
     what = f"phase{'s' if len(phases) > 1 else ''} {numbers}"
-    if eased is None:
+    if not short:
         return SolverError(f"no plan for {what}: {status}; try other time_intervals")
     problem = search.problem
+
+    def sum_up(stages: list[Stage]) -> float:
+        return sum(shortfall.amount for shortfall in list_shortfalls(problem, stages))
+
+    eased = min(short, key=sum_up)
     shortfalls = list_shortfalls(problem, eased)
-    if not shortfalls:
-        return SolverError(
-            f"no plan for {what}: {status}, although limits can be kept; try other time_intervals"
-        )
     are = "are" if len(phases) > 1 else "is"
     text = f"{what} {are} infeasible: {rank_shortfalls(shortfalls)}"
     if replan is None:

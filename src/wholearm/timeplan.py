@@ -12,7 +12,7 @@ it is a better guess, or says why there is no plan.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -31,6 +31,8 @@ REVISIONS = 2
 """Most times that directions of friction are revised."""
 FIRST = 8
 """Most intervals of a phase to start with."""
+CONVINCING = 2
+"""Motions that miss limits least, from different guesses, after which there seems to be no plan."""
 _PACES = (2.0, 4.0, 1.0)
 """Guessed durations to try, in units of that of a fall."""
 
@@ -90,26 +92,36 @@ def plan_phases(
         return _summarise(search, phases, solution)
     from .timeexplain import ease, explain, list_shortfalls
 
-    status, eased = solution.status, None
-    for times, pace in [(t, p) for t in dict.fromkeys((halvings, 0)) for p in _PACES]:
-        guess = outline(times, pace, onwards=True)
-        if pace != _PACES[0] or times != halvings or len(guess) < len(first):
+    status, short = solution.status, list[list[Stage]]()
+    for times, guess in _list_guesses(first, halvings, outline if patient else None):
+        if guess is not first:
             solution = _solve(search, guess, times)
         eased = None if solution.success else ease(search, guess)
-        if eased is not None:
-            if list_shortfalls(problem, eased):
-                break
+        if eased is not None and list_shortfalls(problem, eased):
+            short.append(eased)
+        elif eased is not None:
             solution = _solve(search, eased, times)
         if solution.success:
             return _summarise(search, phases, solution)
-        if not patient:
+        if len(short) == CONVINCING:
             break
 
     def replan(other: Problem) -> object:
         own = [other.phases[phase.index] for phase in phases]
         return plan_phases(other, own, z, options, explained=False, patient=False)
 
-    raise explain(search, phases, eased, status, replan if explained else None)
+    raise explain(search, phases, short, status, replan if explained else None)
+
+
+def _list_guesses(
+    first: list[Stage], halvings: int, outline: Callable[..., list[Stage]] | None
+) -> Iterator[tuple[int, list[Stage]]]:
+    """Guesses, with how often their intervals are to be halved; only the first without others."""
+    yield halvings, first
+    if outline is not None:
+        for times in dict.fromkeys((halvings, 0)):
+            for pace in _PACES:
+                yield times, outline(times, pace, onwards=True)
 
 
 def _choose_intervals(phases: Sequence[Phase]) -> int:

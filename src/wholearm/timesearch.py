@@ -16,14 +16,16 @@ from .timelayout import pack, unpack
 from .timelimits import Give
 from .timemotion import make_motions
 from .timenlp import TimeNLP, bound_unknowns, build_time_nlp
-from .warmstart import Multipliers, carry_multipliers, first_multipliers
+from .warmstart import FIRST_SIZE, Multipliers, carry_multipliers, first_multipliers
 
 ROUNDS = 12
 """Most times that limits are tightened."""
 REFINEMENTS = 1
 """Most times that intervals are halved because of misses."""
-_ITERATIONS = 150
-"""Most iterations of one solve."""
+_ITERATIONS = {Objective.ELASTIC: 300, Objective.RELAX: 300}
+"""Most iterations of one solve, if not 150."""
+_SOFT = 1e-2
+"""First multipliers where limits are soft."""
 _NAMES = {"ipopt": "Ipopt", "fatrop": "fatrop"}
 _DEARER = 0.2
 """How much dearer, relatively, a plan may get by tightening before it counts as lost."""
@@ -103,6 +105,11 @@ class Search:
         """The same search with another objective."""
         return replace(self, goal=goal, give=give, duration=None, solver="ipopt")
 
+    @property
+    def size(self) -> float:
+        """Multipliers of a first guess."""
+        return _SOFT if self.goal in _ITERATIONS else FIRST_SIZE
+
     def solve(self, stages: list[Stage], before: Solution | None = None) -> Solution:
         """Solve from the stages' guesses, until no limit is broken at the points."""
         while True:
@@ -122,10 +129,8 @@ class Search:
 
     def build(self, stages: Sequence[Stage]) -> TimeNLP:
         """Build the NLP."""
-        weight = self.options.time_weight
-        nlp = build_time_nlp(
-            stages, self.scheme, self.goal, weight, _ITERATIONS, self.give, self.solver
-        )
+        weight, limit = self.options.time_weight, _ITERATIONS.get(self.goal, 150)
+        nlp = build_time_nlp(stages, self.scheme, self.goal, weight, limit, self.give, self.solver)
         self.effort.build_time += nlp.build_time
         return nlp
 
@@ -148,7 +153,7 @@ class Search:
             ubx=high,
             lbg=low_g,
             ubg=high_g,
-            **(multipliers or first_multipliers((low, high), (low_g, high_g))),
+            **(multipliers or first_multipliers((low, high), (low_g, high_g), self.size)),
         )
         stats = nlp.solver.stats()
         self.effort.iterations += stats["iter_count"]

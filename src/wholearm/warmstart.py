@@ -10,24 +10,27 @@ from .model import Array
 from .stage import Stage
 from .timenlp import TimeNLP
 
-_MU = 1e-3
+FIRST_SIZE = 1e-3
 """Multipliers of a first guess."""
 
 Multipliers = dict[str, Array]
 """Of the unknowns' bounds, `lam_x0`, and of the rows, `lam_g0`."""
 
 
-def first_multipliers(bounds: Sequence[Array], row_bounds: Sequence[Array]) -> Multipliers:
+def first_multipliers(
+    bounds: Sequence[Array], row_bounds: Sequence[Array], size: float = FIRST_SIZE
+) -> Multipliers:
     """Multipliers of one size for all inequalities.
 
     Parameters
     ----------
     bounds, row_bounds : two arrays each
         Lower and upper bounds of unknowns and rows.
+    size : float
     """
     (low, high), (low_g, high_g) = bounds, row_bounds
     bounded = np.isfinite(high).astype(float) - np.isfinite(low)
-    return {"lam_x0": _MU * bounded, "lam_g0": np.where(high_g > low_g, -_MU, 0.0)}
+    return {"lam_x0": size * bounded, "lam_g0": np.where(high_g > low_g, -size, 0.0)}
 
 
 def carry_multipliers(
