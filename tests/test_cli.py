@@ -409,15 +409,6 @@ def test_verify_names_a_slip(folder: Path, capsys: pytest.CaptureFixture[str]) -
     assert err == "" and "FAILED\n" in out and "v1-palm slips: |c_t| = " in out
 
 
-def test_bench_refuses_what_its_baselines_do_not_know(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["bench", str(BOX), "-o", "results"]) == 2
-    error = capsys.readouterr().err
-    assert "phases[2].contacts: v1-palm rolls; bench measures sliding only" in error
-    assert not Path("results").exists()
-
-
 BAD_TORQUES = {
     "missing column": ("t,tau1\n0,0\n1,0\n", "tau2: column is missing; t,tau1 given"),
     "empty": ("", "t: column is missing; an empty file given"),

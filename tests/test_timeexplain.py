@@ -164,13 +164,20 @@ def test_a_changed_limit_is_the_only_change(index: int) -> None:
 
 def test_failures_that_no_limit_explains_are_the_solvers() -> None:
     problem, _ = shove()
-    stages = [outline(problem)]
-    failed = explain(search(problem), problem.phases, None, "Restoration_Failed", None)
+    failed = explain(search(problem), problem.phases, [], "Restoration_Failed", None)
     assert isinstance(failed, SolverError)
     assert str(failed).startswith("no plan for phases 1 and 2: Restoration_Failed; try other ")
-    kept = explain(search(problem), problem.phases[:1], stages, "Restoration_Failed", None)
-    assert isinstance(kept, SolverError)
-    assert str(kept).startswith("no plan for phase 1: Restoration_Failed, although limits can be ")
+
+
+def test_the_motion_that_is_short_of_least_is_described() -> None:
+    problem = change_limit(shove()[0], 2, 1.2)
+    near, far = outline(problem), outline(problem)
+    far = replace(far, guess=far.guess._replace(forces=0.5 * far.guess.forces))
+    for short in ([far], [near]), ([near], [far]):
+        error = explain(search(problem), problem.phases[:1], short, "", None)
+        assert isinstance(error, InfeasibleError) and error.exit_status == 1
+        assert str(error).startswith("phase 1 is infeasible: c_n of ")
+        assert str(error).count(" is 0.2 N short at t = ") == 3 == str(error).count(" short ")
 
 
 def test_easing_leaves_what_is_feasible_as_it_is() -> None:
