@@ -21,7 +21,7 @@ from .benchreport import Row, write_results
 from .benchsolvers import measure_solvers
 from .benchtime import measure_blocks, measure_order, measure_time_solvers, measure_transcriptions
 from .curve import Curve
-from .errors import InputError
+from .errors import InputError, WholearmError
 from .events import Simulation
 from .model import Array
 from .options import Objective, PlanOptions
@@ -81,8 +81,12 @@ def run_bench(
     ]
     rows: list[Row] = []
     for study, what in studies:
-        report(f"bench: {study.__name__.removeprefix('measure_')}")
-        rows += study(what) if what is not None else []
+        name = study.__name__.removeprefix("measure_").replace("_", " ")
+        report(f"bench: {name}")
+        try:
+            rows += study(what) if what is not None else []
+        except WholearmError as error:
+            rows.append(Row(name, "not measured", "", 0.0, None, str(error)))
     stem = os.path.splitext(os.path.basename(problem.source or problem.name))[0]
     return write_results(problem.name, rows, os.path.join(folder, f"bench_{stem}"))
 
