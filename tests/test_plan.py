@@ -7,13 +7,22 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
+from conftest import HEPTAGON
 from plane import measure_gaps, measure_slip, unbalance
+from thrown import shove
+from timed import fastest
 from tipping import tipped
+from wholearm import timeimpacts, timeplan
 from wholearm.errors import InfeasibleError, InputError
 from wholearm.model import Array
+from wholearm.options import Objective
+from wholearm.outline import load
+from wholearm.phaseplan import PhasePlan
 from wholearm.plan import solve
 from wholearm.problem import Problem
+from wholearm.timemotion import TimeMotion
 from wholearm.trajectory import Samples, Trajectory, load_trajectory
+from wholearm.verify import verify
 
 OBJECTIVES = ["time", "effort", "margin"]
 LIMIT = 2.0
@@ -277,3 +286,42 @@ def test_unknown_option(heptagon: Problem) -> None:
 def test_meta_names_what_rolls(trajectory: Trajectory) -> None:
     assert tipped().meta["rolling"] == [[], ["v1-palm"], []]
     assert trajectory.meta["rolling"] == [[]] * 5
+
+
+def test_a_block_that_starts_elsewhere_gets_another_share() -> None:
+    """Where a landing with another goal ends elsewhere, the slide after it has another length."""
+    path = HEPTAGON.with_name("heptagon_twice.toml")
+    problem, fastest_plan = load(str(path)), fastest(path)
+    allowed = 1.02 * fastest_plan.duration
+    plan = solve(problem, "margin", duration=allowed)
+    times = np.array(fastest_plan.meta["phase_durations"])
+    ratios = np.array(plan.meta["phase_durations"]) / times
+    starts = [each.motions[6].evaluate(np.zeros(1)).z[0] for each in (plan, fastest_plan)]
+    assert np.abs(starts[0] - starts[1]).max() > 1e-5
+    # Such a slide takes its time in proportion to its own least time, and the others the rest.
+    assert plan.duration < allowed * (1 + 1e-6)
+    assert abs(ratios[6] - 1.02) > 1e-3 and np.abs(ratios[[7, 8]] - 1.02).max() < 0.02
+    assert min(plan.meta["phase_values"]) >= problem.epsilon
+    report = verify(problem, plan)
+    assert report.ok, report.to_text()
+
+
+@pytest.mark.parametrize("low", [1, 2])
+def test_a_phase_without_margin_is_named(monkeypatch: pytest.MonkeyPatch, low: int) -> None:
+    problem, _ = shove()
+    plan_phases = timeplan.plan_phases
+
+    def plan_tightly(*arguments: Any, **options: Any) -> list[PhasePlan[TimeMotion]]:
+        plans = plan_phases(*arguments, **options)
+        if arguments[3].goal is Objective.MARGIN:
+            plans[low - 1] = plans[low - 1]._replace(value=0.031)
+        return plans
+
+    monkeypatch.setattr(timeimpacts, "plan_phases", plan_tightly)
+    least = solve(problem, time_intervals=4).meta["phase_durations"][low - 1]
+    with pytest.raises(InfeasibleError) as caught:
+        solve(problem, "margin", time_intervals=4)
+    assert str(caught.value) == (
+        f"phase {low}: in its share of the duration, {2 * least:.5g} s, the largest least c_n is "
+        "0.031 N, below epsilon = 0.05 N; allow a longer duration"
+    )
