@@ -98,9 +98,9 @@ def test_a_phase_that_only_a_quick_motion_carries(
     """Slow motions cannot press v1 on the palm so hard in phase 3."""
     slow = with_speed_limit(curves[2], (0.3, 0.3))
     with pytest.raises(InfeasibleError):
-        plan_path(slow, epsilon, PlanOptions(), 3)
+        plan_path(slow, epsilon, PlanOptions(intervals=40), 3)
     coarse, fine = (PhasePlane(curves[2], epsilon, n).least_time() for n in (300, 600))
-    chosen = plan_path(curves[2], epsilon, PlanOptions(intervals=320), 3)
+    chosen = plan_path(curves[2], epsilon, PlanOptions(intervals=160), 3)
     assert chosen.value == pytest.approx(2 * fine - coarse, rel=2e-4)
 
 
@@ -346,7 +346,7 @@ def test_shortfall_is_that_of_a_linear_program(
 ) -> None:
     problem = edited(**changes)
     with pytest.raises(InfeasibleError) as caught:
-        solve(problem)
+        solve(problem, intervals=40)
     message = str(caught.value)
     found = re.match(
         r"phase (\d) is infeasible: (.*?) is (\S+) N( m)? short at t = 0\.0000 s \(x = ", message
@@ -369,7 +369,7 @@ def test_shortfall_is_that_of_a_linear_program(
 )
 def test_infeasible_limits_are_named(changes: dict[str, Any], words: list[str]) -> None:
     with pytest.raises(InfeasibleError, match=r"^phase \d is infeasible: ") as caught:
-        solve(edited(**changes))
+        solve(edited(**changes), intervals=20)
     message = str(caught.value)
     assert all(word in message for word in words), message
     assert re.search(r"at t = \d+\.\d{4} s \(x = -?[\d.]+ mm, phi = -?[\d.]+ deg\)", message)

@@ -119,17 +119,18 @@ def test_a_slippery_palm_is_named() -> None:
     assert " N short at t = " in text
 
 
-@pytest.mark.parametrize("mu, epsilon", [(0.5, 1.0), (0.5, 2.0), (0.8, 0.7)])
+@pytest.mark.parametrize("mu, epsilon", [(0.5, 1.0), (0.8, 0.7)])
 def test_an_epsilon_that_cones_allow_is_advised(mu: float, epsilon: float) -> None:
     """Rolling contacts need c_n >= epsilon and a cone that is narrower by mu epsilon."""
+    options = PlanOptions(intervals=20)
     with pytest.raises(InfeasibleError) as caught:
-        plan_path(tip_on(mu), epsilon, PlanOptions(), 2)
+        plan_path(tip_on(mu), epsilon, options, 2)
     _, found, advised = str(caught.value).rpartition("epsilon = ")
     assert found and advised.endswith(f" N instead of {epsilon:g}")
     value = float(advised.split()[0])
-    assert plan_path(tip_on(mu), value, PlanOptions(), 2).value > plan("time", mu).value
+    assert plan_path(tip_on(mu), value, options, 2).value > plan("time", mu).value
     with pytest.raises(InfeasibleError):
-        plan_path(tip_on(mu), 1.03 * value, PlanOptions(), 2)
+        plan_path(tip_on(mu), 1.03 * value, options, 2)
 
 
 def test_forces_are_told_apart() -> None:

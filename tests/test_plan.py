@@ -185,7 +185,7 @@ def test_more_time_never_lowers_the_margin(heptagon: Problem, trajectory: Trajec
     least = trajectory.duration
     values = [
         solve(heptagon, "margin", duration=part * least, intervals=40).meta["value"]
-        for part in (1.02, 1.2, 1.6, 2.0, 3.0, 6.0)
+        for part in (1.02, 1.3, 2.0, 6.0)
     ]
     assert (np.diff(values) >= -1e-5).all()
     assert values[0] >= heptagon.epsilon and values[-1] > values[0] + 0.1

@@ -30,8 +30,8 @@ LEAST = 0.35 * 0.2 * 9.81
 """Least c_n of the shoved square [N]: friction shifts 0.15 of its weight to the vertex ahead."""
 
 
-def plan_all(problem: Problem, *, explained: bool = True) -> list[PhasePlan[TimeMotion]]:
-    return plan_phases(problem, problem.phases, problem.start, COARSE, explained=explained)
+def plan_all(problem: Problem, **options: bool) -> list[PhasePlan[TimeMotion]]:
+    return plan_phases(problem, problem.phases, problem.start, COARSE, **options)
 
 
 def why_not(plan: Callable[[], object]) -> str:
@@ -79,14 +79,15 @@ def test_there_is_a_plan_with_what_is_advised_and_none_with_less(
     enough = float(advised[1])
     assert (enough < value) == (index == 2)
     eased = change_limit(problem, index, enough)
-    for plan in plan_all(eased, explained=False):
+    for plan in plan_all(eased, explained=False, patient=False):
         t = np.linspace(0.0, plan.motion.duration, 101)
         samples = plan.motion.evaluate(t)
         assert samples.c_n.min() > eased.epsilon - 1e-6
         assert (np.abs(samples.tau) < eased.scene.torque_limit + 1e-6).all()
     # Advice is meant to be within 2 % of what is needed.
     nearer = enough * (1.03 if index == 2 else 0.97)
-    short = why_not(lambda: plan_all(change_limit(problem, index, nearer), explained=False))
+    closer = change_limit(problem, index, nearer)
+    short = why_not(lambda: plan_all(closer, explained=False, patient=False))
     assert " short at t = " in short and "feasible with" not in short
 
 
