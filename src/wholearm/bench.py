@@ -19,6 +19,7 @@ from .baseline_opti import plan_with_opti
 from .baseline_simulation import simulate_with_scipy
 from .benchreport import Row, write_results
 from .benchsolvers import measure_solvers
+from .benchstress import measure_stress
 from .benchtime import measure_blocks, measure_order, measure_time_solvers, measure_transcriptions
 from .curve import Curve
 from .errors import InputError, WholearmError
@@ -77,6 +78,7 @@ def run_bench(
     studies: list[tuple[Callable[[Problem], list[Row]], Problem | None]] = [
         *((study, curves) for study in ON_CURVES),
         (measure_blocks, problem),
+        (measure_stress, problem),
         (measure_parts, problem),
     ]
     rows: list[Row] = []
