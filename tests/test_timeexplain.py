@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thrown import lift, shove
+from thrown import shove
 from tipping import box
 from wholearm.collocation import make_scheme
 from wholearm.curve import Curve
@@ -66,7 +66,7 @@ def test_a_force_that_weight_limits_has_its_closed_form() -> None:
     "problem, index, value, name",
     [
         (shove()[0], 2, 1.0, "epsilon"),
-        (lift()[0], 0, 0.5, "torque limit of finger 1"),
+        (shove()[0], 0, 0.3, "torque limit of finger 1"),
     ],
     ids=["epsilon", "torque limit"],
 )
