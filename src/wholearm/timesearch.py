@@ -18,7 +18,7 @@ from .timemotion import make_motions
 from .timenlp import TimeNLP, bound_unknowns, build_time_nlp
 from .warmstart import FIRST_SIZE, Multipliers, carry_multipliers, first_multipliers
 
-ROUNDS = 12
+ROUNDS = 24
 """Most times that limits are tightened."""
 REFINEMENTS = 1
 """Most times that intervals are halved because of misses."""
