@@ -7,7 +7,7 @@ import pytest
 
 from timed import landing
 from tipping import box
-from wholearm.bench import keep_curves, run_bench
+from wholearm.benchmark.bench import keep_curves, run_bench
 from wholearm.errors import InputError
 from wholearm.problem import End, Problem
 

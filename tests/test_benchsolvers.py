@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from wholearm.benchreport import format_markdown
-from wholearm.benchsolvers import measure_solvers
+from wholearm.benchmark.benchreport import format_markdown
+from wholearm.benchmark.benchsolvers import measure_solvers
 from wholearm.path import trace_phases
 from wholearm.problem import Problem
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from planned import HEPTAGON
-from wholearm import benchstress
-from wholearm.benchstress import measure_stress
+from wholearm.benchmark import benchstress
+from wholearm.benchmark.benchstress import measure_stress
 from wholearm.outline import load
 
 

@@ -8,9 +8,9 @@ import pytest
 
 from thrown import shove
 from timed import flip
-from wholearm import benchtime
-from wholearm.benchreport import Row, format_markdown
-from wholearm.benchtime import (
+from wholearm.benchmark import benchtime
+from wholearm.benchmark.benchreport import Row, format_markdown
+from wholearm.benchmark.benchtime import (
     measure_blocks,
     measure_order,
     measure_time_solvers,

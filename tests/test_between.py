@@ -9,15 +9,15 @@ import pytest
 from plane import make_formation, measure_gaps
 from thrown import heave
 from timed import instants, landing, plan_landing, stages_of
-from wholearm.between import COARSE, GRAZE, MISS, Limits, find_misses
-from wholearm.collocation import make_scheme
 from wholearm.options import PlanOptions
-from wholearm.stage import Stage
-from wholearm.staging import outline_stages
-from wholearm.timemotion import StageMotion, make_motions
-from wholearm.timenlp import CLEAR
-from wholearm.timeplan import plan_phases
-from wholearm.timesearch import Search
+from wholearm.timedomain.between import COARSE, GRAZE, MISS, Limits, find_misses
+from wholearm.timedomain.collocation import make_scheme
+from wholearm.timedomain.stage import Stage
+from wholearm.timedomain.staging import outline_stages
+from wholearm.timedomain.timemotion import StageMotion, make_motions
+from wholearm.timedomain.timenlp import CLEAR
+from wholearm.timedomain.timeplan import plan_phases
+from wholearm.timedomain.timesearch import Search
 
 EPSILON = 0.05
 SCHEME = make_scheme("radau", 3)

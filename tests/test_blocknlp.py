@@ -6,9 +6,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from wholearm.blocknlp import Block, Kernel, Triplets, assemble_nlp, build_kernel
 from wholearm.contact import Expression
 from wholearm.model import Array
+from wholearm.timedomain.blocknlp import Block, Kernel, Triplets, assemble_nlp, build_kernel
 
 SIZE = 11
 CLOSE = 1e-12

@@ -9,14 +9,14 @@ import pytest
 
 from conftest import HEPTAGON
 from plane import measure_gaps, measure_slip, unbalance
-from wholearm.chain import make_chain
-from wholearm.chainplan import add_up
 from wholearm.curve import metric_weights
 from wholearm.errors import InfeasibleError
 from wholearm.impact import strike
 from wholearm.model import Array
 from wholearm.outline import load
 from wholearm.path import trace_phases
+from wholearm.pathdomain.chain import make_chain
+from wholearm.pathdomain.chainplan import add_up
 from wholearm.plan import solve
 from wholearm.problem import Problem, build_problem
 from wholearm.trajectory import Samples, Trajectory, load_trajectory
@@ -156,7 +156,7 @@ def test_no_plan_with_a_stop_leaves_the_saving_open(
     def fail(*_: object) -> None:
         raise InfeasibleError("nothing holds at rest")
 
-    monkeypatch.setattr("wholearm.chainplan.plan_chain", fail)
+    monkeypatch.setattr("wholearm.pathdomain.chainplan.plan_chain", fail)
     rows = solve(problem, intervals=20).meta["transitions"]
     assert [row["saves"] for row in rows] == 4 * [None]
     assert [row["speed"] > 0 for row in rows] == [True, True, False, False]

@@ -507,7 +507,7 @@ def test_solve_imports_only_what_it_needs(folder: Path) -> None:
     code = (
         "import sys\nfrom wholearm.cli import main\n"
         f"assert main(['solve', {str(HEPTAGON)!r}, '-o', 'a.npz']) == 0\n"
-        "unwanted = ('scipy', 'matplotlib', 'wholearm.simulate', 'wholearm.plots')\n"
+        "unwanted = ('scipy', 'matplotlib', 'wholearm.simulation.simulate', 'wholearm.plots')\n"
         "print([name for name in unwanted if name in sys.modules])"
     )
     result = run("-c", code, cwd=folder)

@@ -13,16 +13,16 @@ from scipy.optimize import linprog
 import wholearm
 from conftest import HEPTAGON
 from plane import finger_gap, make_scene, place_corners, point_to_segment
-from wholearm.borders import NOWHERE, label_cells
 from wholearm.cli import main
-from wholearm.closing import close, contact_table, first_contact
 from wholearm.curve import Curve
 from wholearm.errors import InputError
 from wholearm.formation import Formation, close_finger
-from wholearm.formationmap import Border, FormationMap, Window, build_map, list_formations
+from wholearm.mapping.borders import NOWHERE, label_cells
+from wholearm.mapping.closing import close, contact_table, first_contact
+from wholearm.mapping.formationmap import Border, FormationMap, Window, build_map, list_formations
+from wholearm.mapping.route import format_route
 from wholearm.model import Array, Scene
 from wholearm.problem import Problem, build_problem
-from wholearm.route import format_route
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
 WINDOW = Window((-0.16, 0.16), (np.radians(-110.0), np.radians(60.0)))

@@ -10,12 +10,12 @@ import pytest
 from conftest import HEPTAGON
 from moreau import collide
 from plane import SQUARE, cross, make_formation, make_scene, measure_gaps, measure_slip, touch
-from wholearm.chain import Chain, make_chain
 from wholearm.formation import Formation
 from wholearm.impact import Impact, Obstacle, strike, transfer
 from wholearm.model import Array, Friction, Scene
 from wholearm.outline import load
 from wholearm.path import trace_phases
+from wholearm.pathdomain.chain import Chain, make_chain
 
 ROUGH = Path(HEPTAGON).parent / "heptagon_impact.toml"
 MASS = 0.2

@@ -53,7 +53,8 @@ def test_a_function_is_not_shadowed_by_its_module(name: str) -> None:
     expected = "module" if name == "plots" else "function"
     code = (
         "import importlib, wholearm\n"
-        "for m in ('verify', 'simulate', 'plots', 'plan'): importlib.import_module('wholearm.' + m)"
+        "for m in ('verify', 'simulation.simulate', 'plots', 'plan'):\n"
+        "    importlib.import_module('wholearm.' + m)"
         f"\nprint(type(wholearm.{name}).__name__)"
         f"\nfrom wholearm import {name}\nprint(type({name}).__name__)"
     )

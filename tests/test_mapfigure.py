@@ -14,8 +14,8 @@ from matplotlib.text import Text
 from conftest import HEPTAGON
 from wholearm import plots
 from wholearm.cli import main
-from wholearm.formationmap import FormationMap, build_map
-from wholearm.mapfigure import draw_map
+from wholearm.mapping.formationmap import FormationMap, build_map
+from wholearm.mapping.mapfigure import draw_map
 from wholearm.problem import Problem
 from wholearm.trajectory import Trajectory
 

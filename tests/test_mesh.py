@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from timed import tables
-from wholearm.collocation import Scheme, make_scheme
-from wholearm.mesh import bisect, resample
 from wholearm.model import Array
-from wholearm.stage import StagePoints
+from wholearm.timedomain.collocation import Scheme, make_scheme
+from wholearm.timedomain.mesh import bisect, resample
+from wholearm.timedomain.stage import StagePoints
 
 SCHEMES = [("radau", 2), ("radau", 4), ("legendre", 3)]
 

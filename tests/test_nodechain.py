@@ -10,12 +10,12 @@ import pytest
 from wholearm.curve import Curve
 from wholearm.ipopt import build_solver
 from wholearm.model import Array
-from wholearm.nodechain import Chain, Links, StagedSolver, stage
 from wholearm.options import Objective
-from wholearm.pathdata import prepare
-from wholearm.pathmotion import make_grid
-from wholearm.pathnlp import Tightening, build_path_nlp, make_bounds, pack, parameters
-from wholearm.pathplan import guess
+from wholearm.pathdomain.nodechain import Chain, Links, StagedSolver, stage
+from wholearm.pathdomain.pathdata import prepare
+from wholearm.pathdomain.pathmotion import make_grid
+from wholearm.pathdomain.pathnlp import Tightening, build_path_nlp, make_bounds, pack, parameters
+from wholearm.pathdomain.pathplan import guess
 
 NODES = 7
 WIDTHS = (1, 3, 2, 3, 3, 2, 1)

@@ -12,9 +12,9 @@ from wholearm.formation import Formation
 from wholearm.options import PlanOptions
 from wholearm.outline import close, load, outline_curve, outline_onwards, outline_phase
 from wholearm.path import trace_phases
-from wholearm.pathplan import plan_path
+from wholearm.pathdomain.pathplan import plan_path
 from wholearm.problem import Phase, Problem, Until
-from wholearm.timeplan import plan_phases
+from wholearm.timedomain.timeplan import plan_phases
 
 CLOSED = 1e-9
 """Gap [m] that counts as closed: what a trajectory file promises."""

@@ -12,11 +12,12 @@ from wholearm.curve import Curve
 from wholearm.dynamics import PathForces, inverse
 from wholearm.errors import JammingError
 from wholearm.formation import Formation
+from wholearm.minima import find_least
 from wholearm.model import Array, Friction, Scene
 from wholearm.options import PlanOptions
-from wholearm.pathdata import PhaseData, Places, find_least, fit_torque, prepare
-from wholearm.pathmotion import Profile, directions_of, make_grid
-from wholearm.pathplan import plan_path
+from wholearm.pathdomain.pathdata import PhaseData, Places, fit_torque, prepare
+from wholearm.pathdomain.pathmotion import Profile, directions_of, make_grid
+from wholearm.pathdomain.pathplan import plan_path
 
 PHASES = range(5)
 EPSILON = 0.05

@@ -15,10 +15,10 @@ from wholearm.errors import InfeasibleError, WholearmError
 from wholearm.model import Array
 from wholearm.options import PlanOptions
 from wholearm.path import trace_phases
-from wholearm.pathdata import prepare
-from wholearm.pathexplain import with_limit
-from wholearm.pathmotion import make_grid
-from wholearm.pathplan import plan_path
+from wholearm.pathdomain.pathdata import prepare
+from wholearm.pathdomain.pathexplain import with_limit
+from wholearm.pathdomain.pathmotion import make_grid
+from wholearm.pathdomain.pathplan import plan_path
 from wholearm.plan import solve
 from wholearm.problem import Problem, build_problem
 

@@ -12,7 +12,7 @@ from scipy.integrate import quad, solve_ivp
 
 from wholearm.curve import Curve, Segment
 from wholearm.model import Array
-from wholearm.pathmotion import (
+from wholearm.pathdomain.pathmotion import (
     Grid,
     PathMotion,
     Profile,

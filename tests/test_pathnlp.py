@@ -13,9 +13,9 @@ from toys import Toy, constant, inertia
 from wholearm.curve import Curve
 from wholearm.model import Array
 from wholearm.options import CHOICES, Objective
-from wholearm.pathdata import PhaseData, prepare
-from wholearm.pathmotion import PathMotion, Profile, draw_together, make_grid
-from wholearm.pathnlp import (
+from wholearm.pathdomain.pathdata import PhaseData, prepare
+from wholearm.pathdomain.pathmotion import PathMotion, Profile, draw_together, make_grid
+from wholearm.pathdomain.pathnlp import (
     PathNLP,
     Scales,
     Tightening,
@@ -26,7 +26,7 @@ from wholearm.pathnlp import (
     parameters,
     unpack,
 )
-from wholearm.pathplan import guess
+from wholearm.pathdomain.pathplan import guess
 
 EPSILON = 0.05
 INTERVALS = 24

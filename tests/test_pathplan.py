@@ -16,8 +16,6 @@ from conftest import HEPTAGON
 from plane import with_speed_limit
 from topp import PhasePlane
 from toys import Toy, constant
-from wholearm.chain import Chain, make_chain
-from wholearm.chainplan import plan_chain
 from wholearm.curve import Curve
 from wholearm.dynamics import inverse
 from wholearm.errors import InfeasibleError, JammingError, SolverError
@@ -25,9 +23,11 @@ from wholearm.model import Array
 from wholearm.options import PlanOptions
 from wholearm.outline import load
 from wholearm.path import trace_phases
-from wholearm.pathmotion import PathMotion, directions_of
-from wholearm.pathnlp import build_path_nlp
-from wholearm.pathplan import plan_curves, plan_path
+from wholearm.pathdomain.chain import Chain, make_chain
+from wholearm.pathdomain.chainplan import plan_chain
+from wholearm.pathdomain.pathmotion import PathMotion, directions_of
+from wholearm.pathdomain.pathnlp import build_path_nlp
+from wholearm.pathdomain.pathplan import plan_curves, plan_path
 from wholearm.phaseplan import PhasePlan
 from wholearm.plan import solve
 from wholearm.problem import Problem, build_problem

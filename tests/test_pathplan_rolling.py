@@ -15,8 +15,8 @@ from wholearm.errors import InfeasibleError
 from wholearm.formation import Formation
 from wholearm.model import Array, Friction, Scene
 from wholearm.options import PlanOptions
-from wholearm.pathmotion import PathMotion
-from wholearm.pathplan import plan_path
+from wholearm.pathdomain.pathmotion import PathMotion
+from wholearm.pathdomain.pathplan import plan_path
 from wholearm.phaseplan import PhasePlan
 from wholearm.trajectory import Samples
 

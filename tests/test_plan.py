@@ -12,7 +12,6 @@ from plane import measure_gaps, measure_slip, unbalance
 from thrown import shove
 from timed import fastest
 from tipping import tipped
-from wholearm import timeimpacts, timeplan
 from wholearm.errors import InfeasibleError, InputError
 from wholearm.model import Array
 from wholearm.options import Objective
@@ -20,7 +19,8 @@ from wholearm.outline import load
 from wholearm.phaseplan import PhasePlan
 from wholearm.plan import solve
 from wholearm.problem import Problem
-from wholearm.timemotion import TimeMotion
+from wholearm.timedomain import timeimpacts, timeplan
+from wholearm.timedomain.timemotion import TimeMotion
 from wholearm.trajectory import Samples, Trajectory, load_trajectory
 from wholearm.verify import verify
 

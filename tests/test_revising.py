@@ -9,16 +9,16 @@ import pytest
 from plane import measure_slip
 from thrown import lift
 from timed import landing, plan_landing, stages_of, tables
-from wholearm.collocation import make_scheme
 from wholearm.dynamics import Directions
 from wholearm.model import Array
 from wholearm.options import PlanOptions
 from wholearm.path import trace_phases
-from wholearm.revising import adopt, halve, turn_friction, watch_broken
-from wholearm.stage import Stage
-from wholearm.staging import LEAST_INTERVALS, outline_stages
-from wholearm.timemotion import StageMotion, make_motions
-from wholearm.timesearch import Search, Solution
+from wholearm.timedomain.collocation import make_scheme
+from wholearm.timedomain.revising import adopt, halve, turn_friction, watch_broken
+from wholearm.timedomain.stage import Stage
+from wholearm.timedomain.staging import LEAST_INTERVALS, outline_stages
+from wholearm.timedomain.timemotion import StageMotion, make_motions
+from wholearm.timedomain.timesearch import Search, Solution
 
 SCHEME = make_scheme("radau", 3)
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from planned import plan
-from wholearm import rungekutta
-from wholearm.stepper import STATE, build_stepper
+from wholearm.simulation import rungekutta
+from wholearm.simulation.stepper import STATE, build_stepper
 
 
 def test_rows_sum_to_nodes() -> None:

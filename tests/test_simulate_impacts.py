@@ -17,7 +17,6 @@ from planned import SQUEEZES, DepartingMotion, change
 from timed import fastest
 from wholearm.contact import parse_contact
 from wholearm.dynamics import energy
-from wholearm.events import EventKind, OutcomeKind, Simulation
 from wholearm.formation import Formation
 from wholearm.impact import strike
 from wholearm.model import Array
@@ -25,7 +24,8 @@ from wholearm.outline import load
 from wholearm.path import trace_phases
 from wholearm.plan import solve
 from wholearm.problem import End, Phase, Problem, build_problem
-from wholearm.simulate import simulate
+from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
+from wholearm.simulation.simulate import simulate
 from wholearm.torque import TorqueProfile
 from wholearm.trajectory import Trajectory
 from wholearm.verify import verify

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 from planned import LandingMotion, change, plan_landing
-from wholearm.baseline_simulation import simulate_with_scipy
+from wholearm.benchmark.baseline_simulation import simulate_with_scipy
 from wholearm.contact import parse_contact
 from wholearm.dynamics import Directions, forward
 from wholearm.errors import SimulationError
-from wholearm.events import EventKind, OutcomeKind
 from wholearm.formation import Formation
 from wholearm.model import Array
 from wholearm.problem import End, Phase, Problem, Until
-from wholearm.simulate import simulate
-from wholearm.starting import Departure
-from wholearm.sticking import find_rest
+from wholearm.simulation.events import EventKind, OutcomeKind
+from wholearm.simulation.simulate import simulate
+from wholearm.simulation.starting import Departure
+from wholearm.simulation.sticking import find_rest
+from wholearm.simulation.transitions import project_velocity
 from wholearm.torque import TorqueProfile
-from wholearm.transitions import project_velocity
 from wholearm.verify import verify
 
 RELEASE = 0.5

@@ -8,11 +8,11 @@ import pytest
 from plane import measure_gaps
 from thrown import lift
 from timed import landing
-from wholearm.collocation import make_scheme
 from wholearm.outline import outline_phase
 from wholearm.path import trace_phases
-from wholearm.stage import Stage
-from wholearm.staging import LEAST_INTERVALS, outline_stages
+from wholearm.timedomain.collocation import make_scheme
+from wholearm.timedomain.stage import Stage
+from wholearm.timedomain.staging import LEAST_INTERVALS, outline_stages
 
 SCHEME = make_scheme("radau", 3)
 

@@ -9,20 +9,20 @@ import pytest
 
 from thrown import shove
 from tipping import box
-from wholearm.collocation import make_scheme
 from wholearm.curve import Curve
 from wholearm.errors import InfeasibleError, SolverError
 from wholearm.options import Objective, PlanOptions
 from wholearm.path import trace_phases
-from wholearm.pathplan import plan_path
+from wholearm.pathdomain.pathplan import plan_path
 from wholearm.phaseplan import PhasePlan
 from wholearm.problem import Problem
-from wholearm.stage import Stage
-from wholearm.staging import outline_stages
-from wholearm.timeexplain import change_limit, ease, explain, list_shortfalls
-from wholearm.timemotion import TimeMotion
-from wholearm.timeplan import plan_phases
-from wholearm.timesearch import Search
+from wholearm.timedomain.collocation import make_scheme
+from wholearm.timedomain.stage import Stage
+from wholearm.timedomain.staging import outline_stages
+from wholearm.timedomain.timeexplain import change_limit, ease, explain, list_shortfalls
+from wholearm.timedomain.timemotion import TimeMotion
+from wholearm.timedomain.timeplan import plan_phases
+from wholearm.timedomain.timesearch import Search
 
 SCHEME = make_scheme("radau", 3)
 COARSE = PlanOptions(time_intervals=4)

@@ -8,14 +8,14 @@ import pytest
 from plane import make_formation, measure_gaps, measure_slip, unbalance
 from timed import landing
 from tipping import roll
-from wholearm.blocknlp import Kernel
 from wholearm.contact import parse_contact
 from wholearm.curve import Curve
 from wholearm.dynamics import split_forces
 from wholearm.formation import Formation
 from wholearm.model import Array, Scene
 from wholearm.problem import Until
-from wholearm.timekernels import (
+from wholearm.timedomain.blocknlp import Kernel
+from wholearm.timedomain.timekernels import (
     LEVER,
     effort_kernel,
     end_kernel,

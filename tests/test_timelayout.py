@@ -9,11 +9,21 @@ import pytest
 from plane import make_formation
 from timed import landing, tables
 from tipping import roll
-from wholearm.collocation import make_scheme
 from wholearm.dynamics import Directions
 from wholearm.model import Array
-from wholearm.stage import Stage, StagePoints
-from wholearm.timelayout import BEFORE, MARGIN, StageLayout, T, W, Z, lay_out, pack, unpack
+from wholearm.timedomain.collocation import make_scheme
+from wholearm.timedomain.stage import Stage, StagePoints
+from wholearm.timedomain.timelayout import (
+    BEFORE,
+    MARGIN,
+    StageLayout,
+    T,
+    W,
+    Z,
+    lay_out,
+    pack,
+    unpack,
+)
 
 SCHEMES = [("radau", 2), ("radau", 3), ("legendre", 2), ("legendre", 4)]
 

@@ -8,11 +8,11 @@ import pytest
 from plane import measure_gaps, measure_slip, unbalance
 from planned import CosineMotion
 from timed import drive, fastest_landing, instants, integrate
-from wholearm.collocation import make_scheme
 from wholearm.curve import Curve
 from wholearm.dynamics import Directions
 from wholearm.formation import Formation
-from wholearm.timemotion import StageMotion, TimeMotion
+from wholearm.timedomain.collocation import make_scheme
+from wholearm.timedomain.timemotion import StageMotion, TimeMotion
 from wholearm.trajectory import Samples
 
 

@@ -11,8 +11,6 @@ from plane import make_formation, measure_gaps, with_speed_limit
 from planned import HEPTAGON, CosineMotion
 from timed import drive
 from tipping import roll
-from wholearm.between import Limits, raise_bounds
-from wholearm.collocation import Scheme, make_scheme
 from wholearm.curve import Curve, metric_weights
 from wholearm.dynamics import Directions
 from wholearm.formation import Formation
@@ -20,9 +18,11 @@ from wholearm.model import Array
 from wholearm.options import Objective
 from wholearm.outline import load
 from wholearm.path import trace_phases
-from wholearm.stage import Stage, StagePoints
-from wholearm.timelayout import MARGIN, T, W, pack
-from wholearm.timenlp import (
+from wholearm.timedomain.between import Limits, raise_bounds
+from wholearm.timedomain.collocation import Scheme, make_scheme
+from wholearm.timedomain.stage import Stage, StagePoints
+from wholearm.timedomain.timelayout import MARGIN, T, W, pack
+from wholearm.timedomain.timenlp import (
     CLEAR,
     LONGEST,
     OPENING,

@@ -29,8 +29,8 @@ from wholearm.path import trace_phases
 from wholearm.phaseplan import PhasePlan
 from wholearm.plan import solve
 from wholearm.problem import Problem
-from wholearm.timemotion import StageMotion, TimeMotion
-from wholearm.timeplan import plan_phases
+from wholearm.timedomain.timemotion import StageMotion, TimeMotion
+from wholearm.timedomain.timeplan import plan_phases
 from wholearm.trajectory import Trajectory
 from wholearm.verify import verify
 

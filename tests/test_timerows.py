@@ -3,8 +3,8 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from wholearm.blocknlp import Kernel, build_kernel
-from wholearm.timerows import Rows
+from wholearm.timedomain.blocknlp import Kernel, build_kernel
+from wholearm.timedomain.timerows import Rows
 
 
 def product() -> Kernel:

@@ -14,9 +14,8 @@ import pytest
 from conftest import HEPTAGON
 from timed import flip, landing
 from tipping import box
-from wholearm import fatrop, timenlp, timestaged
+from wholearm import fatrop
 from wholearm.cli import main
-from wholearm.collocation import make_scheme
 from wholearm.contact import Expression
 from wholearm.fatrop import Stages
 from wholearm.model import Array
@@ -25,10 +24,12 @@ from wholearm.outline import load
 from wholearm.path import trace_phases
 from wholearm.plan import solve
 from wholearm.problem import End
-from wholearm.staging import outline_stages
-from wholearm.timelayout import pack
-from wholearm.timenlp import TimeNLP, build_time_nlp
-from wholearm.timesearch import Search, Solution
+from wholearm.timedomain import timenlp, timestaged
+from wholearm.timedomain.collocation import make_scheme
+from wholearm.timedomain.staging import outline_stages
+from wholearm.timedomain.timelayout import pack
+from wholearm.timedomain.timenlp import TimeNLP, build_time_nlp
+from wholearm.timedomain.timesearch import Search, Solution
 
 IMPACTS = HEPTAGON.with_name("heptagon_impact.toml")
 GOALS = [Objective.TIME, Objective.EFFORT]

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from timed import landing
-from wholearm.collocation import make_scheme
 from wholearm.options import PlanOptions
 from wholearm.path import trace_phases
-from wholearm.revising import halve
-from wholearm.staging import outline_stages
-from wholearm.timesearch import Search, Solution
-from wholearm.warmstart import carry_multipliers, first_multipliers
+from wholearm.timedomain.collocation import make_scheme
+from wholearm.timedomain.revising import halve
+from wholearm.timedomain.staging import outline_stages
+from wholearm.timedomain.timesearch import Search, Solution
+from wholearm.timedomain.warmstart import carry_multipliers, first_multipliers
 
 SCHEME = make_scheme("radau", 3)
 

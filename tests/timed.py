@@ -13,7 +13,6 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from plane import accelerate
-from wholearm.collocation import Scheme
 from wholearm.dynamics import Directions
 from wholearm.formation import Formation
 from wholearm.model import Array
@@ -23,9 +22,10 @@ from wholearm.path import trace_phases
 from wholearm.phaseplan import PhasePlan
 from wholearm.plan import solve
 from wholearm.problem import Problem
-from wholearm.stage import StagePoints
-from wholearm.timemotion import StageMotion, TimeMotion
-from wholearm.timeplan import plan_phases
+from wholearm.timedomain.collocation import Scheme
+from wholearm.timedomain.stage import StagePoints
+from wholearm.timedomain.timemotion import StageMotion, TimeMotion
+from wholearm.timedomain.timeplan import plan_phases
 from wholearm.trajectory import Trajectory
 
 HEPTAGON = Path(__file__).parents[1] / "problems" / "heptagon.toml"

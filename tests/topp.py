@@ -9,7 +9,7 @@ import numpy as np
 from wholearm.curve import Curve
 from wholearm.dynamics import PathForces, inverse
 from wholearm.model import Array
-from wholearm.pathmotion import directions_of
+from wholearm.pathdomain.pathmotion import directions_of
 
 
 def _look(curve: Curve, steps: int) -> tuple[Array, PathForces]:

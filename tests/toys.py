@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from wholearm import pathdata
 from wholearm.curve import Curve, Segment
 from wholearm.dynamics import Directions, PathForces
 from wholearm.model import Array
 from wholearm.options import PlanOptions
-from wholearm.pathmotion import PathMotion
-from wholearm.pathplan import plan_path
+from wholearm.pathdomain import pathdata
+from wholearm.pathdomain.pathmotion import PathMotion
+from wholearm.pathdomain.pathplan import plan_path
 from wholearm.phaseplan import PhasePlan
 
 Law = Callable[[Array, NDArray[np.bool_]], tuple[Array, ...]]

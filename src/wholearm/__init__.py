@@ -1,6 +1,6 @@
 """Plans joint-torque trajectories for dynamic whole-arm manipulation in the plane.
 
->>> problem = wholearm.load("problems/heptagon_four_contacts.toml")
+>>> problem = wholearm.load("problems/heptagon.toml")
 >>> trajectory = wholearm.solve(problem, objective="time")
 >>> report = wholearm.verify(problem, trajectory)
 >>> figure = wholearm.plots.force_margins(trajectory)
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     )
     from .outline import load
     from .plan import solve
-    from .simulate import simulate
+    from .simulation.simulate import simulate
     from .torque import TorqueProfile, read_torque_csv
     from .trajectory import Trajectory, load_trajectory
     from .verify import verify
@@ -46,7 +46,7 @@ _HOMES = {
     "load": "outline",
     "load_trajectory": "trajectory",
     "read_torque_csv": "torque",
-    "simulate": "simulate",
+    "simulate": "simulation.simulate",
     "solve": "plan",
     "verify": "verify",
 }

@@ -228,7 +228,7 @@ def _plot(options: argparse.Namespace) -> int:
     simulation = None
     if options.simulate:
         from .problem import build_problem
-        from .simulate import simulate
+        from .simulation.simulate import simulate
 
         problem = build_problem(trajectory.meta["problem"], options.trajectory)
         simulation = simulate(problem, trajectory.torque, progress=_progress())
@@ -248,7 +248,7 @@ def _map(options: argparse.Namespace) -> int:
     if route:
         from math import radians
 
-        from .route import format_route, list_formations
+        from .mapping.route import format_route, list_formations
 
         poses = [(x, radians(angle)) for x, angle in route]
         print(format_route(list_formations(read_problem(options.problem), *poses)), end="")
@@ -260,8 +260,8 @@ def _map(options: argparse.Namespace) -> int:
 def _draw_map(options: argparse.Namespace, phi: tuple[float, float] | None) -> int:
     from . import plots
     from .files import require_writable
-    from .formationmap import build_map, choose_window
-    from .mapfigure import draw_map
+    from .mapping.formationmap import build_map, choose_window
+    from .mapping.mapfigure import draw_map
     from .problem import read_problem
     from .trajectory import load_trajectory
 
@@ -295,7 +295,7 @@ def _protect(text: str) -> str:
 
 
 def _bench(options: argparse.Namespace) -> int:
-    from .bench import run_bench
+    from .benchmark.bench import run_bench
     from .outline import load
 
     written = run_bench(load(options.problem), options.output, progress=_progress())

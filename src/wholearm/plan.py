@@ -17,12 +17,12 @@ import casadi as ca
 import numpy as np
 
 from . import __version__
-from .chain import Chain, make_chain
-from .chainplan import add_up, assess, combine, plan_chain
 from .errors import InfeasibleError
 from .model import Array
 from .options import Objective, PlanOptions
 from .path import runs_on_curve, trace_phase, trace_phases
+from .pathdomain.chain import Chain, make_chain
+from .pathdomain.chainplan import add_up, assess, combine, plan_chain
 from .phaseplan import PhasePlan
 from .problem import End, Phase, Problem
 from .torque import TorqueProfile
@@ -185,7 +185,7 @@ def _plan_block(
     """Plan a block from `z`, along its curves or in the time domain; also its curves."""
     plans: list[PhasePlan[Motion]] = []
     if not _run_on_curves(block, options):
-        from .timeimpacts import plan_struck
+        from .timedomain.timeimpacts import plan_struck
 
         plans += plan_struck(problem, block, z, options, add_up(block, allowed))
         return plans, None
@@ -211,7 +211,7 @@ def _assess_struck(
     found: list[Transition] = []
     for block in split_blocks(problem):
         if len(block) > 1 and not _run_on_curves(block, options):
-            from .timeimpacts import assess_struck
+            from .timedomain.timeimpacts import assess_struck
 
             report(f"phase {block[0].number}: what impacts save")
             own = [plans[phase.index] for phase in block]

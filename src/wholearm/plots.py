@@ -35,7 +35,7 @@ from .torque import TorqueProfile
 from .trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from .events import Simulation
+    from .simulation.events import Simulation
 
 SIZE = (10.0, 8.2)  # in
 _FORMATS: dict[str, dict[str, Any]] = {

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from .cones import slip_margins
 from .errors import InputError
-from .events import Event, EventKind, OutcomeKind, Simulation
-from .jumps import SETTLING
 from .model import Array
 from .problem import End, Phase, Problem
 from .report import (
@@ -22,7 +20,9 @@ from .report import (
     Report,
     SlipMargin,
 )
-from .simulate import simulate
+from .simulation.events import Event, EventKind, OutcomeKind, Simulation
+from .simulation.jumps import SETTLING
+from .simulation.simulate import simulate
 from .torque import TorqueProfile
 from .trajectory import Trajectory
 

@@ -1,0 +1,215 @@
+"""The simulation an ordinary user would write, to measure `wholearm.simulation.simulate` against.
+
+The Newton-Euler equations of object and fingers are written out in NumPy, contact by contact, and
+solved together with the contact conditions as one linear system in every call of
+`scipy.integrate.solve_ivp`. Nothing is shared with the package's own contacts and dynamics, so this
+is an independent second formulation too. Friction keeps the directions it is given: no sticking,
+no reversals, no change of formation.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from ..contact import Contact
+from ..model import Array, Scene
+from ..problem import Problem
+from ..torque import TorqueProfile
+
+
+class BaselineRun(NamedTuple):
+    """What the baseline returns.
+
+    Attributes
+    ----------
+    t : ndarray, shape (n,), [s]
+        Ends of the steps.
+    z, z_dot : ndarray, shape (n, 5)
+    c_n : ndarray, shape (n, n_c), [N]
+    evaluations : int
+        Calls of the right-hand side.
+    lost : int or None
+        Index of the contact whose c_n fell to zero and ended the run at t[-1].
+    """
+
+    t: Array
+    z: Array
+    z_dot: Array
+    c_n: Array
+    evaluations: int
+    lost: int | None
+
+
+def simulate_with_scipy(
+    problem: Problem,
+    phase_index: int,
+    torque: TorqueProfile,
+    z0: Array,
+    z_dot0: Array,
+    Xi: Array,
+    sigma: Array,
+    t_span: tuple[float, float],
+    *,
+    rtol: float = 1e-9,
+    atol: float = 1e-9,
+    method: str = "DOP853",
+    watch_forces: bool = False,
+) -> BaselineRun:
+    """Integrate one phase's formation with SciPy, piece by piece of the torques.
+
+    Parameters
+    ----------
+    problem : Problem
+    phase_index : int
+        From 0.
+    torque : TorqueProfile
+    z0, z_dot0 : ndarray, shape (5,)
+        State at t_span[0].
+    Xi, sigma : ndarray, shape (n_c,) and (2,)
+        Directions of sliding and of the joints, kept throughout.
+    t_span : tuple of float, [s]
+    rtol, atol : float
+        Tolerances of `solve_ivp`.
+    method : str
+        Method of `solve_ivp`.
+    watch_forces : bool
+        Stop where a c_n falls to zero.
+    """
+    from scipy.integrate import solve_ivp
+
+    scene = problem.scene
+    contacts = problem.phases[phase_index].formation.contacts
+
+    def forces(t: float, state: Array) -> tuple[Array, Array]:
+        piece = active
+        start, stop = torque.breaks[piece], torque.breaks[piece + 1]
+        x = (2 * t - start - stop) / (stop - start)
+        tau = torque.coefficients[piece] @ x ** np.arange(torque.coefficients.shape[2])
+        return solve_motion(scene, contacts, state[:5], state[5:], tau, Xi, sigma)
+
+    def derivative(t: float, state: Array) -> Array:
+        acceleration, _ = forces(t, state)
+        return np.concatenate([state[5:], acceleration])
+
+    def watch(index: int) -> object:
+        def event(t: float, state: Array) -> float:
+            return float(forces(t, state)[1][index])
+
+        event.terminal = True  # type: ignore[attr-defined]
+        event.direction = -1  # type: ignore[attr-defined]
+        return event
+
+    events = [watch(k) for k in range(len(contacts))] if watch_forces else None
+    inner = torque.breaks[(torque.breaks > t_span[0]) & (torque.breaks < t_span[1])]
+    ends = [t_span[0], *inner.tolist(), t_span[1]]
+    state = np.concatenate([z0, z_dot0])
+    times, states, normal, evaluations, lost = [], [], [], 0, None
+    for start, stop in pairwise(ends):
+        middle = (start + stop) / 2
+        active = int(np.searchsorted(torque.breaks, middle, side="right")) - 1
+        active = min(max(active, 0), len(torque.coefficients) - 1)
+        solution = solve_ivp(
+            derivative, (start, stop), state, method=method, rtol=rtol, atol=atol, events=events
+        )
+        state = solution.y[:, -1]
+        times.append(solution.t)
+        states.append(solution.y.T)
+        if watch_forces:
+            normal += [forces(t, y)[1] for t, y in zip(solution.t, solution.y.T, strict=True)]
+        evaluations += solution.nfev
+        if solution.status == 1:
+            lost = next(k for k, found in enumerate(solution.t_events) if len(found))
+            break
+    history = np.concatenate(states)
+    c_n = np.array(normal).reshape(-1, len(contacts))
+    return BaselineRun(
+        np.concatenate(times), history[:, :5], history[:, 5:], c_n, evaluations, lost
+    )
+
+
+def solve_motion(
+    scene: Scene,
+    contacts: tuple[Contact, ...],
+    z: Array,
+    z_dot: Array,
+    tau: Array,
+    Xi: Array,
+    sigma: Array,
+) -> tuple[Array, Array]:
+    """Accelerations z'', shape (5,), and c_n, shape (n_c,) [N], from one linear system.
+
+    The unknowns are those of Eqs. (1) and (2) with the friction of Eq. (3) put in, together with
+    the contact conditions differentiated twice.
+    """
+    count = len(contacts)
+    matrix = np.zeros((5 + count, 5 + count))
+    right = np.zeros(5 + count)
+    matrix[range(5), range(5)] = scene.mass_diagonal
+    right[1] = -scene.polygon.mass * scene.gravity
+    for i, finger in enumerate(scene.fingers):
+        friction = finger.viscous * z_dot[3 + i] + finger.dry * sigma[i]
+        right[3 + i] = tau[i] - friction
+    for k, contact in enumerate(contacts):
+        point, normal, bend = _touch(scene, contact, z, z_dot)
+        tangent = np.array([normal[1], -normal[0]])
+        coefficient = scene.friction.of(contact.finger)
+        row = _lever(scene, contact, z, point, normal)
+        force = row - coefficient * Xi[k] * _lever(scene, contact, z, point, tangent)
+        matrix[:5, 5 + k] = -force
+        matrix[5 + k, :5] = row
+        right[5 + k] = -bend
+    solution = np.linalg.solve(matrix, right)
+    return np.asarray(solution[:5]), np.asarray(solution[5:])
+
+
+def _lever(scene: Scene, contact: Contact, z: Array, point: Array, force: Array) -> Array:
+    """Generalised force of a unit force on the object at `point` and its reaction on the finger."""
+    row = np.zeros(5)
+    arm = point - z[:2]
+    row[:3] = force[0], force[1], arm[0] * force[1] - arm[1] * force[0]
+    if contact.finger is not None:
+        arm = point - np.asarray(scene.fingers[contact.finger].base)
+        row[3 + contact.finger] = -(arm[0] * force[1] - arm[1] * force[0])
+    return row
+
+
+def _touch(scene: Scene, contact: Contact, z: Array, z_dot: Array) -> tuple[Array, Array, float]:
+    """Contact point, normal into the object, and the gap's second derivative less A z''."""
+    c, s = math.cos(z[2]), math.sin(z[2])
+    turn = np.array([[c, -s], [s, c]])
+    spin = z_dot[2]
+    arm = turn @ scene.polygon.vertices[contact.index]
+    vertex = z[:2] + arm
+    velocity = z_dot[:2] + spin * np.array([-arm[1], arm[0]])
+    if contact.finger is None:
+        return vertex, np.array([0.0, 1.0]), -(spin**2) * arm[1]
+    finger = scene.fingers[contact.finger]
+    angle, rate = z[3 + contact.finger], z_dot[3 + contact.finger]
+    axis = np.array([math.cos(angle), math.sin(angle)])
+    across = np.array([-axis[1], axis[0]])
+    if contact.surface == "finger":
+        side = 1.0 if contact.finger == 0 else -1.0
+        normal = side * across
+        swing = -side * rate * axis
+        reach = vertex - np.asarray(finger.base)
+        bend = 2 * swing @ velocity - rate**2 * normal @ reach - spin**2 * normal @ arm
+        return vertex, normal, float(bend)
+    if contact.feature != "e":
+        raise ValueError(f"{contact.name}: the baseline knows no contacts with a tip's arc")
+    following = scene.polygon.vertices[(contact.index + 1) % scene.polygon.n_vertices]
+    along = turn @ following - arm
+    along = along / np.hypot(*along)
+    outward = np.array([along[1], -along[0]])
+    tip = np.asarray(finger.base) + finger.length * axis
+    tip_velocity = finger.length * rate * across
+    swing = spin * np.array([-outward[1], outward[0]])
+    bend = (
+        2 * swing @ (tip_velocity - velocity)
+        - spin**2 * outward @ (tip - vertex)
+        + outward @ (spin**2 * arm - rate**2 * finger.length * axis)
+    )
+    return tip - finger.radius * outward, -outward, float(bend)

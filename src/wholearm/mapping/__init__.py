@@ -1,0 +1,1 @@
+"""The contact-formation map: closed configurations over the plane of x and phi."""

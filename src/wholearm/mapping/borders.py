@@ -1,0 +1,285 @@
+"""Borders of the cells of the (x, phi) plane, where four contacts touch.
+
+With the vertex v_p on the palm, y is a function of phi, and every border is an explicit curve:
+
+* an edge flush on the palm: phi is the edge's flush angle;
+* edge j flush on a link: the joint is `radius` outside the edge's line, linear in x;
+* a vertex passing from the side of a link to its tip: abs(p - base)^2 = length^2 + radius^2;
+* a vertex on the tip giving way to an edge: abs(p + radius m - base) = length, m the edge's outward
+  normal. With a pointed tip this and the one before coincide: the tip is at the vertex.
+
+Each curve is sampled, every sample is labelled with what touches there, and the places where the
+label changes are found by bisection. What is left are the pieces that are borders indeed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from ..contact import Contact
+from ..model import Array, Scene
+from .closing import Closed, Flags, Numbers, close, first_contact, lower, place_corners
+
+SAME_ANGLE, ROUNDING = 1e-7, 1e-11
+"""Differences [rad] below which a closed finger that touches one of a border's contacts, and one
+that touches anything, is where the border has it: at the ends of a link angles lose digits."""
+ASIDE = 1e-9
+"""How far beside a pointed tip at a vertex [m] the two contacts that meet there are looked up."""
+NOWHERE = -1
+"""Fills the labels of places that are no border."""
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """The part of the plane that is looked at: `x` in m and `phi` in rad, low and high."""
+
+    x: tuple[float, float]
+    phi: tuple[float, float]
+
+    def bands(self, scene: Scene) -> list[tuple[float, float, int]]:
+        """Ranges of phi in which one vertex is on the palm: low, high, vertex."""
+        angles = [phi for phi, _ in self.flush_angles(scene)]
+        ends = [self.phi[0], *angles, self.phi[1]]
+        middles = np.array([(a + b) / 2 for a, b in pairwise(ends)])
+        vertices = lower(scene, middles)[1]
+        bands = zip(ends[:-1], ends[1:], vertices.tolist(), strict=True)
+        return [band for band in bands if band[1] > band[0]]
+
+    def flush_angles(self, scene: Scene) -> list[tuple[float, int]]:
+        """Angles inside the window at which an edge lies on the palm, increasing, and the edge."""
+        found = []
+        for edge in range(scene.polygon.n_vertices):
+            angle = scene.polygon.flush_angle(edge)
+            turns = np.arange(np.ceil((self.phi[0] - angle) / (2 * np.pi)), 1e3)
+            within = angle + 2 * np.pi * turns
+            within = within[(within > self.phi[0]) & (within < self.phi[1])]
+            found += [(float(value), edge) for value in within]
+        return sorted(found)
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A curve in the (x, phi) plane on which a border may lie.
+
+    Attributes
+    ----------
+    pose : callable
+        Parameter of shape (n,) to (x, phi), each of shape (n,), NaN where there is none.
+    label : callable
+        (x, phi) to labels, shape (n, 6): indices of two contacts each with palm, finger 1 and
+        finger 2, `NOWHERE` for the second where there is one contact only, and for all six where
+        the place is no border.
+    places : ndarray, shape (n,)
+        Parameters to sample at, increasing.
+    flush : tuple (int or None, int), or None
+        The finger (None for the palm) and the edge that lies flush on it; None where a contact
+        only changes its name.
+    """
+
+    pose: Callable[[Array], tuple[Array, Array]]
+    label: Callable[[Array, Array], Numbers]
+    places: Array
+    flush: tuple[int | None, int] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A stretch of a track with one set of contacts.
+
+    Attributes
+    ----------
+    track : Track
+    places : ndarray, shape (n,)
+        Parameters of its points, increasing, ends included.
+    label : ndarray of int, shape (6,)
+    """
+
+    track: Track
+    places: Array
+    label: Numbers
+
+
+def label_cells(scene: Scene, x: Array, phi: Array) -> Numbers:
+    """Labels of n poses inside cells, shape (n, 6); `NOWHERE` where a finger cannot close."""
+    return label_closed(close(scene, x, phi), lower(scene, phi)[1])
+
+
+def label_closed(closed: Closed, vertex: int | Numbers) -> Numbers:
+    """Labels of closed poses with `vertex` on the palm, shape (n, 6)."""
+    labels = np.full((len(closed.z), 6), NOWHERE)
+    labels[:, 0] = vertex
+    labels[:, [2, 4]] = closed.touched
+    labels[(closed.obstacle != 0).any(axis=1)] = NOWHERE
+    return labels
+
+
+def list_tracks(scene: Scene, window: Window, samples: int) -> Iterator[Track]:
+    """Every curve of the window on which a border may lie, about `samples` places across it."""
+    for phi, edge in window.flush_angles(scene):
+        yield palm_track(scene, edge, phi, np.linspace(*window.x, samples))
+    height = window.phi[1] - window.phi[0]
+    for low, high, vertex in window.bands(scene):
+        places = np.linspace(low, high, max(3, round(samples * (high - low) / height)))
+        for finger in (0, 1):
+            for index in range(scene.polygon.n_vertices):
+                yield flush_track(scene, finger, index, vertex, places)
+                yield from _passing_tracks(scene, finger, index, vertex, places)
+
+
+def palm_track(scene: Scene, edge: int, phi: float, places: Array) -> Track:
+    """The line on which `edge` lies flush on the palm, by x [m]."""
+    after = (edge + 1) % scene.polygon.n_vertices
+
+    def pose(x: Array) -> tuple[Array, Array]:
+        return x, np.full_like(x, phi)
+
+    def label(x: Array, phi: Array) -> Numbers:
+        labels = label_closed(close(scene, x, phi), edge)
+        labels[labels[:, 0] != NOWHERE, 1] = after
+        return labels
+
+    return Track(pose, label, places, (None, edge))
+
+
+def flush_track(scene: Scene, finger: int, edge: int, vertex: int, places: Array) -> Track:
+    """The curve on which `edge` lies flush on a link with `vertex` on the palm, by phi [rad]."""
+    link, base = scene.fingers[finger], np.asarray(scene.fingers[finger].base)
+    count = scene.polygon.n_vertices
+    after = (edge + 1) % count
+    near, far = (edge, after) if finger == 0 else (after, edge)
+    first = first_contact(scene, finger)
+
+    def pose(phi: Array) -> tuple[Array, Array]:
+        corners, m = _corners_at(scene, phi, vertex), _outward(scene, edge, phi)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            across = (link.radius - m[:, 1] * (base[1] - corners[:, edge, 1])) / m[:, 0]
+        return base[0] - corners[:, edge, 0] - across, phi
+
+    def label(x: Array, phi: Array) -> Numbers:
+        corners, m = _corners_at(scene, phi, vertex), _outward(scene, edge, phi)
+        corners[..., 0] += x[:, None]
+        sign = 1.0 if finger == 0 else -1.0
+        axis = sign * np.column_stack([-m[:, 1], m[:, 0]])
+        runs = ((corners - base) * axis[:, None]).sum(axis=2)
+        closed = close(scene, x, phi)
+        labels = label_closed(closed, vertex)
+        within = (runs[:, near] > 0) & (runs[:, near] <= link.length)
+        # The edge lies on the link up to its far vertex or up to the tip.
+        on_tip = first + count + edge
+        reaches = runs[:, far] <= link.length
+        second = np.where(reaches, first + far, on_tip)
+        pair = np.column_stack([np.full(len(x), first + near), second])
+        pair[reaches] = [first + edge, first + after]
+        within &= _is_closed(closed, finger, np.arctan2(axis[:, 1], axis[:, 0]), pair)
+        labels[:, [2 + 2 * finger, 3 + 2 * finger]] = pair
+        labels[~within | (labels[:, 0] == NOWHERE)] = NOWHERE
+        return labels
+
+    return Track(pose, label, places, (finger, edge))
+
+
+def _passing_tracks(
+    scene: Scene, finger: int, index: int, vertex: int, places: Array
+) -> Iterator[Track]:
+    """Curves on which a contact of `finger` with vertex `index` changes its name."""
+    link, count = scene.fingers[finger], scene.polygon.n_vertices
+    before = (index - 1) % count
+    for branch in (-1.0, 1.0):
+        yield _circle_track(scene, finger, index, None, branch, vertex, places)
+        if link.radius > 0:
+            for edge in (before, index):
+                yield _circle_track(scene, finger, index, edge, branch, vertex, places)
+
+
+def _circle_track(
+    scene: Scene,
+    finger: int,
+    index: int,
+    edge: int | None,
+    branch: float,
+    vertex: int,
+    places: Array,
+) -> Track:
+    """Vertex `index` at the end of a link's side, or (with an edge) at an end of that edge."""
+    link, base = scene.fingers[finger], np.asarray(scene.fingers[finger].base)
+    count = scene.polygon.n_vertices
+    first = first_contact(scene, finger)
+    side, arc = first + index, first + 2 * count + index
+    distance = np.hypot(link.length, link.radius) if edge is None else link.length
+
+    def centre(phi: Array) -> Array:
+        corners = _corners_at(scene, phi, vertex)[:, index]
+        return corners if edge is None else corners + link.radius * _outward(scene, edge, phi)
+
+    def pose(phi: Array) -> tuple[Array, Array]:
+        place = centre(phi)
+        with np.errstate(invalid="ignore"):
+            across = np.sqrt(distance**2 - (place[:, 1] - base[1]) ** 2)
+        return base[0] - place[:, 0] + branch * across, phi
+
+    def label(x: Array, phi: Array) -> Numbers:
+        closed = close(scene, x, phi)
+        labels = label_closed(closed, vertex)
+        place = centre(phi) + np.column_stack([x, np.zeros_like(x)]) - base
+        angle = np.arctan2(place[:, 1], place[:, 0])
+        sign = 1.0 if finger == 0 else -1.0
+        if edge is None:
+            angle = angle - sign * np.arctan2(link.radius, link.length)
+            inwards = sign * np.column_stack([-np.sin(angle), np.cos(angle)])
+            corners = _corners_at(scene, phi, vertex)
+            supported = (
+                ((corners - corners[:, [index]]) * inwards[:, None]).sum(axis=2) > -1e-12
+            ).all(axis=1)
+            pair = np.broadcast_to([side, arc], (len(x), 2))
+        else:
+            axis = np.column_stack([np.cos(angle), np.sin(angle)])
+            # The tip touches beyond its centre, and with the side that moves when it closes.
+            m = _outward(scene, edge, phi)
+            supported = (m * axis).sum(axis=1) <= 0
+            supported &= sign * (m[:, 1] * axis[:, 0] - m[:, 0] * axis[:, 1]) <= 0
+            pair = np.broadcast_to([arc, first + count + edge], (len(x), 2))
+        if link.radius == 0:
+            beside = [close(scene, x + d, phi).touched[:, finger] for d in (-ASIDE, ASIDE)]
+            pair = np.column_stack(beside)
+            pair = np.sort(pair, axis=1)
+            about = (pair == side) | (pair == first + count + index)
+            about |= pair == first + count + (index - 1) % count
+            supported = about.all(axis=1) & (pair[:, 0] != pair[:, 1])
+        same = _is_closed(closed, finger, angle, pair)
+        labels[:, [2 + 2 * finger, 3 + 2 * finger]] = pair
+        labels[~supported | ~same | (labels[:, 0] == NOWHERE)] = NOWHERE
+        return labels
+
+    return Track(pose, label, places)
+
+
+def _corners_at(scene: Scene, phi: Array, vertex: int) -> Array:
+    """Vertices with `vertex` on the palm and the centroid at x = 0, shape (n, n_v, 2) [m]."""
+    body = scene.polygon.vertices[vertex]
+    y = -(np.sin(phi) * body[0] + np.cos(phi) * body[1])
+    return place_corners(scene, np.zeros_like(phi), y, phi)
+
+
+def _outward(scene: Scene, edge: int, phi: Array) -> Array:
+    """Outward normal of an edge in the world, shape (n, 2)."""
+    body = scene.polygon.vertices
+    run = body[(edge + 1) % len(body)] - body[edge]
+    heading = np.arctan2(-run[0], run[1]) + phi
+    return np.column_stack([np.cos(heading), np.sin(heading)])
+
+
+def _is_closed(closed: Closed, finger: int, angle: Array, pair: Numbers) -> Flags:
+    """Whether a closed finger is at `angle`, where it would touch a pair of contacts."""
+    with np.errstate(invalid="ignore"):
+        off = np.abs(np.mod(closed.z[:, 3 + finger] - angle + np.pi, 2 * np.pi) - np.pi)
+        own = (closed.touched[:, [finger]] == pair).any(axis=1)
+        return np.asarray((off < ROUNDING) | (own & (off < SAME_ANGLE)))
+
+
+def name_contacts(table: tuple[Contact, ...], label: Numbers) -> tuple[Contact, ...]:
+    """The contacts of one label."""
+    return tuple(table[int(index)] for index in label if index != NOWHERE)

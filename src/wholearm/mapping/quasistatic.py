@@ -1,0 +1,135 @@
+"""Where a motion so slow that inertia does not count keeps every contact pressed.
+
+At vanishing speed and acceleration the object's balance g_obj + (W_n - W_t U Xi) c_n = 0 and the
+joints' tau = D sigma - (J_n - J_t U Xi)^T c_n, in this package's signs the rows of -G^T c_n, hold
+with the friction that the direction of travel gives. Three contacts leave no choice; four leave the
+squeeze free, an interval of which may satisfy c_n >= epsilon and the torque limits.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..curve import metric_weights
+from ..dynamics import Directions, inverse, reduced_inertia
+from ..formation import Formation, Kinematics
+from ..model import Array, Scene
+from .closing import Flags, Numbers, full_formation
+
+WAYS = ("+x", "-x", "+phi", "-phi")
+"""Directions of travel inside a cell."""
+REGULAR = 1e-9
+"""Least ratio of singular values of A at which the contacts count as independent."""
+_WAYS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+
+
+def check_border(
+    scene: Scene, epsilon: float, label: Numbers, z: Array, coordinate: int
+) -> tuple[Flags, Flags]:
+    """Whether a quasistatic motion along a border is possible, each way.
+
+    Parameters
+    ----------
+    epsilon : float, [N]
+        Least normal force.
+    label : ndarray of int, shape (4,)
+        The four contacts, as indices into `closing.contact_table`.
+    z : ndarray, shape (n, 5)
+        Configurations on the border.
+    coordinate : {0, 2}
+        x or phi, whichever increases along the border.
+
+    Returns
+    -------
+    forth, back : ndarray of bool, shape (n,)
+        For travel with the coordinate increasing, and decreasing. A motion that jams (reduced
+        inertia of zero or less) counts as impossible.
+    """
+    formation, kinematics = _pick(scene, label, z)
+    weights = np.sqrt(metric_weights(scene))
+    _, sizes, rows = np.linalg.svd(kinematics.A / weights)
+    z_s = rows[:, -1] / weights
+    z_s *= np.where(z_s[:, [coordinate]] < 0, -1.0, 1.0)
+    regular = sizes[:, -1] > REGULAR * sizes[:, 0]
+    part = Kinematics(*(array[regular] for array in kinematics))
+    possible = np.zeros((2, len(z)), dtype=bool)
+    for row, way in zip(possible, (z_s[regular], -z_s[regular]), strict=True):
+        row[regular] = _check_path(formation, part, epsilon, z[regular], way)
+    return possible[0], possible[1]
+
+
+def check_cell(scene: Scene, epsilon: float, label: Numbers, z: Array) -> Flags:
+    """Whether a quasistatic motion from inside a cell is possible towards each of `WAYS`.
+
+    Parameters
+    ----------
+    epsilon : float, [N]
+        Least normal force.
+    label : ndarray of int, shape (3,)
+        The three contacts, as indices into `closing.contact_table`.
+    z : ndarray, shape (n, 5)
+        Configurations in the cell.
+
+    Returns
+    -------
+    ndarray of bool, shape (n, 4)
+    """
+    formation, kinematics = _pick(scene, label, z)
+    rows = np.zeros((2, 5))
+    rows[[0, 1], [0, 2]] = 1.0
+    matrix = np.concatenate([kinematics.A, np.broadcast_to(rows, (len(z), 2, 5))], axis=1)
+    possible = np.zeros((len(z), len(WAYS)), dtype=bool)
+    regular = np.abs(np.linalg.det(matrix)) > 1e-12
+    for k, way in enumerate(_WAYS):
+        right = np.zeros((regular.sum(), 5, 1))
+        right[:, 3:, 0] = way
+        z_s = np.linalg.solve(matrix[regular], right)[..., 0]
+        part = Kinematics(*(array[regular] for array in kinematics))
+        possible[regular, k] = _check_balance(formation, part, epsilon, z_s)
+    return possible
+
+
+def _check_path(
+    formation: Formation, kinematics: Kinematics, epsilon: float, z: Array, z_s: Array
+) -> Flags:
+    directions = _directions(kinematics, z_s)
+    forces = inverse(formation, z, z_s, np.zeros_like(z_s), directions, kinematics)
+    limit = formation.scene.torque_limit
+    # Every limit is offset + slope * squeeze >= 0.
+    offset = np.hstack([forces.C0 - epsilon, limit - forces.T0, limit + forces.T0])
+    slope = np.hstack([forces.Cl, -forces.Tl, forces.Tl])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        edge = -offset / slope
+    low = np.where(slope > 0, edge, -np.inf).max(axis=1)
+    high = np.where(slope < 0, edge, np.inf).min(axis=1)
+    stuck = ((slope == 0) & (offset < 0)).any(axis=1)
+    moving = reduced_inertia(formation, kinematics, directions) > 0
+    return np.asarray((low <= high) & ~stuck & moving)
+
+
+def _check_balance(
+    formation: Formation, kinematics: Kinematics, epsilon: float, z_s: Array
+) -> Flags:
+    scene, directions = formation.scene, _directions(kinematics, z_s)
+    slip = formation.friction * directions.Xi
+    G = kinematics.A - slip[..., None] * kinematics.A_t
+    wrench = G[:, :, :3].transpose(0, 2, 1)
+    regular = np.abs(np.linalg.det(wrench)) > 1e-12
+    wrench[~regular] = np.eye(3)
+    right = np.broadcast_to(-scene.applied_force[:3, None], (len(G), 3, 1))
+    c_n = np.linalg.solve(wrench, right)[..., 0]
+    tau = scene.dry[3:] * directions.sigma - np.einsum("nij,ni->nj", G[:, :, 3:], c_n)
+    held = (c_n >= epsilon).all(axis=1) & (np.abs(tau) <= scene.torque_limit).all(axis=1)
+    return np.asarray(held & regular & (reduced_inertia(formation, kinematics, directions) > 0))
+
+
+def _directions(kinematics: Kinematics, z_s: Array) -> Directions:
+    return Directions(np.sign(np.einsum("nij,nj->ni", kinematics.A_t, z_s)), np.sign(z_s[:, 3:]))
+
+
+def _pick(scene: Scene, label: Numbers, z: Array) -> tuple[Formation, Kinematics]:
+    """A formation and its rows at configurations `z`, from those of all contacts."""
+    full = full_formation(scene)
+    every = full.evaluate(z, z)
+    formation = Formation(scene, tuple(full.contacts[k] for k in label))
+    return formation, Kinematics(*(array[:, label] for array in every))

@@ -1,0 +1,1 @@
+"""One-freedom phases, planned along their curves."""

@@ -1,0 +1,217 @@
+"""Why phases along curves have no plan, and which single limit would have to give way.
+
+All limits are made soft and their shortfalls ranked. Then each limit alone is relaxed as little as
+the others allow, and a plan with that limit is asked for: only what was planned is advised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..advice import Limit, Shortfall, describe_changes, find_changes, rank_shortfalls
+from ..cones import hold_least, name_holds
+from ..curve import Curve, describe_pose
+from ..errors import InfeasibleError, JammingError, SolverError
+from ..model import Array
+from ..options import Objective
+from .pathdata import PhaseData, Relaxation, cut, join, name_phases
+from .pathmotion import PathMotion, Profile
+from .pathnlp import (
+    Scales,
+    Tightening,
+    build_path_nlp,
+    make_bounds,
+    pack,
+    parameters,
+    unpack,
+)
+
+_SHORT = 1e-4
+"""Least shortfall that counts [N or N m]."""
+_FORCE = 10.0
+"""Largest unit of force when a limit is relaxed [N]."""
+
+Replan = Callable[[Sequence[Curve], float], object]
+"""Plans the phases along curves with a least normal force [N]; raises if there is no plan."""
+
+
+class _Candidate(NamedTuple):
+    """A limit that may give way, and what the NLP's relaxation is to it."""
+
+    limit: Limit
+    relaxation: Relaxation
+    key: str
+    finger: int | None
+
+    def value(self, relaxed: float, scales: Scales) -> float:
+        """The limit when relaxed so far."""
+        if self.key == "epsilon":
+            return self.limit.value - relaxed * scales.force
+        power = 1.0 if self.key == "torque_limit" else 0.5
+        return float(self.limit.value * (1 + relaxed) ** power)
+
+    def apply(self, parts: Sequence[PhaseData], value: float) -> tuple[list[Curve], float]:
+        """Curves and epsilon with another value of the limit."""
+        curves = [part.curve for part in parts]
+        if self.finger is None:
+            return curves, value
+        changed = [with_limit(curve, self.finger, self.key, value) for curve in curves]
+        return changed, parts[0].epsilon
+
+
+def explain(
+    parts: Sequence[PhaseData],
+    profile: Profile,
+    scales: Scales,
+    phases: Sequence[int],
+    stopped: str,
+    replan: Replan,
+) -> InfeasibleError | SolverError:
+    """Say why phases have no plan and what would change that.
+
+    Parameters
+    ----------
+    parts : sequence of PhaseData
+    profile : Profile
+        A guess of the motion through all of them.
+    scales : Scales
+    phases : sequence of int
+        Their numbers.
+    stopped : str
+        How the solver ended, in words.
+    replan : callable
+    """
+    data = join(parts)
+    eased = _ease(data, profile, scales)
+    if eased is None:
+        return SolverError(stopped)
+    shortfalls = [
+        short
+        for part, own, phase in zip(parts, cut(parts, eased), phases, strict=True)
+        for short in _list_shortfalls(part, own, f", phase {phase}" if len(phases) > 1 else "")
+    ]
+    if not shortfalls:
+        return SolverError(f"{stopped} although limits can be kept")
+    scales = _quicken(data, scales)
+    candidates = _list_candidates(data, scales)
+
+    def find_least(index: int) -> float | None:
+        return _relax(data, eased, scales, candidates[index])
+
+    def can_plan(index: int, value: float) -> bool:
+        try:
+            replan(*candidates[index].apply(parts, value))
+        except (InfeasibleError, SolverError, JammingError):
+            return False
+        return True
+
+    limits = [candidate.limit for candidate in candidates]
+    changes = find_changes(limits, find_least, can_plan)
+    return InfeasibleError(
+        f"{name_phases(phases, 'infeasible')}: {rank_shortfalls(shortfalls)}; "
+        f"{describe_changes(changes)}"
+    )
+
+
+def _quicken(data: PhaseData, scales: Scales) -> Scales:
+    """Units for motions as quick as a fall, with forces that a hand may have.
+
+    In units of a slow motion, or of an absurd epsilon, the small costs that choose among equals
+    would outweigh what is relaxed.
+    """
+    length, gravity = float(data.grid.s[-1]), data.curve.formation.scene.gravity
+    pace = np.sqrt(length / max(gravity, 1e-9))
+    return scales._replace(time=min(scales.time, pace), force=min(scales.force, _FORCE))
+
+
+def _ease(data: PhaseData, profile: Profile, scales: Scales) -> Profile | None:
+    """The motion with the least shortfalls when every limit is soft."""
+    formation = data.curve.formation
+    intervals, n_c = len(data.grid.s) - 1, formation.n_contacts
+    nlp = build_path_nlp(n_c, intervals, Objective.ELASTIC, formation.n_rolling)
+    short = np.maximum(_shortfalls(data, profile), 0.0) + 0.1
+    result = nlp.solver(
+        x0=pack(nlp, profile, scales, 0.0, short),
+        p=parameters(nlp, data, scales, 1.0),
+        **make_bounds(nlp, data, scales, Tightening.none(data, None)),
+    )
+    if not nlp.solver.stats()["success"]:
+        return None
+    return unpack(nlp, data.grid, result["x"].full()[:, 0], scales)[0]
+
+
+def _shortfalls(data: PhaseData, profile: Profile) -> Array:
+    """By how much H c and tau miss their limits at the nodes, shape (n, n_h + 2) [N, N m]."""
+    slack = data.slack(data.nodes, profile)
+    held, torque = slack[:, :-4], np.minimum(slack[:, -4:-2], slack[:, -2:])
+    return -np.hstack([held, torque])
+
+
+def _list_shortfalls(data: PhaseData, profile: Profile, suffix: str) -> list[Shortfall]:
+    short = _shortfalls(data, profile)
+    names = name_holds(data.curve.formation, data.epsilon)
+    units = ["N"] * len(names) + ["N m"] * 2
+    names += [f"torque limit of finger {i + 1} = {data.torque_limit[i]:g} N m" for i in range(2)]
+    times = PathMotion(data.curve, data.grid, profile).times
+    z = data.curve.evaluate(data.grid.s).z
+    found = []
+    for row, (name, unit) in enumerate(zip(names, units, strict=True)):
+        worst = int(short[:, row].argmax())
+        if short[worst, row] > _SHORT:
+            where = f"t = {times[worst]:.4f} s ({describe_pose(z[worst])}){suffix}"
+            found.append(Shortfall(name, float(short[worst, row]), unit, where))
+    return found
+
+
+def _list_candidates(data: PhaseData, scales: Scales) -> list[_Candidate]:
+    """Torque limits, speed limits if there are any, and epsilon."""
+    formation, scene = data.curve.formation, data.curve.formation.scene
+    n_h = len(data.least)
+    unit = np.eye(n_h + 3)
+    found = []
+    for i in range(2):
+        torque, speed = float(scene.torque_limit[i]), float(scene.speed_limit[i])
+        limit = Limit(f"torque limit of finger {i + 1}", torque, "N m", 1)
+        found.append(_Candidate(limit, Relaxation(torque * unit[n_h + i]), "torque_limit", i))
+        if np.isfinite(speed):
+            limit = Limit(f"speed limit of finger {i + 1}", speed, "rad/s", 1)
+            found.append(_Candidate(limit, Relaxation(unit[-1], i), "speed_limit", i))
+    limit = Limit("epsilon", data.epsilon, "N", -1)
+    every = np.append(scales.force * hold_least(formation, 1.0), np.zeros(3))
+    return [*found, _Candidate(limit, Relaxation(every), "epsilon", None)]
+
+
+def _relax(
+    data: PhaseData, profile: Profile, scales: Scales, candidate: _Candidate
+) -> float | None:
+    """The value at which one limit just lets all others be kept, if there is one."""
+    formation, relaxation = data.curve.formation, candidate.relaxation
+    intervals, n_c = len(data.grid.s) - 1, formation.n_contacts
+    nlp = build_path_nlp(n_c, intervals, Objective.RELAX, formation.n_rolling)
+    short, worth = _shortfalls(data, profile).max(axis=0), relaxation.worth[:-1]
+    needed = np.divide(short, worth, out=np.zeros_like(short), where=worth > 0)
+    result = nlp.solver(
+        x0=pack(nlp, profile, scales, max(1.0, 1.5 * float(needed.max()))),
+        p=parameters(nlp, data, scales, 1.0, relaxation),
+        **make_bounds(nlp, data, scales, Tightening.none(data, None), relaxation),
+    )
+    if not nlp.solver.stats()["success"]:
+        return None
+    relaxed = unpack(nlp, data.grid, result["x"].full()[:, 0], scales)[1]
+    return candidate.value(relaxed, scales)
+
+
+def with_limit(curve: Curve, finger: int, key: str, value: float) -> Curve:
+    """The curve with another `torque_limit` or `speed_limit` of one finger."""
+    scene = curve.formation.scene
+    change: Any = {key: value}
+    right, left = (
+        replace(link, **change) if index == finger else link
+        for index, link in enumerate(scene.fingers)
+    )
+    other = replace(scene, fingers=(right, left))
+    return replace(curve, formation=replace(curve.formation, scene=other))

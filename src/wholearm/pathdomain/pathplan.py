@@ -1,0 +1,331 @@
+"""Planning one-freedom phases: first guess, NLP, and limits that hold between nodes too.
+
+The NLP of `pathnlp` keeps the limits at its nodes. Once solved, the grid is drawn together
+where they are missed most between nodes (where the plan switches from one limit to another). Then
+limits are tightened by what they miss and the NLP is solved again from where it was, until nothing
+misses more than `MISS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..curve import Curve
+from ..errors import InfeasibleError, SolverError, WholearmError
+from ..model import Array
+from ..options import Objective, PlanOptions
+from ..phaseplan import PhasePlan
+from .nodechain import StagedSolver
+from .pathdata import PhaseData, cut, fit_torque, join, name_phases, prepare
+from .pathmotion import Grid, PathMotion, Profile, draw_together, make_grid
+from .pathnlp import (
+    PathNLP,
+    Scales,
+    Tightening,
+    build_path_nlp,
+    first_multipliers,
+    make_bounds,
+    move_multipliers,
+    pack,
+    parameters,
+    unpack,
+)
+
+MISS = 5e-7
+"""Largest miss of a force or torque limit between nodes [N or N m]; of b and T, relative."""
+ROUNDS = 40
+"""Most times that the NLP is solved for one phase."""
+_COARSE = 1.5e-4
+"""Miss, over the typical force, above which the grid is drawn together."""
+_SLOW = -12
+"""Height of the slowest guess, as a power of two times that of a fall."""
+_OVER = 1.05
+"""How much more than the miss a limit is tightened."""
+
+
+class _Solution(NamedTuple):
+    profile: Profile
+    margin: float
+    multipliers: dict[str, Array]
+    iterations: int
+    seconds: float
+
+
+class _StoppedError(Exception):
+    """The solver has stopped without an answer."""
+
+
+class _StuckError(SolverError):
+    """A solve that failed, with the phases that it failed for."""
+
+    def __init__(self, parts: Sequence[PhaseData], message: str) -> None:
+        self.parts = parts
+        super().__init__(message)
+
+
+def plan_path(
+    curve: Curve,
+    epsilon: float,
+    options: PlanOptions,
+    phase: int,
+    duration: float | None = None,
+) -> PhasePlan[PathMotion]:
+    """Plan one phase along a curve, from rest to rest; see `plan_curves`."""
+    return plan_curves((curve,), epsilon, options, (phase,), duration)[0]
+
+
+def plan_curves(
+    curves: Sequence[Curve],
+    epsilon: float,
+    options: PlanOptions,
+    phases: Sequence[int],
+    duration: float | None = None,
+    explained: bool = True,
+) -> list[PhasePlan[PathMotion]]:
+    """Plan phases along curves that are run through one after the other, from rest to rest.
+
+    Parameters
+    ----------
+    curves : sequence of Curve
+        At such paces that the speed is the same on both sides of where two of them meet.
+    epsilon : float, [N]
+        Least normal force.
+    options : PlanOptions
+    phases : sequence of int
+        The phases' numbers, for messages.
+    duration : float, optional, [s]
+        Longest duration of all, for the objective `margin`.
+    explained : bool
+        Whether to find out why there is no plan, which takes longer than planning.
+
+    Raises
+    ------
+    InfeasibleError
+        If no motion keeps the limits; names what is short, where and by how much, and each single
+        limit with which there would be a plan.
+    JammingError
+        If friction jams a formation somewhere on its curve.
+    SolverError
+        If the solver stops without an answer.
+    """
+    where = name_phases(phases)
+    try:
+        plans = _plan(curves, epsilon, options, phases, duration)
+    except _StuckError as stuck:
+        if options.solver != "ipopt":
+            robust = replace(options, solver="ipopt")
+            return plan_curves(curves, epsilon, robust, phases, duration, explained)
+        if not explained:
+            raise
+        from .pathexplain import explain
+
+        late = _explain_duration(curves, epsilon, options, phases, duration)
+        raise late or explain(
+            stuck.parts,
+            *guess_slowly(join(stuck.parts)),
+            phases,
+            str(stuck),
+            lambda changed, least: _plan(changed, least, options, phases, duration),
+        ) from None
+    if options.goal is Objective.MARGIN and plans[0].value < epsilon - MISS:
+        late = _explain_duration(curves, epsilon, options, phases, duration)
+        raise late or SolverError(f"{where}: the margin found is below epsilon")
+    return plans
+
+
+def _explain_duration(
+    curves: Sequence[Curve],
+    epsilon: float,
+    options: PlanOptions,
+    phases: Sequence[int],
+    duration: float | None,
+) -> InfeasibleError | None:
+    """Say so if the duration is shorter than the least time, and which one would do."""
+    from ..advice import Limit, describe_changes, find_changes
+
+    if duration is None:
+        return None
+    fastest = replace(options, objective=Objective.TIME, duration=None)
+    try:
+        least = sum(plan.value for plan in _plan(curves, epsilon, fastest, phases, None))
+    except WholearmError:
+        return None
+    if least <= duration:
+        return None
+
+    def can_plan(_: int, value: float) -> bool:
+        try:
+            return _plan(curves, epsilon, options, phases, value)[0].value >= epsilon
+        except SolverError:
+            return False
+
+    changes = find_changes([Limit("duration", duration, "s", 1)], lambda _: least, can_plan)
+    return InfeasibleError(
+        f"{name_phases(phases, 'infeasible')}: duration = {duration:g} s is "
+        f"{least - duration:.3g} s shorter than the least time; {describe_changes(changes)}"
+    )
+
+
+def _plan(
+    curves: Sequence[Curve],
+    epsilon: float,
+    options: PlanOptions,
+    phases: Sequence[int],
+    duration: float | None,
+) -> list[PhasePlan[PathMotion]]:
+    def prepare_all(grids: Iterable[Grid]) -> list[PhaseData]:
+        given = zip(curves, grids, phases, strict=True)
+        return [prepare(curve, epsilon, grid, phase) for curve, grid, phase in given]
+
+    parts = prepare_all(make_grid(curve, options.intervals) for curve in curves)
+    data = join(parts)
+    first, intervals = curves[0].formation, len(data.grid.steps)
+    nlp = build_path_nlp(first.n_contacts, intervals, options.goal, first.n_rolling, options.solver)
+    profile, scales = guess(data)
+    tightening = Tightening.none(data, duration)
+    solution = _Solution(profile, 0.0, first_multipliers(nlp, data, profile, scales), 0, 0.0)
+    for solves in range(1, ROUNDS + 1):
+        try:
+            solution = _solve(nlp, data, scales, tightening, solution, options.time_weight)
+        except _StoppedError as stop:
+            raise _StuckError(parts, f"{name_phases(phases)}: {stop}") from None
+        profile, margin = solution.profile, solution.margin
+        motions = [
+            PathMotion(part.curve, part.grid, own)
+            for part, own in zip(parts, cut(parts, profile), strict=True)
+        ]
+        short, speeding = data.misses(profile, margin)
+        total = sum(motion.duration for motion in motions)
+        late = max(0.0, total / duration - 1) if duration else 0.0
+        if max(short.max(), speeding.max(), late) <= MISS:
+            break
+        coarse = short.max(axis=1) / (_COARSE * scales.force)
+        if solves == 1 and coarse.max() > 1:
+            old = data.grid
+            shares = np.split(coarse, np.cumsum([len(part.solid) for part in parts])[:-1])
+            parts = prepare_all(
+                draw_together(part.grid, part.solid, share)
+                for part, share in zip(parts, shares, strict=True)
+            )
+            data = join(parts)
+            solution = solution._replace(
+                profile=Profile(*(np.interp(data.grid.s, old.s, part) for part in profile)),
+                multipliers=move_multipliers(nlp, solution.multipliers, old, data.grid),
+            )
+        else:
+            reach = data.beside(data.slack_beside(profile, margin, short))
+            short, speeding = data.beside(short), data.beside(speeding)
+            tightening = tightening.by(reach, _OVER * short, _OVER * speeding, _OVER * late)
+    else:
+        raise SolverError(
+            f"{name_phases(phases)}: after {ROUNDS} solves limits are still missed by "
+            f"{short.max():.2g} N between nodes; plan with more intervals"
+        )
+    plans: list[PhasePlan[PathMotion]] = []
+    for part, motion in zip(parts, motions, strict=True):
+        torque, squares = fit_torque(part, motion)
+        value = {
+            Objective.TIME: motion.duration,
+            Objective.EFFORT: squares + options.time_weight * motion.duration,
+            Objective.MARGIN: epsilon + margin,
+        }[options.goal]
+        costs = (0, 0, 0.0, 0.0)
+        if not plans:
+            costs = (solution.iterations, solves, nlp.build_time, solution.seconds)
+        plans.append(PhasePlan(motion, torque, value, *costs, options.solver))
+    return plans
+
+
+def _solve(
+    nlp: PathNLP,
+    data: PhaseData,
+    scales: Scales,
+    tightening: Tightening,
+    start: _Solution,
+    time_weight: float,
+) -> _Solution:
+    result = nlp.solver(
+        x0=pack(nlp, start.profile, scales, start.margin),
+        p=parameters(nlp, data, scales, time_weight),
+        **make_bounds(nlp, data, scales, tightening),
+        **start.multipliers,
+    )
+    stats = nlp.solver.stats()
+    if not stats["success"]:
+        name = "fatrop" if isinstance(nlp.solver, StagedSolver) else "Ipopt"
+        raise _StoppedError(f"{name} stopped with {stats['return_status']}")
+    profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], scales)
+    multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
+    iterations = start.iterations + stats["iter_count"]
+    seconds = start.seconds + stats["t_wall_total"]
+    return _Solution(profile, margin, multipliers, iterations, seconds)
+
+
+def guess(data: PhaseData) -> tuple[Profile, Scales]:
+    """Guess a motion: b a parabola in s as high as limits allow, the squeeze amid its range.
+
+    Where limits forbid even a slow one, it is as quick as a fall: a plan, if there is one, is not
+    slow, and in units of a slow one the costs that choose among equals would weigh too much.
+    """
+    b_max = data.largest_b(data.nodes)
+    fall = _fall(data)
+
+    def possible(height: float) -> bool:
+        low, high = _squeeze_range(data, height)
+        b = _parabola(data, height)[1]
+        return bool((low <= high).all() and (b <= b_max).all())
+
+    # Bisection over heights from 2^-12 to 2^8 times that of a fall over this length.
+    low_power, high_power = float(_SLOW), 8.0
+    for _ in range(7):
+        power = (low_power + high_power) / 2
+        if possible(fall * 2**power):
+            low_power = power
+        else:
+            high_power = power
+    none = low_power == _SLOW
+    return _guess_at(data, 0.7 * fall * (1.0 if none else 2**low_power))
+
+
+def guess_slowly(data: PhaseData) -> tuple[Profile, Scales]:
+    """Guess a slow motion, whatever limits say."""
+    return _guess_at(data, 0.7 * _fall(data) * 2.0**_SLOW)
+
+
+def _fall(data: PhaseData) -> float:
+    """The b of a fall over the length of the curve [m^2/s^2]."""
+    return 2 * data.curve.formation.scene.gravity * float(data.grid.s[-1]) + 1e-9
+
+
+def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
+    """The a and b of a parabola in s of this height."""
+    length = data.grid.s[-1]
+    x = data.grid.s / length
+    return height * 2 * (1 - 2 * x) / length, height * 4 * x * (1 - x)
+
+
+def _squeeze_range(data: PhaseData, height: float) -> tuple[Array, Array]:
+    """Least and largest squeeze that limits allow at each node."""
+    a, b = _parabola(data, height)
+    slack = data.slack(data.nodes, Profile(a, b, np.zeros_like(a)))
+    forces = data.nodes.forces
+    rate = np.hstack([forces.Cl, forces.Tl, -forces.Tl])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        bound = -slack / rate
+    low = np.where(rate > 0, bound, -np.inf).max(axis=1)
+    high = np.where(rate < 0, bound, np.inf).min(axis=1)
+    return low, high
+
+
+def _guess_at(data: PhaseData, height: float) -> tuple[Profile, Scales]:
+    low, high = _squeeze_range(data, height)
+    middle = np.where(np.isfinite(low + high) & (low <= high), (low + high) / 2, 0.0)
+    length = float(data.grid.s[-1])
+    duration = np.pi / 2 * length / np.sqrt(height)
+    force = max(1.0, data.epsilon, float(np.abs(middle).mean()))
+    scales = Scales(length, 0.6 * duration, force)
+    return Profile(*_parabola(data, height), middle), scales

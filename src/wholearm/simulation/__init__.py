@@ -1,0 +1,1 @@
+"""Forward simulation, which shares nothing with planning but the model."""

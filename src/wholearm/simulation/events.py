@@ -1,0 +1,254 @@
+"""What a simulation returns: states, forces, energies, events and how it ended."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..dynamics import energy
+from ..model import Array
+from ..problem import Phase, Problem
+from .stepper import Outputs
+
+
+class EventKind(Enum):
+    """What happens at an instant of a simulation."""
+
+    START = "start"
+    """The object starts to move from rest."""
+    REST = "rest"
+    """The object comes to rest short of the end of the phase."""
+    STICK = "stick"
+    """The object stays at rest."""
+    REVERSAL = "reversal"
+    """A contact's sliding or a joint changes direction."""
+    TORQUE_STEP = "torque step"
+    """The torques jump."""
+    ARRIVAL = "arrival"
+    """The end of the phase is reached, and the next formation taken."""
+    IMPACT = "impact"
+    """The velocity jumps onto the next formation, which is taken if every contact presses."""
+    RELEASE = "release"
+    """The contacts that the next phase does not have are let go, and its formation is taken."""
+    HELD = "held"
+    """Friction holds a contact or a joint while the rest moves."""
+    CONTACT_LOST = "contact lost"
+    """A normal force falls to zero."""
+    SLIP = "slip"
+    """A rolling contact leaves its friction cone."""
+    LIMIT = "limit"
+    """The formation stops being valid in another way."""
+    END = "end"
+    """The torques end before the goal."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happens at an instant.
+
+    Attributes
+    ----------
+    time : float, [s]
+    phase : int
+        Index of the phase, from 0.
+    kind : EventKind
+    text : str
+        What has happened, in words.
+    contact : str
+        The contact or joint concerned, empty if there is none.
+    value : float
+        Arrival: rate at which the distance to the phase's end closes [m/s or rad/s]; contact lost
+        and release: the c_n that the contact would need [N]; slip: its margin mu c_n - |c_t| [N];
+        impact: the least impulse, that of `contact` [N s]; end: the distance to the phase's end [m
+        or rad], NaN if that is a release; NaN otherwise.
+    """
+
+    time: float
+    phase: int
+    kind: EventKind
+    text: str
+    contact: str = ""
+    value: float = float("nan")
+
+
+class OutcomeKind(Enum):
+    """How a simulation ends."""
+
+    GOAL_REACHED = "goal reached"
+    CONTACT_LOST = "contact lost"
+    SLIPS = "slips"
+    HELD = "held"
+    LIMIT_REACHED = "limit reached"
+    GOAL_MISSED = "goal missed"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a simulation ended, with one sentence that says it."""
+
+    kind: OutcomeKind
+    text: str
+
+    @property
+    def reached(self) -> bool:
+        """Whether the last phase's end was reached."""
+        return self.kind is OutcomeKind.GOAL_REACHED
+
+
+@dataclass(frozen=True, eq=False)
+class Energies:
+    """Energies at n instants, each of shape (n,) [J].
+
+    Attributes
+    ----------
+    stored : ndarray
+        Kinetic and potential energy.
+    work : ndarray
+        Work of the torques so far.
+    viscous, dry, contact : ndarray
+        Lost so far to viscous and dry joint friction and to sliding.
+    impact : ndarray
+        Lost so far where a contact gained stopped the motion, or part of it.
+    """
+
+    stored: Array
+    work: Array
+    viscous: Array
+    dry: Array
+    contact: Array
+    impact: Array
+
+    @property
+    def residual(self) -> Array:
+        """Work less the change of stored energy and the losses, shape (n,) [J]: zero if exact."""
+        losses = self.viscous + self.dry + self.contact + self.impact
+        return np.asarray(self.work - (self.stored - self.stored[0]) - losses)
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """A simulated motion, at every accepted step and every instant asked for.
+
+    A phase boundary and a step of the torques are there twice, since forces jump.
+
+    Attributes
+    ----------
+    t : ndarray, shape (n,), [s]
+    z, z_dot, z_ddot : ndarray, shape (n, 5)
+    tau : ndarray, shape (n, 2), [N m]
+    phase : ndarray of int, shape (n,)
+        Index of the phase, from 0.
+    contacts : tuple of str, length m
+        Every contact of the problem.
+    c_n, c_t : ndarray, shape (n, m), [N]
+        NaN where a contact is not in the formation, and at rest, where forces are indeterminate.
+    events : tuple of Event
+    energies : Energies
+    outcome : Outcome
+    missed_by : float, [m or rad]
+        Distance to the end of the last phase entered; zero when the goal is reached, and NaN if
+        that phase ends by a release.
+    steps, rejected : int
+        Accepted and rejected Runge-Kutta steps.
+    """
+
+    t: Array
+    z: Array
+    z_dot: Array
+    z_ddot: Array
+    tau: Array
+    phase: NDArray[np.int64]
+    contacts: tuple[str, ...]
+    c_n: Array
+    c_t: Array
+    events: tuple[Event, ...]
+    energies: Energies
+    outcome: Outcome
+    missed_by: float
+    steps: int
+    rejected: int
+
+    def find(self, kind: EventKind) -> tuple[Event, ...]:
+        """Events of one kind, in the order of time."""
+        return tuple(event for event in self.events if event.kind is kind)
+
+    def at(self, t: float) -> Array:
+        """State (z, z') at a recorded instant, shape (10,), the later one where there are two.
+
+        Raises
+        ------
+        ValueError
+            If `t` was not among the instants asked for and no step ends there.
+        """
+        index = int(np.searchsorted(self.t, t, side="right")) - 1
+        if index < 0 or self.t[index] != t:
+            raise ValueError(f"t = {t} s was not recorded; ask for it with `times`")
+        return np.concatenate([self.z[index], self.z_dot[index]])
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """What is recorded while one phase is simulated, row by row.
+
+    Attributes
+    ----------
+    phase : Phase
+    to : Outputs
+        Layout of the rows.
+    times, rows, impacts : list
+        Instants [s], packed outputs, and the energy lost to impacts so far [J].
+    """
+
+    phase: Phase
+    to: Outputs
+    times: list[float] = field(default_factory=list)
+    rows: list[Array] = field(default_factory=list)
+    impacts: list[float] = field(default_factory=list)
+
+
+def collect(
+    problem: Problem,
+    sections: Sequence[Section],
+    events: Sequence[Event],
+    outcome: Outcome,
+    missed_by: float,
+    counts: tuple[int, int],
+) -> Simulation:
+    """Put the sections of a simulation together; `counts` are steps and rejected steps."""
+    contacts = problem.contacts
+    columns: list[tuple[Array, ...]] = []
+    for section in sections:
+        to, formation = section.to, section.phase.formation
+        rows = np.array(section.rows).reshape(-1, to.size)
+        forces = np.full((2, len(rows), len(contacts)), np.nan)
+        where = [contacts.index(contact) for contact in formation.contacts]
+        forces[:, :, where] = rows[:, to.c_n], rows[:, to.c_t]
+        y = rows[:, to.y]
+        stored = energy(formation, y[:, :5], y[:, 5:10])
+        index = np.full(len(rows), section.phase.index)
+        parts = np.array(section.times), y, rows[:, to.acceleration], rows[:, to.tau]
+        columns.append((*parts, index, *forces, stored, np.array(section.impacts)))
+    t, y, z_ddot, tau, phase, c_n, c_t, stored, impact = (
+        np.concatenate(column) for column in zip(*columns, strict=True)
+    )
+    return Simulation(
+        t=t,
+        z=y[:, :5],
+        z_dot=y[:, 5:10],
+        z_ddot=z_ddot,
+        tau=tau,
+        phase=phase,
+        contacts=tuple(contact.name for contact in contacts),
+        c_n=c_n,
+        c_t=c_t,
+        events=tuple(events),
+        energies=Energies(stored, y[:, 10], y[:, 11], y[:, 12], y[:, 13], impact),
+        outcome=outcome,
+        missed_by=missed_by,
+        steps=counts[0],
+        rejected=counts[1],
+    )

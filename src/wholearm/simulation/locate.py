@@ -1,0 +1,85 @@
+"""The first event within a step, found by repeating the step with other lengths."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ..model import Array
+from .replay import Replay
+
+
+def find_first(run: Replay, start: Array, h: float, among: range | None = None) -> list[int]:
+    """Shorten the step just tried to the first event within it; returns the event's rows.
+
+    Parameters
+    ----------
+    start : ndarray
+        Outputs at the start of the step.
+    h : float, [s]
+    among : range, optional
+        The rows to look at.
+    """
+    s = run.stepper
+    rows, among = s.rows, among or range(s.rows.size)
+    before = start[s.to.events]
+    # A value that starts within rounding of zero has to fall below that.
+    shift = np.where(before > s.slack, 0.0, s.slack)
+    before = before + shift
+    turning = slice(rows.slide.start, rows.joint.stop)
+    seen: list[int] = []
+    done: list[int] = []
+    while True:
+        after = s.outputs[s.to.events] + shift
+        left = [k for k in among if after[k] < 0 and k not in done]
+        if not left:
+            return [k for k in seen if after[k] <= s.slack[k] or k == done[-1]]
+        seen += [k for k in left if k not in seen]
+        share = {k: before[k] / (before[k] - after[k]) for k in left}
+        k = rows.speed if rows.speed in left else min(left, key=share.__getitem__)
+        place, offset = s.to.events.start + k, float(shift[k])
+
+        def value(step: float, place: int = place, offset: float = offset) -> float:
+            run.step_to(step)
+            return float(s.outputs[place]) + offset
+
+        h = _find_root(value, h, float(before[k]), float(after[k]))
+        done.append(k)
+        if h != s.inputs[s.at.h]:
+            run.step_to(h)
+        if k == rows.speed:
+            # When the motion stops all sliding does; what reversed before shows just before.
+            run.step_to(0.999 * h)
+            if (s.outputs[s.to.events][turning] + shift[turning] < 0).any():
+                h *= 0.999
+            else:
+                run.step_to(h)
+
+
+def _find_root(
+    function: Callable[[float], float], high: float, f_low: float, f_high: float
+) -> float:
+    """Root in [0, high] of a function that falls from f_low >= 0 to f_high < 0, to rounding.
+
+    The Illinois variant of regula falsi, which converges fast on the smooth functions here.
+    """
+    if f_low <= 0:
+        return 0.0
+    low = 0.0
+    for _ in range(60):
+        middle = high - f_high * (high - low) / (f_high - f_low)
+        if not low < middle < high and not high < middle < low:
+            break
+        f_middle = function(middle)
+        if f_middle == 0.0:
+            return middle
+        if f_middle * f_high < 0:
+            low, f_low = high, f_high
+        else:
+            f_low /= 2
+        close = abs(middle - high) <= 1e-16
+        high, f_high = middle, f_middle
+        if close:
+            break
+    return high

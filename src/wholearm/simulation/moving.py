@@ -1,0 +1,200 @@
+"""A formation in motion: integrate its equations from event to event."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..model import Array
+from ..problem import End
+from .events import EventKind, Outcome, OutcomeKind
+from .jumps import (
+    REACHED,
+    SETTLING,
+    SLOW,
+    Arrival,
+    Ending,
+    Rested,
+    coast,
+    let_go,
+    look_again,
+    slip,
+    steps_within,
+    turn,
+)
+from .locate import find_first
+from .replay import FIRST_STEP, Replay
+from .rungekutta import ORDER
+from .stepper import SLACK_FORCE
+
+LONGEST_WINDOW = 1e-3
+"""How long before a torque break an arrival at a speed may come and still belong to it [s]."""
+SHORTEST_STEP = 1e-14
+"""Step below which the integration gives up, relative to the time [s]."""
+
+
+def move(run: Replay) -> Ending:
+    """Integrate until the motion rests, arrives, releases its contacts or fails."""
+    s = run.stepper
+    outputs, to = s.outputs, s.to
+    start = outputs.copy()
+    run.h = min(run.h, FIRST_STEP)
+    while True:
+        target = min(run.breaks[run.piece + 1], run.wanted[run.next_wanted])
+        h, whole = _try_step(run, target)
+        if outputs[to.worst] < 0 and not (whole and _is_there(run, target)):
+            ending = _stop_at_event(run, start, h)
+            if ending is not None:
+                return ending
+            start = outputs.copy()
+            continue
+        start = run.accept(target if whole else run.t + h)
+        if not whole:
+            continue
+        if target == run.wanted[run.next_wanted]:
+            run.next_wanted += 1
+        if target == run.breaks[run.piece + 1]:
+            ending = _pass_break(run)
+            if ending is not None:
+                return ending
+            start = outputs.copy()
+
+
+def _try_step(run: Replay, target: float) -> tuple[float, bool]:
+    """Find a step within the tolerance; returns its length and whether it ends at `target`."""
+    s = run.stepper
+    inputs, outputs, at, to = s.inputs, s.outputs, s.at, s.to
+    remaining = target - run.t
+    while True:
+        whole = run.h >= 0.999 * remaining
+        h = remaining if whole else min(run.h, remaining / 2)
+        inputs[at.t], inputs[at.h] = run.t, h
+        s.step()
+        error = outputs[to.error]
+        sudden = outputs[to.dip] < -1e-6 and outputs[to.worst] >= 0 and h > 1e-7
+        if error <= 1 and not sudden:
+            grown = h * (5.0 if error < 1e-6 else min(5.0, 0.9 * error ** (-1 / ORDER)))
+            run.h = grown if h == run.h else max(run.h, grown)
+            run.steps += 1
+            return h, whole
+        run.rejected += 1
+        factor = 0.9 * error ** (-1 / ORDER) if error > 1 else 0.2
+        run.h = h * (0.5 if error <= 1 else max(0.2, factor))
+        if run.h < SHORTEST_STEP * max(1.0, abs(run.t)):
+            run.fail_to_step(float(outputs[to.ratio]))
+
+
+def _is_there(run: Replay, t: float) -> bool:
+    """Whether the step just tried ends at the end of the phase, and at a torque break.
+
+    By rounding a planned motion ends a little beyond the end of its phase, or has just turned back.
+    It has to be at rest there, or to reach a contact softly; a coordinate is passed at any speed,
+    and an impact comes at any, with the step of the torques that goes with it, or as they end.
+    """
+    s = run.stepper
+    if t != run.breaks[run.piece + 1] or abs(run.value(s.rows.until)) >= REACHED:
+        return False
+    speed = abs(float(s.outputs[s.to.until_rate]))
+    if run.phase.end is End.SMOOTH:
+        speed = speed if run.phase.until.contact else 0.0
+    elif run.phase.end is End.IMPACT:
+        coming = run.piece + 1
+        speed = 0.0 if coming >= len(run.steps_at) or run.steps_at[coming] else speed
+    elif s.is_free:
+        speed = float(np.abs(s.outputs[s.to.y][5:10]).max())
+    held = s.outputs[s.to.events][: s.rows.cone.stop]
+    return speed < SLOW and bool(held.min() >= -SLACK_FORCE)
+
+
+def _pass_break(run: Replay) -> Ending | None:
+    """Go on to the next piece of the torques."""
+    s = run.stepper
+    if _is_there(run, run.t):
+        arrival = Arrival(-float(s.outputs[s.to.until_rate]), SETTLING, _strikes(run))
+        if run.piece + 2 < len(run.breaks):
+            run.next_piece()
+        return arrival
+    if run.t >= run.breaks[-1]:
+        return run.run_out()
+    if not run.next_piece():
+        return None
+    run.note(EventKind.TORQUE_STEP, f"the torques step {run.when()}")
+    return look_again(run)
+
+
+def _stop_at_event(run: Replay, start: Array, h: float) -> Ending | None:
+    """End the step at the first event within it; None if the motion goes on."""
+    s = run.stepper
+    rows = s.rows
+    kinds = find_first(run, start, h)
+    run.accept(run.t + float(s.inputs[s.at.h]))
+    if rows.until in kinds:
+        return _pass_on(run) if run.phase.end is End.SMOOTH or _strikes(run) else _reach(run)
+    if rows.speed in kinds:
+        if abs(run.value(rows.until)) >= REACHED:
+            run.note(EventKind.REST, f"the object comes to rest {run.when()}")
+        return Rested()
+    pulling = [k for k in kinds if k < rows.force.stop]
+    if pulling:
+        return let_go(run, pulling)
+    if any(rows.cone.start <= k < rows.cone.stop for k in kinds):
+        return slip(run)
+    for k in kinds:
+        if rows.limit.start <= k < rows.limit.stop:
+            text = f"{run.limits[k - rows.limit.start]} {run.when()}"
+            run.note(EventKind.LIMIT, text)
+            return Outcome(OutcomeKind.LIMIT_REACHED, text)
+    return turn(run, kinds)
+
+
+def _reach(run: Replay) -> Arrival:
+    """The end of the phase is reached while moving."""
+    s = run.stepper
+    rate = -float(s.outputs[s.to.until_rate])
+    # A planned motion that comes this early by its error would have stopped v / a later.
+    stopping = 2 * _time_to_stop(run)
+    window = min(stopping, LONGEST_WINDOW) if stopping < math.inf else 0.0
+    if abs(rate) < SLOW:
+        window = max(window, SETTLING)
+    return Arrival(rate, window)
+
+
+def _time_to_stop(run: Replay) -> float:
+    """Time in which the motion would stop at its present deceleration [s]."""
+    s = run.stepper
+    heading = run.problem.scene.mass_diagonal * s.outputs[s.to.heading]
+    slowing = -float(heading @ s.outputs[s.to.acceleration])
+    speed = float(heading @ s.outputs[s.to.y][5:10])
+    return speed / slowing if slowing > 0 else math.inf
+
+
+def _strikes(run: Replay) -> bool:
+    """Whether the phase ends with an impact here, and not at rest but for an error of the motion.
+
+    Where impulses do not allow an impact a planned motion stops instead.
+    """
+    rate = -float(run.stepper.outputs[run.stepper.to.until_rate])
+    stops = rate < SLOW or rate * _time_to_stop(run) / 2 < REACHED
+    return run.phase.end is End.IMPACT and not stops
+
+
+def _pass_on(run: Replay) -> Arrival:
+    """The end of a phase is reached that the motion passes.
+
+    If a planned motion comes early by its error, the torques of the next formation have still to
+    come. Until then the old one's contacts go on, while the gap dips below zero by that error.
+    """
+    s = run.stepper
+    s.inputs[s.at.t] = run.t
+    rate, window = -float(s.outputs[s.to.until_rate]), SETTLING
+    strikes = run.phase.end is End.IMPACT
+    if run.phase.until.contact is not None and not strikes:
+        run.step_to(SETTLING)
+        slowing = (float(s.outputs[s.to.until_rate]) + rate) / SETTLING
+        if slowing > 0:
+            window = min(max(2 * rate / slowing, SETTLING), LONGEST_WINDOW)
+    if steps_within(run, window):
+        coast(run, run.breaks[run.piece + 1], hide=False)
+        run.next_piece()
+    return Arrival(rate, window, strikes)

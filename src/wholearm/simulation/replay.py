@@ -1,0 +1,224 @@
+"""The state of a simulation under way, and what it records."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..errors import JammingError, SimulationError
+from ..model import Array
+from ..problem import Phase, Problem
+from ..torque import TorqueProfile
+from .events import Event, EventKind, Outcome, OutcomeKind, Section
+from .stepper import STATE, Stepper
+
+FIRST_STEP = 1e-3
+"""Length of the first step tried from rest [s]."""
+STEP_OF_TORQUE = 1e-9
+"""Jump of the torques at a break that counts as one [N m]."""
+
+
+class Replay:
+    """A simulation under way: the state, where it is in the torques, and what is recorded.
+
+    Attributes
+    ----------
+    t : float, [s]
+    y : ndarray, shape (STATE,)
+        z, z', then work, viscous, dry and contact losses.
+    h : float, [s]
+        The step to try next.
+    piece : int
+        Piece of the torques.
+    phase : Phase
+    stepper : Stepper
+        Of the phase's formation.
+    limits : list of str
+        What has happened when each of the stepper's limits is zero.
+    releasable : tuple of str
+        The contacts whose release ends the phase.
+    moving : bool
+        Whether the motion goes on into the phase that is entered.
+    """
+
+    stepper: Stepper
+    phase: Phase
+    limits: list[str]
+    releasable: tuple[str, ...]
+
+    def __init__(
+        self,
+        problem: Problem,
+        torque: TorqueProfile,
+        tolerance: float,
+        wanted: Array,
+    ) -> None:
+        self.problem, self.tolerance = problem, tolerance
+        self.breaks = [float(b) for b in torque.breaks]
+        self.coefficients = torque.coefficients
+        self.steps_at = _find_steps(torque)
+        inside = wanted[(wanted >= self.breaks[0]) & (wanted <= self.breaks[-1])]
+        self.wanted = [*inside.tolist(), math.inf]
+        self.next_wanted = 0
+        self.t, self.piece = self.breaks[0], 0
+        self.y = np.zeros(STATE)
+        self.y[:5] = problem.start
+        self.h = FIRST_STEP
+        self.hold = -math.inf
+        self.impact = 0.0
+        self.moving = False
+        self.sections: list[Section] = []
+        self.events: list[Event] = []
+        self.steps = self.rejected = 0
+
+    def accept(self, t: float) -> Array:
+        """Take the step just made, to time `t`, and record its end."""
+        s = self.stepper
+        self.t = t
+        self.y[:] = s.outputs[s.to.y]
+        s.inputs[s.at.heading] = s.outputs[s.to.heading]
+        if not s.outputs[s.to.ratio] > 0:
+            self.fail_to_step(float(s.outputs[s.to.ratio]))
+        return self.keep(s.outputs.copy())
+
+    def fail_to_step(self, ratio: float) -> None:
+        """Raise the error for a step size that underflows."""
+        names = " ".join(self.phase.formation.names)
+        if not ratio > 1e-3:
+            raise JammingError(
+                f"{names} jams {self.where()}: friction makes the reduced inertia {ratio:.3g} of "
+                "its frictionless value"
+            )
+        raise SimulationError(f"the step size of {names} underflows {self.where()}")
+
+    def step_to(self, h: float) -> None:
+        """Repeat the step with another length."""
+        s = self.stepper
+        s.inputs[s.at.h] = h
+        s.step()
+
+    def record(self, still: bool = False) -> Array:
+        """Record the present state; at rest without forces and acceleration."""
+        s = self.stepper
+        s.inputs[s.at.y], s.inputs[s.at.t] = self.y, self.t
+        s.look()
+        row = s.outputs.copy()
+        if still:
+            row[s.to.acceleration] = 0.0
+            row[s.to.c_n] = row[s.to.c_t] = math.nan
+        return self.keep(row)
+
+    def keep(self, row: Array) -> Array:
+        """Append a row of outputs to the records; it becomes the start of the next step."""
+        s, section = self.stepper, self.sections[-1]
+        s.inputs[s.at.y] = self.y
+        section.times.append(self.t)
+        section.rows.append(row)
+        section.impacts.append(self.impact)
+        return row
+
+    def drop(self) -> None:
+        """Take back the last record."""
+        section = self.sections[-1]
+        for column in (section.times, section.rows, section.impacts):
+            column.pop()
+
+    def note(
+        self,
+        kind: EventKind,
+        text: str,
+        contact: str = "",
+        value: float = math.nan,
+        time: float | None = None,
+    ) -> None:
+        """Append an event, at present if no time is given."""
+        time = self.t if time is None else time
+        self.events.append(Event(time, self.phase.index, kind, text, contact, value))
+
+    def lose(self, contact: str, c_n: float) -> Outcome:
+        """End because `contact` would have to pull."""
+        how = "to zero" if c_n > -1e-6 else f"to {c_n:.3g} N"
+        text = f"c_n of {contact} falls {how} {self.when()}"
+        self.note(EventKind.CONTACT_LOST, text, contact, c_n)
+        return Outcome(OutcomeKind.CONTACT_LOST, text)
+
+    def slip(self, row: int, c_n: float, c_t: float) -> Outcome:
+        """End because a rolling contact slips: the `row`-th of the formation, with forces in N."""
+        formation = self.phase.formation
+        name, bound = formation.names[row], formation.friction[row] * c_n
+        how = "exceeds" if abs(c_t) - bound > 1e-6 else "reaches"
+        text = f"{name} slips: |c_t| = {abs(c_t):.5g} N {how} mu c_n = {bound:.5g} N {self.when()}"
+        self.note(EventKind.SLIP, text, name, bound - abs(c_t))
+        return Outcome(OutcomeKind.SLIPS, text)
+
+    def stay(self, name: str) -> Outcome:
+        """End because friction holds a contact or a joint while the rest moves."""
+        joint = name.startswith("joint")
+        what = "held joints are not modelled" if joint else "the phase plans it as sliding"
+        text = f"friction holds {name} {self.when()}, while the rest moves: {what}"
+        self.note(EventKind.HELD, text, name)
+        return Outcome(OutcomeKind.HELD, text)
+
+    def run_out(self) -> Outcome:
+        """End because the torques end."""
+        if self.phase.until.is_release:
+            names = ", ".join(self.releasable)
+            text = f"the torques end {self.when()}, before {names} is released"
+            self.note(EventKind.END, text)
+            return Outcome(OutcomeKind.GOAL_MISSED, text)
+        distance = self.value(self.stepper.rows.until)
+        unit = "rad" if self.phase.until.coordinate == "phi" else "m"
+        text = f"the torques end {self.when()}, {distance:.3g} {unit} short of {self.phase.until}"
+        self.note(EventKind.END, text, "", distance)
+        return Outcome(OutcomeKind.GOAL_MISSED, text)
+
+    def value(self, row: int) -> float:
+        """One of the event values at the present state."""
+        return float(self.stepper.outputs[self.stepper.to.events.start + row])
+
+    def load_piece(self) -> None:
+        """Hand the present piece of the torques to the stepper."""
+        s, k = self.stepper, self.piece
+        s.inputs[s.at.piece] = self.breaks[k], self.breaks[k + 1]
+        s.inputs[s.at.torque] = self.coefficients[k].ravel()
+
+    def next_piece(self) -> bool:
+        """Go on to the next piece, if there is one; whether the torques step there."""
+        if self.piece + 2 >= len(self.breaks):
+            return False
+        self.piece += 1
+        self.load_piece()
+        return bool(self.steps_at[self.piece])
+
+    def fraction(self, t: float) -> float:
+        """Where time `t` is on the present piece, from -1 to 1."""
+        start, stop = self.breaks[self.piece], self.breaks[self.piece + 1]
+        return min(1.0, max(-1.0, (2 * t - start - stop) / (stop - start)))
+
+    def time(self, x: float) -> float:
+        """Time at `x` of the present piece [s]."""
+        start, stop = self.breaks[self.piece], self.breaks[self.piece + 1]
+        return (start + stop + x * (stop - start)) / 2
+
+    def when(self) -> str:
+        """Present time and phase, to end a sentence."""
+        return f"at t = {self.t:.5g} s, phase {self.phase.number}"
+
+    def where(self) -> str:
+        """Present phase and time, for errors."""
+        return f"in phase {self.phase.number} at t = {self.t:.5g} s"
+
+    @property
+    def stored(self) -> float:
+        """Kinetic and potential energy [J]."""
+        scene, v = self.problem.scene, self.y[5:10]
+        height = scene.polygon.mass * scene.gravity * self.y[1]
+        return float(0.5 * v**2 @ scene.mass_diagonal + height)
+
+
+def _find_steps(torque: TorqueProfile) -> Array:
+    """Whether the torques step at the start of each piece, shape (k,)."""
+    alternate = (-1.0) ** np.arange(torque.coefficients.shape[2])
+    jump = (torque.coefficients[1:] @ alternate) - torque.coefficients[:-1].sum(axis=2)
+    return np.append(True, np.abs(jump).max(axis=1) > STEP_OF_TORQUE)

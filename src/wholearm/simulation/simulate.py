@@ -1,0 +1,218 @@
+"""Forward simulation: joint torques in, motion and contact forces out.
+
+The motion starts at rest in the first phase's formation. While it moves, the constrained equations
+of motion are integrated to a given tolerance with the friction of the sliding directions; every
+step ends at the latest where a torque's polynomial piece ends, and events are located by repeating
+a step with another length. At rest the formation waits until it can start (`sticking`).
+
+When the end of a phase is reached the motion stops, if the phase ends at rest, and goes on from
+rest in the next phase's formation. If it ends smoothly the motion goes on with its velocity, less
+what the contacts of the next formation do not let through; contacts that this formation does not
+have are let go. If it ends with an impact, impulses of the next formation's contacts change the
+velocity, and all of them have to press (`wholearm.impact`).
+
+Nothing here is shared with the planner but the contacts and the scene.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import InputError, JammingError, SimulationError
+from ..problem import End, Phase, Problem
+from ..torque import TorqueProfile
+from .events import EventKind, Outcome, OutcomeKind, Simulation, collect
+from .jumps import REACHED, REST_WINDOW, Arrival, Ending, Released, Rested
+from .moving import move
+from .replay import Replay
+from .starting import Departure
+from .sticking import Collapse, Rest, find_rest
+from .transitions import collide, enter, go_on, set_off
+
+
+def simulate(
+    problem: Problem,
+    torque: TorqueProfile,
+    *,
+    tolerance: float = 1e-9,
+    times: ArrayLike | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Simulation:
+    """Replay joint torques open loop from the problem's start at rest.
+
+    Parameters
+    ----------
+    problem : Problem
+    torque : TorqueProfile
+    tolerance : float
+        Largest error of each step, in z and z' [m, rad, m/s, rad/s].
+    times : array_like, shape (n,), optional, [s]
+        Instants at which the state is wanted; steps end there. Those outside the torques' time
+        are left out.
+    progress : callable, optional
+        Receives a line at the start of each phase.
+
+    Returns
+    -------
+    Simulation
+        Whatever happens to the object: a lost contact is an outcome, not an error.
+
+    Raises
+    ------
+    InputError
+        If `tolerance` is not a number from 1e-14 to 1e-2, or a time is not finite.
+    JammingError
+        If friction makes the reduced inertia vanish or turn negative.
+    SimulationError
+        If a formation does not close at its start, or the step size underflows.
+    """
+    if not 1e-14 <= tolerance <= 1e-2:
+        raise InputError("", "tolerance", f"{tolerance!r} is not between 1e-14 and 1e-2")
+    wanted = np.unique(np.asarray([] if times is None else times, dtype=float))
+    if not np.isfinite(wanted).all():
+        raise InputError("", "times", "holds numbers that are not finite")
+    run = Replay(problem, torque, tolerance, wanted)
+    for phase, following in zip(problem.phases, [*problem.phases[1:], None], strict=True):
+        if progress is not None:
+            progress(f"simulating phase {phase.number} of {len(problem.phases)}")
+        outcome = _play(run, phase, following)
+        if outcome is not None:
+            return _collect(run, outcome)
+    goal = problem.phases[-1].until
+    text = f"{goal} is reached at t = {run.t:.5g} s, the end of phase {len(problem.phases)}"
+    return _collect(run, Outcome(OutcomeKind.GOAL_REACHED, text))
+
+
+def _play(run: Replay, phase: Phase, following: Phase | None) -> Outcome | None:
+    """Simulate one phase; None if its end is reached."""
+    enter(run, phase, following)
+    ending: Departure | Ending = Rested()
+    if run.moving:
+        ending = go_on(run) or move(run)
+    brief = 0
+    while True:
+        if isinstance(ending, Rested):
+            ending = _rest(run)
+        if isinstance(ending, Departure):
+            started = run.t
+            run.note(EventKind.START, f"the object starts to move {run.when()}")
+            set_off(run, ending)
+            ending = move(run)
+            brief = brief + 1 if run.t - started < 1e-12 else 0
+            if brief > 20:
+                raise SimulationError(f"starting and stopping do not end {run.where()}")
+        if isinstance(ending, Outcome):
+            return ending
+        if isinstance(ending, Arrival):
+            return _arrive(run, ending, following)
+        if isinstance(ending, Released):
+            _release(run, ending)
+            return None
+
+
+def _arrive(run: Replay, arrival: Arrival, following: Phase | None) -> Outcome | None:
+    """End the phase; if it ends at rest the motion stops, with a plastic impact if need be."""
+    until, rate = run.phase.until, arrival.rate
+    text = f"{until} reached {run.when()}"
+    run.note(EventKind.ARRIVAL, text, str(until), rate)
+    if arrival.strikes and following is not None:
+        run.moving = True
+        return collide(run, following)
+    run.moving = run.phase.end is End.SMOOTH
+    if run.moving:
+        return None
+    before = run.stored
+    run.y[5:10] = 0.0
+    run.impact += before - run.stored
+    coming = next((b for b in run.breaks if b > run.t), math.inf)
+    run.hold = coming if coming - run.t <= arrival.window else run.t
+    return None
+
+
+def _release(run: Replay, release: Released) -> None:
+    """End the phase where the next one's formation lets contacts go."""
+    names = ", ".join(run.releasable)
+    run.note(EventKind.RELEASE, f"{names} released {run.when()}", names, release.c_n)
+    run.moving = True
+
+
+def _rest(run: Replay) -> Departure | Arrival | Released | Outcome:
+    """Wait at rest until the formation can start, the goal is near or something gives way."""
+    y = run.y
+    before = run.stored
+    y[5:10] = 0.0
+    run.impact += before - run.stored
+    run.record(still=True)
+    if abs(run.value(run.stepper.rows.until)) < REACHED:
+        return Arrival(0.0, REST_WINDOW)
+    rest = find_rest(run.phase.formation, y[:5])
+    sticks = False
+    while True:
+        if run.t >= run.breaks[-1]:
+            return run.run_out()
+        if run.t >= run.hold:
+            x = run.fraction(run.t)
+            change = rest.wait(run.coefficients[run.piece], x)
+            if isinstance(change, Departure) and change.x <= x:
+                return change
+            if not sticks:
+                run.note(EventKind.STICK, f"the object sticks {run.when()}")
+            sticks = True
+            if isinstance(change, Departure):
+                _advance(run, run.time(change.x))
+                return change
+            if isinstance(change, Collapse) and not _settles(run, change):
+                return _collapse(run, rest, change)
+        _advance(run, run.breaks[run.piece + 1])
+        run.next_piece()
+
+
+def _settles(run: Replay, change: Collapse) -> bool:
+    """Whether the torques step before a contact could part."""
+    coming = run.piece + 1
+    steps = coming < len(run.steps_at) and bool(run.steps_at[coming])
+    return steps and run.breaks[coming] - run.time(change.x) <= REST_WINDOW
+
+
+def _advance(run: Replay, stop: float) -> None:
+    """Let time pass at rest."""
+    while run.wanted[run.next_wanted] <= stop:
+        run.t = max(run.t, run.wanted[run.next_wanted])
+        run.record(still=True)
+        run.next_wanted += 1
+    run.t = stop
+    run.record(still=True)
+
+
+def _collapse(run: Replay, rest: Rest, change: Collapse) -> Released | Outcome:
+    """End because nothing balances at rest."""
+    _advance(run, max(run.t, run.time(change.x)))
+    if change.jammed:
+        raise JammingError(
+            f"{' '.join(rest.formation.names)} jams at rest {run.where()}: friction makes "
+            "the reduced inertia vanish or turn negative"
+        )
+    if change.held:
+        return run.stay(change.contact)
+    if change.c_t is not None:
+        row = run.phase.formation.names.index(change.contact)
+        return run.slip(row, change.c_n, change.c_t)
+    if change.contact in run.releasable:
+        return Released(change.c_n)
+    return run.lose(change.contact, change.c_n)
+
+
+def _collect(run: Replay, outcome: Outcome) -> Simulation:
+    """Put everything recorded together."""
+    missed = 0.0 if outcome.reached else run.value(run.stepper.rows.until)
+    if run.phase.until.is_release:
+        missed = math.nan
+    counts = (run.steps, run.rejected)
+    return collect(run.problem, run.sections, run.events, outcome, missed, counts)
+
+
+__all__ = ["simulate"]

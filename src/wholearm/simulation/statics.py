@@ -1,0 +1,64 @@
+"""Whether contact forces can hold a formation at rest, whatever they are."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from ..contact import Contact
+from ..formation import Formation
+from ..model import Array, Scene
+
+BALANCED = 1e-6
+"""Pull that counts as none: the accuracy of the linear programme [N]."""
+
+
+def balances(scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array) -> bool:
+    """Whether contact forces inside the friction cones balance gravity and torques at rest."""
+    return not find_pulls(scene, contacts, z, tau).max() > BALANCED
+
+
+def find_pulls(scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array) -> Array:
+    """Least pulls with which contact forces balance gravity and torques at rest.
+
+    A linear programme in c_n >= 0, c_t within U c_n, dry joint friction within D and a pull p >= 0
+    of each contact: least sum of p with g + S (tau - friction) + A^T (c_n - p) + A_t^T c_t = 0.
+
+    Parameters
+    ----------
+    contacts : tuple of Contact
+        All that touch.
+    z : ndarray, shape (5,)
+    tau : ndarray, shape (2,), [N m]
+
+    Returns
+    -------
+    ndarray, shape (n,), [N]
+        Pull of each contact, infinite if none balance; all zero if no contact has to pull.
+    """
+    from scipy.optimize import linprog
+
+    touching = _formation(scene, contacts)
+    kinematics = touching.evaluate(z[None], np.zeros((1, 5)))
+    n_c = touching.n_contacts
+    normal, joints = kinematics.A[0].T, np.eye(5)[:, 3:]
+    balance = np.hstack([normal, kinematics.A_t[0].T, -joints, -normal])
+    cone, unit, none = -np.diag(touching.friction), np.eye(n_c), np.zeros((n_c, 2 + n_c))
+    within = np.vstack([np.hstack([cone, sign * unit, none]) for sign in (1.0, -1.0)])
+    free, pressing = [(None, None)] * n_c, [(0.0, None)] * n_c
+    answer = linprog(
+        np.repeat([0.0, 1.0], [2 * n_c + 2, n_c]),
+        A_ub=within,
+        b_ub=np.zeros(2 * n_c),
+        A_eq=balance,
+        b_eq=-(scene.applied_force + joints @ tau),
+        bounds=[*pressing, *free, *((-d, d) for d in scene.dry[3:]), *pressing],
+        method="highs",
+    )
+    return np.asarray(answer.x[-n_c:]) if answer.status == 0 else np.full(n_c, np.inf)
+
+
+@lru_cache(maxsize=64)
+def _formation(scene: Scene, contacts: tuple[Contact, ...]) -> Formation:
+    return Formation(scene, contacts)

@@ -1,0 +1,342 @@
+"""A formation at rest: which way it starts to move, and when.
+
+At rest friction can take either sign. With one freedom each of the two ways along the free
+direction is tried with the friction that would oppose it; with more, every choice of directions is
+(`starting`). The formation moves that way if it then accelerates that way, presses on
+every contact and closes no other. If no way does, it sticks; its forces are then indeterminate, and
+all that can be asked is whether any inside the friction cones balance.
+Accelerations and normal forces at rest are affine in the torques, so on one polynomial piece of
+them the instant of starting is a root of a polynomial.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cones import find_weakest
+from ..contact import Contact
+from ..dynamics import Directions
+from ..errors import SimulationError
+from ..formation import TOUCHING, Formation, Kinematics
+from ..model import Array
+from .starting import STILL, Departure, Pattern, Way, find_patterns, solve_at_rest
+from .statics import balances, find_pulls
+from .stepper import SLACK_FORCE, SLACK_LIMIT
+
+_AHEAD = 1e-5
+"""How far ahead along the free direction signs and gaps are looked for [m, rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class RestDirection:
+    """One way in which a formation at rest could move.
+
+    Attributes
+    ----------
+    heading : ndarray, shape (5,)
+        The direction, of length one in the metric M5.
+    directions : Directions
+        The friction that opposes it.
+    acceleration : ndarray, shape (3,)
+        Acceleration along `heading` is acceleration @ (1, tau_1, tau_2).
+    holds : ndarray, shape (n_c + 2 R, 3)
+        Likewise what has to be positive for the contacts to hold, H c [N] (`wholearm.cones`).
+    ratio : float
+        Reduced inertia over that without friction; jammed at zero and below.
+    closes : bool
+        Whether it would push features that touch already into one another.
+    """
+
+    heading: Array
+    directions: Directions
+    acceleration: Array
+    holds: Array
+    ratio: float
+    closes: bool
+
+    @property
+    def margins(self) -> list[tuple[Array, float]]:
+        """Rows r and offsets d with r @ (1, tau_1, tau_2) + d >= 0 while it moves this way."""
+        return [(self.acceleration, -STILL), *((row, SLACK_FORCE) for row in self.holds)]
+
+    def drive(self, tau: Array) -> float:
+        """How strongly it accelerates this way, in the metric M5."""
+        return float(self.acceleration @ [1.0, *tau])
+
+    def slides(self, tau: Array) -> bool:
+        """Whether it accelerates this way, if every contact can press or pull."""
+        return self.drive(tau) > STILL and not self.closes
+
+    def moves(self, tau: Array) -> bool:
+        """Whether the formation starts to move this way under torques `tau`, shape (2,)."""
+        keeps = float((self.holds @ [1.0, *tau]).min()) >= -SLACK_FORCE
+        return self.ratio > 0 and keeps and self.slides(tau)
+
+    def depart(self, x: float, tau: Array) -> Departure:
+        """Start this way at `x` of a piece; the torques do not matter."""
+        return Departure(x, self.heading, self.directions)
+
+
+@dataclass(frozen=True)
+class Collapse:
+    """No forces balance any more at `x` of a piece, and no way holds every contact.
+
+    Attributes
+    ----------
+    x : float
+    contact : str
+        The contact that would have to pull most, that cannot start to slide, or that slips.
+    c_n : float, [N]
+        NaN if the contact cannot start to slide.
+    jammed : bool
+        Whether friction jams one of the ways.
+    c_t : float or None, [N]
+        Of a rolling contact that slips, although it presses with `c_n`.
+    """
+
+    x: float
+    contact: str
+    c_n: float
+    jammed: bool
+    c_t: float | None = None
+
+    @property
+    def held(self) -> bool:
+        """Whether the rest would start to move while friction holds the contact or joint."""
+        return math.isnan(self.c_n)
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """A formation at rest at a configuration.
+
+    Attributes
+    ----------
+    formation : Formation
+    z : ndarray, shape (5,)
+    ways : tuple of Way
+        The ways it could move: two with one freedom, every choice of directions with more.
+    touching : tuple of Contact
+        Every contact that touches, in the formation or not.
+    """
+
+    formation: Formation
+    z: Array
+    ways: tuple[Way, ...]
+    touching: tuple[Contact, ...]
+
+    def wait(self, coefficients: Array, x: float) -> Departure | Collapse | None:
+        """Find what ends the rest on one piece of the torques, from `x` on.
+
+        Parameters
+        ----------
+        coefficients : ndarray, shape (2, d + 1), [N m]
+            Torques in ascending powers of x in [-1, 1].
+        x : float
+            Where to begin.
+
+        Returns
+        -------
+        Departure, Collapse or None
+            None if the formation rests to the end of the piece.
+        """
+        tau = _evaluate(coefficients, x)
+        for way in self.ways:
+            if way.moves(tau):
+                return way.depart(x, tau)
+        ends = self._changes(coefficients, x)
+        for start, stop in zip(ends, [*ends[1:], 1.0], strict=True):
+            middle = (start + stop) / 2
+            tau = _evaluate(coefficients, middle)
+            ways = sorted(self.ways, key=lambda way: -way.drive(tau))
+            for way in ways:
+                if way.moves(tau):
+                    return way.depart(start, tau)
+            # Torques that balance form a convex set: the ends of a linear piece speak for it all.
+            linear = coefficients.shape[1] <= 2
+            for place in (start, stop) if linear else (start, middle, stop):
+                if not self._balances(coefficients, place):
+                    return self._collapse(coefficients, start, place)
+        return None
+
+    def _changes(self, coefficients: Array, x: float) -> list[float]:
+        """Where on the piece an acceleration or a normal force changes sign, from `x` on."""
+        places = {x}
+        for way in self.ways:
+            for row, offset in way.margins:
+                polynomial = row[1:] @ coefficients
+                polynomial[0] += row[0] + offset
+                places |= {root for root in _roots(polynomial) if x < root < 1}
+        return sorted(places)
+
+    def _balances(self, coefficients: Array, x: float) -> bool:
+        tau = _evaluate(coefficients, x)
+        return balances(self.formation.scene, self.touching, self.z, tau)
+
+    def _collapse(self, coefficients: Array, low: float, high: float) -> Collapse:
+        if not self._balances(coefficients, low):
+            high = low
+        while high - low > 1e-10:
+            middle = (low + high) / 2
+            low, high = (middle, high) if self._balances(coefficients, middle) else (low, middle)
+        tau = _evaluate(coefficients, high)
+        free = [way for way in self.ways if way.slides(tau)]
+        if not free and isinstance(self.ways[0], Pattern):
+            return Collapse(high, self._find_held(tau), math.nan, self._jams)
+        load = np.array([1.0, *tau])
+        pulls = find_pulls(self.formation.scene, self.touching, self.z, tau)
+        if free or np.isinf(pulls).all():
+            weakest = min((way.holds @ load for way in free or self.ways), key=np.min)
+            row, least, c_t = find_weakest(self.formation, weakest)
+            return Collapse(high, self.formation.names[row], least, self._jams, c_t)
+        name, least = self.touching[int(pulls.argmax())].name, -float(pulls.max())
+        return Collapse(high, name, least, self._jams)
+
+    @property
+    def _jams(self) -> bool:
+        """Whether friction jams one of the two ways, or every choice of directions."""
+        jammed = [way.ratio <= 0 for way in self.ways]
+        return all(jammed) if isinstance(self.ways[0], Pattern) else any(jammed)
+
+    def _find_held(self, tau: Array) -> str:
+        """The contact or joint that stays, by the choice of directions with fewest that do."""
+        patterns = [way for way in self.ways if isinstance(way, Pattern)]
+        pressing = [p for p in patterns if (p.holds @ [1.0, *tau] >= -SLACK_FORCE).all()]
+        found = [p.find_held(tau) for p in pressing or patterns]
+        names = (*self.formation.names, "joint 1", "joint 2")
+        fewest = min((held for held in found if len(held)), key=len, default=np.zeros(1, int))
+        return names[int(fewest[0])]
+
+
+def find_rest(formation: Formation, z: Array) -> Rest:
+    """Return a formation at rest at `z`, shape (5,).
+
+    Raises
+    ------
+    SimulationError
+        If the contacts depend on one another, or leave no freedom.
+    """
+    root = np.sqrt(formation.scene.mass_diagonal)
+    kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
+    P = kinematics.P[0]
+    _, values, right = np.linalg.svd(P / root)
+    rank = int((values > 1e-9 * values[0]).sum())
+    if rank < len(P) or rank == 5:
+        raise SimulationError(
+            f"{' '.join(formation.names)} leaves {5 - rank} freedoms, and no forces that are "
+            "determined; it cannot start from rest"
+        )
+    if rank < 4:
+        near = np.abs(formation.evaluate_limits(z[None])[0]) < TOUCHING
+        patterns = find_patterns(formation, z, near)
+        return Rest(formation, z, patterns, formation.contacts + _gained(formation, near))
+    heading = right[4] / root
+    step = _AHEAD / np.abs(heading).max()
+    limits = formation.evaluate_limits(z + step * np.array([[0.0], [1.0], [-1.0]]) * heading)
+    near = np.abs(limits[0]) < TOUCHING
+    # The curvature of the path cancels in the difference of both ways.
+    rise = (limits[1, near] - limits[2, near]) / 2
+    closes = [bool((sign * rise < -SLACK_LIMIT).any()) for sign in (1.0, -1.0)]
+    rates = np.concatenate([kinematics.A_t[0] @ heading, heading[3:]])
+    rates[list(formation.rolling_rows)] = 0.0
+    still = np.abs(rates) < 1e-9
+    signs = np.sign([rates, -rates])
+    if still.any():
+        # What is stationary here has the direction that it takes up just after.
+        ahead = [_rates(formation, z, step, sign * heading) for sign in (1, -1)]
+        signs = np.where(still, np.where(np.abs(ahead) > 1e-12, np.sign(ahead), 0.0), signs)
+    ways = tuple(
+        _build_way(formation, side * heading, Directions(s[:-2], s[-2:]), kinematics, close)
+        for side, s, close in zip((1.0, -1.0), signs, closes, strict=True)
+    )
+    return Rest(formation, z, ways, formation.contacts + _gained(formation, near))
+
+
+def _gained(formation: Formation, near: NDArray[np.bool_]) -> tuple[Contact, ...]:
+    """Contacts that touch but are not in the formation."""
+    gained = [formation.limits[k].gained for k in np.flatnonzero(near)]
+    return tuple(contact for contact in gained if contact is not None)
+
+
+def _build_way(
+    formation: Formation,
+    heading: Array,
+    directions: Directions,
+    kinematics: Kinematics,
+    closes: bool,
+) -> RestDirection:
+    acceleration, holds, ratio = solve_at_rest(formation, directions, kinematics)
+    drive = heading * formation.scene.mass_diagonal @ acceleration
+    return RestDirection(heading, directions, drive, holds, ratio, closes)
+
+
+def _rates(formation: Formation, z: Array, step: float, heading: Array) -> Array:
+    """Sliding and joint rates a `step` from `z` along the free direction, shape (n_c + 2,)."""
+    slip = formation.evaluate_slip(z[None])[0]
+    ahead = close_contacts(formation, z + step * heading, slip=slip)
+    kinematics = formation.evaluate(ahead[None], heading[None])
+    P, inverse_mass = kinematics.P[0], 1 / formation.scene.mass_diagonal
+    lift = inverse_mass[:, None] * P.T
+    tangent = heading - lift @ np.linalg.solve(P @ lift, P @ heading)
+    return np.concatenate([kinematics.A_t[0] @ tangent, tangent[3:]])
+
+
+def close_contacts(
+    formation: Formation, z: Array, within: float = np.inf, slip: Array | None = None
+) -> Array:
+    """Nearest configuration, in the metric M5, with every contact of the formation closed.
+
+    Parameters
+    ----------
+    z : ndarray, shape (5,)
+    within : float, [m]
+        Largest gap to close.
+    slip : ndarray, shape (R,), optional, [m]
+        Slip coordinates to give to rolling contacts; without them these start to roll where they
+        are.
+
+    Raises
+    ------
+    SimulationError
+        If a gap is larger, or the contacts cannot be closed from `z`.
+    """
+    inverse_mass = 1 / formation.scene.mass_diagonal
+    for _ in range(8):
+        kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
+        gaps, rows = kinematics.C[0], kinematics.A[0]
+        worst = int(np.abs(gaps).argmax())
+        if np.abs(gaps[worst]) > within:
+            raise SimulationError(
+                f"{formation.names[worst]}, with a gap of {gaps[worst]:.3g} m, does not touch"
+            )
+        slid = np.zeros(0) if slip is None else formation.evaluate_slip(z[None])[0] - slip
+        if np.abs(gaps[worst]) < 1e-16 and (np.abs(slid) < 1e-16).all():
+            break
+        rows = rows if slip is None else kinematics.P[0]
+        lift = inverse_mass[:, None] * rows.T
+        try:
+            z = z - lift @ np.linalg.solve(rows @ lift, np.concatenate([gaps, slid]))
+        except np.linalg.LinAlgError:
+            raise SimulationError(f"{' '.join(formation.names)} depend on one another") from None
+    if not np.abs(gaps[worst]) < TOUCHING * 1e-3:
+        raise SimulationError(
+            f"{formation.names[worst]}, with a gap of {gaps[worst]:.3g} m, cannot be closed"
+        )
+    return z
+
+
+def _evaluate(coefficients: Array, x: float) -> Array:
+    return np.asarray(coefficients @ x ** np.arange(coefficients.shape[1]))
+
+
+def _roots(polynomial: Array) -> list[float]:
+    """Real roots of a polynomial given by ascending coefficients."""
+    significant = np.flatnonzero(np.abs(polynomial) > 1e-14 * np.abs(polynomial).max())
+    if not len(significant) or significant[-1] == 0:
+        return []
+    roots = np.polynomial.polynomial.polyroots(polynomial[: significant[-1] + 1])
+    return [float(root.real) for root in roots if abs(root.imag) < 1e-9]

@@ -1,0 +1,141 @@
+"""From one phase's formation to the next one's, at rest or with the velocity going on."""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+
+import numpy as np
+
+from ..errors import JammingError, SimulationError
+from ..formation import Formation
+from ..impact import Obstacle, strike, transfer
+from ..model import Array
+from ..problem import End, Phase
+from .events import EventKind, Outcome, OutcomeKind, Section
+from .jumps import REACHED, Ending, find_held, look_again
+from .replay import Replay
+from .starting import Departure
+from .stepper import build_stepper, open_limits
+from .sticking import close_contacts
+
+STANDING = 1e-9
+"""Speed that counts as none where a formation is entered [m/s or rad/s]: the integration's error
+may give it either sign."""
+_OUTCOMES = {
+    Obstacle.PULL: OutcomeKind.CONTACT_LOST,
+    Obstacle.SLIP: OutcomeKind.SLIPS,
+    Obstacle.CLOSING: OutcomeKind.LIMIT_REACHED,
+    Obstacle.HELD: OutcomeKind.HELD,
+}
+
+
+def enter(run: Replay, phase: Phase, following: Phase | None) -> None:
+    """Take the formation of `phase`; what it does not let the motion keep is lost to impact."""
+    run.phase = phase
+    before = run.stored
+    run.y[:5] = _close(run, phase.formation)
+    if run.moving:
+        run.y[5:10] = project_velocity(phase.formation, run.y[:5], run.y[5:10])
+        run.moving = bool(np.abs(run.y[5:10]).max() > STANDING)
+    if not run.moving:
+        run.y[5:10] = 0.0
+    run.impact += before - run.stored
+    until, side = phase.until, 1.0
+    if until.value is not None:
+        side = math.copysign(1.0, run.y[0 if until.coordinate == "x" else 2] - until.value)
+    degree = run.coefficients.shape[2] - 1
+    run.stepper = build_stepper(phase.formation, until, side, degree)
+    run.sections.append(Section(phase, run.stepper.to))
+    run.limits = [limit.text for limit in open_limits(phase.formation, until)]
+    run.releasable = find_releasable(phase, following)
+    run.stepper.inputs[run.stepper.at.tolerance] = run.tolerance
+    run.stepper.inputs[run.stepper.at.slip] = phase.formation.evaluate_slip(run.y[None, :5])[0]
+    run.load_piece()
+
+
+def _close(run: Replay, formation: Formation) -> Array:
+    """The present configuration with every contact of a formation closed."""
+    try:
+        return close_contacts(formation, run.y[:5], 10 * REACHED)
+    except SimulationError as error:
+        raise SimulationError(f"{error} {run.where()}") from None
+
+
+def collide(run: Replay, following: Phase) -> Outcome | None:
+    """Throw the velocity onto the next formation; what ends the motion if that is not possible."""
+    z = _close(run, following.formation)
+    impact = strike(run.phase.formation, following.formation, z, run.y[5:10])
+    name, least = impact.least
+    names = following.formation.names
+    normal = impact.p[: len(names)]
+    impulses = ", ".join(f"{p:.4g} on {n}" for n, p in zip(names, normal, strict=True))
+    run.note(EventKind.IMPACT, f"impact {run.when()}, in N s {impulses}", name, least)
+    if impact.hindrances:
+        worst = impact.hindrances[0]
+        text = f"{worst.describe()} in the impact {run.when()}"
+        if worst.kind is Obstacle.JAM:
+            raise JammingError(text)
+        return Outcome(_OUTCOMES[worst.kind], text)
+    before = run.stored
+    run.y[5:10] = impact.v
+    run.impact += before - run.stored
+    return None
+
+
+def find_releasable(phase: Phase, following: Phase | None) -> tuple[str, ...]:
+    """Names of the contacts whose release ends the phase."""
+    if phase.end is End.REST or following is None or not phase.until.is_release:
+        return ()
+    kept = following.formation.names
+    return tuple(name for name in phase.formation.names if name not in kept)
+
+
+def project_velocity(formation: Formation, z: Array, v: Array) -> Array:
+    """Velocity nearest to `v` in the metric M5 that keeps every constraint, shape (5,)."""
+    P = formation.evaluate(z[None], v[None]).P[0]
+    return transfer(formation.scene.mass_diagonal, P, P, v)[0]
+
+
+def set_off(run: Replay, departure: Departure) -> None:
+    """Give the stepper the directions of a motion that starts from rest."""
+    s = run.stepper
+    s.inputs[s.at.Xi], s.inputs[s.at.sigma] = departure.directions
+    s.inputs[s.at.heading] = departure.heading
+    run.record()
+
+
+def go_on(run: Replay) -> Ending | None:
+    """Give the stepper the directions of the present velocity; what ends the motion at once.
+
+    What does not slide or turn here takes the direction in which it accelerates.
+    """
+    s = run.stepper
+    y, formation = run.y, run.phase.formation
+    s.inputs[s.at.y], s.inputs[s.at.t] = y, run.t
+    v = y[5:10]
+    mass = formation.scene.mass_diagonal
+    s.inputs[s.at.heading] = v / np.sqrt(mass @ v**2)
+    rates = np.concatenate([formation.evaluate(y[None, :5], v[None]).A_t[0] @ v, v[3:]])
+    signs = np.where(rates < 0, -1.0, 1.0)
+    signs[list(formation.rolling_rows)] = 0.0
+    still = np.flatnonzero((np.abs(rates) < STANDING) & (signs != 0)).tolist()
+    rows = [s.rows.slide.start + k for k in still]
+    choices = product((1.0, -1.0), repeat=len(still))
+    _point(run, signs)
+    for choice in choices if still else ():
+        tried = signs.copy()
+        tried[still] *= choice
+        _point(run, tried)
+        if s.outputs[s.to.ratio] > 0 and not find_held(run, rows):
+            break
+    else:
+        _point(run, signs)
+    return look_again(run, rows)
+
+
+def _point(run: Replay, signs: Array) -> None:
+    """Look with the given directions of contacts and joints, shape (n_c + 2,)."""
+    s = run.stepper
+    s.inputs[s.at.Xi], s.inputs[s.at.sigma] = signs[:-2], signs[-2:]
+    s.look()

@@ -1,0 +1,1 @@
+"""Phases with any number of freedoms, planned over time by collocation."""

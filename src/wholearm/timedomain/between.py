@@ -1,0 +1,114 @@
+"""What a motion in the time domain misses between its collocation points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cones import hold_least, slip_margins
+from ..minima import find_least
+from ..model import Array
+from .stage import Stage
+from .timemotion import StageMotion
+from .timenlp import CLEAR, TimeNLP
+
+MISS = 5e-7
+"""Largest miss of a force limit between points [N]."""
+GRAZE = 1e-8
+"""Deepest overlap between points [m]."""
+COARSE = 1e-2
+"""Miss of a force limit above which an interval is halved [N]."""
+LOOKS = 25
+"""Places per interval at which limits are looked at."""
+_OVER = 1.5
+"""How much more than the miss a limit is tightened."""
+
+
+class Limits(NamedTuple):
+    """Amounts by which limits of one stage are missed or raised, never negative.
+
+    Attributes
+    ----------
+    c_n : ndarray, shape (K, n_c), [N]
+    cone : ndarray, shape (K, R), [N]
+    gap : ndarray, shape (K, n_watched), [m]
+    """
+
+    c_n: Array
+    cone: Array
+    gap: Array
+
+    @staticmethod
+    def none(stage: Stage) -> Limits:
+        """Nothing is raised."""
+        formation = stage.formation
+        widths = (formation.n_contacts, formation.n_rolling, len(stage.watched))
+        return Limits(*(np.zeros((stage.intervals, width)) for width in widths))
+
+    def raised(self, misses: Limits) -> Limits:
+        """Raised by somewhat more than the misses."""
+        return Limits(*(own + _OVER * miss for own, miss in zip(self, misses, strict=True)))
+
+    @property
+    def worst(self) -> float:
+        """The largest, over what is allowed."""
+        allowed = (MISS, MISS, GRAZE)
+        return max(float(t.max(initial=0.0)) / a for t, a in zip(self, allowed, strict=True))
+
+    @property
+    def coarse(self) -> NDArray[np.bool_]:
+        """Which intervals are to be halved, shape (K,)."""
+        return np.asarray((np.hstack([self.c_n, self.cone]) > COARSE).any(axis=1))
+
+
+def find_misses(stage: Stage, motion: StageMotion, epsilon: float, margin: float = 0.0) -> Limits:
+    """By how much limits are missed in each interval, at worst.
+
+    Parameters
+    ----------
+    epsilon, margin : float, [N]
+        Least c_n, and what c_n but no friction cone has to exceed it by.
+    """
+    formation, inner = stage.formation, np.linspace(1e-9, 1 - 1e-9, LOOKS)
+    places = stage.guess.places(inner).ravel()
+    samples = motion.evaluate(places * motion.duration)
+    grip = slip_margins(formation, samples.c_n - epsilon, samples.c_t)
+    gaps = formation.evaluate_limits(samples.z)[:, list(stage.watched)]
+    clear = CLEAR / 2 * np.isin(stage.watched, stage.released)
+    later = (not stage.opens) | (places > 1 / 2)
+    tables = (
+        samples.c_n - (epsilon + margin),
+        grip,
+        gaps - np.outer(later, clear),
+    )
+    shape = (stage.intervals, LOOKS)
+    slack = (find_least(table.reshape(*shape, table.shape[1])) for table in tables)
+    return Limits(*(np.maximum(-part, 0.0) for part in slack))
+
+
+def raise_bounds(
+    nlp: TimeNLP, stages: Sequence[Stage], limits: Sequence[Limits], epsilon: float, low_x: Array
+) -> tuple[Array, Array]:
+    """Bounds of the NLP's rows; raises those of its unknowns in `low_x` in place.
+
+    Parameters
+    ----------
+    epsilon : float, [N]
+        Least c_n.
+    """
+    low, high = nlp.rows.bounds
+    for k, (stage, raised) in enumerate(zip(stages, limits, strict=True)):
+        formation, own = stage.formation, nlp.rows_of[k]
+        floor = epsilon + raised.c_n
+        c_n = nlp.layouts[k].forces[:, :, : formation.n_contacts]
+        # Where rows hold c_n at the points too, its own bounds must not.
+        if own.limits.presses.shape[1] <= 2:
+            low_x[c_n] = floor[:, None]
+        low[own.limits.presses] = floor[:, None]
+        cushion = hold_least(formation, epsilon)[formation.n_contacts :]
+        low[own.limits.cones] = cushion + np.tile(raised.cone, 2)[:, None]
+        low[own.watches] += raised.gap[:, None] / formation.scene.polygon.gyration_radius
+    return low, high

@@ -1,0 +1,186 @@
+"""Which stages a motion has at first: those of its outlines, with a first guess on each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from ..dynamics import Directions
+from ..formation import TOUCHING, Formation
+from ..model import Array
+from ..outline import Outline, outline_onwards, outline_phase
+from ..problem import End, Phase, Problem
+from .collocation import Scheme
+from .stage import Stage, StagePoints
+from .timekernels import new_rows
+
+LEAST_INTERVALS = 3
+"""Fewest intervals of a stage."""
+_NEAR = 0.02
+"""Distance over the radius of gyration at which a limit is watched from the start."""
+
+
+def outline_stages(
+    problem: Problem,
+    phases: Sequence[Phase],
+    z: Array,
+    scheme: Scheme,
+    intervals: int,
+    pace: float,
+    onwards: bool = False,
+) -> list[Stage]:
+    """Stages of phases that are planned as one, with a first guess.
+
+    The guessed duration is `pace` times that of a fall over the length of the outlines. With
+    `onwards`, phases that go on in motion may end farther away where that takes fewer reversals.
+    """
+    parts: list[tuple[Phase, Outline, bool]] = []
+    for phase in phases:
+        outlines = outline_phase(problem, phase, z)
+        if parts and parts[-1][0].end is End.SMOOTH:
+            outlines = [*_turn_first(outlines[0], parts[-1][1]), *outlines[1:]]
+            if onwards:
+                outlines = _go_straight(phase, outlines, parts[-1][1])
+        parts += [(phase, outline, outline is outlines[-1]) for outline in outlines]
+        z = outlines[-1].z[-1]
+    lengths = np.array([outline.length for _, outline, _ in parts])
+    gravity = problem.scene.gravity or 9.81
+    total = pace * float(np.sqrt(lengths.sum() / gravity))
+    ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
+    # The guess runs as (1 - cos) over all stages, so each has its own share of the time.
+    clock = np.arccos(1 - 2 * np.clip(ends, 0.0, 1.0)) / np.pi
+    longest = {phase.index: lengths[[p is phase for p, _, _ in parts]].sum() for phase in phases}
+    stages: list[Stage] = []
+    released: tuple[int, ...] = ()
+    for k, (phase, outline, last) in enumerate(parts):
+        count = max(LEAST_INTERVALS, round(lengths[k] / longest[phase.index] * intervals))
+        following = problem.phases[phase.index + 1] if phase is not phases[-1] and last else None
+        strikes = following is not None and phase.end is End.IMPACT
+        guess = _guess(
+            outline, scheme, count, (clock[k], clock[k + 1]), (ends[k], ends[k + 1]), total
+        )
+        if strikes and following is not None:
+            guess = guess._replace(impulses=np.zeros(following.formation.n_constraints))
+        opens = k > 0 and parts[k - 1][0] is not phase
+        if opens:
+            touching = np.abs(phase.formation.evaluate_limits(outline.z[:1])[0]) < TOUCHING
+            released = tuple(np.flatnonzero(touching).tolist())
+        stages.append(
+            Stage(
+                phase.index,
+                phase.formation,
+                outline.directions,
+                guess,
+                until=phase.until if last and not phase.until.is_release else None,
+                turns=outline.turns,
+                gained=_find_gained(phase, following) if not strikes else None,
+                strikes=strikes,
+                watched=tuple(sorted({*_choose_watched(phase, outline), *released})),
+                released=released,
+                opens=opens,
+            )
+        )
+    return stages
+
+
+def _guess(
+    outline: Outline,
+    scheme: Scheme,
+    count: int,
+    clock: tuple[float, float],
+    ends: tuple[float, float],
+    total: float,
+) -> StagePoints:
+    """Motion along an outline, without accelerations and with every contact pressed alike.
+
+    Parameters
+    ----------
+    clock, ends : tuple of float
+        Shares of all stages' time and length at the start and the end.
+    total : float, [s]
+        Duration of all stages.
+    """
+    formation = outline.formation
+    knots = np.linspace(0.0, 1.0, len(outline.z))
+    slopes = np.gradient(outline.z, knots, axis=0)
+    breaks = np.linspace(0.0, 1.0, count + 1)
+
+    def follow(share: Array) -> tuple[Array, Array]:
+        angle = np.pi * (clock[0] + share * (clock[1] - clock[0]))
+        span = max(ends[1] - ends[0], 1e-12)
+        place = ((1 - np.cos(angle)) / 2 - ends[0]) / span
+        rate = np.pi * np.sin(angle) / (2 * span * total)
+        z, slope = (
+            np.stack([np.interp(place, knots, column) for column in table.T], axis=-1)
+            for table in (outline.z, slopes)
+        )
+        return z, slope * rate[..., None]
+
+    z, v = follow(breaks[:-1, None] + scheme.points / count)
+    forces = np.zeros((count, scheme.degree, formation.n_constraints))
+    forces[..., : formation.n_contacts] = 1.0
+    return StagePoints(
+        total * (clock[1] - clock[0]),
+        np.full(count, 1 / count),
+        np.stack(follow(breaks), axis=1),
+        z,
+        v,
+        np.zeros_like(z),
+        forces,
+        np.zeros((count, 2, 2)),
+        np.zeros(0),
+    )
+
+
+def _go_straight(phase: Phase, nearest: list[Outline], before: Outline) -> list[Outline]:
+    """Of outlines to the nearest end and to ends ahead, those with the fewest reversals."""
+    ahead = [_turn_first(other, before) for other in outline_onwards(phase, before)]
+    return min([nearest, *ahead], key=lambda way: (len(way), sum(part.length for part in way)))
+
+
+def _turn_first(outline: Outline, before: Outline) -> list[Outline]:
+    """Split an outline so that it starts with the directions of the one that it goes on from.
+
+    Velocities are continuous, so what slides the other way in the outline has to turn on the way.
+    """
+    names = before.formation.names
+    known = dict(zip(names, before.directions.Xi, strict=True))
+    own, formation = np.concatenate(outline.directions), outline.formation
+    n_c = formation.n_contacts
+    signs = own.copy()
+    signs[n_c:] = before.directions.sigma
+    for k in range(n_c):
+        if k not in formation.rolling_rows:
+            together = [formation.names[i] for i in formation.turn_with(k)]
+            signs[k] = next((known[name] for name in together if name in known), signs[k])
+    differing = np.flatnonzero(signs != own).tolist()
+    turns = list(dict.fromkeys(formation.turn_with(k) for k in differing))
+    pieces = []
+    cuts = np.linspace(0, len(outline.z) - 1, len(turns) + 2).astype(int)
+    for k, (begin, stop) in enumerate(pairwise(cuts)):
+        turn = turns[k] if k < len(turns) else outline.turns
+        directions = Directions(signs[:n_c].copy(), signs[n_c:].copy())
+        z = outline.z[begin : stop + 1]
+        pieces.append(replace(outline, z=z, directions=directions, turns=turn))
+        if k < len(turns):
+            signs[list(turns[k])] = own[list(turns[k])]
+    return pieces
+
+
+def _find_gained(phase: Phase, following: Phase | None) -> Formation | None:
+    """The next phase's formation, if it has a constraint that this phase's has not."""
+    if following is None or not new_rows(phase.formation, following.formation):
+        return None
+    return following.formation
+
+
+def _choose_watched(phase: Phase, outline: Outline) -> tuple[int, ...]:
+    """Limits that are near zero along the outline, and the phase's own end."""
+    values = outline.formation.evaluate_limits(outline.z)
+    near = values.min(axis=0) < _NEAR * outline.formation.scene.polygon.gyration_radius
+    gained = [limit.gained == phase.until.contact for limit in outline.formation.limits]
+    mine = np.array(gained) & (phase.until.contact is not None)
+    return tuple(np.flatnonzero(near | mine).tolist())

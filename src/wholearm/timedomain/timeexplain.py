@@ -1,0 +1,144 @@
+"""Why phases have no plan in the time domain, and which single limit would have to give way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..advice import Limit, Shortfall, describe_changes, find_changes, rank_shortfalls
+from ..errors import InfeasibleError, InputError, SolverError
+from ..model import Array
+from ..options import Objective
+from ..problem import Phase, Problem
+from .stage import Stage
+from .timelimits import Give
+from .timesearch import Search
+
+SHORT = 1e-4
+"""Least shortfall that counts [N or N m]."""
+
+Replan = Callable[[Problem], object]
+"""Plans the same phases of another problem; raises if there is no plan."""
+
+
+def ease(search: Search, stages: Sequence[Stage]) -> list[Stage] | None:
+    """The motion with the least shortfalls when every limit is soft, or None."""
+    solution = search.aiming(Objective.ELASTIC).solve(list(stages))
+    return solution.stages if solution.success else None
+
+
+def explain(
+    search: Search,
+    phases: Sequence[Phase],
+    short: Sequence[list[Stage]],
+    status: str,
+    replan: Replan | None,
+) -> InfeasibleError | SolverError:
+    """Say why phases have no plan and what would change that.
+
+    Parameters
+    ----------
+    search : Search
+    phases : sequence of Phase
+    short : sequence of list of Stage
+        What `ease` found from different guesses, where that is short of something.
+    status : str
+        How the solver ended, in words.
+    replan : callable, optional
+        When left out, no change is looked for.
+    """
+    numbers = " and ".join(str(phase.number) for phase in phases)
+    what = f"phase{'s' if len(phases) > 1 else ''} {numbers}"
+    if not short:
+        return SolverError(f"no plan for {what}: {status}; try other time_intervals")
+    problem = search.problem
+
+    def sum_up(stages: list[Stage]) -> float:
+        return sum(shortfall.amount for shortfall in list_shortfalls(problem, stages))
+
+    eased = min(short, key=sum_up)
+    shortfalls = list_shortfalls(problem, eased)
+    are = "are" if len(phases) > 1 else "is"
+    text = f"{what} {are} infeasible: {rank_shortfalls(shortfalls)}"
+    if replan is None:
+        return InfeasibleError(text)
+    limits = [
+        Limit(f"torque limit of finger {k + 1}", float(problem.scene.torque_limit[k]), "N m", 1)
+        for k in range(2)
+    ]
+    limits.append(Limit("epsilon", problem.epsilon, "N", -1))
+    gives = [Give(0.0, (1.0, 0.0)), Give(0.0, (0.0, 1.0)), Give(1.0)]
+
+    def find_least(index: int) -> float | None:
+        solution = search.aiming(Objective.RELAX, gives[index]).solve(eased)
+        limit = limits[index]
+        return limit.value + limit.sign * solution.cost if solution.success else None
+
+    def can_plan(index: int, value: float) -> bool:
+        try:
+            replan(change_limit(problem, index, value))
+        except (InfeasibleError, SolverError, InputError):
+            return False
+        return True
+
+    changes = describe_changes(find_changes(limits, find_least, can_plan))
+    return InfeasibleError(f"{text}; {changes}")
+
+
+def list_shortfalls(problem: Problem, stages: Sequence[Stage]) -> list[Shortfall]:
+    """What the motion of stages is short of, each limit where it is worst."""
+    worst: dict[str, Shortfall] = {}
+    passed = 0.0
+    for stage in stages:
+        for found in _list_of_stage(problem, stage, passed):
+            if found.limit not in worst or found.amount > worst[found.limit].amount:
+                worst[found.limit] = found
+        passed += stage.guess.duration
+    return list(worst.values())
+
+
+def _list_of_stage(problem: Problem, stage: Stage, passed: float) -> list[Shortfall]:
+    formation, part = stage.formation, stage.guess
+    n_c, count = formation.n_contacts, len(part.fractions)
+    c_n, c_t = part.forces[..., :n_c], part.forces[..., n_c:]
+    rolling = list(formation.rolling_rows)
+    grip = formation.friction[rolling] * (c_n[..., rolling] - problem.epsilon)
+    over = np.abs(part.tau) - problem.scene.torque_limit
+    names = [f"c_n of {name} >= epsilon = {problem.epsilon:g} N" for name in formation.names]
+    names += [
+        f"friction cone of {formation.names[k]}, "
+        f"|c_t| <= {formation.friction[k]:g} (c_n - {problem.epsilon:g} N),"
+        for k in rolling
+    ]
+    names += [
+        f"torque limit of finger {k + 1} = {problem.scene.torque_limit[k]:g} N m" for k in range(2)
+    ]
+
+    def flat(table: Array) -> Array:
+        return np.asarray(table.max(axis=1))
+
+    short = np.hstack([flat(problem.epsilon - c_n), flat(np.abs(c_t) - grip), flat(over)])
+    middles = passed + part.duration * (part.breaks[:-1] + part.fractions / 2)
+    found = []
+    for column, name in enumerate(names):
+        row = int(short[:count, column].argmax())
+        if short[row, column] > SHORT:
+            unit = "N m" if column >= len(names) - 2 else "N"
+            where = f"t = {middles[row]:.4f} s, phase {stage.phase + 1}"
+            found.append(Shortfall(name, float(short[row, column]), unit, where))
+    return found
+
+
+def change_limit(problem: Problem, index: int, value: float) -> Problem:
+    """The problem with another torque limit of finger 1 or 2 (index 0 or 1), or epsilon (2)."""
+    if index == 2:
+        return replace(problem, epsilon=value)
+    right, left = (
+        replace(link, torque_limit=value) if k == index else link
+        for k, link in enumerate(problem.scene.fingers)
+    )
+    scene = replace(problem.scene, fingers=(right, left))
+    phases = [replace(p, formation=replace(p.formation, scene=scene)) for p in problem.phases]
+    return replace(problem, scene=scene, phases=tuple(phases))

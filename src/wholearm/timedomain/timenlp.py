@@ -1,0 +1,377 @@
+"""The planning NLP in the time domain, for formations with any number of freedoms.
+
+A stage is a stretch on one formation with fixed directions of friction, of free duration T, in K
+intervals with d collocation points each. Torques are linear in each interval and may step between.
+Unknowns are z, w = T z' and T at the nodes between intervals, and z, w, u = T^2 z'' and the contact
+forces c at every point, where
+
+    C(z) = 0,  P w = 0,  P u + P'(w) w = 0,
+    M5 u + T B w = T^2 (g - D sigma + S tau + G^T c),
+    c_n >= epsilon,  |tau| <= limit,  Xi A_t w >= 0,  sigma theta' >= 0,
+    |c_t| <= mu (c_n - epsilon) (rolling).
+
+So contacts hold at every point, without drift, and friction never pushes the wrong way. Along the
+contacts' tangent space alone, with an orthonormal basis N of the null space of P at a guess of
+each interval, the differential equations are collocated, with h the interval's share of T:
+
+    N^T (z_j - z_0 - h sum_l a_jl w_l) = 0,  N^T (w_j - w_0 - h sum_l a_jl u_l) = 0.
+
+These rows are linear. Unknowns and rows are in the order of time, and each node's z, w and T are a
+function of the interval before it. What stands still at an instant has no sense of friction there:
+an inequality that equations keep at zero would leave the solver no interior.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..contact import Expression
+from ..curve import metric_weights
+from ..formation import Formation
+from ..ipopt import build_solver
+from ..model import Array
+from ..options import Objective
+from .blocknlp import Indices, assemble_nlp
+from .collocation import Scheme
+from .stage import Stage
+from .timekernels import (
+    effort_kernel,
+    end_kernel,
+    goal_kernel,
+    impact_kernel,
+    join_kernel,
+    opening_kernel,
+    point_kernel,
+    watch_kernel,
+)
+from .timelayout import BEFORE, MARGIN, StageLayout, T, W, Z, lay_out
+from .timelimits import Give, LimitRows, add_limits
+from .timerows import Rows
+
+OPENING = 0.1
+"""Least acceleration with which the gap of a released contact opens [m/s^2]."""
+CLEAR = 2e-5
+"""Gap of a released contact after a third of the first stage without it at least [m]."""
+SLIDING = 0.05
+"""Least sliding over the radius of gyration, and least speed of a joint [rad/s]: what hardly moves
+would be held by friction."""
+SHORTEST, LONGEST = 1e-4, 20.0
+"""Least and largest duration of a stage [s]."""
+_HURRY = 1e-2
+"""Weight of time against shortfalls [N/s]: keeps a motion that is short of something brisk."""
+PUSH = 1e-6
+"""How far the first guess is kept from its bounds."""
+
+
+@dataclass(frozen=True, eq=False)
+class StageRows:
+    """Rows of one stage, interval by interval.
+
+    Attributes
+    ----------
+    states : ndarray of int, shape (K, m)
+        How z, w and T go on.
+    points : ndarray of int, shape (K, d, m)
+        What holds at the points.
+    limits : LimitRows
+    watches : ndarray of int, shape (K, d, m)
+        Limits of the formation.
+    """
+
+    states: Indices
+    points: Indices
+    limits: LimitRows
+    watches: Indices
+
+    @property
+    def groups(self) -> tuple[Indices, ...]:
+        """All of them."""
+        return (self.states, self.points, *self.limits, self.watches)
+
+
+@dataclass(frozen=True, eq=False)
+class TimeNLP:
+    """A built NLP.
+
+    Attributes
+    ----------
+    solver : casadi.Function
+    layouts : list of StageLayout
+    rows : Rows
+    rows_of : list of StageRows
+    lasts : int
+        Row of the whole duration, if something gives way; otherwise -1.
+    soft : ndarray of bool, shape (2,)
+        Which torque limits are rows and not bounds.
+    build_time : float, [s]
+    """
+
+    solver: Expression
+    layouts: list[StageLayout]
+    rows: Rows
+    rows_of: list[StageRows]
+    lasts: int
+    soft: NDArray[np.bool_]
+    build_time: float
+
+
+def build_time_nlp(
+    stages: Sequence[Stage],
+    scheme: Scheme,
+    objective: Objective,
+    time_weight: float,
+    max_iter: int,
+    give: Give | None = None,
+    solver_name: str = "ipopt",
+) -> TimeNLP:
+    """Build the NLP of stages that follow one another and end at rest.
+
+    Parameters
+    ----------
+    stages : sequence of Stage
+    scheme : Scheme
+    objective : Objective
+    time_weight : float, [(N m)^2]
+        For `effort`.
+    max_iter : int
+        Most iterations of the solver.
+    give : Give, optional
+        Which limits give way, for `relax`; for `margin` it is every c_n.
+    solver_name : {"ipopt", "fatrop"}
+    """
+    started = time.perf_counter()
+    if objective is Objective.MARGIN:
+        give = Give(-1.0)
+    layouts = lay_out(stages, scheme, give is not None, objective is Objective.ELASTIC)
+    rows, cost = Rows(), np.zeros(layouts[-1].stop)
+    _start(rows, layouts[0].nodes[0], stages[0].guess.nodes[0])
+    weights = {Objective.TIME: 1.0, Objective.EFFORT: time_weight, Objective.ELASTIC: _HURRY}
+    rows_of = []
+    for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True)):
+        rows_of.append(_add_stage(rows, stage, layout, scheme, stage is stages[-1], give))
+        if k + 1 < len(stages):
+            _join(rows, stage, stages[k + 1], layout, layouts[k + 1].nodes[0])
+        if objective is Objective.EFFORT:
+            columns = np.hstack([layout.tau, layout.nodes[:-1, T, None]])
+            rows.charge(effort_kernel(), columns, stage.guess.fractions[:, None])
+        cost[layout.nodes[-1, T]] = weights.get(objective, 0.0)
+        cost[layout.short] = 1 / stage.intervals
+    lasts, last, end = -1, stages[-1], layouts[-1].nodes[-1]
+    if give is not None:
+        cost[end[MARGIN]] = -1.0 if objective is Objective.MARGIN else 1.0
+        total = rows.linear(1, high=np.inf)
+        rows.put(total, end[[T, BEFORE]], 1.0)
+        lasts = int(total[0])
+    N = tangent_basis(last.formation, last.guess.nodes[-1, 0])
+    rest = rows.linear(N.shape[1])
+    rows.put(rest[:, None], end[W], N.T)
+    solver = _build_solver(solver_name, rows, layouts, cost, max_iter)
+    soft = np.array(give.tau if give else (0.0, 0.0)) + (objective is Objective.ELASTIC) > 0
+    seconds = time.perf_counter() - started
+    return TimeNLP(solver, layouts, rows, rows_of, lasts, soft, seconds)
+
+
+def _build_solver(
+    name: str, rows: Rows, layouts: list[StageLayout], cost: Array, max_iter: int
+) -> Expression:
+    if name == "fatrop":
+        from .timestaged import build_staged_solver
+
+        return build_staged_solver(rows, layouts, cost, max_iter)
+    built = assemble_nlp(len(cost), rows.triplets, rows.linear_rows, rows.blocks, cost)
+    return build_solver("time_nlp", built.nlp, PUSH, built.derivatives, max_iter=max_iter)
+
+
+def _start(rows: Rows, node: Indices, state: Array) -> None:
+    """Rest at the first node, and nothing passed yet."""
+    own = rows.linear(10, low=state.ravel(), high=state.ravel())
+    rows.put(own, node[:T], 1.0)
+    if len(node) > MARGIN:
+        rows.put(rows.linear(1), node[BEFORE], 1.0)
+
+
+def _add_stage(
+    rows: Rows,
+    stage: Stage,
+    layout: StageLayout,
+    scheme: Scheme,
+    last: bool,
+    give: Give | None,
+) -> StageRows:
+    """What holds in a stage."""
+    formation = stage.formation
+    node, coming = layout.nodes[:-1], layout.nodes[1:]
+    chain = rows.linear(*node.shape)
+    rows.put(chain, coming, 1.0)
+    rows.put(chain[:, :T], layout.ends, -1.0)
+    rows.put(chain[:, T:], node[:, T:], -1.0)
+    states = np.hstack([chain, _collocate(rows, stage, layout, scheme)])
+    points = _balance(rows, stage, layout, scheme, last)
+    if not scheme.ends:
+        first = node[:, Z] if formation.rolling else node[:, :0]
+        kernel = end_kernel(formation)
+        own = rows.nonlinear(stage.intervals, kernel.outputs)
+        rows.repeat(kernel, np.hstack([layout.ends, first]), own)
+        states = np.hstack([states, own])
+    watches = _watch(rows, stage, layout, scheme)
+    gained = [formation.limits[k].gained for k in stage.released]
+    for contact in [c for c in gained if c is not None and stage.opens]:
+        count = scheme.degree
+        columns = [layout.z[0], layout.w[0], layout.u[0], np.full((count, 1), node[0, T])]
+        own = rows.nonlinear(count, 1, low=OPENING, high=np.inf)
+        rows.repeat(opening_kernel(formation, contact), np.hstack(columns), own)
+    speed = formation.scene.speed_limit
+    for k in np.flatnonzero(np.isfinite(speed)):
+        for sign in (1.0, -1.0):
+            own = rows.linear(*layout.w.shape[:2], high=np.inf)
+            rows.put(own, layout.w[..., 3 + k], sign)
+            rows.put(own, node[:, T, None], speed[k])
+    goal = goal_kernel(formation, stage.until, stage.turns, stage.gained)
+    if goal is not None:
+        rows.repeat(goal, layout.nodes[-1:, :T], rows.nonlinear(1, goal.outputs))
+    limits = add_limits(rows, stage, layout, scheme, give)
+    return StageRows(states, points, limits, watches)
+
+
+def _collocate(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
+    """Collocate z and w along the tangent space, shape (K, m)."""
+    collected = []
+    integrals = scheme.integrals
+    for k, h in enumerate(stage.guess.fractions):
+        N = tangent_basis(stage.formation, stage.guess.z[k, scheme.degree // 2]).T
+        for state, rate, part in ((layout.z, layout.w, Z), (layout.w, layout.u, W)):
+            here, table = state[k], integrals
+            if not scheme.ends:
+                here = np.vstack([here, layout.ends[k, part]])
+                table = np.vstack([integrals, scheme.weights])
+            own = rows.linear(len(here), len(N))
+            rows.put(own[:, :, None], here[:, None], N)
+            rows.put(own[:, :, None], layout.nodes[k, part], -N)
+            rows.put(own[:, None, :, None], rate[k][:, None], -h * table[:, :, None, None] * N)
+            collected.append(own.ravel())
+    return np.array(collected).reshape(stage.intervals, -1)
+
+
+def _balance(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool) -> Indices:
+    """The equations of motion, constraints and senses at every point, shape (K, d, n)."""
+    formation, shape = stage.formation, layout.z.shape[:2]
+    n_c, kernel = formation.n_contacts, point_kernel(formation)
+    node = layout.nodes[:-1]
+
+    def spread(table: Indices) -> Indices:
+        return np.broadcast_to(table[:, None], (*shape, table.shape[1]))
+
+    columns = [layout.z, layout.w, layout.u, layout.forces, spread(layout.tau)]
+    columns += [spread(node[:, T, None]), spread(node[:, Z] if formation.rolling else node[:, :0])]
+    signs = np.concatenate(stage.directions)
+    parameters = np.empty((*shape, n_c + 5))
+    parameters[..., : n_c + 2] = signs
+    parameters[..., n_c + 2] = scheme.points
+    parameters[..., n_c + 3] = least_rates(stage, scheme)
+    parameters[..., n_c + 4] = stage.guess.duration
+    sliding = [k for k in range(n_c) if k not in formation.rolling_rows]
+    still = _find_still(stage, last) if scheme.ends else set()
+    senses = kernel.outputs - len(sliding)
+    high = np.where(np.arange(kernel.outputs) < senses, 0.0, np.inf)
+    low = np.zeros((*shape, kernel.outputs))
+    low[-1, -1, [senses + i for i, k in enumerate(sliding) if k in still]] = -np.inf
+    own = rows.nonlinear(*shape, kernel.outputs, low=low, high=high)
+    count = shape[0] * shape[1]
+    table = np.concatenate(columns, axis=2).reshape(count, -1)
+    rows.repeat(kernel, table, own.reshape(count, -1), parameters.reshape(count, -1))
+    return own
+
+
+def least_rates(stage: Stage, scheme: Scheme) -> Array:
+    """Least rate of each point, shape (K, d) [rad/s].
+
+    It is nothing where motion starts, stops or turns, and in a stage with one freedom: there all
+    moves together, and friction cannot hold one contact alone.
+    """
+    at = stage.guess.places(scheme.points)
+    free = stage.formation.n_constraints < 4
+    return np.asarray(SLIDING * free * np.minimum(1.0, 8 * np.minimum(at, 1 - at)))
+
+
+def _find_still(stage: Stage, last: bool) -> set[int]:
+    """Rows of (contacts, joints) that stand still at the end of a stage."""
+    return set(range(stage.formation.n_contacts + 2)) if last else set(stage.turns)
+
+
+def _watch(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
+    """Keep limits positive, but for the one that is reached at the end, shape (K, d, m)."""
+    formation, (K, d) = stage.formation, layout.z.shape[:2]
+    if not stage.watched:
+        return np.zeros((K, d, 0), dtype=np.int64)
+    released = np.isin(stage.watched, stage.released)
+    later = (not stage.opens) | (stage.guess.places(scheme.points)[..., None] > 1 / 3)
+    low = CLEAR / formation.scene.polygon.gyration_radius * (later & released)
+    goal = None if stage.until is None else stage.until.contact
+    reached = [goal is not None and formation.limits[k].gained == goal for k in stage.watched]
+    if scheme.ends:
+        low[-1, -1, reached] = -np.inf
+    own = rows.nonlinear(K, d, len(stage.watched), low=low, high=np.inf)
+    kernel = watch_kernel(formation, stage.watched)
+    rows.repeat(kernel, layout.z.reshape(K * d, 5), own.reshape(K * d, -1))
+    return own
+
+
+def _join(rows: Rows, stage: Stage, coming: Stage, layout: StageLayout, first: Indices) -> None:
+    """Position and velocity go on from one stage to the next; an impact changes the velocity."""
+    last, following = layout.nodes[-1], layout.following
+    place = rows.linear(6)
+    rows.put(place, np.append(first[Z], first[T]), 1.0)
+    rows.put(place, np.append(last[Z], following[0]), -1.0)
+    columns = [first[W], last[W], [last[T], following[0]]]
+    if stage.strikes:
+        kernel = impact_kernel(stage.formation, coming.formation)
+        equal = np.arange(kernel.outputs) < 5 + coming.formation.n_constraints
+        own = rows.nonlinear(1, kernel.outputs, high=np.where(equal, 0.0, np.inf))
+        columns += [last[Z], following[1:]]
+        rows.repeat(kernel, np.concatenate(columns)[None], own, coming.directions.Xi[None])
+    else:
+        rows.repeat(join_kernel(), np.concatenate(columns)[None], rows.nonlinear(1, 5))
+    if len(first) > MARGIN:
+        more = rows.linear(2)
+        rows.put(more, first[MARGIN:], 1.0)
+        rows.put(more, last[MARGIN:], -1.0)
+        rows.put(more[1], last[T], -1.0)
+
+
+def tangent_basis(formation: Formation, z: Array) -> Array:
+    """Basis of the null space of P at `z`, shape (5, f), orthonormal in radii of gyration."""
+    metric = metric_weights(formation.scene)
+    P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
+    _, values, right = np.linalg.svd(P / np.sqrt(metric))
+    rank = int((values > 1e-9 * values[0]).sum())
+    return np.asarray((right[rank:] * np.sqrt(metric)).T / np.sqrt(metric[2]))
+
+
+def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tuple[Array, Array]:
+    """Bounds of the unknowns but for the least c_n: durations, torques, joint speeds, impulses."""
+    size = nlp.layouts[-1].stop
+    low, high = np.full(size, -np.inf), np.full(size, np.inf)
+    for stage, layout in zip(stages, nlp.layouts, strict=True):
+        limit = np.tile(stage.formation.scene.torque_limit, 2)
+        soft = np.tile(nlp.soft, 2)
+        low[layout.tau] = np.where(soft, -np.inf, -limit)
+        high[layout.tau] = np.where(soft, np.inf, limit)
+        low[layout.short] = 0.0
+        low[layout.nodes[:, T]], high[layout.nodes[:, T]] = SHORTEST, LONGEST
+        still = _find_still(stage, stage is stages[-1]) if scheme.ends else set()
+        rate = least_rates(stage, scheme) * stage.guess.duration
+        for joint, sigma in enumerate(stage.directions.sigma):
+            own = layout.w[..., 3 + joint]
+            ends = np.zeros_like(own, dtype=bool)
+            ends[-1, -1] = stage.formation.n_contacts + joint in still
+            low[own] = np.where((sigma < 0) | ends, -np.inf, rate)
+            high[own] = np.where((sigma > 0) | ends, np.inf, -rate)
+        if len(layout.following) > 1:
+            coming = stages[list(stages).index(stage) + 1].formation.n_contacts
+            low[layout.following[1 : 1 + coming]] = 0.0
+    return low, high

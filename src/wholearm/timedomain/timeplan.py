@@ -1,0 +1,170 @@
+"""Planning phases in the time domain: guesses, friction, intervals and limits between points.
+
+Phases that pass into one another in motion are one NLP. It starts from the phases' outlines, with
+the directions of friction that these have, on few intervals; these are then halved, each time
+starting from the solution before. Where the solution would rather slide the other way (a sense of
+friction is at its least over a stretch), the stage is split and the NLP solved again. Limits are
+looked at between points: intervals that miss them by much are halved, and what is then left is
+added to the limits. Where no guess leads to a plan, the motion that misses limits least is found:
+it is a better guess, or says why there is no plan.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from ..model import Array
+from ..options import Objective, PlanOptions
+from ..phaseplan import PhasePlan
+from ..problem import Phase, Problem
+from .collocation import make_scheme
+from .revising import halve, turn_friction
+from .stage import Stage
+from .staging import outline_stages
+from .timemotion import TimeMotion, make_motions
+from .timesearch import Search, Solution
+
+REVISIONS = 2
+"""Most times that directions of friction are revised."""
+FIRST = 8
+"""Most intervals of a phase to start with."""
+CONVINCING = 2
+"""Motions that miss limits least, from different guesses, after which there seems to be no plan."""
+_PACES = (2.0, 4.0, 1.0)
+"""Guessed durations to try, in units of that of a fall."""
+
+
+def plan_phases(
+    problem: Problem,
+    phases: Sequence[Phase],
+    z: Array,
+    options: PlanOptions,
+    duration: float | None = None,
+    *,
+    explained: bool = True,
+    patient: bool = True,
+) -> list[PhasePlan[TimeMotion]]:
+    """Plan phases that are one NLP, from rest at `z` to rest.
+
+    Parameters
+    ----------
+    problem : Problem
+    phases : sequence of Phase
+        All but the last one end in motion.
+    z : ndarray, shape (5,)
+    options : PlanOptions
+    duration : float, optional, [s]
+        Longest duration of all these phases, for the objective `margin`.
+    explained : bool
+        Whether to look for a change that would make a plan possible, where there is none.
+    patient : bool
+        Whether to try further guesses where the first one leads nowhere.
+
+    Raises
+    ------
+    InputError
+        If a phase's contacts do not touch or its end cannot be reached.
+    InfeasibleError, SolverError
+        If there is no plan.
+    """
+    scheme = make_scheme(options.scheme, options.degree)
+    search = Search(problem, options, scheme, duration, options.goal)
+    wanted = options.time_intervals or _choose_intervals(phases)
+    halvings = max(0, math.ceil(math.log2(wanted / FIRST)))
+
+    def outline(times: int, pace: float, onwards: bool = False) -> list[Stage]:
+        count = math.ceil(wanted / 2**times)
+        return outline_stages(problem, phases, z, scheme, count, pace, onwards)
+
+    first = outline(halvings, _PACES[0])
+    # The rows of an impact are not of the form that fatrop asks for.
+    if options.solver != "ipopt" and not any(stage.strikes for stage in first):
+        search.solver = options.solver
+        solution = _solve(search, first, halvings)
+        if solution.success:
+            return _summarise(search, phases, solution)
+        search.solver = "ipopt"
+    solution = _solve(search, first, halvings)
+    if solution.success:
+        return _summarise(search, phases, solution)
+    from .timeexplain import ease, explain, list_shortfalls
+
+    status, short = solution.status, list[list[Stage]]()
+    for times, guess in _list_guesses(first, halvings, outline if patient else None):
+        if guess is not first:
+            solution = _solve(search, guess, times)
+        eased = None if solution.success else ease(search, guess)
+        if eased is not None and list_shortfalls(problem, eased):
+            short.append(eased)
+        elif eased is not None:
+            solution = _solve(search, eased, times)
+        if solution.success:
+            return _summarise(search, phases, solution)
+        if len(short) == CONVINCING:
+            break
+
+    def replan(other: Problem) -> object:
+        own = [other.phases[phase.index] for phase in phases]
+        return plan_phases(other, own, z, options, explained=False, patient=False)
+
+    raise explain(search, phases, short, status, replan if explained else None)
+
+
+def _list_guesses(
+    first: list[Stage], halvings: int, outline: Callable[..., list[Stage]] | None
+) -> Iterator[tuple[int, list[Stage]]]:
+    """Guesses, with how often their intervals are to be halved; only the first without others."""
+    yield halvings, first
+    if outline is not None:
+        for times in dict.fromkeys((halvings, 0)):
+            for pace in _PACES:
+                yield times, outline(times, pace, onwards=True)
+
+
+def _choose_intervals(phases: Sequence[Phase]) -> int:
+    """Intervals of each phase: a phase with one freedom has fewer unknowns in each."""
+    return 32 if len(phases) == 1 and phases[0].formation.n_constraints == 4 else 16
+
+
+def _solve(search: Search, stages: list[Stage], halvings: int) -> Solution:
+    """Solve, revise friction, halve all intervals, and make limits hold in between."""
+    solution = search.solve(stages)
+    for _ in range(REVISIONS if solution.success else 0):
+        turned = turn_friction(solution.stages, search.scheme)
+        other = search.solve(turned) if turned is not None else None
+        if other is None or not other.success or not other.cost < solution.cost:
+            break
+        solution = other
+    for _ in range(halvings):
+        if solution.success:
+            every = [np.ones(stage.intervals, dtype=bool) for stage in solution.stages]
+            solution = search.solve(halve(solution.stages, search.scheme, every), solution)
+    return search.hold(solution) if solution.success else solution
+
+
+def _summarise(
+    search: Search, phases: Sequence[Phase], solution: Solution
+) -> list[PhasePlan[TimeMotion]]:
+    """The plan of each phase; what solving has cost counts for the first."""
+    plans, effort, options = [], search.effort, search.options
+    motions = make_motions(solution.stages, search.scheme)
+    for phase in phases:
+        stages = zip(motions, solution.stages, strict=True)
+        motion = TimeMotion([own for own, stage in stages if stage.phase == phase.index])
+        torque = motion.torque
+        value = {
+            Objective.TIME: motion.duration,
+            Objective.EFFORT: options.time_weight * motion.duration + torque.integrate_squares(),
+            Objective.MARGIN: search.problem.epsilon + solution.margin,
+        }[search.goal]
+        plans.append(PhasePlan(motion, torque, value, 0, 0, 0.0, 0.0, search.solver))
+    plans[0] = plans[0]._replace(
+        iterations=effort.iterations,
+        solves=effort.solves,
+        build_time=effort.build_time,
+        solve_time=effort.solve_time,
+    )
+    return plans

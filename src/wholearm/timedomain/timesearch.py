@@ -1,0 +1,205 @@
+"""Solving for stages: one NLP after another, until limits hold between points too."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+from ..options import Objective, PlanOptions
+from ..problem import Problem
+from .between import Limits, find_misses, raise_bounds
+from .collocation import Scheme
+from .revising import adopt, halve, watch_broken
+from .stage import Stage
+from .timelayout import pack, unpack
+from .timelimits import Give
+from .timemotion import make_motions
+from .timenlp import TimeNLP, bound_unknowns, build_time_nlp
+from .warmstart import FIRST_SIZE, Multipliers, carry_multipliers, first_multipliers
+
+ROUNDS = 24
+"""Most times that limits are tightened."""
+REFINEMENTS = 1
+"""Most times that intervals are halved because of misses."""
+_ITERATIONS = {Objective.ELASTIC: 300, Objective.RELAX: 300}
+"""Most iterations of one solve, if not 150."""
+_SOFT = 1e-2
+"""First multipliers where limits are soft."""
+_NAMES = {"ipopt": "Ipopt", "fatrop": "fatrop"}
+_DEARER = 0.2
+"""How much dearer, relatively, a plan may get by tightening before it counts as lost."""
+
+
+@dataclass
+class Effort:
+    """What solving has cost so far."""
+
+    iterations: int = 0
+    solves: int = 0
+    build_time: float = 0.0
+    solve_time: float = 0.0
+
+
+class Solution(NamedTuple):
+    """Stages with what the solver found as their guess.
+
+    Attributes
+    ----------
+    stages : list of Stage
+    cost : float
+        Objective.
+    margin : float, [N]
+        Least c_n over epsilon, if that is an unknown.
+    status : str
+        How it ended, in words.
+    success : bool
+    nlp : TimeNLP
+        What was solved.
+    multipliers : dict
+        What it ended with.
+    """
+
+    stages: list[Stage]
+    cost: float
+    margin: float
+    status: str
+    success: bool
+    nlp: TimeNLP
+    multipliers: Multipliers
+
+    @property
+    def watched(self) -> list[tuple[int, ...]]:
+        """Limits that each stage watches."""
+        return [stage.watched for stage in self.stages]
+
+
+@dataclass
+class Search:
+    """A search for a plan: what stays the same from solve to solve, and what it has cost.
+
+    Attributes
+    ----------
+    problem : Problem
+    options : PlanOptions
+    scheme : Scheme
+    duration : float or None, [s]
+        Longest duration, for the objective `margin`.
+    goal : Objective
+    give : Give or None
+        Which limits give way, for the objective `relax`.
+    solver : {"ipopt", "fatrop"}
+    effort : Effort
+    """
+
+    problem: Problem
+    options: PlanOptions
+    scheme: Scheme
+    duration: float | None
+    goal: Objective
+    give: Give | None = None
+    solver: str = "ipopt"
+    effort: Effort = field(default_factory=Effort)
+
+    def aiming(self, goal: Objective, give: Give | None = None) -> Search:
+        """The same search with another objective."""
+        return replace(self, goal=goal, give=give, duration=None, solver="ipopt")
+
+    @property
+    def size(self) -> float:
+        """Multipliers of a first guess."""
+        return _SOFT if self.goal in _ITERATIONS else FIRST_SIZE
+
+    def solve(self, stages: list[Stage], before: Solution | None = None) -> Solution:
+        """Solve from the stages' guesses, until no limit is broken at the points."""
+        while True:
+            nlp = self.build(stages)
+            multipliers = None
+            if before is not None and before.watched == [stage.watched for stage in stages]:
+                multipliers = carry_multipliers(
+                    before.multipliers, before.nlp, nlp, before.stages, stages
+                )
+            plain = [Limits.none(stage) for stage in stages]
+            margin = before.margin if before else 0.0
+            solution = self.run(nlp, stages, plain, multipliers, margin)
+            watching = watch_broken(solution.stages) if solution.success else None
+            if watching is None:
+                return solution
+            stages = watching
+
+    def build(self, stages: Sequence[Stage]) -> TimeNLP:
+        """Build the NLP."""
+        weight, limit = self.options.time_weight, _ITERATIONS.get(self.goal, 150)
+        nlp = build_time_nlp(stages, self.scheme, self.goal, weight, limit, self.give, self.solver)
+        self.effort.build_time += nlp.build_time
+        return nlp
+
+    def run(
+        self,
+        nlp: TimeNLP,
+        stages: Sequence[Stage],
+        limits: Sequence[Limits],
+        multipliers: Multipliers | None,
+        margin: float,
+    ) -> Solution:
+        """Run the solver once."""
+        low, high = bound_unknowns(nlp, stages, self.scheme)
+        low_g, high_g = raise_bounds(nlp, stages, limits, self.problem.epsilon, low)
+        if self.duration is not None and nlp.lasts >= 0:
+            high_g[nlp.lasts] = self.duration
+        result = nlp.solver(
+            x0=pack([stage.guess for stage in stages], nlp.layouts, margin),
+            lbx=low,
+            ubx=high,
+            lbg=low_g,
+            ubg=high_g,
+            **(multipliers or first_multipliers((low, high), (low_g, high_g), self.size)),
+        )
+        stats = nlp.solver.stats()
+        self.effort.iterations += stats["iter_count"]
+        self.effort.solves += 1
+        self.effort.solve_time += stats["t_wall_total"]
+        x, cost = result["x"].full()[:, 0], float(result["f"])
+        return Solution(
+            adopt(stages, unpack(stages, x, nlp.layouts)),
+            cost,
+            -cost if self.goal is Objective.MARGIN else 0.0,
+            f"{_NAMES[self.solver]} stopped with {stats['return_status']}",
+            stats["success"],
+            nlp,
+            {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")},
+        )
+
+    def hold(self, solution: Solution) -> Solution:
+        """Go on from a solution until limits hold between points too."""
+        refined = 0
+        limits = [Limits.none(stage) for stage in solution.stages]
+        for _ in range(ROUNDS):
+            motions = make_motions(solution.stages, self.scheme)
+            misses = [
+                find_misses(stage, motion, self.problem.epsilon, solution.margin)
+                for stage, motion in zip(solution.stages, motions, strict=True)
+            ]
+            worst = max(miss.worst for miss in misses)
+            if worst <= 1:
+                return solution
+            marked = [miss.coarse for miss in misses]
+            if refined < REFINEMENTS and any(mine.any() for mine in marked):
+                refined += 1
+                finer = self.solve(halve(solution.stages, self.scheme, marked), solution)
+                if finer.success:
+                    solution = finer
+                    limits = [Limits.none(stage) for stage in solution.stages]
+                    continue
+            limits = [raised.raised(miss) for raised, miss in zip(limits, misses, strict=True)]
+            tighter = self.run(
+                solution.nlp, solution.stages, limits, solution.multipliers, solution.margin
+            )
+            if not tighter.success:
+                return tighter
+            if tighter.cost - solution.cost > _DEARER * abs(solution.cost):
+                status = "a plan that keeps limits between points is much dearer"
+                return tighter._replace(status=status, success=False)
+            solution = tighter
+        status = f"limits are still missed {worst:.2g} times what is allowed between points"
+        return solution._replace(status=status, success=False)
