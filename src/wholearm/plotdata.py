@@ -29,13 +29,17 @@ def choose_snapshots(trajectory: Trajectory, least: int = 6, most: int = 7) -> N
     return np.asarray(chosen[few.round().astype(int)])
 
 
+STEP = 0.1
+"""Step of the torques over the largest one from which on lines are broken: less is no gap to see."""
+
+
 def find_steps(trajectory: Trajectory) -> NDArray[np.int64]:
     """Rows before which forces step: a new phase, a torque's step, a reversed sliding direction."""
     profile = trajectory.torque
     before = profile.coefficients[:-1].sum(axis=2)
     signs = (-1.0) ** np.arange(profile.coefficients.shape[2])
     after = (profile.coefficients[1:] * signs).sum(axis=2)
-    stepping = np.abs(after - before).max(axis=1) > 1e-3 * np.abs(profile.coefficients).max()
+    stepping = np.abs(after - before).max(axis=1) > STEP * np.abs(profile.coefficients).max()
     breaks, starts = profile.breaks[1:-1], trajectory.phase_starts
     inner = np.abs(breaks[:, None] - starts).min(axis=1) > 1e-9 * trajectory.duration
     steps = np.searchsorted(trajectory.t, breaks[stepping & inner], side="right")
