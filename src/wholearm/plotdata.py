@@ -30,7 +30,7 @@ def choose_snapshots(trajectory: Trajectory, least: int = 6, most: int = 7) -> N
 
 
 STEP = 0.1
-"""Step of the torques over the largest one from which on lines are broken: less is no gap to see."""
+"""Step of the torques, over the largest, from which on lines are broken: less cannot be seen."""
 
 
 def find_steps(trajectory: Trajectory) -> NDArray[np.int64]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..cones import hold_least, hold_rows
 from ..curve import Curve, describe_pose
 from ..dynamics import PathForces, inverse, reduced_inertia
-from ..errors import JammingError
+from ..errors import JammingError, SolverError
 from ..minima import find_least
 from ..model import Array
 from ..torque import TorqueProfile
@@ -270,6 +270,11 @@ def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, floa
 
     Where that misses the torque between the knots, it goes through more places. Also returns the
     integral of tau^T tau [(N m)^2 s].
+
+    Raises
+    ------
+    SolverError
+        If the motion takes no time, or for ever, between two nodes.
     """
     knots, looks = data.fine
     torque = _fit(data, motion, data.knots, knots)
@@ -289,6 +294,8 @@ def _fit(data: PhaseData, motion: PathMotion, places: Places, fractions: Array) 
     k = data.solid
     values = places.forces.tau(*data.spread(motion.profile, fractions))
     spans = motion.durations(fractions)[k]
+    if not (np.isfinite(spans).all() and (np.diff(spans, axis=1) > 0).all()):
+        raise SolverError("the motion all but stops between two nodes; plan with more intervals")
     x = 2 * spans / spans[:, -1:] - 1
     vandermonde = x[..., None] ** np.arange(len(fractions))
     coefficients = np.linalg.solve(vandermonde, values.reshape(len(k), len(fractions), 2))

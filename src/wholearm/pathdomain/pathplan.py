@@ -221,9 +221,12 @@ def _plan(
             short, speeding = data.beside(short), data.beside(speeding)
             tightening = tightening.by(reach, _OVER * short, _OVER * speeding, _OVER * late)
     else:
+        missed = f"limits are still missed by {short.max():.2g} N between nodes"
+        if short.max() <= MISS:
+            over = max(speeding.max(), late)
+            missed = f"the speed limit or the duration is still exceeded by {over:.2g} of it"
         raise SolverError(
-            f"{name_phases(phases)}: after {ROUNDS} solves limits are still missed by "
-            f"{short.max():.2g} N between nodes; plan with more intervals"
+            f"{name_phases(phases)}: after {ROUNDS} solves {missed}; plan with more intervals"
         )
     plans: list[PhasePlan[PathMotion]] = []
     for part, motion in zip(parts, motions, strict=True):
