@@ -154,7 +154,7 @@ def measure_time_solvers(problem: Problem) -> list[Row]:
             for solver in ("ipopt", "fatrop"):
                 options = PlanOptions(goal, solver=solver)
                 search = Search(problem, options, scheme, None, goal, solver=solver)
-                stages = outline_stages(problem, block, start, scheme, FIRST, _PACE)
+                stages = outline_stages(problem, block, start, scheme, FIRST // 2, _PACE)
                 solution = search.solve(stages)
                 note = f"{search.effort.iterations} iterations"
                 if solution.success:
