@@ -30,7 +30,7 @@ from .timesearch import Search, Solution
 REVISIONS = 2
 """Most times that directions of friction are revised."""
 FIRST = 16
-"""Most intervals of a phase to start with; half as many where not the time is to be least."""
+"""Intervals of a phase for least time that are few enough to start with; otherwise half of it."""
 CONVINCING = 2
 """Motions that miss limits least, from different guesses, after which there seems to be no plan."""
 _PACES = (2.0, 4.0, 1.0)
@@ -73,7 +73,8 @@ def plan_phases(
     scheme = make_scheme(options.scheme, options.degree)
     search = Search(problem, options, scheme, duration, options.goal)
     wanted = options.time_intervals or _choose_intervals(phases)
-    most = FIRST if options.goal is Objective.TIME else FIRST // 2
+    at_once = options.goal is Objective.TIME and wanted <= FIRST
+    most = FIRST if at_once else FIRST // 2
     halvings = max(0, math.ceil(math.log2(wanted / most)))
 
     def outline(times: int, pace: float, onwards: bool = False) -> list[Stage]:
