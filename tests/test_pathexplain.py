@@ -11,10 +11,13 @@ from scipy.optimize import linprog
 
 from conftest import HEPTAGON
 from wholearm.curve import Curve
-from wholearm.errors import InfeasibleError, WholearmError
+from wholearm.errors import InfeasibleError, SolverError, WholearmError
 from wholearm.model import Array
 from wholearm.options import PlanOptions
+from wholearm.outline import load
 from wholearm.path import trace_phases
+from wholearm.pathdomain.chain import make_chain
+from wholearm.pathdomain.chainplan import plan_chain
 from wholearm.pathdomain.pathdata import prepare
 from wholearm.pathdomain.pathexplain import with_limit
 from wholearm.pathdomain.pathmotion import make_grid
@@ -220,6 +223,20 @@ def test_whole_problems_are_advised() -> None:
     (name, value), *others = read_advice(str(caught.value)).items()
     assert name == "torque limit of finger 2" and not others
     assert solve(edited({name: value})).meta["status"] == "solved"
+
+
+def test_phases_that_impacts_join_are_advised_together() -> None:
+    problem = load(str(HEPTAGON.with_name("heptagon_impact.toml")))
+    chain = make_chain(problem.phases, trace_phases(problem)).split()[0]
+    with pytest.raises(InfeasibleError, match=r"^phases 1 to 3 are infeasible: ") as caught:
+        plan_chain(chain, 1.0, OPTIONS)
+    (value,) = read_advice(str(caught.value)).values()
+    assert all(plan.motion.duration > 0 for plan in plan_chain(chain, value, OPTIONS))
+    with pytest.raises(InfeasibleError):
+        plan_chain(chain, 1.03 * value, OPTIONS)
+    # Where only the fact counts, no time is spent on advice.
+    with pytest.raises(SolverError, match=r"^phases 1 to 3: Ipopt stopped with "):
+        plan_chain(chain, 1.0, OPTIONS, explained=False)
 
 
 def test_advice_does_not_depend_on_the_solver() -> None:
