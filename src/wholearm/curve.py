@@ -214,6 +214,11 @@ def metric_weights(scene: Scene) -> Array:
     return np.array([1.0, 1.0, rho**2, rho**2, rho**2])
 
 
+def measure_speed(scene: Scene, v: Array) -> float:
+    """Speed of a velocity, shape (5,), in the metric of curves [m/s]."""
+    return float(np.sqrt(metric_weights(scene) @ v**2))
+
+
 def refine(s: Array, stop: float) -> Array:
     """Places to look at along a panel with nodes `s`, up to `stop`."""
     grid = np.interp(np.linspace(0, len(s) - 1, REFINE * len(s)), np.arange(len(s)), s)

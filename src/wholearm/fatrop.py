@@ -115,6 +115,12 @@ def keep_bounds(low: Array, high: Array) -> tuple[Array, Array]:
     return low + inset(low), high - inset(high)
 
 
+def read_stats(solver: Expression) -> dict[str, Any]:
+    """Statistics of the last solve, under the names that Ipopt's have."""
+    stats: dict[str, Any] = solver.stats()
+    return stats | {"return_status": describe_status(solver)}
+
+
 def describe_status(solver: Expression) -> str:
     """Say in words how the last solve ended."""
     flag = solver.stats()["fatrop"]["return_flag"]

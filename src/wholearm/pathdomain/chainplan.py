@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..curve import Curve, metric_weights
+from ..curve import Curve, measure_speed
 from ..errors import InfeasibleError, SolverError
 from ..options import Objective, PlanOptions
 from ..phaseplan import PhasePlan
@@ -106,7 +106,7 @@ def _describe(join: Join, speed: float, saves: float) -> Transition:
 def _speed_at_end(curve: Curve, motion: Motion) -> float:
     """Speed along a curve at the end of a motion [m/s]."""
     z_dot = motion.evaluate(np.array([motion.duration])).z_dot[0]
-    return float(np.sqrt(z_dot**2 @ metric_weights(curve.formation.scene)))
+    return measure_speed(curve.formation.scene, z_dot)
 
 
 def _plan_stop(

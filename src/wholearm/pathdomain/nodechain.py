@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..contact import Expression
-from ..fatrop import Stages, build_solver, describe_status, keep_bounds
+from ..fatrop import Stages, build_solver, keep_bounds, read_stats
 from ..model import Array
 
 _Numbers = NDArray[np.int64]
@@ -111,8 +111,7 @@ class StagedSolver:
 
     def stats(self) -> dict[str, Any]:
         """Statistics of the last solve, under the names that Ipopt's have."""
-        stats: dict[str, Any] = self.solver.stats()
-        return stats | {"return_status": describe_status(self.solver)}
+        return read_stats(self.solver)
 
 
 def stage(name: str, chain: Chain, **options: Any) -> StagedSolver:

@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..curve import metric_weights
+from ..curve import measure_speed
 from ..errors import InfeasibleError, SolverError
 from ..impact import Impact, strike
 from ..model import Array
@@ -92,7 +92,7 @@ def _strike_at_stop(phase: Phase, following: Phase, plan: PhasePlan[Motion]) -> 
     duration = plan.motion.duration
     z = _last_state(plan)[0]
     v = plan.motion.evaluate(np.array([duration * (1 - 1e-3)])).z_dot[0]
-    v = v / np.sqrt(metric_weights(phase.formation.scene) @ v**2)
+    v = v / measure_speed(phase.formation.scene, v)
     return strike(phase.formation, following.formation, z, v)
 
 
@@ -116,8 +116,7 @@ def assess_struck(
         Longest duration of the block, for the objective `margin`.
     """
     ends = [k + 1 for k, phase in enumerate(block) if phase.end is End.IMPACT]
-    metric = metric_weights(problem.scene)
-    speeds = {k: float(np.sqrt(metric @ _last_state(plans[k - 1])[1] ** 2)) for k in ends}
+    speeds = {k: measure_speed(problem.scene, _last_state(plans[k - 1])[1]) for k in ends}
     stops = [k for k in ends if speeds[k] < AT_REST]
     found = []
     for k in ends:
@@ -128,7 +127,7 @@ def assess_struck(
         z, v = _last_state(plans[k - 1])
         impact = strike(phase.formation, following.formation, z, v / speeds[k])
         contact, impulse = impact.least
-        ratio = float(np.sqrt(metric @ impact.v**2))
+        ratio = measure_speed(problem.scene, impact.v)
         begin = max((stop for stop in stops if stop < k), default=0)
         end = min((stop for stop in stops if stop > k), default=len(block))
         share = None if duration is None else duration * (end - begin) / len(block)
@@ -146,7 +145,7 @@ def _describe_stop(phase: Phase, following: Phase, plan: PhasePlan[Motion]) -> T
     reason = "no plan passes it at speed"
     if impact.hindrances:
         reason = impact.hindrances[0].describe(PER_SPEED)
-    ratio = float(np.sqrt(metric_weights(phase.formation.scene) @ impact.v**2))
+    ratio = measure_speed(phase.formation.scene, impact.v)
     until = str(phase.until)
     return Transition(phase.number, until, False, reason, ratio, impulse, contact, 0.0, math.nan)
 

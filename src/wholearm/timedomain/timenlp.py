@@ -356,7 +356,7 @@ def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tup
     """Bounds of the unknowns but for the least c_n: durations, torques, joint speeds, impulses."""
     size = nlp.layouts[-1].stop
     low, high = np.full(size, -np.inf), np.full(size, np.inf)
-    for stage, layout in zip(stages, nlp.layouts, strict=True):
+    for stage, coming, layout in zip(stages, [*stages[1:], None], nlp.layouts, strict=True):
         limit = np.tile(stage.formation.scene.torque_limit, 2)
         soft = np.tile(nlp.soft, 2)
         low[layout.tau] = np.where(soft, -np.inf, -limit)
@@ -371,7 +371,6 @@ def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tup
             ends[-1, -1] = stage.formation.n_contacts + joint in still
             low[own] = np.where((sigma < 0) | ends, -np.inf, rate)
             high[own] = np.where((sigma > 0) | ends, np.inf, -rate)
-        if len(layout.following) > 1:
-            coming = stages[list(stages).index(stage) + 1].formation.n_contacts
-            low[layout.following[1 : 1 + coming]] = 0.0
+        if coming is not None and stage.strikes:
+            low[layout.following[1 : 1 + coming.formation.n_contacts]] = 0.0
     return low, high

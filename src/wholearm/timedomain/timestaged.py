@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from ..contact import Expression
-from ..fatrop import Stages, build_solver, describe_status, keep_bounds
+from ..fatrop import Stages, build_solver, keep_bounds, read_stats
 from ..model import Array
 from .blocknlp import Indices, Triplets, assemble_nlp
 from .timelayout import StageLayout
@@ -48,8 +48,7 @@ class StagedSolver:
 
     def stats(self) -> dict[str, Any]:
         """Statistics of the last solve, under the names that Ipopt's have."""
-        stats: dict[str, Any] = self.solver.stats()
-        return stats | {"return_status": describe_status(self.solver)}
+        return read_stats(self.solver)
 
 
 def build_staged_solver(
