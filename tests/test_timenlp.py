@@ -11,7 +11,7 @@ from plane import make_formation, measure_gaps, with_speed_limit
 from planned import HEPTAGON, CosineMotion
 from timed import drive
 from tipping import roll
-from wholearm.curve import Curve, metric_weights
+from wholearm.curve import Curve, metric_weights, tangent_basis
 from wholearm.dynamics import Directions
 from wholearm.formation import Formation
 from wholearm.model import Array
@@ -32,7 +32,6 @@ from wholearm.timedomain.timenlp import (
     bound_unknowns,
     build_time_nlp,
     least_rates,
-    tangent_basis,
 )
 
 PHASE = 3

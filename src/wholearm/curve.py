@@ -219,6 +219,15 @@ def measure_speed(scene: Scene, v: Array) -> float:
     return float(np.sqrt(metric_weights(scene) @ v**2))
 
 
+def tangent_basis(formation: Formation, z: Array) -> Array:
+    """Basis of the null space of P at `z`, shape (5, f), orthonormal in radii of gyration."""
+    metric = metric_weights(formation.scene)
+    P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
+    _, values, right = np.linalg.svd(P / np.sqrt(metric))
+    rank = int((values > 1e-9 * values[0]).sum())
+    return np.asarray((right[rank:] * np.sqrt(metric)).T / np.sqrt(metric[2]))
+
+
 def refine(s: Array, stop: float) -> Array:
     """Places to look at along a panel with nodes `s`, up to `stop`."""
     grid = np.interp(np.linspace(0, len(s) - 1, REFINE * len(s)), np.arange(len(s)), s)

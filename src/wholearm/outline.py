@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .curve import Curve, metric_weights
+from .curve import Curve, metric_weights, tangent_basis
 from .dynamics import Directions
 from .errors import InputError
 from .formation import TOUCHING, Formation
@@ -113,9 +113,7 @@ def outline_phase(problem: Problem, phase: Phase, z: Array) -> list[Outline]:
 
 def count_freedoms(formation: Formation, z: Array) -> int:
     """Freedoms that a formation leaves at `z`: 5 less the rank of P."""
-    P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
-    values = np.linalg.svd(P / np.sqrt(metric_weights(formation.scene)))[1]
-    return 5 - int((values > 1e-9 * values[0]).sum())
+    return int(tangent_basis(formation, z).shape[1])
 
 
 def _find_goal(problem: Problem, phase: Phase, z: Array) -> Array:

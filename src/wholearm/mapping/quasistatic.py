@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..curve import metric_weights
-from ..dynamics import Directions, inverse, reduced_inertia
+from ..dynamics import Directions, force_rows, inverse, reduced_inertia
 from ..formation import Formation, Kinematics
 from ..model import Array, Scene
 from .closing import Flags, Numbers, full_formation
@@ -80,11 +80,11 @@ def check_cell(scene: Scene, epsilon: float, label: Numbers, z: Array) -> Flags:
     matrix = np.concatenate([kinematics.A, np.broadcast_to(rows, (len(z), 2, 5))], axis=1)
     possible = np.zeros((len(z), len(WAYS)), dtype=bool)
     regular = np.abs(np.linalg.det(matrix)) > 1e-12
+    part = Kinematics(*(array[regular] for array in kinematics))
     for k, way in enumerate(_WAYS):
         right = np.zeros((regular.sum(), 5, 1))
         right[:, 3:, 0] = way
         z_s = np.linalg.solve(matrix[regular], right)[..., 0]
-        part = Kinematics(*(array[regular] for array in kinematics))
         possible[regular, k] = _check_balance(formation, part, epsilon, z_s)
     return possible
 
@@ -111,8 +111,7 @@ def _check_balance(
     formation: Formation, kinematics: Kinematics, epsilon: float, z_s: Array
 ) -> Flags:
     scene, directions = formation.scene, _directions(kinematics, z_s)
-    slip = formation.friction * directions.Xi
-    G = kinematics.A - slip[..., None] * kinematics.A_t
+    G = force_rows(formation, kinematics, directions)
     wrench = G[:, :, :3].transpose(0, 2, 1)
     regular = np.abs(np.linalg.det(wrench)) > 1e-12
     wrench[~regular] = np.eye(3)

@@ -31,8 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..contact import Expression
-from ..curve import metric_weights
-from ..formation import Formation
+from ..curve import tangent_basis
 from ..ipopt import build_solver
 from ..model import Array
 from ..options import Objective
@@ -341,15 +340,6 @@ def _join(rows: Rows, stage: Stage, coming: Stage, layout: StageLayout, first: I
         rows.put(more, first[MARGIN:], 1.0)
         rows.put(more, last[MARGIN:], -1.0)
         rows.put(more[1], last[T], -1.0)
-
-
-def tangent_basis(formation: Formation, z: Array) -> Array:
-    """Basis of the null space of P at `z`, shape (5, f), orthonormal in radii of gyration."""
-    metric = metric_weights(formation.scene)
-    P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
-    _, values, right = np.linalg.svd(P / np.sqrt(metric))
-    rank = int((values > 1e-9 * values[0]).sum())
-    return np.asarray((right[rank:] * np.sqrt(metric)).T / np.sqrt(metric[2]))
 
 
 def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tuple[Array, Array]:
