@@ -218,3 +218,18 @@ def test_require_number_refuses_what_is_not_real(value: Any) -> None:
 def test_require_vector_takes_tuples_and_arrays() -> None:
     assert require_vector((1, 2), "key", 2).tolist() == [1.0, 2.0]
     assert require_vector(np.array([1, 2]), "key", 2).tolist() == [1.0, 2.0]
+
+
+def test_scales_follow_the_units() -> None:
+    scene = make_scene(SQUARE)
+    scales = scene.scales
+    assert scales.force == scene.polygon.mass * scene.gravity
+    assert scales.speed * scales.time == pytest.approx(scales.length, rel=1e-14)
+    assert scales.acceleration * scales.time**2 == pytest.approx(scales.length, rel=1e-14)
+    assert scales.acceleration == pytest.approx(scene.gravity, rel=1e-14)
+
+
+def test_without_gravity_the_weaker_finger_sets_the_force() -> None:
+    long, short = make_finger([0.1, 0.0], length=0.3), make_finger([-0.1, 0.0], length=0.1)
+    scene = replace(make_scene(SQUARE), gravity=0.0, fingers=(long, short))
+    assert scene.scales.force == pytest.approx(long.torque_limit / 0.3, rel=1e-14)

@@ -33,6 +33,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -230,6 +232,44 @@ class Friction:
         return self.palm if finger is None else (self.finger1, self.finger2)[finger]
 
 
+class Scales(NamedTuple):
+    """The scene's own units, which every tolerance is relative to.
+
+    Attributes
+    ----------
+    length : float, [m]
+        Radius of gyration of the object.
+    mass : float, [kg]
+        Of the object.
+    force : float, [N]
+        Weight of the object; without gravity, what the weaker finger can press with at its tip.
+    """
+
+    length: float
+    mass: float
+    force: float
+
+    @property
+    def torque(self) -> float:
+        """Force times length [N m]."""
+        return self.force * self.length
+
+    @property
+    def time(self) -> float:
+        """In which the force moves the mass by about the length [s]."""
+        return math.sqrt(self.mass * self.length / self.force)
+
+    @property
+    def speed(self) -> float:
+        """Length over time [m/s]."""
+        return self.length / self.time
+
+    @property
+    def acceleration(self) -> float:
+        """Force over mass [m/s^2]."""
+        return self.force / self.mass
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Everything that does not move by plan: object, both fingers, friction and gravity.
@@ -255,6 +295,15 @@ class Scene:
                 "fingers.1.base",
                 f"{right.tolist()} is not to the right of fingers.2.base {left.tolist()}",
             )
+
+    @cached_property
+    def scales(self) -> Scales:
+        """Units that fit the scene: tolerances count in them."""
+        mass = self.polygon.mass
+        force = mass * self.gravity
+        if force == 0:
+            force = min(finger.torque_limit / finger.length for finger in self.fingers)
+        return Scales(self.polygon.gyration_radius, mass, force)
 
     @property
     def mass_diagonal(self) -> Array:
