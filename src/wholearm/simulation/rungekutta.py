@@ -105,15 +105,16 @@ def build_step(
     end, fifth, third : expression, shape (n,)
         The state at t + h, and the errors of the embedded formulas of order 5 and 3.
     """
-    zero = ca.SX(y.shape[0], 1)
-    rates: list[Expression] = []
-    for node, row in zip(_NODES, _ROWS, strict=True):
-        stage = y + h * sum((a * rates[j] for j, a in row.items()), zero)
-        rates.append(rate(stage, t + node * h))
+    rates: Expression = ca.SX(y.shape[0], 0)
 
     def combine(weights: dict[int, float]) -> Expression:
-        return h * sum((w * rates[j] for j, w in weights.items()), zero)
+        column = ca.DM.zeros(rates.shape[1], 1)
+        for stage, weight in weights.items():
+            column[stage] = weight
+        return h * (rates @ ca.sparsify(column))
 
+    for node, row in zip(_NODES, _ROWS, strict=True):
+        rates = ca.horzcat(rates, rate(y + combine(row), t + node * h))
     return y + combine(_WEIGHTS), combine(_ERROR_5), combine(_ERROR_3)
 
 

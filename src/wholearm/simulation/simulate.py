@@ -72,9 +72,10 @@ def simulate(
     """
     if not 1e-14 <= tolerance <= 1e-2:
         raise InputError("", "tolerance", f"{tolerance!r} is not between 1e-14 and 1e-2")
-    wanted = np.unique(np.asarray([] if times is None else times, dtype=float))
+    wanted = np.sort(np.asarray([] if times is None else times, dtype=float).ravel())
     if not np.isfinite(wanted).all():
         raise InputError("", "times", "holds numbers that are not finite")
+    wanted = wanted[np.diff(wanted, prepend=-np.inf) > 0]
     run = Replay(problem, torque, tolerance, wanted)
     for phase, following in zip(problem.phases, [*problem.phases[1:], None], strict=True):
         if progress is not None:

@@ -225,7 +225,7 @@ def _compile(
     y, forces = packed[at.y], []
 
     def rate(state: Expression, t: Expression) -> Expression:
-        rates, c, *_ = model.dynamics(state, t)
+        rates, c, *_ = model.dynamics(state, t, packed)
         forces.append(model.holds @ c)
         return rates
 
@@ -236,14 +236,14 @@ def _compile(
     limits = len(open_limits(formation, until))
     rows = EventRows(*_layout(n_c, 2 * rolls, n_c, 2, limits, None, None))
     time = packed[at.t] + packed[at.h]
-    functions, to = [], None
-    for name, state, when, measured in (
-        ("step", end, time, (error, dip)),
-        ("look", y, packed[at.t], (ca.SX(0), ca.SX(0))),
-    ):
-        outputs, to = model.outputs(state, when, *measured, _slack(rows))
-        functions.append(ca.Function(name, [packed], [outputs]))
-    assert to is not None
+    at_end = ca.SX.sym("state", STATE), ca.SX.sym("time"), ca.SX.sym("error"), ca.SX.sym("dip")
+    outputs, to = model.outputs(*at_end, _slack(rows))
+    report = ca.Function("report", [*at_end, packed], [outputs])
+    results = report(end, time, error, dip, packed), report(y, packed[at.t], 0, 0, packed)
+    functions = [
+        ca.Function(name, [packed], [result])
+        for name, result in zip(("step", "look"), results, strict=True)
+    ]
     return functions, at, to, rows
 
 
@@ -270,22 +270,21 @@ class _Model:
         values = ca.vertcat(*(limit.value for limit in open_limits(formation, until)))
         rate = ca.jacobian(distance, z)
         self.geometry = ca.Function("geometry", [z], [values, distance, rate])
+        # The stages of a step call this, which is quicker than writing it out for each.
+        state, time = ca.SX.sym("state", STATE), ca.SX.sym("time")
+        self.dynamics = ca.Function("dynamics", [state, time, packed], self._move(state, time))
 
     def torque(self, t: Expression) -> Expression:
         """Torques at time t, shape (2,)."""
         start, stop = self.packed[self.at.piece][0], self.packed[self.at.piece][1]
         x = (2 * t - start - stop) / (stop - start)
-        coefficients = self.packed[self.at.torque]
-        count = coefficients.shape[0] // 2
-        values = []
-        for joint in range(2):
-            value = coefficients[(joint + 1) * count - 1]
-            for power in range(count - 2, -1, -1):
-                value = value * x + coefficients[joint * count + power]
-            values.append(value)
-        return ca.vertcat(*values)
+        coefficients = ca.reshape(self.packed[self.at.torque], -1, 2)
+        value = coefficients[-1, :]
+        for power in range(coefficients.shape[0] - 2, -1, -1):
+            value = value * x + coefficients[power, :]
+        return value.T
 
-    def dynamics(self, y: Expression, t: Expression) -> tuple[Expression, ...]:
+    def _move(self, y: Expression, t: Expression) -> list[Expression]:
         """Rates of the state, c, v_t, tau, K and P at (z, z') = y[:10]."""
         formation = self.formation
         scene = formation.scene
@@ -304,14 +303,14 @@ class _Model:
         drag = ca.DM(formation.sliding_friction) * self.Xi * c[: formation.n_contacts]
         powers = [ca.dot(force, v[3:]) for force in (tau, viscous, dry)]
         powers.append(ca.dot(drag, v_t))
-        return ca.vertcat(v, acceleration, *powers), c, v_t, tau, K, P
+        return [ca.vertcat(v, acceleration, *powers), c, v_t, tau, K, P]
 
     def outputs(
         self, y: Expression, t: Expression, error: Expression, dip: Expression, slack: Array
     ) -> tuple[Expression, Outputs]:
         """All outputs at a state, packed, and their layout."""
         formation = self.formation
-        rates, c, v_t, tau, K, P = self.dynamics(y, t)
+        rates, c, v_t, tau, K, P = self.dynamics(y, t, self.packed)
         c_n = c[: formation.n_contacts]
         c_t = -ca.DM(formation.sliding_friction) * self.Xi * c_n
         if formation.rolling:
