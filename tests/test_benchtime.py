@@ -13,7 +13,6 @@ from wholearm.benchmark.benchreport import Row, format_markdown
 from wholearm.benchmark.benchtime import (
     measure_blocks,
     measure_order,
-    measure_time_solvers,
     measure_transcriptions,
 )
 from wholearm.plan import solve
@@ -69,19 +68,6 @@ def test_least_times_are_compared_with_those_along_the_curve(
         assert row.note == f"{iterations} iterations in {solves} solves"
 
 
-def test_both_solvers_are_measured_on_the_same_blocks() -> None:
-    rows = measure_time_solvers(flip())
-    assert [(row.method, row.setting) for row in rows] == [
-        (solver, f"phase 1, {goal}")
-        for goal in ("time", "effort")
-        for solver in ("Ipopt", "fatrop")
-    ]
-    assert all(re.match(r"\d+ iterations", row.note) and row.seconds > 0 for row in rows)
-    for ipopt, fatrop in zip(rows[::2], rows[1::2], strict=True):
-        assert ipopt.error is None
-        assert fatrop.error is not None and abs(fatrop.error) < 1e-6
-
-
 def test_whole_plans_are_measured_where_phases_need_the_time_domain() -> None:
     assert measure_blocks(flip()) == []
     rows = measure_blocks(shove()[0])
@@ -96,8 +82,8 @@ def test_whole_plans_are_measured_where_phases_need_the_time_domain() -> None:
 def test_each_study_has_its_table() -> None:
     rows = [
         Row(f"time domain: {study}", "a", "b", 0.1, error)
-        for study, error in (("order", 1e-3), ("solvers", None))
+        for study, error in (("order", 1e-3), ("whole plans", None))
     ]
     text = format_markdown("heptagon", rows)
-    assert "## Time domain: order" in text and "## Time domain: solvers" in text
+    assert "## Time domain: order" in text and "## Time domain: whole plans" in text
     assert "| a | b | 0.1000 | 1.00e-03 |  |" in text and "| a | b | 0.1000 |  |  |" in text

@@ -106,17 +106,6 @@ def test_solve_names_its_output_after_the_problem(folder: Path) -> None:
     assert [path.name for path in folder.iterdir()] == ["heptagon_four_contacts.npz"]
 
 
-def test_solve_with_fatrop(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = ["-o", "a.npz", "--json", "--intervals", "40"]
-    metas = []
-    for solver in ("ipopt", "fatrop"):
-        assert main(["solve", str(HEPTAGON), "--solver", solver, *options]) == 0
-        metas.append(json.loads(capsys.readouterr().out))
-        assert metas[-1]["solver"] == solver and load_trajectory("a.npz").meta["solver"] == solver
-    # Both tighten limits until they are kept to 5e-7 between nodes, not by the same.
-    assert metas[1]["value"] == pytest.approx(metas[0]["value"], rel=2e-6)
-
-
 def test_solve_lists_the_impacts(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     impacts = str(HEPTAGON.with_name("heptagon_impact.toml"))
     assert main(["solve", impacts, "-o", "a.npz", "--intervals", "40"]) == 0
@@ -345,11 +334,6 @@ def test_output_that_is_a_device(capsys: pytest.CaptureFixture[str]) -> None:
         (["slove"], "invalid choice: 'slove'"),
         (["solve"], "problem"),
         (["solve", str(HEPTAGON), "--speed", "3"], "unrecognized arguments: --speed 3"),
-        (["solve", str(HEPTAGON), "--solver", "snopt"], "solver: 'snopt' given; allowed are ipopt"),
-        (
-            ["solve", str(HEPTAGON), "--solver", "fatrop", "--objective", "margin"],
-            "solver: 'fatrop' is for time and effort; margin needs ipopt",
-        ),
         (["solve", str(HEPTAGON), "--intervals", "ten"], "invalid int value: 'ten'"),
         (["solve", str(HEPTAGON), "--intervals", "5"], "intervals: 5 is not a whole number of 10"),
         (["solve", str(HEPTAGON), "--objective", "fun"], "objective: 'fun' given; allowed are"),

@@ -64,11 +64,6 @@ def test_the_grid_in_the_time_domain_is_kept(transcription: str, degree: int) ->
         ("transcription", "path"),
         ("transcription", ""),
         ("transcription", None),
-        ("solver", "snopt"),
-        ("solver", "Ipopt"),
-        ("solver", None),
-        # Margins need Ipopt.
-        ("solver", "fatrop"),
     ],
 )
 def test_bad_options_are_named(key: str, given: Any) -> None:
@@ -77,14 +72,6 @@ def test_bad_options_are_named(key: str, given: Any) -> None:
         PlanOptions(**options)
     assert caught.value.key == key and caught.value.exit_status == 2
     assert repr(given) in str(caught.value)
-
-
-@pytest.mark.parametrize("transcription", ["auto", "time"])
-def test_fatrop_is_for_time_and_effort(transcription: str) -> None:
-    for objective in ("time", "effort"):
-        options = PlanOptions(objective, solver="fatrop", transcription=transcription)
-        assert options.solver == "fatrop"
-    assert PlanOptions(transcription=transcription).solver == "ipopt"
 
 
 @pytest.mark.parametrize("objective", ["time", "effort"])

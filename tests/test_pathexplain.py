@@ -239,16 +239,6 @@ def test_phases_that_impacts_join_are_advised_together() -> None:
         plan_chain(chain, 1.0, OPTIONS, explained=False)
 
 
-def test_advice_does_not_depend_on_the_solver() -> None:
-    problem = edited({"epsilon": 1.0})
-    messages = []
-    for solver in ("ipopt", "fatrop"):
-        with pytest.raises(InfeasibleError) as caught:
-            solve(problem, solver=solver, intervals=INTERVALS)
-        messages.append(str(caught.value))
-    assert messages[0] == messages[1]
-
-
 @pytest.mark.parametrize("duration", [0.05, 0.1])
 def test_too_short_a_duration_is_named(curves: tuple[Curve, ...], duration: float) -> None:
     options = PlanOptions("margin", intervals=INTERVALS)
@@ -281,15 +271,3 @@ def test_changing_one_limit_leaves_everything_else(curves: tuple[Curve, ...]) ->
     )
     assert changed.fingers[0] is scene.fingers[0] and changed.polygon is scene.polygon
     assert other.formation.names == curve.formation.names and other.panels is curve.panels
-
-
-def test_what_fatrop_cannot_solve_is_planned_by_ipopt(curves: tuple[Curve, ...]) -> None:
-    """Least effort of phase 4 is beyond fatrop's numerics."""
-    plans = [
-        plan_path(curves[3], 0.05, PlanOptions("effort", solver=solver), 4)
-        for solver in ("fatrop", "ipopt")
-    ]
-    assert [plan.solver for plan in plans] == ["ipopt", "ipopt"]
-    assert plans[0].value == plans[1].value
-    easy = plan_path(curves[3], 0.05, PlanOptions("time", solver="fatrop"), 4)
-    assert easy.solver == "fatrop"

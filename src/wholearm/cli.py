@@ -66,7 +66,6 @@ def build_parser() -> argparse.ArgumentParser:
     solve.add_argument("--time-intervals", type=int, help="intervals of a phase in the time domain")
     solve.add_argument("--degree", type=int, help="collocation points of an interval there")
     solve.add_argument("--scheme", help="radau (the default) or legendre points")
-    solve.add_argument("--solver", help="ipopt or, for time and effort, fatrop")
     solve.add_argument("--json", action="store_true", help="print the summary as JSON")
 
     verify = _command(commands, "verify", _verify, "replay torques open loop and check the motion")
@@ -159,9 +158,6 @@ def _summarise(trajectory: Trajectory, output: str) -> str:
         torque = abs(trajectory.tau[rows]).max()
         lines.append(f"{index + 1:>5}  {duration:>12.6f}  {least:>13.6f}  {torque:>19.6f}")
     lines += _list_transitions(meta)
-    others = [str(k + 1) for k, solver in enumerate(meta["solvers"]) if solver != meta["solver"]]
-    if others:
-        lines.append(f"{meta['solver']} does not converge: Ipopt planned {', '.join(others)}")
     value = f"{meta['objective']} = {meta['value']:.6f} {meta['value_unit']}"
     return "\n".join([*lines, f"{value}, {trajectory.duration:.6f} s in all; wrote {output}"])
 

@@ -28,7 +28,6 @@ CHOICES = tuple(
     choice.value for choice in Objective if choice not in (Objective.ELASTIC, Objective.RELAX)
 )
 """Objectives that a user can ask for."""
-SOLVERS = ("ipopt", "fatrop")
 
 
 @dataclass(frozen=True)
@@ -57,9 +56,6 @@ class PlanOptions:
         Collocation points per interval in the time domain, from 2 to 6.
     scheme : str
         Which points: ``"radau"`` or ``"legendre"``.
-    solver : str
-        ``"ipopt"``, or ``"fatrop"`` for `time` and `effort`, with Ipopt where that stops without
-        an answer.
 
     Raises
     ------
@@ -76,7 +72,6 @@ class PlanOptions:
     time_intervals: int | None = None
     degree: int = 3
     scheme: str = "radau"
-    solver: str = "ipopt"
 
     def __post_init__(self) -> None:
         given = self.objective
@@ -97,11 +92,6 @@ class PlanOptions:
         if self.transcription not in ("auto", "time"):
             given = self.transcription
             raise InputError("", "transcription", f"{given!r} given; allowed are auto and time")
-        if self.solver not in SOLVERS:
-            allowed = " and ".join(SOLVERS)
-            raise InputError("", "solver", f"{self.solver!r} given; allowed are {allowed}")
-        if self.solver == "fatrop" and self.objective is Objective.MARGIN:
-            raise InputError("", "solver", "'fatrop' is for time and effort; margin needs ipopt")
         weight = require_number(self.time_weight, "time_weight", positive=True)
         object.__setattr__(self, "time_weight", weight)
         if self.duration is not None:

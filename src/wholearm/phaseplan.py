@@ -24,8 +24,6 @@ class PhasePlan(NamedTuple, Generic[M_co]):
         Of the solver in all, and how often it ran. Of phases in one NLP only the first one counts.
     build_time, solve_time : float, [s]
         The same for them.
-    solver : str
-        The solver that found it.
     """
 
     motion: M_co
@@ -35,4 +33,3 @@ class PhasePlan(NamedTuple, Generic[M_co]):
     solves: int
     build_time: float
     solve_time: float
-    solver: str = "ipopt"

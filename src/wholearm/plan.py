@@ -108,8 +108,6 @@ def solve_with(
         "transitions": [transition.to_dict() for transition in transitions],
         "intervals": options.intervals,
         "transcription": options.transcription,
-        "solver": options.solver,
-        "solvers": [plan.solver for plan in plans],
         "time_weight": options.time_weight,
         "timings": {
             "trace": traced - started,

@@ -33,9 +33,8 @@ from ..verify import verify
 from .baseline_opti import plan_with_opti
 from .baseline_simulation import simulate_with_scipy
 from .benchreport import Row, write_results
-from .benchsolvers import measure_solvers
 from .benchstress import measure_stress
-from .benchtime import measure_blocks, measure_order, measure_time_solvers, measure_transcriptions
+from .benchtime import measure_blocks, measure_order, measure_transcriptions
 
 INTERVALS = (10, 20, 40, 80, 160, 320, 640, 800)
 FINE = 1600
@@ -341,9 +340,7 @@ ON_CURVES: tuple[Callable[[Problem], list[Row]], ...] = (
     measure_planner,
     measure_simulator,
     measure_baseline,
-    measure_solvers,
     measure_order,
     measure_transcriptions,
-    measure_time_solvers,
 )
 """Studies of phases that are curves of four sliding contacts."""

@@ -11,13 +11,13 @@ from ..model import Array
 from ..options import Objective, PlanOptions
 from ..path import runs_on_curve, trace_phases
 from ..pathdomain.pathplan import plan_path
-from ..plan import solve, split_blocks
+from ..plan import solve
 from ..problem import Phase, Problem
 from ..simulation.simulate import simulate
 from ..timedomain.collocation import make_scheme
 from ..timedomain.staging import outline_stages
 from ..timedomain.timemotion import TimeMotion, make_motions
-from ..timedomain.timeplan import FIRST, plan_phases
+from ..timedomain.timeplan import plan_phases
 from ..timedomain.timesearch import Search
 from .benchreport import Row
 
@@ -129,48 +129,4 @@ def measure_blocks(problem: Problem) -> list[Row]:
         share = timings["build"] / timings["plan"]
         note += f"; building is {share:.0%} of planning"
         rows.append(Row("time domain: whole plans", goal, "default", timings["plan"], missed, note))
-    return rows
-
-
-def measure_time_solvers(problem: Problem) -> list[Row]:
-    """Ipopt and fatrop on the same NLPs in the time domain.
-
-    The error is the relative difference of fatrop's optimum from Ipopt's.
-    """
-    rows = []
-    scheme = make_scheme("radau", 3)
-    z = problem.start
-    blocks: list[tuple[tuple[Phase, ...], Array]] = []
-    for phase, curve in zip(problem.phases, trace_phases(problem), strict=False):
-        blocks.append(((phase,), z))
-        z = curve.end
-    rest = tuple(problem.phases[len(blocks) :])
-    if rest:
-        first = next(block for block in split_blocks(problem) if block[0] is rest[0])
-        blocks.append((first, z))
-    for block, start in blocks:
-        for goal in (Objective.TIME, Objective.EFFORT):
-            costs: dict[str, float] = {}
-            for solver in ("ipopt", "fatrop"):
-                options = PlanOptions(goal, solver=solver)
-                search = Search(problem, options, scheme, None, goal, solver=solver)
-                stages = outline_stages(problem, block, start, scheme, FIRST // 2, _PACE)
-                solution = search.solve(stages)
-                note = f"{search.effort.iterations} iterations"
-                if solution.success:
-                    costs[solver] = solution.cost
-                else:
-                    note += f", does not converge: {solution.status}"
-                error = costs["fatrop"] / costs["ipopt"] - 1 if len(costs) == 2 else None
-                numbers = "-".join(str(phase.number) for phase in block)
-                rows.append(
-                    Row(
-                        "time domain: solvers",
-                        "Ipopt" if solver == "ipopt" else solver,
-                        f"phase {numbers}, {goal.value}",
-                        search.effort.solve_time,
-                        error,
-                        note,
-                    )
-                )
     return rows

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,10 +19,9 @@ from ..contact import Expression
 from ..ipopt import build_solver
 from ..model import Array
 from ..options import Objective
-from .nodechain import stage
 from .pathdata import PhaseData, Relaxation
 from .pathmotion import Grid, Profile
-from .pathterms import CHAINED, LEAST_B, Terms, count_extras, write_terms
+from .pathterms import CHAINED, LEAST_B, count_extras, write_terms
 
 _MU = 1e-2
 """Complementarity of the first guess's multipliers: the barrier parameter to start from."""
@@ -83,7 +81,7 @@ class PathNLP:
 
     Attributes
     ----------
-    solver : casadi.Function or wholearm.nodechain.StagedSolver
+    solver : casadi.Function
         Takes x0, p, bounds and multipliers; see `build_path_nlp` for their order.
     n_contacts, n_rolling, intervals : int
     objective : Objective
@@ -131,32 +129,19 @@ def build_path_nlp(
     intervals: int,
     objective: Objective,
     n_rolling: int = 0,
-    solver: str = "ipopt",
 ) -> PathNLP:
     """Build the NLP for every phase of so many contacts, of which so many roll.
 
     See `pathterms` for its unknowns, parameters and rows.
     """
     started = time.perf_counter()
-    staged = solver == "fatrop"
-    terms = write_terms(n_contacts, intervals, objective, n_rolling, rough=staged)
-    built = stage("path_nlp", terms.chain) if staged else _build_ipopt(terms, objective)
-    seconds = time.perf_counter() - started
-    return PathNLP(built, n_contacts, n_rolling, intervals, objective, seconds)
-
-
-def _build_ipopt(terms: Terms, objective: Objective) -> Expression:
-    chain = terms.chain
-    nlp = {
-        "x": chain.x,
-        "p": chain.p,
-        "f": ca.sum1(chain.link_costs) + ca.sum1(chain.node_costs),
-        "g": ca.vertcat(chain.links.values, ca.vec(chain.rows.T), *terms.last),
-    }
+    nlp = write_terms(n_contacts, intervals, objective, n_rolling)
     # Started from nowhere near their optimum, these need the more robust strategy.
     robust = objective in (Objective.ELASTIC, Objective.RELAX)
     strategy: dict[str, Any] = {"mu_strategy": "monotone"} if robust else {"mu_oracle": "probing"}
-    return build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
+    solver = build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
+    seconds = time.perf_counter() - started
+    return PathNLP(solver, n_contacts, n_rolling, intervals, objective, seconds)
 
 
 def parameters(

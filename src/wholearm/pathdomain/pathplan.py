@@ -19,7 +19,6 @@ from ..errors import InfeasibleError, SolverError, WholearmError
 from ..model import Array
 from ..options import Objective, PlanOptions
 from ..phaseplan import PhasePlan
-from .nodechain import StagedSolver
 from .pathdata import PhaseData, cut, fit_torque, join, name_phases, prepare
 from .pathmotion import Grid, PathMotion, Profile, draw_together, make_grid
 from .pathnlp import (
@@ -116,9 +115,6 @@ def plan_curves(
     try:
         plans = _plan(curves, epsilon, options, phases, duration)
     except _StuckError as stuck:
-        if options.solver != "ipopt":
-            robust = replace(options, solver="ipopt")
-            return plan_curves(curves, epsilon, robust, phases, duration, explained)
         if not explained:
             raise
         from .pathexplain import explain
@@ -184,7 +180,7 @@ def _plan(
     parts = prepare_all(make_grid(curve, options.intervals) for curve in curves)
     data = join(parts)
     first, intervals = curves[0].formation, len(data.grid.steps)
-    nlp = build_path_nlp(first.n_contacts, intervals, options.goal, first.n_rolling, options.solver)
+    nlp = build_path_nlp(first.n_contacts, intervals, options.goal, first.n_rolling)
     profile, scales = guess(data)
     tightening = Tightening.none(data, duration)
     solution = _Solution(profile, 0.0, first_multipliers(nlp, data, profile, scales), 0, 0.0)
@@ -239,7 +235,7 @@ def _plan(
         costs = (0, 0, 0.0, 0.0)
         if not plans:
             costs = (solution.iterations, solves, nlp.build_time, solution.seconds)
-        plans.append(PhasePlan(motion, torque, value, *costs, options.solver))
+        plans.append(PhasePlan(motion, torque, value, *costs))
     return plans
 
 
@@ -259,8 +255,7 @@ def _solve(
     )
     stats = nlp.solver.stats()
     if not stats["success"]:
-        name = "fatrop" if isinstance(nlp.solver, StagedSolver) else "Ipopt"
-        raise _StoppedError(f"{name} stopped with {stats['return_status']}")
+        raise _StoppedError(f"Ipopt stopped with {stats['return_status']}")
     profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], scales)
     multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
     iterations = start.iterations + stats["iter_count"]

@@ -19,14 +19,10 @@ column through all rows would make building the Jacobian quadratic in the number
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import casadi as ca
-import numpy as np
 
 from ..contact import Expression
 from ..options import Objective
-from .nodechain import Chain, Links
 
 CHAINED = (Objective.MARGIN, Objective.RELAX)
 """Objectives with one more unknown, which every node has a copy of."""
@@ -38,45 +34,35 @@ _SMOOTH = 1e-5
 """Weight of changes of a and lambda: rules out ripple that the objective does not see."""
 
 
-class Terms(NamedTuple):
-    """The NLP as a chain of nodes, and what rows it has beside those of a chain.
-
-    Attributes
-    ----------
-    chain : Chain
-    last : tuple of casadi.SX
-        T for `margin`; else nothing.
-    """
-
-    chain: Chain
-    last: tuple[Expression, ...]
-
-
 def count_extras(objective: Objective, n_held: int) -> int:
     """Unknowns per node besides b, a and squeeze: shortfalls, or the margin or relaxation."""
     return n_held + 2 if objective is Objective.ELASTIC else int(objective in CHAINED)
 
 
 def write_terms(
-    n_contacts: int, intervals: int, objective: Objective, n_rolling: int, rough: bool
-) -> Terms:
+    n_contacts: int, intervals: int, objective: Objective, n_rolling: int
+) -> dict[str, Expression]:
     """Write the NLP for every phase of so many contacts, of which so many roll.
 
     The unknowns are (b, a, squeeze, extras) node by node, without b at the two ends. The extras
     are shortfalls for `elastic`, the least margin for `margin` and the relaxation for `relax`. The
     parameters are the speeds at the ends, the steps, the weight of time, and the coefficients of
     `PathForces` but for C0 and T0, which are part of the bounds; for `relax` also what the
-    relaxation is worth for each limit, and b's coefficients in the speed limit. The links are the N
-    rows of b' = 2 a, those that chain the margin or the relaxation, and the changes of a over the
-    first and the last interval. A node's rows are H c and tau, and the speed for `relax`.
+    relaxation is worth for each limit, and b's coefficients in the speed limit. The rows are the N
+    of b' = 2 a, those that chain the margin or the relaxation, and the changes of a over the first
+    and the last interval; then node by node H c and tau, and the speed for `relax`; last T for
+    `margin`.
 
     Parameters
     ----------
     n_contacts, intervals : int
     objective : Objective
     n_rolling : int
-    rough : bool
-        For a solver that strays beyond bounds on its way, where roots must not fail.
+
+    Returns
+    -------
+    dict
+        Expressions of x, p, f and g.
     """
     n, n_held = intervals + 1, n_contacts + 2 * n_rolling
     m = n_held + 2
@@ -86,7 +72,7 @@ def write_terms(
     h, weight = ca.SX.sym("h", intervals), ca.SX.sym("weight")
     coefficients = [ca.SX.sym(name, n, m) for name in ("Pa", "Pb", "Pl")] + [ca.SX.sym("Tv", n, 2)]
     b = ca.vertcat(ends[0] ** 2, b_inner, ends[1] ** 2)
-    speed = ca.vertcat(ends[0], ca.sqrt(ca.fmax(b_inner, LEAST_B) if rough else b_inner), ends[1])
+    speed = ca.vertcat(ends[0], ca.sqrt(b_inner), ends[1])
 
     def spread(column: Expression) -> Expression:
         return ca.repmat(column, 1, m)
@@ -135,16 +121,10 @@ def write_terms(
     if objective is Objective.RELAX:
         tau_rows = ca.horzcat(tau_rows, Rb * b - short[:, m])
     nodes = ca.horzcat(b, a, squeeze, extra).T
-    chain = Chain(
-        ca.vertcat(nodes[1:, 0], ca.vec(nodes[:, 1:-1]), nodes[1:, -1]),
-        ca.vertcat(ends, h, weight, *(ca.vec(block) for block in coefficients)),
-        np.repeat(np.arange(n), nodes.size1())[1:-1],
-        Links(
-            ca.vertcat(*links, a[1] - a[0], a[-1] - a[-2]),
-            np.append(np.tile(np.arange(intervals), len(links)), [0, intervals - 1]),
-        ),
-        ca.horzcat(c_rows, tau_rows),
-        link_costs,
-        node_costs,
-    )
-    return Terms(chain, last)
+    rows = ca.horzcat(c_rows, tau_rows)
+    return {
+        "x": ca.vertcat(nodes[1:, 0], ca.vec(nodes[:, 1:-1]), nodes[1:, -1]),
+        "p": ca.vertcat(ends, h, weight, *(ca.vec(block) for block in coefficients)),
+        "f": ca.sum1(link_costs) + ca.sum1(node_costs),
+        "g": ca.vertcat(*links, a[1] - a[0], a[-1] - a[-2], ca.vec(rows.T), *last),
+    }

@@ -126,7 +126,6 @@ def build_time_nlp(
     time_weight: float,
     max_iter: int,
     give: Give | None = None,
-    solver_name: str = "ipopt",
 ) -> TimeNLP:
     """Build the NLP of stages that follow one another and end at rest.
 
@@ -141,7 +140,6 @@ def build_time_nlp(
         Most iterations of the solver.
     give : Give, optional
         Which limits give way, for `relax`; for `margin` it is every c_n.
-    solver_name : {"ipopt", "fatrop"}
     """
     started = time.perf_counter()
     if objective is Objective.MARGIN:
@@ -169,21 +167,11 @@ def build_time_nlp(
     N = tangent_basis(last.formation, last.guess.nodes[-1, 0])
     rest = rows.linear(N.shape[1])
     rows.put(rest[:, None], end[W], N.T)
-    solver = _build_solver(solver_name, rows, layouts, cost, max_iter)
+    built = assemble_nlp(len(cost), rows.triplets, rows.linear_rows, rows.blocks, cost)
+    solver = build_solver("time_nlp", built.nlp, PUSH, built.derivatives, max_iter=max_iter)
     soft = np.array(give.tau if give else (0.0, 0.0)) + (objective is Objective.ELASTIC) > 0
     seconds = time.perf_counter() - started
     return TimeNLP(solver, layouts, rows, rows_of, lasts, soft, seconds)
-
-
-def _build_solver(
-    name: str, rows: Rows, layouts: list[StageLayout], cost: Array, max_iter: int
-) -> Expression:
-    if name == "fatrop":
-        from .timestaged import build_staged_solver
-
-        return build_staged_solver(rows, layouts, cost, max_iter)
-    built = assemble_nlp(len(cost), rows.triplets, rows.linear_rows, rows.blocks, cost)
-    return build_solver("time_nlp", built.nlp, PUSH, built.derivatives, max_iter=max_iter)
 
 
 def _start(rows: Rows, node: Indices, state: Array) -> None:

@@ -82,13 +82,6 @@ def plan_phases(
         return outline_stages(problem, phases, z, scheme, count, pace, onwards)
 
     first = outline(halvings, _PACES[0])
-    # The rows of an impact are not of the form that fatrop asks for.
-    if options.solver != "ipopt" and not any(stage.strikes for stage in first):
-        search.solver = options.solver
-        solution = _solve(search, first, halvings)
-        if solution.success:
-            return _summarise(search, phases, solution)
-        search.solver = "ipopt"
     solution = _solve(search, first, halvings)
     if solution.success:
         return _summarise(search, phases, solution)
@@ -162,7 +155,7 @@ def _summarise(
             Objective.EFFORT: options.time_weight * motion.duration + torque.integrate_squares(),
             Objective.MARGIN: search.problem.epsilon + solution.margin,
         }[search.goal]
-        plans.append(PhasePlan(motion, torque, value, 0, 0, 0.0, 0.0, search.solver))
+        plans.append(PhasePlan(motion, torque, value, 0, 0, 0.0, 0.0))
     plans[0] = plans[0]._replace(
         iterations=effort.iterations,
         solves=effort.solves,

@@ -26,7 +26,6 @@ _ITERATIONS = {Objective.ELASTIC: 300, Objective.RELAX: 300}
 """Most iterations of one solve, if not 150."""
 _SOFT = 1e-2
 """First multipliers where limits are soft."""
-_NAMES = {"ipopt": "Ipopt", "fatrop": "fatrop"}
 _DEARER = 0.2
 """How much dearer, relatively, a plan may get by tightening before it counts as lost."""
 
@@ -88,7 +87,6 @@ class Search:
     goal : Objective
     give : Give or None
         Which limits give way, for the objective `relax`.
-    solver : {"ipopt", "fatrop"}
     effort : Effort
     """
 
@@ -98,12 +96,11 @@ class Search:
     duration: float | None
     goal: Objective
     give: Give | None = None
-    solver: str = "ipopt"
     effort: Effort = field(default_factory=Effort)
 
     def aiming(self, goal: Objective, give: Give | None = None) -> Search:
         """The same search with another objective."""
-        return replace(self, goal=goal, give=give, duration=None, solver="ipopt")
+        return replace(self, goal=goal, give=give, duration=None)
 
     @property
     def size(self) -> float:
@@ -130,7 +127,7 @@ class Search:
     def build(self, stages: Sequence[Stage]) -> TimeNLP:
         """Build the NLP."""
         weight, limit = self.options.time_weight, _ITERATIONS.get(self.goal, 150)
-        nlp = build_time_nlp(stages, self.scheme, self.goal, weight, limit, self.give, self.solver)
+        nlp = build_time_nlp(stages, self.scheme, self.goal, weight, limit, self.give)
         self.effort.build_time += nlp.build_time
         return nlp
 
@@ -164,7 +161,7 @@ class Search:
             adopt(stages, unpack(stages, x, nlp.layouts)),
             cost,
             -cost if self.goal is Objective.MARGIN else 0.0,
-            f"{_NAMES[self.solver]} stopped with {stats['return_status']}",
+            f"Ipopt stopped with {stats['return_status']}",
             stats["success"],
             nlp,
             {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")},
