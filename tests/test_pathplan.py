@@ -3,6 +3,7 @@ from __future__ import annotations
 import copy
 import re
 import tomllib
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -20,13 +21,14 @@ from wholearm.curve import Curve
 from wholearm.dynamics import inverse
 from wholearm.errors import InfeasibleError, JammingError, SolverError
 from wholearm.model import Array
-from wholearm.options import PlanOptions
+from wholearm.options import Objective, PlanOptions
 from wholearm.outline import load
 from wholearm.path import trace_phases
+from wholearm.pathdomain import pathplan
 from wholearm.pathdomain.chain import Chain, make_chain
 from wholearm.pathdomain.chainplan import plan_chain
 from wholearm.pathdomain.pathmotion import PathMotion, directions_of
-from wholearm.pathdomain.pathnlp import build_path_nlp
+from wholearm.pathdomain.pathnlp import PathNLP, build_path_nlp
 from wholearm.pathdomain.pathplan import plan_curves, plan_path
 from wholearm.phaseplan import PhasePlan
 from wholearm.plan import solve
@@ -244,15 +246,16 @@ def test_torques_do_not_jitter(curves: tuple[Curve, ...], phase: int, objective:
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
-def test_planning_twice_gives_the_same_bits(curves: tuple[Curve, ...], objective: str) -> None:
+def test_planning_twice_gives_the_same_plan(curves: tuple[Curve, ...], objective: str) -> None:
     first = plan(curves[2], objective)
     # Another phase in between must leave no trace.
     duration = ALLOWED if objective == "margin" else None
     plan_path(curves[0], EPSILON, PlanOptions(objective=objective), 1, duration)
     again = plan_path(curves[2], EPSILON, PlanOptions(objective=objective), 1, duration)
+    # The solver's own tolerance is 1e-8; a plan that started from another one would differ more.
     for one, other in zip(first.motion.profile, again.motion.profile, strict=True):
-        np.testing.assert_array_equal(one, other)
-    assert first.value == again.value and first.iterations == again.iterations
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-7 * np.abs(one).max())
+    assert again.value == pytest.approx(first.value, rel=1e-9)
 
 
 def test_one_build_serves_all_phases(curves: tuple[Curve, ...]) -> None:
@@ -285,7 +288,13 @@ def test_small_dips_between_slack_nodes_are_lifted(
     curves: tuple[Curve, ...], phase: int, objective: str, intervals: int
 ) -> None:
     """A force that dips below its limit between nodes at which it is above."""
-    assert plan(curves[phase], objective, intervals).solves <= 6
+    chosen = plan(curves[phase], objective, intervals)
+    c_n = chosen.motion.evaluate(inner_times(chosen, np.linspace(0, 1, 41))).c_n
+    least = chosen.value if objective == "margin" else EPSILON
+    assert c_n.min() >= least - 1e-6
+    # The lift itself costs next to nothing, as a few nodes need it.
+    coarse = plan(curves[phase], objective).value
+    assert chosen.value == pytest.approx(coarse, rel=2e-3)
 
 
 # No plan: why, where and by how much.
@@ -382,8 +391,21 @@ def test_jamming_friction_is_named() -> None:
     assert caught.value.exit_status == 1
 
 
-def test_a_stuck_solver_does_not_blame_the_limits() -> None:
-    """Strong viscous drag on a fine grid takes Ipopt more iterations than it has."""
-    toy = Toy(constant(1.0, 0.0, 3.0))
-    with pytest.raises(SolverError, match=r"Ipopt stopped with .* although limits can be kept"):
-        toy.plan(intervals=320)
+class Stopped:
+    """A solver that gives up where it starts."""
+
+    def __call__(self, x0: Array, **_: Array) -> dict[str, Array]:
+        return {"x": x0}
+
+    def stats(self) -> dict[str, Any]:
+        return {"success": False, "return_status": "Maximum_Iterations_Exceeded"}
+
+
+def test_a_stuck_solver_does_not_blame_the_limits(monkeypatch: pytest.MonkeyPatch) -> None:
+    def build(contacts: int, intervals: int, goal: Objective, rolling: int = 0) -> PathNLP:
+        nlp = build_path_nlp(contacts, intervals, goal, rolling)
+        return replace(nlp, solver=Stopped()) if goal is Objective.TIME else nlp
+
+    monkeypatch.setattr(pathplan, "build_path_nlp", build)
+    with pytest.raises(SolverError, match=r"Ipopt stopped with Max.* although limits can be kept"):
+        Toy(constant(1.0, 0.0, 3.0)).plan(intervals=20)
