@@ -138,9 +138,8 @@ def turn(run: Replay, rows: Sequence[int]) -> Ending | None:
         s.look()
     stepped = steps_within(run, window)
     if stepped:
-        coast(run, run.breaks[run.piece + 1], hide=True)
+        coast_to_step(run, hide=True)
         run.drop()
-        run.next_piece()
     _flip(s, rows)
     for row in rows:
         _note_reversal(run, row, now)
@@ -165,10 +164,8 @@ def find_held(run: Replay, rows: Sequence[int]) -> list[int]:
 
 
 def steps_within(run: Replay, window: float) -> bool:
-    """Whether the torques step at the end of their present piece, and that is near."""
-    coming = run.piece + 1
-    steps = coming < len(run.steps_at) and bool(run.steps_at[coming])
-    return steps and run.breaks[coming] - run.t <= window
+    """Whether the torques step soon."""
+    return run.coming_step - run.t <= window
 
 
 def coast(run: Replay, stop: float, hide: bool) -> None:
@@ -184,6 +181,16 @@ def coast(run: Replay, stop: float, hide: bool) -> None:
         run.next_wanted += 1
     run.step_to(stop - run.t)
     run.accept(stop)
+
+
+def coast_to_step(run: Replay, hide: bool) -> None:
+    """Step to where the torques step next, as `coast` does, and go on to the piece from there."""
+    while True:
+        coast(run, run.breaks[run.piece + 1], hide)
+        if run.next_piece():
+            return
+        run.drop()
+        run.stepper.inputs[run.stepper.at.t] = run.t
 
 
 def _hold(run: Replay, row: int) -> Rested | Outcome:
@@ -217,8 +224,9 @@ def _bridge(run: Replay) -> list[int]:
     """
     s = run.stepper
     if steps_within(run, SETTLING):
-        _cross(run, run.breaks[run.piece + 1])
-        run.next_piece()
+        run.drop()
+        coast_to_step(run, hide=True)
+        run.drop()
         run.note(EventKind.TORQUE_STEP, f"the torques step {run.when()}")
         run.record()
         return []

@@ -11,12 +11,13 @@ from ..problem import End
 from .events import EventKind, Outcome, OutcomeKind
 from .jumps import (
     REACHED,
+    REST_WINDOW,
     SETTLING,
     SLOW,
     Arrival,
     Ending,
     Rested,
-    coast,
+    coast_to_step,
     let_go,
     look_again,
     slip,
@@ -111,10 +112,10 @@ def _pass_break(run: Replay) -> Ending | None:
     """Go on to the next piece of the torques."""
     s = run.stepper
     if _is_there(run, run.t):
-        arrival = Arrival(-float(s.outputs[s.to.until_rate]), SETTLING, _strikes(run))
-        if run.piece + 2 < len(run.breaks):
-            run.next_piece()
-        return arrival
+        rate, strikes = -float(s.outputs[s.to.until_rate]), _strikes(run)
+        # Before a step that is still to come, the torques are those of the phase that ends.
+        stepped = run.next_piece()
+        return Arrival(rate, SETTLING if stepped else REST_WINDOW, strikes)
     if run.t >= run.breaks[-1]:
         return run.run_out()
     if not run.next_piece():
@@ -195,6 +196,5 @@ def _pass_on(run: Replay) -> Arrival:
         if slowing > 0:
             window = min(max(2 * rate / slowing, SETTLING), LONGEST_WINDOW)
     if steps_within(run, window):
-        coast(run, run.breaks[run.piece + 1], hide=False)
-        run.next_piece()
+        coast_to_step(run, hide=False)
     return Arrival(rate, window, strikes)

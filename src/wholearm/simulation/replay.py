@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 
 import numpy as np
 
@@ -58,6 +59,7 @@ class Replay:
         self.breaks = [float(b) for b in torque.breaks]
         self.coefficients = torque.coefficients
         self.steps_at = _find_steps(torque)
+        self.step_times = [b for b, s in zip(self.breaks, self.steps_at, strict=False) if s]
         inside = wanted[(wanted >= self.breaks[0]) & (wanted <= self.breaks[-1])]
         self.wanted = [*inside.tolist(), math.inf]
         self.next_wanted = 0
@@ -190,6 +192,12 @@ class Replay:
         self.piece += 1
         self.load_piece()
         return bool(self.steps_at[self.piece])
+
+    @property
+    def coming_step(self) -> float:
+        """When the torques step next, after the present piece, or infinity [s]."""
+        k = bisect_left(self.step_times, self.breaks[self.piece + 1])
+        return self.step_times[k] if k < len(self.step_times) else math.inf
 
     def fraction(self, t: float) -> float:
         """Where time `t` is on the present piece, from -1 to 1."""

@@ -129,7 +129,8 @@ def _arrive(run: Replay, arrival: Arrival, following: Phase | None) -> Outcome |
     before = run.stored
     run.y[5:10] = 0.0
     run.impact += before - run.stored
-    coming = next((b for b in run.breaks if b > run.t), math.inf)
+    # The torques of the phase that has ended go on until they step, or end.
+    coming = min(run.coming_step, run.breaks[-1])
     run.hold = coming if coming - run.t <= arrival.window else run.t
     return None
 
@@ -174,9 +175,7 @@ def _rest(run: Replay) -> Departure | Arrival | Released | Outcome:
 
 def _settles(run: Replay, change: Collapse) -> bool:
     """Whether the torques step before a contact could part."""
-    coming = run.piece + 1
-    steps = coming < len(run.steps_at) and bool(run.steps_at[coming])
-    return steps and run.breaks[coming] - run.time(change.x) <= REST_WINDOW
+    return run.coming_step - run.time(change.x) <= REST_WINDOW
 
 
 def _advance(run: Replay, stop: float) -> None:
