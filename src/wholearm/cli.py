@@ -72,6 +72,12 @@ def build_parser() -> argparse.ArgumentParser:
     verify.add_argument("problem", help="problem file (TOML)")
     verify.add_argument("torques", help="trajectory file (.npz) or torques (.csv: t,tau1,tau2)")
     verify.add_argument("--tolerance", type=float, default=1e-9, help="of the simulator (1e-9)")
+    text = (
+        "how far the replay may be from the plan, over the object's radius of gyration, and in rad"
+    )
+    verify.add_argument("--departure", type=float, help=f"{text} (1e-3)")
+    text = "speed that passes for rest, over the root of that radius times gravity"
+    verify.add_argument("--rest-speed", type=float, help=f"{text} (2e-2)")
     verify.add_argument("--json", action="store_true", help="print the report as JSON")
 
     plot = _command(commands, "plot", _plot, "draw force margins, torques and snapshots")
@@ -193,9 +199,13 @@ def _verify(options: argparse.Namespace) -> int:
     from .outline import load
     from .verify import verify
 
-    tolerance = require_number(options.tolerance, "--tolerance", positive=True)
+    given = {
+        key: require_number(getattr(options, key), f"--{key.replace('_', '-')}", positive=True)
+        for key in ("tolerance", "departure", "rest_speed")
+        if getattr(options, key) is not None
+    }
     problem = load(options.problem)
-    report = verify(problem, _read_torques(options.torques), tolerance=tolerance)
+    report = verify(problem, _read_torques(options.torques), **given)
     _clear_progress()
     print(json.dumps(report.to_dict(), indent=2) if options.json else report.to_text())
     return report.exit_status

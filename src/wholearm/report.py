@@ -56,10 +56,21 @@ class SlipMargin:
 
 @dataclass(frozen=True)
 class Deviation:
-    """Largest difference between planned and simulated state: coordinates [m], angles [rad]."""
+    """Largest difference between planned and simulated state.
+
+    Attributes
+    ----------
+    position : float, [m]
+        Of the coordinates x and y.
+    angle : float, [rad]
+        Of phi and the joint angles.
+    time : float, [s]
+        When the larger of the two was, positions counting over the scene's length.
+    """
 
     position: float
     angle: float
+    time: float
 
 
 @dataclass(frozen=True)
@@ -82,6 +93,9 @@ class PhaseReport:
         When its end was reached, None if it was not.
     arrival_rate : float or None, [m/s or rad/s]
         How fast the distance to the end was closing then; None for a release.
+    end_speed : float or None, [m/s]
+        The largest speed left at an end at rest, angular ones times the scene's length; None where
+        the phase ends otherwise, or was not ended.
     impact : LeastImpulse or None
         None if there was no impact; one that is planned for may have been a stop.
     end_deviation, deviation : Deviation or None
@@ -96,6 +110,7 @@ class PhaseReport:
     rolling: tuple[SlipMargin, ...]
     arrival: float | None
     arrival_rate: float | None
+    end_speed: float | None
     impact: LeastImpulse | None
     end_deviation: Deviation | None
     deviation: Deviation | None
@@ -146,7 +161,7 @@ class Report:
     missed_by : float, [m or rad]
         Distance to the end of the last phase entered, NaN if that is a release.
     failures : tuple of str
-        Why the torques are not good, empty if they are.
+        Why the torques are not good, the most important first, empty if they are.
     warnings : tuple of str
         What is not asked for but worth knowing.
     phases : tuple of PhaseReport
@@ -175,6 +190,11 @@ class Report:
         return not self.failures
 
     @property
+    def reason(self) -> str:
+        """The one sentence behind the verdict: the first failure, or that the goal is reached."""
+        return self.failures[0] if self.failures else self.outcome
+
+    @property
     def exit_status(self) -> int:
         """Exit status of the command line: 0 or 1."""
         return 0 if self.ok else 1
@@ -182,12 +202,15 @@ class Report:
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain values for JSON, with None where there is no number."""
         plain = _plain(asdict(self))
-        return {"ok": self.ok, "exit_status": self.exit_status, **plain}
+        verdict = {"ok": self.ok, "exit_status": self.exit_status, "reason": self.reason}
+        return {**verdict, **plain}
 
     def to_text(self) -> str:
-        """Everything as aligned tables."""
-        parts = [f"{self.name}: {'ok' if self.ok else 'FAILED'}", self.outcome]
-        parts += [f"failure: {text}" for text in self.failures if text != self.outcome]
+        """The verdict with its reason, then everything else as aligned tables."""
+        parts = [f"{self.name}: {'ok' if self.ok else 'FAILED'}: {self.reason}"]
+        parts += [f"failure: {text}" for text in self.failures[1:]]
+        if self.outcome not in (*self.failures, self.reason):
+            parts.append(f"end of the replay: {self.outcome}")
         parts += [f"warning: {text}" for text in self.warnings]
         tables = [_contact_table, _rolling_table, _phase_table, _energy_table]
         parts += [line for table in tables for line in _after_blank(table(self))]
@@ -227,21 +250,28 @@ def _rolling_table(report: Report) -> list[str]:
 
 
 def _phase_table(report: Report) -> list[str]:
-    header = ["phase", "until", "end", "arrival [s]", "rate [m/s, rad/s]"]
+    header = ["phase", "until", "end", "arrival [s]", "rate [m/s, rad/s]", "left [m/s]"]
     planned = any(p.deviation is not None for p in report.phases)
     impacts = any(p.end == "impact" for p in report.phases)
     header += ["least impulse [N s]", "on"] if impacts else []
     header += ["end dev. [m]", "[rad]", "largest dev. [m]", "[rad]"] if planned else []
     rows = []
     for p in report.phases:
-        row = [str(p.number), p.until, p.end, _show(p.arrival, ".5f"), _show(p.arrival_rate, ".1e")]
+        row = [
+            str(p.number),
+            p.until,
+            p.end,
+            _show(p.arrival, ".5f"),
+            _show(p.arrival_rate, ".1e"),
+            _show(p.end_speed, ".1e"),
+        ]
         if impacts:
             row += [_show(p.impact.impulse, ".4f"), p.impact.contact] if p.impact else ["-", "-"]
         for deviation in (p.end_deviation, p.deviation) if planned else ():
             pair = (deviation.position, deviation.angle) if deviation else (None, None)
             row += [_show(value, ".1e") for value in pair]
         rows.append(row)
-    return _table(header, rows, {1, 2, 6} if impacts else {1, 2})
+    return _table(header, rows, {1, 2, 7} if impacts else {1, 2})
 
 
 def _energy_table(report: Report) -> list[str]:
