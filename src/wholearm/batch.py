@@ -6,6 +6,7 @@ import numpy as np
 
 from .contact import Expression
 from .model import Array
+from .sharing import exclusive
 
 SIZE = 64
 """Points per call. Larger needs more memory at no gain; smaller, more calls."""
@@ -38,6 +39,7 @@ class Batch:
             self._many.set_res(i, result.data)
             self._one.set_res(i, result[0].data)
 
+    @exclusive
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate at n points.
 

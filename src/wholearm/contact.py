@@ -32,6 +32,7 @@ import numpy as np
 
 from .errors import InputError
 from .model import Array, Scene
+from .sharing import retire_with
 
 Expression = Any
 """A CasADi SX expression (CasADi has no type stubs)."""
@@ -221,6 +222,7 @@ def build_features(scene: Scene) -> Features:
     """
     if scene not in _FEATURES:
         _FEATURES[scene] = _build_features(scene)
+        retire_with(scene, _FEATURES[scene])
     return _FEATURES[scene]
 
 

@@ -36,6 +36,9 @@ class InputError(WholearmError):
         self.problem = problem
         super().__init__(": ".join(part for part in (source, key, problem) if part))
 
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
+        return type(self), (self.source, self.key, self.problem)
+
 
 class InfeasibleError(WholearmError):
     """No motion satisfies the constraints; the message names constraint, phase and place."""

@@ -40,6 +40,7 @@ from .contact import (
 )
 from .errors import InputError
 from .model import Array, Scene
+from .sharing import Keeper, exclusive, kept_property
 from .slip import build_slip
 
 TOUCHING = 1e-7
@@ -70,7 +71,7 @@ class Kinematics(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Formation:
+class Formation(Keeper):
     """A contact formation of a scene.
 
     Parameters
@@ -135,7 +136,7 @@ class Formation:
         friction[list(self.rolling_rows)] = 0.0
         return friction
 
-    @cached_property
+    @kept_property
     def function(self) -> Expression:
         """CasADi function (z, v) -> (C, A, A_t, A' v), with n_c rows each."""
         z, v = build_features(self.scene).z, ca.SX.sym("v", 5)
@@ -146,7 +147,7 @@ class Formation:
         outputs = [gaps, A, A_t, ca.jtimes(A @ v, z, v)]
         return ca.Function("formation", [z, v], [ca.densify(part) for part in outputs])
 
-    @cached_property
+    @kept_property
     def roll_function(self) -> Expression:
         """CasADi function (z, v) -> (slip coordinates [m], A_t' v), one row per rolling contact."""
         z, v = build_features(self.scene).z, ca.SX.sym("v", 5)
@@ -170,15 +171,15 @@ class Formation:
         P = ca.vertcat(A, A_t[list(self.rolling_rows), :])
         return ca.vertcat(C, slip), P, ca.vertcat(A_dot_v, bend), A_t
 
-    @cached_property
+    @kept_property
     def _batch(self) -> Batch:
         return Batch(self.function)
 
-    @cached_property
+    @kept_property
     def _roll_batch(self) -> Batch:
         return Batch(self.roll_function)
 
-    @cached_property
+    @kept_property
     def limits(self) -> tuple[Limit, ...]:
         """Where this formation stops being valid, for every contact and every other feature."""
         limits = [limit for c in self.contacts for limit in build_limits(c, self.scene)]
@@ -208,13 +209,13 @@ class Formation:
             limits.append(build_clearance(contact, self.scene, bool(on_side)))
         return limits
 
-    @cached_property
+    @kept_property
     def limit_function(self) -> Expression:
         """CasADi function z -> values of `limits`, shape (n_limits,) [m]."""
         values = ca.vertcat(*(limit.value for limit in self.limits))
         return ca.Function("limits", [build_features(self.scene).z], [ca.densify(values)])
 
-    @cached_property
+    @kept_property
     def _limit_batch(self) -> Batch:
         return Batch(self.limit_function)
 
@@ -243,6 +244,7 @@ class Formation:
         """Values of `limits` at n configurations, shape (n, n_limits) [m]."""
         return self._limit_batch(z)[0][..., 0]
 
+    @exclusive
     def evaluate_gap(self, contact: Contact, z: Array) -> Array:
         """C-function of any contact of the scene at n configurations, shape (n,) [m]."""
         function = ca.Function(
@@ -311,6 +313,7 @@ def close_finger(scene: Scene, q: Array, finger: int) -> float:
     return (outside if finger == 0 else math.pi - outside) + sign * min(swept)
 
 
+@exclusive
 def find_touching(scene: Scene, z: Array) -> tuple[Contact, ...]:
     """Return the contacts whose gap is below `TOUCHING` at `z`, in the order palm, finger 1, 2."""
     touching = []

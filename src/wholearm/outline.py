@@ -13,6 +13,7 @@ from .formation import TOUCHING, Formation
 from .model import Array
 from .path import require_touching, runs_on_curve, trace_phase, trace_phases
 from .problem import Phase, Problem, read_problem
+from .sharing import exclusive
 
 POINTS = 25
 """Configurations along an outline."""
@@ -28,6 +29,7 @@ _STEP = 1e-6
 """Step of the differences that give the gradients of limits [m or rad]."""
 
 
+@exclusive
 def load(path: str) -> Problem:
     """Read a problem file and check that every phase can be carried out geometrically.
 

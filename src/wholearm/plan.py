@@ -25,6 +25,7 @@ from .pathdomain.chain import Chain, make_chain
 from .pathdomain.chainplan import add_up, assess, combine, plan_chain
 from .phaseplan import PhasePlan
 from .problem import End, Phase, Problem
+from .sharing import exclusive
 from .torque import TorqueProfile
 from .trajectory import Motion, Trajectory, assemble
 from .transition import Transition
@@ -69,6 +70,7 @@ def solve(
     return solve_with(problem, PlanOptions(objective=objective, **options), progress)
 
 
+@exclusive
 def solve_with(
     problem: Problem, options: PlanOptions, progress: Callable[[str], None] | None = None
 ) -> Trajectory:

@@ -31,6 +31,7 @@ from .files import write_whole
 from .model import Array, Finger, Scene, require_number
 from .plotdata import choose_snapshots, cone_shares, find_steps, sample_torques
 from .problem import build_problem
+from .sharing import exclusive
 from .torque import TorqueProfile
 from .trajectory import Trajectory
 
@@ -72,6 +73,7 @@ class ContactStyle(NamedTuple):
 Styles = Mapping[str, ContactStyle]
 
 
+@exclusive
 def force_margins(trajectory: Trajectory, *, simulation: Simulation | None = None) -> Figure:
     """Draw a plan: snapshots, the force margin of every contact, and the torques.
 
@@ -141,6 +143,7 @@ def require_format(path: str | os.PathLike[str]) -> str:
     return ending
 
 
+@exclusive
 def save(figure: Figure, path: str | os.PathLike[str]) -> None:
     """Write a figure as PNG, PDF or SVG, by the ending of `path`; equal figures, equal bytes.
 
@@ -196,6 +199,7 @@ def place_vertices(scene: Scene, z: Array) -> Array:
     return np.asarray(z[:2] + scene.polygon.vertices @ np.array([[c, s], [-s, c]]))
 
 
+@exclusive
 def place_contacts(scene: Scene, z: Array, contacts: Sequence[str]) -> Array:
     """World positions of contacts, shape (n_c, 2) [m]."""
     points = [build_geometry(parse_contact(name, scene), scene).point for name in contacts]

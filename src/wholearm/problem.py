@@ -18,6 +18,7 @@ from .contact import Contact, parse_contact
 from .errors import InputError
 from .formation import Formation, close_finger, describe, find_touching, place_flush
 from .model import Array, Finger, Friction, Polygon, Scene, require_number
+from .sharing import exclusive
 
 _T = TypeVar("_T")
 
@@ -171,6 +172,7 @@ def read_problem(path: str) -> Problem:
         raise InputError(str(path), error.key, error.problem) from None
 
 
+@exclusive
 def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
     """Validate a problem given as the nested tables of a problem file."""
     _check_keys(table, "", _TOP, required=_TOP - {"name", "gravity"})

@@ -11,6 +11,7 @@ from .margins import list_contact_margins, list_slip_margins
 from .model import Array
 from .problem import End, Phase, Problem
 from .report import Deviation, EnergyBalance, LeastImpulse, PhaseReport, Report
+from .sharing import exclusive
 from .simulation.events import Event, EventKind, Simulation
 from .simulation.simulate import simulate
 from .torque import TorqueProfile
@@ -31,6 +32,7 @@ SAMPLES = 2000
 """About how many instants normal forces are looked at, besides the simulation's own steps."""
 
 
+@exclusive
 def verify(
     problem: Problem,
     what: Trajectory | TorqueProfile,

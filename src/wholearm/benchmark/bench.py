@@ -26,6 +26,7 @@ from ..pathdomain.pathnlp import build_path_nlp
 from ..pathdomain.pathplan import guess, plan_path
 from ..plan import solve
 from ..problem import End, Problem, read_problem
+from ..sharing import exclusive
 from ..simulation.events import Simulation
 from ..simulation.simulate import simulate
 from ..torque import TorqueProfile
@@ -45,6 +46,7 @@ BASELINE_INTERVALS = 40
 REPEATS = 3
 
 
+@exclusive
 def run_bench(
     problem: Problem, folder: str, progress: Callable[[str], None] | None = None
 ) -> list[str]:

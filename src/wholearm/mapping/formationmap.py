@@ -16,6 +16,7 @@ from ..errors import InputError
 from ..formation import TOUCHING
 from ..model import Array, Scene
 from ..problem import Problem
+from ..sharing import exclusive
 from .borders import NOWHERE, Piece, Window, label_cells, label_closed, list_tracks, name_contacts
 from .closing import Flags, Numbers, close, contact_table, full_formation, lower
 from .pieces import cut
@@ -128,6 +129,7 @@ class FormationMap:
     possible: Flags
 
 
+@exclusive
 def build_map(
     problem: Problem,
     resolution: int = 200,
@@ -187,6 +189,7 @@ def build_map(
     )
 
 
+@exclusive
 def choose_window(problem: Problem, phi_deg: tuple[float, float] | None = None) -> Window:
     """All x that both fingers reach, and phi one flush angle beyond what the phases cover.
 

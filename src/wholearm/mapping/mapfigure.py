@@ -20,6 +20,7 @@ from scipy import ndimage
 from ..contact import Contact
 from ..model import Array
 from ..plots import _STYLE
+from ..sharing import exclusive
 from ..trajectory import Trajectory
 from .closing import Flags, Numbers
 from .formationmap import Border, FormationMap
@@ -40,6 +41,7 @@ _LETTER, _HEIGHT = 4.4, 9.0
 """Size of a letter of a label [points]."""
 
 
+@exclusive
 def draw_map(chart: FormationMap, plan: Trajectory | None = None) -> Figure:
     """Draw a contact-formation map.
 

@@ -14,6 +14,7 @@ from ..model import Array, Scene
 from ..outline import outline_phase
 from ..path import trace_phases
 from ..problem import Problem, Until
+from ..sharing import exclusive
 from .borders import (
     Piece,
     Track,
@@ -66,6 +67,7 @@ class Stretch:
         return f"[[phases]]\ncontacts = [{names}]\nuntil = {end}\n"
 
 
+@exclusive
 def list_formations(problem: Problem, *poses: Sequence[float]) -> list[Stretch]:
     """List the contact formations along a route of straight legs.
 

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 
 from ..errors import InputError, JammingError, SimulationError
 from ..problem import End, Phase, Problem
+from ..sharing import exclusive
 from ..torque import TorqueProfile
 from .events import EventKind, Outcome, OutcomeKind, Simulation, collect
 from .jumps import REACHED, REST_WINDOW, Arrival, Ending, Released, Rested
@@ -34,6 +35,7 @@ from .sticking import Collapse, Rest, find_rest
 from .transitions import collide, enter, go_on, set_off
 
 
+@exclusive
 def simulate(
     problem: Problem,
     torque: TorqueProfile,

@@ -13,6 +13,7 @@ from ..curve import metric_weights
 from ..dynamics import Directions, build_forward, split_forces
 from ..formation import Formation
 from ..model import Array
+from ..sharing import Keeper, kept_property
 from ..torque import TorqueProfile
 from ..trajectory import Samples
 from .collocation import Scheme
@@ -25,7 +26,7 @@ _SWEEPS = 6
 
 
 @dataclass(frozen=True, eq=False)
-class StageMotion:
+class StageMotion(Keeper):
     """One stage as a function of time.
 
     tau is linear in each interval. z is what it leads to from the interval's start, pulled onto
@@ -65,7 +66,7 @@ class StageMotion:
         coefficients = np.stack([(first + last) / 2, (last - first) / 2], axis=2)
         return TorqueProfile(self.breaks, coefficients)
 
-    @cached_property
+    @kept_property
     def _forward(self) -> Batch:
         return Batch(build_forward(self.formation))
 

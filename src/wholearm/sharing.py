@@ -1,0 +1,118 @@
+"""One thread at a time: CasADi counts references, and keeps tables, without locks of its own.
+
+Its wrapper lets other threads run during every call, even while an object is deleted. So whatever
+uses CasADi holds one lock (`exclusive`, `kept_property`), and what it leaves behind is never
+deleted outside of it: values that objects keep are set aside when their owners go (`retire_with`),
+and an error that leaves the package takes no local variables along.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable
+from functools import wraps
+from threading import RLock
+from typing import Any, Generic, ParamSpec, TypeVar, overload
+from weakref import finalize
+
+_T = TypeVar("_T")
+_P = ParamSpec("_P")
+
+LOCK = RLock()
+"""Held by whoever uses CasADi."""
+_retired: deque[object] = deque()
+"""Values whose owners are gone, to be deleted by the next holder of the lock."""
+
+if hasattr(os, "register_at_fork"):
+    # A child process must not start from the middle of another thread's call.
+    os.register_at_fork(
+        before=LOCK.acquire, after_in_parent=LOCK.release, after_in_child=LOCK.release
+    )
+
+
+def exclusive(function: Callable[_P, _T]) -> Callable[_P, _T]:
+    """Make a function hold the lock; it may call others that do."""
+
+    @wraps(function)
+    def run(*args: _P.args, **kwargs: _P.kwargs) -> _T:
+        with LOCK:
+            _retired.clear()
+            try:
+                return function(*args, **kwargs)
+            except BaseException as error:
+                _drop_locals(error)
+                raise
+            finally:
+                _retired.clear()
+
+    return run
+
+
+class kept_property(Generic[_T]):  # noqa: N801 -- used like cached_property
+    """A cached property made of CasADi objects: computed and deleted under the lock.
+
+    Its value must not refer to the object that it belongs to, which would then live for ever.
+    """
+
+    def __init__(self, compute: Callable[[Any], _T]) -> None:
+        self._compute = compute
+        self.__doc__ = compute.__doc__
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> kept_property[_T]: ...
+    @overload
+    def __get__(self, instance: object, owner: type) -> _T: ...
+    def __get__(self, instance: object | None, owner: type) -> kept_property[_T] | _T:
+        if instance is None:
+            return self
+        with LOCK:
+            # Another thread may have come first.
+            if self._name not in instance.__dict__:
+                value = exclusive(self._compute)(instance)
+                retire_with(instance, value)
+                instance.__dict__[self._name] = value
+            kept: _T = instance.__dict__[self._name]
+            return kept
+
+
+class Keeper:
+    """An object with kept properties: pickled and copied without them, to be computed anew."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        kind = type(self)
+        return {
+            name: value
+            for name, value in self.__dict__.items()
+            if not isinstance(getattr(kind, name, None), kept_property)
+        }
+
+
+def retire_with(owner: object, value: object) -> None:
+    """Have `value` set aside, and not deleted, when its owner is."""
+    finalize(owner, _retired.append, value).atexit = False
+
+
+def _drop_locals(error: BaseException) -> None:
+    """Delete the local variables of all finished calls that an error and its causes came through.
+
+    They may hold CasADi objects, and the error is dropped where nobody holds the lock.
+    """
+    seen: set[int] = set()
+    pending: list[BaseException | None] = [error]
+    while pending:
+        one = pending.pop()
+        if one is None or id(one) in seen:
+            continue
+        seen.add(id(one))
+        pending += [one.__cause__, one.__context__]
+        trace = one.__traceback__
+        while trace is not None:
+            try:
+                trace.tb_frame.clear()
+            except RuntimeError:
+                pass  # still running: it has its variables anyway
+            trace = trace.tb_next
