@@ -12,6 +12,7 @@ from scipy.optimize import linprog
 
 import wholearm
 from conftest import HEPTAGON
+from crossing import hexagon, measure_fingers
 from plane import finger_gap, make_scene, place_corners, point_to_segment
 from wholearm.cli import main
 from wholearm.curve import Curve
@@ -19,7 +20,14 @@ from wholearm.errors import InputError
 from wholearm.formation import Formation, close_finger
 from wholearm.mapping.borders import NOWHERE, label_cells
 from wholearm.mapping.closing import close, contact_table, first_contact
-from wholearm.mapping.formationmap import Border, FormationMap, Window, build_map, list_formations
+from wholearm.mapping.formationmap import (
+    CROSSED,
+    Border,
+    FormationMap,
+    Window,
+    build_map,
+    list_formations,
+)
 from wholearm.mapping.route import format_route
 from wholearm.model import Array, Scene
 from wholearm.problem import Problem, build_problem
@@ -380,6 +388,39 @@ def test_routes_that_cannot_be_followed_are_named(heptagon: Problem) -> None:
     x = -0.06368782401
     with pytest.raises(InputError, match="crossing"):
         list_formations(heptagon, (x - 0.01, phi - 0.1), (x + 0.01, phi + 0.1))
+
+
+@pytest.fixture(scope="module")
+def crossed() -> FormationMap:
+    """Long fingers that meet over the hexagon."""
+    problem = hexagon((0.19, 0.19), -0.085)
+    return build_map(problem, 90, Window((-0.1, 0.1), (np.radians(-30.0), np.radians(30.0))))
+
+
+def test_places_where_the_fingers_overlap_are_marked(crossed: FormationMap) -> None:
+    scene = crossed.problem.scene
+    x, phi = (part.ravel() for part in np.meshgrid(crossed.x, crossed.phi))
+    overlap = (measure_fingers(scene, close(scene, x, phi).z) < 0).reshape(crossed.cell.shape)
+    np.testing.assert_array_equal(crossed.cell == CROSSED, overlap)
+    assert 20 < overlap.sum() < overlap.size / 4
+
+
+def test_borders_end_where_the_fingers_touch(crossed: FormationMap) -> None:
+    scene = crossed.problem.scene
+    gaps = [measure_fingers(scene, border.z) for border in crossed.borders]
+    assert min(gap.min() for gap in gaps) > -1e-9
+    ends = [gap[k] for gap in gaps for k in (0, -1)]
+    assert np.sum(np.abs(ends) < 1e-9) >= 4
+
+
+def test_a_route_into_touching_fingers_says_so() -> None:
+    problem = hexagon((0.19, 0.19), -0.085)
+    with pytest.raises(InputError, match=r"cannot be followed .*: finger 1 touches finger 2"):
+        list_formations(problem, (0.065, 0.0), (-0.05, 0.0))
+    with pytest.raises(InputError, match="finger 1 touches finger 2"):
+        list_formations(problem, (0.02, -0.02), (-0.03, 0.03))
+    free = hexagon((0.19, 0.19), -0.085, solid=False)
+    assert len(list_formations(free, (0.065, 0.0), (-0.05, 0.0))) == 4
 
 
 def test_map_needs_a_sound_grid_and_some_reach(heptagon: Problem) -> None:

@@ -8,13 +8,16 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
+from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from matplotlib.text import Text
 
 from conftest import HEPTAGON
+from crossing import hexagon
 from wholearm import plots
 from wholearm.cli import main
-from wholearm.mapping.formationmap import FormationMap, build_map
+from wholearm.mapping.formationmap import FormationMap, Window, build_map
 from wholearm.mapping.mapfigure import draw_map
 from wholearm.problem import Problem
 from wholearm.trajectory import Trajectory
@@ -130,3 +133,20 @@ def test_command_writes_the_figure(
     captured = capsys.readouterr()
     assert captured.out.startswith("# from x = 45 mm") and captured.err == "wrote m.pdf\n"
     assert (tmp_path / "m.pdf").read_bytes()[:4] == b"%PDF"
+
+
+def test_overlap_of_the_fingers_has_its_own_hatching(figure: Figure) -> None:
+    window = Window((-0.06, 0.05), (np.radians(-15.0), np.radians(15.0)))
+    drawn = draw_map(build_map(hexagon((0.19, 0.19), -0.085), 60, window))
+    label = "the fingers would overlap"
+    assert label in texts(drawn) and label not in texts(figure)
+    legend = drawn.legends[0]
+    looks = {
+        text.get_text(): patch
+        for text, patch in zip(legend.get_texts(), legend.legend_handles, strict=True)
+    }
+    (crossed,) = [c for c in drawn.axes[0].collections if isinstance(c, QuadContourSet)]
+    own, other = looks[label], looks["cannot be reached"]
+    assert isinstance(own, Patch) and isinstance(other, Patch)
+    assert crossed.hatches == [own.get_hatch()] != [other.get_hatch()]
+    np.testing.assert_array_equal(crossed.get_facecolor()[0], own.get_facecolor())

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from crossing import hexagon, measure_fingers
 from plane import (
     SQUARE,
     convex_polygon,
@@ -42,6 +43,7 @@ def make_problem(scene: Scene, flush: int, x: float, *phases: tuple[str, Any]) -
     return build_problem(
         {
             "epsilon": 0.05,
+            "fingers_collide": scene.fingers_collide,
             "object": {
                 "vertices": np.asarray(scene.polygon.points).tolist(),
                 "mass": scene.polygon.mass,
@@ -59,6 +61,7 @@ def make_problem(scene: Scene, flush: int, x: float, *phases: tuple[str, Any]) -
 def stationary(heptagon: Problem) -> Curve:
     """A flip during which joint 1 stops and turns back: P_AI is singular there."""
     scene = make_scene(np.asarray(heptagon.scene.polygon.points), base=0.12, length=0.25)
+    scene = replace(scene, fingers_collide=False)
     problem = make_problem(
         scene,
         1,
@@ -271,7 +274,7 @@ def test_early_ending_says_what_and_where(
     length: float, contact: str, goal: float, text: str, x: float
 ) -> None:
     """A square slides on the palm; where it must stop is worked out by hand."""
-    scene = make_scene(SQUARE, lengths=(length, 0.25))
+    scene = replace(make_scene(SQUARE, lengths=(length, 0.25)), fingers_collide=False)
     problem = make_problem(scene, 0, 0.0, (f"{LEFT_V3} {contact}", {"x": goal}))
     with pytest.raises(InputError) as caught:
         trace_phases(problem)
@@ -299,7 +302,7 @@ def test_a_tip_is_reached_and_gone_round(
     length: float, contact: str, until: str, follower: str
 ) -> None:
     """From the side or an edge onto the tip's arc, and on until the arc ends."""
-    scene = make_scene(SQUARE, lengths=(length, 0.25))
+    scene = replace(make_scene(SQUARE, lengths=(length, 0.25)), fingers_collide=False)
     problem = make_problem(scene, 0, 0.0, (f"{LEFT_V3} {contact}", until))
     (first,) = trace_phases(problem)
     assert (first.reached and until in first.ending) or "runs off" in first.ending
@@ -341,6 +344,8 @@ def test_random_hands_give_valid_curves(seed: int) -> None:
             z = np.array([*q, close_finger(scene, q, 0), close_finger(scene, q, 1)])
         except InputError:
             continue
+        # Hands that are crossed from the start are for fingers that pass each other.
+        scene = replace(scene, fingers_collide=bool(measure_fingers(scene, z[None])[0] > 0))
         formation = Formation(scene, find_touching(scene, z))
         if formation.n_contacts != 4:
             continue
@@ -348,9 +353,28 @@ def test_random_hands_give_valid_curves(seed: int) -> None:
             curve = trace_curve(formation, z, heading, NEVER)
             assert not curve.reached and curve.length > 0
             check_clear(curve)
+            if scene.fingers_collide:
+                along = curve.evaluate(np.linspace(0.0, curve.length, 40)).z
+                assert measure_fingers(scene, along).min() > -1e-9
             limits = formation.evaluate_limits(curve.end[None])[0]
             ended = [k for k, limit in enumerate(formation.limits) if limit.text in curve.ending]
             assert len(ended) == 1 and abs(limits[ended[0]]) < 1e-12
             assert limits.min() > -1e-11
             traced += 1
     assert traced > 0
+
+
+def test_fingers_that_touch_end_a_curve() -> None:
+    """Halfway through the hexagon's slide."""
+    problem = hexagon()
+    with pytest.raises(InputError, match=r"one way finger 1 touches finger 2 at x = 1\.05. mm"):
+        trace_phases(problem)
+    passing = trace_phases(hexagon(solid=False))
+    s = np.linspace(0.0, passing[2].length, 50)
+    assert measure_fingers(problem.scene, passing[2].evaluate(s).z).min() < -1e-4
+    phase, start = problem.phases[2], passing[2].start
+    curve = trace_curve(phase.formation, start, passing[2].panels[0].z_s[0], phase.until)
+    assert not curve.reached and curve.ending.startswith("finger 1 touches finger 2 at x = ")
+    s = np.linspace(0.0, curve.length, 50)
+    gaps = measure_fingers(problem.scene, curve.evaluate(s).z)
+    assert gaps[-1] == pytest.approx(0.0, abs=1e-9) and (gaps[:-1] > 0).all()

@@ -147,6 +147,8 @@ ALLOWED_UNTIL = "allowed are a contact name"
         (put("epsilon", math.nan), "epsilon", "finite"),
         (put("epsilon", True), "epsilon", "True"),
         (put("gravity", -9.81), "gravity", ">= 0"),
+        (put("fingers_collide", 0), "fingers_collide", "0 given; allowed are true and false"),
+        (put("fingers.collide", False), "fingers.collide", "unknown key"),
         (put("object", 3), "object", "not a table"),
         (put("object.mass", -0.2), "object.mass", "positive"),
         (put("object.mass", math.nan), "object.mass", "finite"),
@@ -297,3 +299,29 @@ def test_never_reached_says_what_stops_it_both_ways(tmp_path: Path) -> None:
         load(str(path))
     assert "v6 touches finger 2 at x = -19.91 mm" in caught.value.problem
     assert "v2 touches finger 1 at x = 16.68 mm" in caught.value.problem
+
+
+@pytest.mark.parametrize("solid", [None, True, False])
+def test_fingers_may_lie_in_different_planes(solid: bool | None) -> None:
+    problem = read_edited(lambda table: solid is None or put("fingers_collide", solid)(table))
+    assert problem.scene.fingers_collide is (solid is not False)
+
+
+def test_a_hand_that_is_crossed_at_the_start_is_refused() -> None:
+    """Long links close over an object in the middle, unless they pass each other."""
+
+    def cross(table: dict[str, Any]) -> None:
+        table["start"]["x"] = 0.0
+        for finger in table["fingers"].values():
+            finger["length"] = 0.3
+
+    with pytest.raises(InputError, match=r"into each other: their gap is -0\.0") as caught:
+        read_edited(cross)
+    assert caught.value.key == "start.x" and "allowed is 0 or more" in caught.value.problem
+
+    def pass_by(table: dict[str, Any]) -> None:
+        cross(table)
+        table["fingers_collide"] = False
+        table["phases"] = table["phases"][1:2]
+
+    assert read_edited(pass_by).start[0] == 0.0

@@ -8,7 +8,9 @@ import sys
 import numpy as np
 import pytest
 
+from crossing import HEXAGON, hexagon, measure_fingers
 from planned import CosineMotion, change, plan
+from timed import fastest
 from wholearm.benchmark.baseline_simulation import simulate_with_scipy, solve_motion
 from wholearm.contact import parse_contact
 from wholearm.dynamics import Directions, forward
@@ -372,6 +374,21 @@ def test_another_limit_ends_the_motion() -> None:
     assert simulation.outcome.kind is OutcomeKind.LIMIT_REACHED
     assert "v6 touches finger 2" in simulation.outcome.text
     assert np.abs(simulation.z[-1] - motion.curve.end).max() < 1e-7
+
+
+@pytest.mark.parametrize("solid", [True, False])
+def test_fingers_that_touch_end_the_motion(solid: bool) -> None:
+    """The hexagon's plan replayed by a hand with a longer left finger."""
+    problem = hexagon(solid=solid)
+    simulation = simulate(problem, fastest(HEXAGON).torque)
+    gaps = measure_fingers(problem.scene, simulation.z)
+    if not solid:
+        assert simulation.outcome.reached and gaps.min() < -1e-4
+        return
+    assert simulation.outcome.kind is OutcomeKind.LIMIT_REACHED
+    assert simulation.outcome.text.startswith("finger 1 touches finger 2 at t = ")
+    assert simulation.outcome.text.endswith("phase 3")
+    assert abs(gaps[-1]) < 2e-6 and gaps[:-1].min() > -1e-9
 
 
 def test_until_may_be_a_coordinate() -> None:

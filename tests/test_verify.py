@@ -8,10 +8,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from crossing import HEXAGON, hexagon, measure_fingers
 from planned import change, plan
+from timed import fastest
 from tipping import box, scale, tipped
 from wholearm.errors import InputError
 from wholearm.model import Array
+from wholearm.outline import load
 from wholearm.simulation.simulate import simulate
 from wholearm.torque import TorqueProfile
 from wholearm.verify import verify
@@ -253,3 +256,30 @@ def test_a_slip_fails(later: float) -> None:
     assert text.startswith("v1-palm slips: |c_t| = ") and " mu c_n = " in text
     assert text.endswith(f"at t = {margin.time:.5g} s, phase 2")
     assert margin.least < 1e-9 and start - 1e-5 <= margin.time < starts[2]
+
+
+def test_the_least_gap_of_the_fingers_is_reported() -> None:
+    problem, plan_ = load(str(HEXAGON)), fastest(HEXAGON)
+    report = verify(problem, plan_)
+    assert report.ok and report.finger_gap is not None
+    motions = zip(plan_.motions, plan_.phase_starts, strict=False)
+    instants = [(start + np.linspace(0, m.duration, 4001), m) for m, start in motions]
+    z = np.concatenate([m.evaluate(t - t[0]).z for t, m in instants])
+    gaps = measure_fingers(problem.scene, z)
+    assert report.finger_gap.least == pytest.approx(gaps.min(), abs=1e-7) and gaps.min() > 1e-3
+    when = np.concatenate([t for t, _ in instants])[gaps.argmin()]
+    assert report.finger_gap.time == pytest.approx(when, abs=1e-3)
+    text = f"least gap of the fingers: {gaps.min():.4f}"
+    assert text in report.to_text()
+    values = json.loads(json.dumps(report.to_dict()))["finger_gap"]
+    assert values == {"least": report.finger_gap.least, "time": report.finger_gap.time}
+
+
+def test_fingers_that_touch_fail() -> None:
+    report = verify(hexagon(), fastest(HEXAGON))
+    assert not report.ok and report.finger_gap is not None
+    assert report.failures[0].startswith("finger 1 touches finger 2 at t = ")
+    assert report.finger_gap.least < 1e-6
+    passing = verify(hexagon(solid=False), fastest(HEXAGON))
+    assert passing.ok and passing.finger_gap is None
+    assert "gap of the fingers" not in passing.to_text()

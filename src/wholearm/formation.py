@@ -39,6 +39,7 @@ from .contact import (
     candidate_contacts,
 )
 from .errors import InputError
+from .links import build_finger_limit
 from .model import Array, Scene
 from .sharing import Keeper, exclusive, kept_property
 from .slip import build_slip
@@ -181,11 +182,14 @@ class Formation(Keeper):
 
     @kept_property
     def limits(self) -> tuple[Limit, ...]:
-        """Where this formation stops being valid, for every contact and every other feature."""
+        """Where this formation stops being valid.
+
+        For every contact, for every other feature of object and hand, and between the links.
+        """
         limits = [limit for c in self.contacts for limit in build_limits(c, self.scene)]
         for finger in (None, 0, 1):
             limits += self._clearances(finger)
-        return tuple(limits)
+        return tuple(limits + build_finger_limit(self.scene))
 
     def _clearances(self, finger: int | None) -> list[Limit]:
         held = [contact for contact in self.contacts if contact.finger == finger]

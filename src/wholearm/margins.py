@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cones import slip_margins
-from .model import Array
+from .links import evaluate_finger_gap
+from .model import Array, Scene
 from .problem import Phase, Problem
-from .report import ContactMargin, SlipMargin
+from .report import ContactMargin, FingerGap, SlipMargin
 from .simulation.events import EventKind, Simulation
 from .simulation.jumps import SETTLING
 
@@ -51,6 +52,13 @@ def list_slip_margins(
             least, time = slipped[name].value, slipped[name].time
         margins.append(SlipMargin(name, least, time))
     return tuple(margins)
+
+
+def find_finger_gap(scene: Scene, simulation: Simulation, breaks: Array) -> FingerGap | None:
+    """Least gap between the links in a replay; None if they pass each other."""
+    if not scene.fingers_collide:
+        return None
+    return FingerGap(*find_least(simulation.t, evaluate_finger_gap(scene, simulation.z), breaks))
 
 
 def find_least(t: Array, values: Array, breaks: Array) -> tuple[float, float]:

@@ -274,20 +274,34 @@ class Scales(NamedTuple):
 class Scene:
     """Everything that does not move by plan: object, both fingers, friction and gravity.
 
+    Parameters
+    ----------
+    polygon : Polygon
+    fingers : (Finger, Finger)
+        The right one, then the left one.
+    friction : Friction
+    gravity : float, [m/s^2]
+    fingers_collide : bool
+        Whether the links are solid to each other; False for fingers in different planes.
+
     Raises
     ------
     InputError
-        If finger 1 is not to the right of finger 2.
+        If finger 1 is not to the right of finger 2, or a value is not of its type.
     """
 
     polygon: Polygon
     fingers: tuple[Finger, Finger]
     friction: Friction
     gravity: float = 9.81
+    fingers_collide: bool = True
 
     def __post_init__(self) -> None:
         value = require_number(self.gravity, "gravity", nonnegative=True)
         object.__setattr__(self, "gravity", value)
+        if not isinstance(self.fingers_collide, bool):
+            given = f"{self.fingers_collide!r} given; allowed are true and false"
+            raise InputError("", "fingers_collide", given)
         right, left = (np.asarray(finger.base) for finger in self.fingers)
         if right[0] <= left[0]:
             raise InputError(

@@ -28,6 +28,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from .contact import build_features, build_geometry, parse_contact
 from .errors import InputError
 from .files import write_whole
+from .links import evaluate_finger_gap
 from .model import Array, Finger, Scene, require_number
 from .plotdata import choose_snapshots, cone_shares, find_steps, sample_torques
 from .problem import build_problem
@@ -130,7 +131,7 @@ def force_margins(trajectory: Trajectory, *, simulation: Simulation | None = Non
             axes.tick_params(labelbottom=False)
         figure.align_ylabels(panels)
         look: Any = {"fontsize": 10.5, "fontweight": "bold", "parse_math": False}
-        title = _title(trajectory, epsilon)
+        title = _title(trajectory, problem.scene, epsilon)
         figure.text(0.2 / SIZE[0], 1 - 0.12 / SIZE[1], title, va="top", **look)
     return figure
 
@@ -397,8 +398,11 @@ def _place(*inches: float) -> Any:
     return tuple(np.array(inches) / (SIZE + SIZE))
 
 
-def _title(trajectory: Trajectory, epsilon: float) -> str:
-    parts = [textwrap.shorten(str(trajectory.meta.get("name", "")), 50, placeholder="\u2026")]
+def _title(trajectory: Trajectory, scene: Scene, epsilon: float) -> str:
+    parts = [textwrap.shorten(str(trajectory.meta.get("name", "")), 36, placeholder="\u2026")]
     parts.append(f"objective {trajectory.meta.get('objective', 'unknown')}")
     parts += [f"duration {trajectory.duration:.4g} s", f"\u03b5 = {epsilon:g} N"]
+    if scene.fingers_collide:
+        gap = 1e3 * float(evaluate_finger_gap(scene, trajectory.z).min())
+        parts.append(f"finger gap \u2265 {gap:.3g} mm".replace("-", "\u2212"))
     return "  \u00b7  ".join(filter(None, parts))

@@ -16,7 +16,8 @@ import numpy as np
 
 from .contact import Contact, parse_contact
 from .errors import InputError
-from .formation import Formation, close_finger, describe, find_touching, place_flush
+from .formation import TOUCHING, Formation, close_finger, describe, find_touching, place_flush
+from .links import evaluate_finger_gap
 from .model import Array, Finger, Friction, Polygon, Scene, require_number
 from .sharing import exclusive
 
@@ -25,7 +26,8 @@ _T = TypeVar("_T")
 ROLLING = " rolling"
 """Follows the name of a contact that rolls in a phase's `contacts`."""
 
-_TOP = {"name", "epsilon", "gravity", "object", "fingers", "friction", "start", "phases"}
+_OPTIONAL = {"name", "gravity", "fingers_collide"}
+_TOP = _OPTIONAL | {"epsilon", "object", "fingers", "friction", "start", "phases"}
 _OBJECT = {"vertices", "mass", "inertia"}
 _FINGER = {
     "base": True,
@@ -175,7 +177,7 @@ def read_problem(path: str) -> Problem:
 @exclusive
 def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
     """Validate a problem given as the nested tables of a problem file."""
-    _check_keys(table, "", _TOP, required=_TOP - {"name", "gravity"})
+    _check_keys(table, "", _TOP, required=_TOP - _OPTIONAL)
     name = table.get("name", "unnamed")
     if not isinstance(name, str):
         raise InputError("", "name", f"{name!r} is not a string")
@@ -189,6 +191,7 @@ def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
     for phase, following in zip(phases, [*phases[1:], None], strict=True):
         _check_end(phase, following)
     problem = Problem(name, scene, epsilon, start, phases, source, table)
+    _check_start(problem)
     _check_first_formation(problem)
     return problem
 
@@ -207,6 +210,7 @@ def _read_scene(table: Mapping[str, Any]) -> Scene:
         (_read_finger(fingers, "1"), _read_finger(fingers, "2")),
         Friction(friction["palm"], friction["finger1"], friction["finger2"]),
         table.get("gravity", 9.81),
+        table.get("fingers_collide", True),
     )
 
 
@@ -336,6 +340,21 @@ def _check_first_formation(problem: Problem) -> None:
             "",
             "phases[1].contacts",
             f"{describe(first)} given, but the closed fingers touch {describe(touching)}",
+        )
+
+
+def _check_start(problem: Problem) -> None:
+    """Check that the fingers do not overlap at the start."""
+    scene = problem.scene
+    if not scene.fingers_collide:
+        return
+    gap = float(evaluate_finger_gap(scene, problem.start[None])[0])
+    if gap < -TOUCHING:
+        raise InputError(
+            "",
+            "start.x",
+            f"{problem.start[0]:g} closes the fingers into each other: their gap is {gap:.4g} m; "
+            "allowed is 0 or more, unless fingers_collide = false",
         )
 
 

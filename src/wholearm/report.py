@@ -55,6 +55,22 @@ class SlipMargin:
 
 
 @dataclass(frozen=True)
+class FingerGap:
+    """The least gap between the two links.
+
+    Attributes
+    ----------
+    least : float, [m]
+        Negative where they overlap.
+    time : float, [s]
+        When.
+    """
+
+    least: float
+    time: float
+
+
+@dataclass(frozen=True)
 class Deviation:
     """Largest difference between planned and simulated state.
 
@@ -167,6 +183,8 @@ class Report:
     phases : tuple of PhaseReport
         Those entered.
     energy : EnergyBalance
+    finger_gap : FingerGap or None
+        None if the fingers lie in different planes.
     tolerance : float
     steps : int
         Of the simulation.
@@ -181,6 +199,7 @@ class Report:
     warnings: tuple[str, ...]
     phases: tuple[PhaseReport, ...]
     energy: EnergyBalance
+    finger_gap: FingerGap | None
     tolerance: float
     steps: int
 
@@ -212,6 +231,9 @@ class Report:
         if self.outcome not in (*self.failures, self.reason):
             parts.append(f"end of the replay: {self.outcome}")
         parts += [f"warning: {text}" for text in self.warnings]
+        if self.finger_gap is not None:
+            gap = self.finger_gap
+            parts.append(f"least gap of the fingers: {gap.least:.5g} m at t = {gap.time:.5g} s")
         tables = [_contact_table, _rolling_table, _phase_table, _energy_table]
         parts += [line for table in tables for line in _after_blank(table(self))]
         return "\n".join(parts)

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .links import FINGERS_TOUCH
 from .margins import SHORTEST
 from .model import Array, Scene, require_number
 from .problem import End, Problem
-from .report import Deviation, PhaseReport
+from .report import Deviation, FingerGap, PhaseReport
 from .simulation.events import EventKind, OutcomeKind, Simulation
 
 DEPARTURE = 1e-3
@@ -28,6 +29,9 @@ ROUNDING = 5e-7
 GOAL = 3e-4
 """Distance to the end of the last phase that counts as there, relative to the scene's length, and
 in rad."""
+
+OVERLAP = 3e-5
+"""Overlap of the links that passes for touching, relative to the scene's length: a replay strays."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,13 @@ class Allowance:
         for key in ("departure", "rest_speed", "stray"):
             value = require_number(getattr(self, key), key, positive=True)
             object.__setattr__(self, key, value)
+
+
+def describe_overlap(scene: Scene, gap: FingerGap | None) -> list[str]:
+    """A sentence on links that overlap."""
+    if gap is None or gap.least >= -OVERLAP * scene.scales.length:
+        return []
+    return [f"{FINGERS_TOUCH} at t = {gap.time:.5g} s: they overlap by {-gap.least:.3g} m"]
 
 
 def judge_end(problem: Problem, simulation: Simulation, allowance: Allowance) -> tuple[bool, str]:

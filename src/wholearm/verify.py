@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from .errors import InputError
-from .margins import list_contact_margins, list_slip_margins
+from .margins import find_finger_gap, list_contact_margins, list_slip_margins
 from .model import Array
 from .problem import End, Phase, Problem
 from .report import Deviation, EnergyBalance, LeastImpulse, PhaseReport, Report
@@ -21,6 +21,7 @@ from .verdict import (
     REST_SPEED,
     Allowance,
     describe_departures,
+    describe_overlap,
     describe_stops,
     describe_thin,
     judge_end,
@@ -97,6 +98,8 @@ def inspect(
     reached, outcome = judge_end(problem, simulation, allowance)
     failures = [] if reached else [outcome]
     failures += describe_stops(problem, simulation, allowance)
+    gap = find_finger_gap(problem.scene, simulation, torque.breaks)
+    failures += describe_overlap(problem.scene, gap) if reached else []
     thin = describe_thin(problem, phases, simulation, allowance)
     warnings = _describe_torques(problem, torque)
     if plan is not None:
@@ -113,6 +116,7 @@ def inspect(
         warnings=tuple(warnings),
         phases=phases,
         energy=_balance(problem, simulation),
+        finger_gap=gap,
         tolerance=tolerance,
         steps=simulation.steps,
     )

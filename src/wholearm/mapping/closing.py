@@ -17,13 +17,15 @@ from numpy.typing import NDArray
 
 from ..contact import Contact, candidate_contacts
 from ..formation import Formation
+from ..links import evaluate_finger_gap
 from ..model import Array, Finger, Scene
 
 Numbers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-TOO_SHORT, JOINT_COVERED = 1, 2
-"""Why a finger cannot close: it reaches no part of the object, or its joint is in the object."""
+TOO_SHORT, JOINT_COVERED, FINGERS_CROSS = 1, 2, 3
+"""Why a finger cannot close: it reaches no part of the object, its joint is in the object, or the
+other finger, closed, is in its way."""
 
 
 class Closed(NamedTuple):
@@ -36,7 +38,8 @@ class Closed(NamedTuple):
     touched : ndarray of int, shape (n, 2)
         What each finger touches first, as an index into `contact_table`; -1 where it cannot close.
     obstacle : ndarray of int, shape (n, 2)
-        0, or why a finger cannot close: `TOO_SHORT` or `JOINT_COVERED`.
+        0, or why a finger cannot close: `TOO_SHORT`, `JOINT_COVERED` or, for both fingers,
+        `FINGERS_CROSS`.
     """
 
     z: Array
@@ -97,6 +100,8 @@ def close(scene: Scene, x: Array, phi: Array) -> Closed:
         closed = obstacle[:, finger] == 0
         z[:, 3 + finger] = np.where(closed, angle, np.nan)
         touched[:, finger] = np.where(closed, first_contact(scene, finger) + feature, -1)
+    if scene.fingers_collide:
+        obstacle[evaluate_finger_gap(scene, z) < 0] = FINGERS_CROSS
     return Closed(z, touched, obstacle)
 
 

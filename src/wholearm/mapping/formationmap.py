@@ -33,6 +33,8 @@ ARROWS = 24
 """Places across the map at which directions inside cells are checked."""
 BEYOND = np.radians(6.0)
 """How far the window reaches beyond the flush angles next to the plan [rad]."""
+CROSSED = -5
+"""Cell of the places where the closed fingers would overlap."""
 SAME_PLACE = 1e-6
 """Distance [m or rad] below which ends of borders are one crossing."""
 
@@ -106,7 +108,7 @@ class FormationMap:
         Grid.
     cell : ndarray of int, shape (n_phi, n_x)
         Index into `formations`; -1 and -2 where finger 1 and 2 is too short, -3 and -4 where the
-        joint of finger 1 and 2 is in the object.
+        joint of finger 1 and 2 is in the object, `CROSSED` where the fingers would overlap.
     formations : tuple of tuple of Contact
         The three contacts of each cell.
     borders : tuple of Border

@@ -23,12 +23,21 @@ from ..plots import _STYLE
 from ..sharing import exclusive
 from ..trajectory import Trajectory
 from .closing import Flags, Numbers
-from .formationmap import Border, FormationMap
+from .formationmap import CROSSED, Border, FormationMap
 from .route import trace_problem
 
 SIZE = (11.0, 7.9)  # in
 _BOX = (0.75, 1.0, 9.4, 6.2)  # axes: left, bottom, width, height [in]
-_INK, _LINE, _FAINT, _HATCH = "#222222", "#9aa1ab", "#c3c8d0", "#b8b8b8"
+_INK, _LINE, _FAINT = "#222222", "#9aa1ab", "#c3c8d0"
+_LOST = ("#ececec", "#b8b8b8", "////")  # face, lines and hatch
+_CROSSED = ("#f6e3ee", "#CC79A7", "\\\\\\\\")
+_UNREACHED = {
+    "finger 1 too short": -1,
+    "finger 2 too short": -2,
+    "joint 1 in the object": -3,
+    "joint 2 in the object": -4,
+    "fingers overlap": CROSSED,
+}
 _FORTH, _BACK, _FREE = "#0072B2", "#D55E00", "#7a838f"
 _TINTS = ("#f3f6fb", "#fbf6ea", "#eef7f0", "#f9eff4", "#f4f1fb", "#eef6f8", "#f7f7ee")
 _ASIDE = 2.6
@@ -75,7 +84,7 @@ def draw_map(chart: FormationMap, plan: Trajectory | None = None) -> Figure:
         points = _to_axes(np.array([c.point for c in flush]).reshape(-1, 2))
         axes.plot(*points.T, "o", ms=3.6, mfc=_INK, mec="white", mew=0.5, zorder=6, ls="none")
         _draw_paths(axes, paths)
-        _draw_legend(figure, bool(paths))
+        _draw_legend(figure, bool(paths), bool((chart.cell == CROSSED).any()))
         _name_palm_lines(axes, chart)
         problem = chart.problem
         limits = " and ".join(dict.fromkeys(f"{v:g}" for v in problem.scene.torque_limit))
@@ -108,16 +117,18 @@ def _draw_cells(axes: Axes, chart: FormationMap, x: Array, phi: Array) -> None:
     look: Any = {"shading": "nearest", "rasterized": True, "zorder": 0}
     shown = np.ma.masked_less(shown, 0)
     axes.pcolormesh(x, phi, shown, cmap=ListedColormap(_TINTS), vmin=0, vmax=len(_TINTS), **look)
-    lost = (chart.cell < 0).astype(float)
-    if lost.any():
-        field = axes.contourf(
-            x, phi, lost, levels=[0.5, 1.5], colors=["#ececec"], hatches=["////"], zorder=0.5
-        )
-        field.set(edgecolor=_HATCH, linewidth=0.0)
-        for name, code in (("finger 1 too short", -1), ("finger 2 too short", -2)):
-            _write_inside(axes, name, chart.cell == code, x, phi, color="#666666", italic=True)
-        for name, code in (("joint 1 in the object", -3), ("joint 2 in the object", -4)):
-            _write_inside(axes, name, chart.cell == code, x, phi, color="#666666", italic=True)
+    crossed = chart.cell == CROSSED
+    for region, (face, edge, hatch) in (
+        ((chart.cell < 0) & ~crossed, _LOST),
+        (crossed, _CROSSED),
+    ):
+        if region.any():
+            field = axes.contourf(
+                x, phi, region.astype(float), [0.5, 1.5], colors=[face], hatches=[hatch], zorder=0.5
+            )
+            field.set(edgecolor=edge, linewidth=0.0)
+    for name, code in _UNREACHED.items():
+        _write_inside(axes, name, chart.cell == code, x, phi, color="#666666", italic=True)
 
 
 def _choose_tints(cell: Numbers) -> Numbers:
@@ -288,7 +299,12 @@ def _name_palm_lines(axes: Axes, chart: FormationMap) -> None:
         )
 
 
-def _draw_legend(figure: Figure, with_path: bool) -> None:
+def _patch(look: tuple[str, str, str], label: str) -> Patch:
+    face, edge, hatch = look
+    return Patch(fc=face, ec=edge, hatch=hatch, lw=0, label=label)
+
+
+def _draw_legend(figure: Figure, with_path: bool, crossed: bool) -> None:
     arrow: Any = {"marker": ">", "ms": 5, "lw": 1.4}
     handles: list[Any] = [
         Line2D([], [], color=_FORTH, label="quasistatic motion possible, +x or +\u03c6", **arrow),
@@ -312,8 +328,10 @@ def _draw_legend(figure: Figure, with_path: bool) -> None:
             ls="none",
             label="possible ways inside a cell",
         ),
-        Patch(fc="#ececec", ec=_HATCH, hatch="////", lw=0, label="cannot be reached"),
+        _patch(_LOST, "cannot be reached"),
     ]
+    if crossed:
+        handles.append(_patch(_CROSSED, "the fingers would overlap"))
     if with_path:
         handles.insert(6, Line2D([], [], color=_INK, lw=5, alpha=0.42, label="plan, by phase"))
     note = (

@@ -10,6 +10,7 @@ import numpy as np
 from ..contact import Contact
 from ..curve import describe_pose
 from ..errors import InputError
+from ..links import FINGERS_TOUCH
 from ..model import Array, Scene
 from ..outline import outline_phase
 from ..path import trace_phases
@@ -24,7 +25,7 @@ from .borders import (
     name_contacts,
     palm_track,
 )
-from .closing import close, contact_table
+from .closing import FINGERS_CROSS, JOINT_COVERED, TOO_SHORT, close, contact_table
 from .pieces import cut
 
 NEAR = np.array([5e-4, np.radians(0.5)])
@@ -205,8 +206,11 @@ def _require_reached(
             text = "there the border has ended"
             for finger, obstacle in enumerate(closed.obstacle[0].tolist()):
                 if obstacle:
-                    joint = f"the joint of finger {finger + 1} is in the object"
-                    text = joint if obstacle == 2 else f"finger {finger + 1} is too short"
+                    text = {
+                        TOO_SHORT: f"finger {finger + 1} is too short",
+                        JOINT_COVERED: f"the joint of finger {finger + 1} is in the object",
+                        FINGERS_CROSS: FINGERS_TOUCH,
+                    }[obstacle]
             where = _describe(np.array(pose).ravel())
             raise InputError("", "route", f"cannot be followed at {where}: {text}")
 

@@ -1,0 +1,55 @@
+"""The gap between two links in plain NumPy, and hexagons between fingers that meet."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plane import cross, point_to_segment
+from wholearm.model import Array, Scene
+from wholearm.problem import Problem, build_problem
+
+HEXAGON = Path(__file__).parents[1] / "problems" / "hexagon.toml"
+
+
+def hexagon(
+    lengths: tuple[float, float] = (0.18, 0.18), base: float = -0.08, solid: bool = True
+) -> Problem:
+    """The hexagon's problem; with links of equal length they touch halfway through the slide."""
+    table = tomllib.loads(HEXAGON.read_text(encoding="utf-8"))
+    for key, length in zip("12", lengths, strict=True):
+        table["fingers"][key]["length"] = length
+    table["fingers"]["2"]["base"][0] = base
+    return build_problem(table | {"fingers_collide": solid})
+
+
+def place_links(scene: Scene, z: Array) -> list[Array]:
+    """Ends of both segments at n configurations, shape (n, 2, 2) each [m]."""
+    ends = []
+    for link, angle in zip(scene.fingers, z[:, 3:].T, strict=True):
+        base = np.broadcast_to(np.asarray(link.base), (len(z), 2))
+        tip = base + link.length * np.column_stack([np.cos(angle), np.sin(angle)])
+        ends.append(np.stack([base, tip], axis=1))
+    return ends
+
+
+def measure_centres(scene: Scene, z: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Distance of the links' segments, 0 where they cross, and whether they do, shape (n,) each."""
+    one, other = place_links(scene, z)
+    distances = [point_to_segment(one[:, k], other[:, 0], other[:, 1]) for k in (0, 1)]
+    distances += [point_to_segment(other[:, k], one[:, 0], one[:, 1]) for k in (0, 1)]
+
+    def parted(a: Array, b: Array) -> NDArray[np.bool_]:
+        run = a[:, 1] - a[:, 0]
+        return np.asarray(cross(run, b[:, 0] - a[:, 0]) * cross(run, b[:, 1] - a[:, 0]) > 0)
+
+    crossed = ~parted(one, other) & ~parted(other, one)
+    return np.where(crossed, 0.0, np.min(distances, axis=0)), crossed
+
+
+def measure_fingers(scene: Scene, z: Array) -> Array:
+    """Gap between the links, shape (n,) [m]; no less than minus both radii."""
+    return measure_centres(scene, z)[0] - sum(link.radius for link in scene.fingers)
