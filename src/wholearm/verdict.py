@@ -29,9 +29,8 @@ ROUNDING = 5e-7
 GOAL = 3e-4
 """Distance to the end of the last phase that counts as there, relative to the scene's length, and
 in rad."""
-
 OVERLAP = 3e-5
-"""Overlap of the links that passes for touching, relative to the scene's length: a replay strays."""
+"""Overlap of the links that passes for touching, relative to the scene's length."""
 
 
 @dataclass(frozen=True)
