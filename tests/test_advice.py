@@ -87,8 +87,8 @@ def test_changes_in_words() -> None:
 
 
 def test_shortfalls_are_ranked() -> None:
-    small = Shortfall("torque limit of finger 1 = 2 N m", 0.4, "N m", "t = 0.1000 s, phase 2")
-    large = Shortfall("c_n of v3-finger1 >= epsilon = 0.05 N", 0.81234, "N", "t = 0.0000 s")
+    small = Shortfall("torque limit of finger 1 = 2 N m", 0.4, "N m", "t = 0.1000 s, phase 2", 0.2)
+    large = Shortfall("c_n of v3-finger1 >= epsilon = 0.05 N", 0.81234, "N", "t = 0.0000 s", 0.4)
     assert rank_shortfalls([small, large]) == (
         "c_n of v3-finger1 >= epsilon = 0.05 N is 0.812 N short at t = 0.0000 s; "
         "torque limit of finger 1 = 2 N m is 0.4 N m short at t = 0.1000 s, phase 2"

@@ -232,4 +232,4 @@ def test_scales_follow_the_units() -> None:
 def test_without_gravity_the_weaker_finger_sets_the_force() -> None:
     long, short = make_finger([0.1, 0.0], length=0.3), make_finger([-0.1, 0.0], length=0.1)
     scene = replace(make_scene(SQUARE), gravity=0.0, fingers=(long, short))
-    assert scene.scales.force == pytest.approx(long.torque_limit / 0.3, rel=1e-14)
+    assert scene.scales.force == pytest.approx(long.torque_limit / 0.3 / 100, rel=1e-14)

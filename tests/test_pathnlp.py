@@ -17,8 +17,8 @@ from wholearm.pathdomain.pathdata import PhaseData, prepare
 from wholearm.pathdomain.pathmotion import PathMotion, Profile, draw_together, make_grid
 from wholearm.pathdomain.pathnlp import (
     PathNLP,
-    Scales,
     Tightening,
+    Units,
     build_path_nlp,
     make_bounds,
     move_multipliers,
@@ -30,7 +30,7 @@ from wholearm.pathdomain.pathplan import guess
 
 EPSILON = 0.05
 INTERVALS = 24
-SCALES = Scales(0.04, 0.03, 7.0)
+UNITS = Units(0.04, 0.03, 7.0, np.array([1.7, 0.6]), 1.3)
 LIMIT = 2.0
 
 
@@ -58,16 +58,16 @@ def profile(data: PhaseData) -> Profile:
 def evaluate(nlp: PathNLP, data: PhaseData, x: Array, time_weight: float = 1.0) -> tuple[Any, ...]:
     """Objective and constraints of the NLP that the solver holds."""
     oracle = nlp.solver.oracle()
-    f, g = oracle(x, parameters(nlp, data, SCALES, time_weight))
+    f, g = oracle(x, parameters(nlp, data, UNITS, time_weight))
     return float(f), g.full()[:, 0]
 
 
 @pytest.mark.parametrize("objective", Objective)
 def test_pack_and_unpack(data: PhaseData, profile: Profile, objective: Objective) -> None:
     nlp = build_path_nlp(4, INTERVALS, objective)
-    x = pack(nlp, profile, SCALES, 0.7)
+    x = pack(nlp, profile, UNITS, 0.7)
     assert x.shape == (nlp.solver.size1_in("x0"),)
-    found, margin = unpack(nlp, data.grid, x, SCALES)
+    found, margin = unpack(nlp, data.grid, x, UNITS)
     for one, other in zip(found, profile, strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-13 * np.abs(other).max())
     chained = objective in (Objective.MARGIN, Objective.RELAX)
@@ -79,8 +79,8 @@ def test_unpack_restores_the_integral_of_a(data: PhaseData, profile: Profile) ->
     """What Ipopt leaves of b' = 2 a is taken out, down to rounding."""
     nlp = build_path_nlp(4, INTERVALS, Objective.TIME)
     rng = np.random.default_rng(2)
-    x = pack(nlp, profile, SCALES, 0.0)
-    found, _ = unpack(nlp, data.grid, x + 1e-9 * rng.uniform(-1, 1, len(x)), SCALES)
+    x = pack(nlp, profile, UNITS, 0.0)
+    found, _ = unpack(nlp, data.grid, x + 1e-9 * rng.uniform(-1, 1, len(x)), UNITS)
     rises = data.grid.steps * (found.a[1:] + found.a[:-1])
     np.testing.assert_allclose(np.diff(found.b), rises, rtol=0, atol=1e-15)
     np.testing.assert_allclose(found.b, profile.b, rtol=0, atol=1e-7)
@@ -93,11 +93,11 @@ def test_constraints_are_the_limits(
     """Distances of the constraints from their bounds are the slacks of the phase."""
     nlp = build_path_nlp(4, INTERVALS, objective)
     margin = 0.3 if objective is Objective.MARGIN else 0.0
-    _, g = evaluate(nlp, data, pack(nlp, profile, SCALES, margin))
+    _, g = evaluate(nlp, data, pack(nlp, profile, UNITS, margin))
     rng = np.random.default_rng(3)
     tight = rng.uniform(0, 0.1, (len(data.grid.s), 8))
     tightening = Tightening(tight, np.ones(len(data.grid.s)), 0.5)
-    bounds = make_bounds(nlp, data, SCALES, tightening)
+    bounds = make_bounds(nlp, data, UNITS, tightening)
     assert len(bounds["lbx"]) == len(bounds["ubx"]) == nlp.solver.size1_in("x0")
     assert len(bounds["lbg"]) == len(bounds["ubg"]) == len(g)
 
@@ -105,18 +105,18 @@ def test_constraints_are_the_limits(
     np.testing.assert_allclose(g[: first - 2], 0.0, atol=1e-13)
     np.testing.assert_array_equal(bounds["lbg"][:first], bounds["ubg"][:first])
     ends = [profile.a[1] - profile.a[0], profile.a[-1] - profile.a[-2]]
-    np.testing.assert_allclose(g[first - 2 : first] * SCALES.profile[1], ends, atol=1e-12)
+    np.testing.assert_allclose(g[first - 2 : first] * UNITS.profile[1], ends, atol=1e-12)
     rows = slice(first, first + 6 * (INTERVALS + 1))
     low = (g - bounds["lbg"])[rows].reshape(-1, 6)
     high = (bounds["ubg"] - g)[rows].reshape(-1, 6)
     slack = data.slack(data.nodes, profile, margin) - tight
-    np.testing.assert_allclose(low[:, :4] * SCALES.force, slack[:, :4], rtol=0, atol=1e-11)
+    np.testing.assert_allclose(low[:, :4] * UNITS.force, slack[:, :4], rtol=0, atol=1e-11)
     assert np.isposinf(high[:, :4]).all()
-    np.testing.assert_allclose(low[:, 4:], slack[:, 4:6], rtol=0, atol=1e-12)
-    np.testing.assert_allclose(high[:, 4:], slack[:, 6:], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(low[:, 4:] * UNITS.torque, slack[:, 4:6], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(high[:, 4:] * UNITS.torque, slack[:, 6:], rtol=0, atol=1e-12)
     if objective is Objective.MARGIN:
         # The sum 2 h / (v + v) of the constraint is T for a constant acceleration only.
-        late = (bounds["ubg"][-1] - g[-1]) * SCALES.time
+        late = (bounds["ubg"][-1] - g[-1]) * UNITS.time
         motion = PathMotion(data.curve, data.grid, profile)
         assert late == pytest.approx(0.5 - motion.duration, rel=0.02)
 
@@ -124,30 +124,31 @@ def test_constraints_are_the_limits(
 def test_elastic_constraints_give_way(data: PhaseData, profile: Profile) -> None:
     nlp = build_path_nlp(4, INTERVALS, Objective.ELASTIC)
     short = np.random.default_rng(4).uniform(0, 1, (len(data.grid.s), 6))
-    _, hard = evaluate(nlp, data, pack(nlp, profile, SCALES, 0.0))
-    _, soft = evaluate(nlp, data, pack(nlp, profile, SCALES, 0.0, short))
+    _, hard = evaluate(nlp, data, pack(nlp, profile, UNITS, 0.0))
+    _, soft = evaluate(nlp, data, pack(nlp, profile, UNITS, 0.0, short))
     change = (soft - hard)[INTERVALS + 2 :].reshape(-1, 8)
-    np.testing.assert_allclose(change[:, :4] * SCALES.force, short[:, :4], atol=1e-12)
-    np.testing.assert_allclose(change[:, 4:6], short[:, 4:], atol=1e-12)
-    np.testing.assert_allclose(change[:, 6:], -short[:, 4:], atol=1e-12)
+    np.testing.assert_allclose(change[:, :4] * UNITS.force, short[:, :4], atol=1e-12)
+    np.testing.assert_allclose(change[:, 4:6] * UNITS.torque, short[:, 4:], atol=1e-12)
+    np.testing.assert_allclose(change[:, 6:] * UNITS.torque, -short[:, 4:], atol=1e-12)
 
 
 def test_objectives_measure_the_motion(data: PhaseData, profile: Profile) -> None:
     """Up to the rule of each interval and the small weights that choose among equals."""
     motion = PathMotion(data.curve, data.grid, profile)
     nlp = build_path_nlp(4, INTERVALS, Objective.TIME)
-    time, _ = evaluate(nlp, data, pack(nlp, profile, SCALES, 0.0))
-    assert time * SCALES.time == pytest.approx(motion.duration, rel=0.02)
+    time, _ = evaluate(nlp, data, pack(nlp, profile, UNITS, 0.0))
+    assert time * UNITS.time == pytest.approx(motion.duration, rel=0.02)
     nlp = build_path_nlp(4, INTERVALS, Objective.EFFORT)
-    x = pack(nlp, profile, SCALES, 0.0)
+    x = pack(nlp, profile, UNITS, 0.0)
     light, heavy = (evaluate(nlp, data, x, weight)[0] for weight in (1.0, 3.0))
-    assert (heavy - light) / 2 * SCALES.time == pytest.approx(motion.duration, rel=0.02)
+    unit = UNITS.power * UNITS.time
+    assert (heavy - light) / 2 * unit == pytest.approx(motion.duration, rel=0.02)
     t = np.linspace(0, motion.duration, 4001)
     squares = trapezoid((motion.evaluate(t).tau ** 2).sum(axis=1), t)
-    assert (light - (heavy - light) / 2) * SCALES.time == pytest.approx(squares, rel=0.03)
+    assert (light - (heavy - light) / 2) * unit == pytest.approx(squares, rel=0.03)
     nlp = build_path_nlp(4, INTERVALS, Objective.MARGIN)
-    low, high = (evaluate(nlp, data, pack(nlp, profile, SCALES, m))[0] for m in (0.0, 1.4))
-    assert low - high == pytest.approx(1.4 / SCALES.force, rel=1e-12)
+    low, high = (evaluate(nlp, data, pack(nlp, profile, UNITS, m))[0] for m in (0.0, 1.4))
+    assert low - high == pytest.approx(1.4 / UNITS.force, rel=1e-12)
 
 
 def test_tightening_reaches_what_is_slack(data: PhaseData) -> None:
@@ -194,8 +195,8 @@ def test_one_build_serves_every_phase(curves: tuple[Curve, ...]) -> None:
     assert build_path_nlp(4, INTERVALS, Objective.EFFORT) is not nlp
     for curve in curves:
         data = prepare(curve, EPSILON, make_grid(curve, INTERVALS), 1)
-        _, scales = guess(data)
-        assert len(parameters(nlp, data, scales, 1.0)) == nlp.solver.size1_in("p")
+        _, units = guess(data)
+        assert len(parameters(nlp, data, units, 1.0)) == nlp.solver.size1_in("p")
 
 
 @pytest.mark.parametrize("objective", Objective)
@@ -357,5 +358,5 @@ def test_no_speed_comes_out_imaginary(data: PhaseData, profile: Profile) -> None
     shares = np.linalg.solve(reached[1:].T, [-1e-9, 0.0] - reached[0])
     a = shapes[0] + shares @ shapes[1:]
     assert integrate(a)[middle] == pytest.approx(-1e-9, abs=1e-12)
-    found, _ = unpack(nlp, data.grid, pack(nlp, profile._replace(a=a), SCALES, 0.0), SCALES)
+    found, _ = unpack(nlp, data.grid, pack(nlp, profile._replace(a=a), UNITS, 0.0), UNITS)
     assert found.b[middle] == 0.0 and found.b.min() == 0.0

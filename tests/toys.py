@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from wholearm.curve import Curve, Segment
 from wholearm.dynamics import Directions, PathForces
-from wholearm.model import Array
+from wholearm.model import Array, Scales
 from wholearm.options import PlanOptions
 from wholearm.pathdomain import pathdata
 from wholearm.pathdomain.pathmotion import PathMotion
@@ -45,6 +45,7 @@ class Toy:
         ends = [0.0, *self.breaks, self.length]
         scene = SimpleNamespace(
             gravity=9.81,
+            scales=Scales(1.0, 2.0, 2.0),
             torque_limit=np.array(self.limit),
             speed_limit=np.array(self.speed_limit),
         )

@@ -31,12 +31,15 @@ class Shortfall(NamedTuple):
     unit : str
     where : str
         Time, and place or phase, of that.
+    share : float
+        The amount over what is much for such a limit, which shortfalls are ranked by.
     """
 
     limit: str
     amount: float
     unit: str
     where: str
+    share: float
 
     def __str__(self) -> str:
         return f"{self.limit} is {self.amount:.3g} {self.unit} short at {self.where}"
@@ -74,7 +77,7 @@ class Change(NamedTuple):
 
 def rank_shortfalls(shortfalls: Iterable[Shortfall]) -> str:
     """All shortfalls in one line, the worst first."""
-    return "; ".join(map(str, sorted(shortfalls, key=lambda short: -short.amount)))
+    return "; ".join(map(str, sorted(shortfalls, key=lambda short: -short.share)))
 
 
 def find_changes(

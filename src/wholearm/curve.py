@@ -237,16 +237,17 @@ def refine(s: Array, stop: float) -> Array:
 def find_root(function: Callable[[float], float], low: float, high: float) -> float:
     """Root of a scalar function between a sign change, to rounding (the Illinois method)."""
     f_low, f_high = function(low), function(high)
+    rounding = 4 * np.finfo(float).eps * max(abs(low), abs(high))
     for _ in range(60):
         middle = high - f_high * (high - low) / (f_high - f_low)
         f_middle = function(middle)
-        if f_middle == 0.0 or abs(high - low) < 1e-15 * max(1.0, abs(low)):
+        if f_middle == 0.0 or abs(high - low) < rounding:
             return float(middle)
         if f_middle * f_high < 0:
             low, f_low = high, f_high
         else:
             f_low /= 2
-        if abs(middle - high) < 1e-15:
+        if abs(middle - high) < rounding:
             return float(middle)
         high, f_high = middle, f_middle
     return float(high)

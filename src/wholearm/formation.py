@@ -319,14 +319,14 @@ def close_finger(scene: Scene, q: Array, finger: int) -> float:
 
 @exclusive
 def find_touching(scene: Scene, z: Array) -> tuple[Contact, ...]:
-    """Return the contacts whose gap is below `TOUCHING` at `z`, in the order palm, finger 1, 2."""
+    """Return the contacts that touch at `z`, in the order palm, finger 1, finger 2."""
     touching = []
     for finger in (None, 0, 1):
         candidates = candidate_contacts(scene, finger)
         clearances = [build_clearance(c, scene, touching=False).value for c in candidates]
         values = ca.Function("touching", [build_features(scene).z], [ca.vertcat(*clearances)])
         for contact, value in zip(candidates, values(z).full()[:, 0], strict=True):
-            if abs(value) < TOUCHING:
+            if abs(value) < scene.touching:
                 touching.append(contact)
     return tuple(touching)
 

@@ -24,14 +24,15 @@ from typing import NamedTuple
 import numpy as np
 
 from .cones import hold_rows
+from .curve import measure_speed, metric_weights
 from .dynamics import Directions, force_rows, reduced_inertia
-from .formation import TOUCHING, Formation
+from .formation import Formation
 from .model import Array
 
-ROUNDING = 1e-7
-"""Share of the momentum or of the speed that counts as rounding."""
+ROUNDING = 1e-6
+"""Share of the momentum or of the speed, in the metric of curves, that counts as rounding."""
 _STEP = 1e-5
-"""Step of the difference quotient of limits [m, rad]."""
+"""Step of the difference quotient of limits, in radii of gyration or radians."""
 
 
 class Obstacle(Enum):
@@ -157,7 +158,8 @@ def _strike(before: Formation, after: Formation, z: Array, v: Array, Xi: Array) 
         jam = Hindrance(Obstacle.JAM, " ".join(after.names), ratio)
         return Impact(after, np.full(5, np.nan), np.full(len(P), np.nan), Xi, (jam,))
     v_after, p = transfer(mass, P, force_rows(after, kinematics, directions)[0], v)
-    speed, momentum = np.abs(v).max(), np.abs(mass * v).max()
+    speed = measure_speed(after.scene, v)
+    momentum = float(np.abs(mass * v / np.sqrt(metric_weights(after.scene))).max())
     rolls = [after.names[row] for row in after.rolling_rows]
     normal, cones = np.split(hold_rows(after) @ p, [after.n_contacts])
     found = [
@@ -211,10 +213,11 @@ def _rates(
     others = [
         k
         for k, limit in enumerate(after.limits)
-        if abs(values[k]) < TOUCHING and limit.gained not in released.values()
+        if abs(values[k]) < after.scene.touching and limit.gained not in released.values()
     ]
     if others:
-        h = _STEP / max(float(np.abs(v).max()), 1e-300)
+        scene = after.scene
+        h = _STEP * scene.scales.length / max(measure_speed(scene, v), np.finfo(float).tiny)
         ahead, behind = after.evaluate_limits(np.array([z + h * v, z - h * v]))[:, others]
         rates += list((ahead - behind) / (2 * h))
         texts += [after.limits[k].text for k in others]

@@ -43,6 +43,9 @@ from .errors import InputError
 
 Array = NDArray[np.float64]
 
+TOUCHING = 3e-6
+"""Gap below which features count as touching, in radii of gyration of the object."""
+
 
 def require_number(
     value: object, key: str, *, positive: bool = False, nonnegative: bool = False
@@ -242,7 +245,8 @@ class Scales(NamedTuple):
     mass : float, [kg]
         Of the object.
     force : float, [N]
-        Weight of the object; without gravity, what the weaker finger can press with at its tip.
+        Weight of the object, or a hundredth of what the weaker finger can press with at its tip
+        where that is more.
     """
 
     length: float
@@ -314,10 +318,14 @@ class Scene:
     def scales(self) -> Scales:
         """Units that fit the scene: tolerances count in them."""
         mass = self.polygon.mass
-        force = mass * self.gravity
-        if force == 0:
-            force = min(finger.torque_limit / finger.length for finger in self.fingers)
+        press = min(finger.torque_limit / finger.length for finger in self.fingers)
+        force = max(mass * self.gravity, press / 100)
         return Scales(self.polygon.gyration_radius, mass, force)
+
+    @property
+    def touching(self) -> float:
+        """Gap below which features count as touching [m]: above rounding, below real clearance."""
+        return TOUCHING * self.scales.length
 
     @property
     def mass_diagonal(self) -> Array:

@@ -16,16 +16,18 @@ import numpy as np
 
 from .curve import Curve, Panel, border, describe_pose, find_root, metric_weights, refine
 from .errors import InputError
-from .formation import TOUCHING, Formation, describe, find_touching
-from .model import Array
+from .formation import Formation, describe, find_touching
+from .model import TOUCHING, Array
 from .problem import End, Phase, Problem, Until
 
 NODES = 17
 """Nodes of a panel."""
 RESOLVED = 1e-13
 """Largest trailing Chebyshev coefficient of a resolved panel, relative to the object's size."""
-HELD = 1e-6
-"""Distance to `until` [m or rad] below which a phase would have nothing to do."""
+HELD = 3e-5
+"""Distance to `until`, in radii of gyration or radians, below which there is nothing to do."""
+ROUNDING = 3e-10
+"""Below zero by no more than this, in radii of gyration, a limit counts as kept."""
 LONGEST = 60.0
 """Longest curve that is traced, in radii of gyration: several turns of the object."""
 
@@ -71,7 +73,7 @@ def trace_phase(problem: Problem, phase: Phase, z: Array) -> Curve:
     formation, until = phase.formation, phase.until
     ways = [trace_curve(formation, z, way, until) for way in _headings(formation, z, until)]
     curve = max(ways, key=lambda curve: curve.length)
-    if curve.length < HELD:
+    if curve.length < HELD * problem.scene.scales.length:
         key = f"phases[{phase.number}].contacts"
         raise InputError(problem.source, key, f"cannot move: {curve.ending}")
     return curve
@@ -88,19 +90,20 @@ def require_touching(problem: Problem, phase: Phase, z: Array) -> None:
     key = f"phases[{phase.number}].contacts"
     formation = phase.formation
     gaps = formation.evaluate(z[None], np.zeros((1, 5))).C[0]
-    if np.abs(gaps).max() > TOUCHING:
+    touching = problem.scene.touching
+    if np.abs(gaps).max() > touching:
         missing = [
-            c.name for c, gap in zip(formation.contacts, gaps, strict=True) if abs(gap) > TOUCHING
+            c.name for c, gap in zip(formation.contacts, gaps, strict=True) if abs(gap) > touching
         ]
         when = f"at the end of phase {phase.index}" if phase.index else "at the start"
-        touching = describe(find_touching(problem.scene, z))
+        found = describe(find_touching(problem.scene, z))
         raise InputError(
             problem.source,
             key,
-            f"{', '.join(missing)} does not touch {when}; touching are {touching}",
+            f"{', '.join(missing)} does not touch {when}; touching are {found}",
         )
     limits = formation.evaluate_limits(z[None])[0]
-    if limits.min() < -TOUCHING:
+    if limits.min() < -touching:
         text = formation.limits[int(limits.argmin())].text
         raise InputError(problem.source, key, f"cannot hold at {describe_pose(z)}: {text}")
 
@@ -162,7 +165,7 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
     wanted = [len(names) - 1] if until.contact is None else wanted
 
     def margins(points: Array) -> Array:
-        values = formation.evaluate_limits(points)
+        values = formation.evaluate_limits(points) / rho
         if until.contact is not None:
             return np.hstack([values, np.ones((len(points), 1))])
         return np.hstack([values, until_distance(formation, until, points)[:, None] * side])
@@ -197,28 +200,34 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
 
 
 def until_distance(formation: Formation, until: Until, z: Array) -> Array:
-    """How far each configuration is from `until`, shape (n,): a gap [m], metres or radians."""
+    """How far each configuration is from `until`, shape (n,), in radii of gyration or radians."""
+    rho = formation.scene.scales.length
     if until.contact is not None:
-        return formation.evaluate_gap(until.contact, z)
+        return formation.evaluate_gap(until.contact, z) / rho
     if until.value is None:
         return np.ones(len(z))
-    return np.asarray(z[:, 0 if until.coordinate == "x" else 2] - until.value)
+    if until.coordinate == "x":
+        return np.asarray((z[:, 0] - until.value) / rho)
+    return np.asarray(z[:, 2] - until.value)
 
 
 def _first_crossing(
     panel: Panel, margins: Callable[[Array], Array]
 ) -> tuple[float, list[int]] | None:
-    """Where on the panel a margin first falls below zero, and which ones do so there."""
+    """Where on the panel a margin first falls below zero, and which ones do so there.
+
+    Margins are in radii of gyration or radians.
+    """
     grid = refine(panel.s, panel.s[-1])
     values = margins(panel.interpolate(grid)[0])
     # What starts closed (the contact just given up) has to open; rounding is not closing.
-    broken = values < -1e-11
+    broken = values < -ROUNDING
     if not broken.any():
         return None
     row = int(broken.any(axis=1).argmax())
     roots = {}
     for k in np.flatnonzero(broken[row]):
-        if row == 0 or values[row - 1, k] <= TOUCHING * 1e-3:
+        if row == 0 or values[row - 1, k] <= 10 * ROUNDING:
             roots[int(k)] = float(grid[max(row - 1, 0)])
         else:
 
@@ -264,7 +273,7 @@ def _build_panel(
         return None
     z_u = np.linalg.solve(border(kinematics.P, projection), np.eye(5)[:, 4:])[..., 0]
     speed = np.sqrt(z_u**2 @ metric)
-    scaled = np.column_stack([points * np.sqrt(metric) / rho, speed])
+    scaled = np.column_stack([(points - z) * np.sqrt(metric) / rho, speed])
     tail = np.abs(analyse @ scaled)[-2:].max()
     if speed.max() > 1.5 or tail > RESOLVED:
         return None

@@ -21,8 +21,8 @@ from ..model import Array
 from ..torque import TorqueProfile
 from .pathmotion import Grid, PathMotion, Profile, directions_of
 
-TORQUE_ERROR = 1e-6
-"""Largest error of the torque's polynomials between the knots [N m]."""
+TORQUE_ERROR = 5e-7
+"""Largest error of the torque's polynomials between the knots, over the torque limit."""
 PLACES = 9
 """Places that they go through where that is exceeded."""
 
@@ -103,6 +103,12 @@ class PhaseData(NamedTuple):
         """Torque limits, shape (2,) [N m]."""
         return self.curve.formation.scene.torque_limit
 
+    @property
+    def spans(self) -> Array:
+        """What is much for each limit, shape (n_h + 4,): the scene's force, the torque limits."""
+        force = self.curve.formation.scene.scales.force
+        return np.append(np.full(len(self.least), force), np.tile(self.torque_limit, 2))
+
     def slack(self, places: Places, profile: Profile, margin: float = 0.0) -> Array:
         """How far each limit is from being missed, shape (n, n_h + 4) [N, N m].
 
@@ -123,7 +129,9 @@ class PhaseData(NamedTuple):
             limit[spared] = np.inf
         if np.isinf(limit).all():
             return np.full(len(places.rates), np.inf)
-        return np.asarray(((limit / np.maximum(np.abs(places.rates), 1e-12)) ** 2).min(axis=1))
+        # A joint that stands still has no limit, but dividing by zero would warn.
+        rates = np.maximum(np.abs(places.rates), np.finfo(float).tiny ** 0.25)
+        return np.asarray(((limit / rates) ** 2).min(axis=1))
 
     def relative_rates(self, places: Places, finger: int | None) -> Array:
         """Rate of a joint over its speed limit, shape (n,) [s/m]; zero without a joint."""
@@ -281,8 +289,8 @@ def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, floa
     times = motion.times[data.solid, None] + motion.durations(looks)[data.solid]
     wanted = data.looks.forces.tau(*data.spread(motion.profile, looks))
     inner = np.tile((looks > 0) & (looks < 1), len(data.solid))
-    misfit = np.abs(torque.at(times.ravel()[inner]) - wanted[inner]).max()
-    if misfit > TORQUE_ERROR and len(knots) < PLACES:
+    misfit = torque.at(times.ravel()[inner]) - wanted[inner]
+    if np.abs(misfit / data.torque_limit).max() > TORQUE_ERROR and len(knots) < PLACES:
         every = (len(looks) - 1) // (PLACES - 1)
         rows = np.tile(np.arange(len(looks)) % every == 0, len(data.solid))
         torque = _fit(data, motion, data.looks.pick(rows), looks[::every])

@@ -21,8 +21,8 @@ from ..options import Objective
 from .pathdata import PhaseData, Relaxation, cut, join, name_phases
 from .pathmotion import PathMotion, Profile
 from .pathnlp import (
-    Scales,
     Tightening,
+    Units,
     build_path_nlp,
     make_bounds,
     pack,
@@ -30,10 +30,12 @@ from .pathnlp import (
     unpack,
 )
 
-_SHORT = 1e-4
-"""Least shortfall that counts [N or N m]."""
-_FORCE = 10.0
-"""Largest unit of force when a limit is relaxed [N]."""
+_SHORT = 5e-5
+"""Least shortfall that counts, over the scene's force or the torque limit."""
+_TORQUE = 15.0
+"""Unit of the torques' shortfalls, over the scene's torque: as bad as one of its force."""
+_FORCE = 5.0
+"""Largest unit of force when a limit is relaxed, over the scene's."""
 
 Replan = Callable[[Sequence[Curve], float], object]
 """Plans the phases along curves with a least normal force [N]; raises if there is no plan."""
@@ -47,10 +49,10 @@ class _Candidate(NamedTuple):
     key: str
     finger: int | None
 
-    def value(self, relaxed: float, scales: Scales) -> float:
+    def value(self, relaxed: float, units: Units) -> float:
         """The limit when relaxed so far."""
         if self.key == "epsilon":
-            return self.limit.value - relaxed * scales.force
+            return self.limit.value - relaxed * units.force
         power = 1.0 if self.key == "torque_limit" else 0.5
         return float(self.limit.value * (1 + relaxed) ** power)
 
@@ -66,7 +68,7 @@ class _Candidate(NamedTuple):
 def explain(
     parts: Sequence[PhaseData],
     profile: Profile,
-    scales: Scales,
+    units: Units,
     phases: Sequence[int],
     stopped: str,
     replan: Replan,
@@ -78,7 +80,7 @@ def explain(
     parts : sequence of PhaseData
     profile : Profile
         A guess of the motion through all of them.
-    scales : Scales
+    units : Units
     phases : sequence of int
         Their numbers.
     stopped : str
@@ -86,7 +88,9 @@ def explain(
     replan : callable
     """
     data = join(parts)
-    eased = _ease(data, profile, scales)
+    torque = _TORQUE * data.curve.formation.scene.scales.torque
+    units = units._replace(torque=np.full(2, torque))
+    eased = _ease(data, profile, units)
     if eased is None:
         return SolverError(stopped)
     shortfalls = [
@@ -96,11 +100,11 @@ def explain(
     ]
     if not shortfalls:
         return SolverError(f"{stopped} although limits can be kept")
-    scales = _quicken(data, scales)
-    candidates = _list_candidates(data, scales)
+    units = _quicken(data, units)
+    candidates = _list_candidates(data, units)
 
     def find_least(index: int) -> float | None:
-        return _relax(data, eased, scales, candidates[index])
+        return _relax(data, eased, units, candidates[index])
 
     def can_plan(index: int, value: float) -> bool:
         try:
@@ -117,31 +121,31 @@ def explain(
     )
 
 
-def _quicken(data: PhaseData, scales: Scales) -> Scales:
+def _quicken(data: PhaseData, units: Units) -> Units:
     """Units for motions as quick as a fall, with forces that a hand may have.
 
     In units of a slow motion, or of an absurd epsilon, the small costs that choose among equals
     would outweigh what is relaxed.
     """
-    length, gravity = float(data.grid.s[-1]), data.curve.formation.scene.gravity
-    pace = np.sqrt(length / max(gravity, 1e-9))
-    return scales._replace(time=min(scales.time, pace), force=min(scales.force, _FORCE))
+    length, scales = float(data.grid.s[-1]), data.curve.formation.scene.scales
+    pace = float(np.sqrt(length / scales.acceleration))
+    return units._replace(time=min(units.time, pace), force=min(units.force, _FORCE * scales.force))
 
 
-def _ease(data: PhaseData, profile: Profile, scales: Scales) -> Profile | None:
+def _ease(data: PhaseData, profile: Profile, units: Units) -> Profile | None:
     """The motion with the least shortfalls when every limit is soft."""
     formation = data.curve.formation
     intervals, n_c = len(data.grid.s) - 1, formation.n_contacts
     nlp = build_path_nlp(n_c, intervals, Objective.ELASTIC, formation.n_rolling)
-    short = np.maximum(_shortfalls(data, profile), 0.0) + 0.1
+    short = np.maximum(_shortfalls(data, profile), 0.0) + 0.05 * data.spans[:-2]
     result = nlp.solver(
-        x0=pack(nlp, profile, scales, 0.0, short),
-        p=parameters(nlp, data, scales, 1.0),
-        **make_bounds(nlp, data, scales, Tightening.none(data, None)),
+        x0=pack(nlp, profile, units, 0.0, short),
+        p=parameters(nlp, data, units, 1.0),
+        **make_bounds(nlp, data, units, Tightening.none(data, None)),
     )
     if not nlp.solver.stats()["success"]:
         return None
-    return unpack(nlp, data.grid, result["x"].full()[:, 0], scales)[0]
+    return unpack(nlp, data.grid, result["x"].full()[:, 0], units)[0]
 
 
 def _shortfalls(data: PhaseData, profile: Profile) -> Array:
@@ -161,13 +165,14 @@ def _list_shortfalls(data: PhaseData, profile: Profile, suffix: str) -> list[Sho
     found = []
     for row, (name, unit) in enumerate(zip(names, units, strict=True)):
         worst = int(short[:, row].argmax())
-        if short[worst, row] > _SHORT:
+        if short[worst, row] > _SHORT * data.spans[row]:
             where = f"t = {times[worst]:.4f} s ({describe_pose(z[worst])}){suffix}"
-            found.append(Shortfall(name, float(short[worst, row]), unit, where))
+            share = float(short[worst, row] / data.spans[row])
+            found.append(Shortfall(name, float(short[worst, row]), unit, where, share))
     return found
 
 
-def _list_candidates(data: PhaseData, scales: Scales) -> list[_Candidate]:
+def _list_candidates(data: PhaseData, units: Units) -> list[_Candidate]:
     """Torque limits, speed limits if there are any, and epsilon."""
     formation, scene = data.curve.formation, data.curve.formation.scene
     n_h = len(data.least)
@@ -181,13 +186,11 @@ def _list_candidates(data: PhaseData, scales: Scales) -> list[_Candidate]:
             limit = Limit(f"speed limit of finger {i + 1}", speed, "rad/s", 1)
             found.append(_Candidate(limit, Relaxation(unit[-1], i), "speed_limit", i))
     limit = Limit("epsilon", data.epsilon, "N", -1)
-    every = np.append(scales.force * hold_least(formation, 1.0), np.zeros(3))
+    every = np.append(units.force * hold_least(formation, 1.0), np.zeros(3))
     return [*found, _Candidate(limit, Relaxation(every), "epsilon", None)]
 
 
-def _relax(
-    data: PhaseData, profile: Profile, scales: Scales, candidate: _Candidate
-) -> float | None:
+def _relax(data: PhaseData, profile: Profile, units: Units, candidate: _Candidate) -> float | None:
     """The value at which one limit just lets all others be kept, if there is one."""
     formation, relaxation = data.curve.formation, candidate.relaxation
     intervals, n_c = len(data.grid.s) - 1, formation.n_contacts
@@ -195,14 +198,14 @@ def _relax(
     short, worth = _shortfalls(data, profile).max(axis=0), relaxation.worth[:-1]
     needed = np.divide(short, worth, out=np.zeros_like(short), where=worth > 0)
     result = nlp.solver(
-        x0=pack(nlp, profile, scales, max(1.0, 1.5 * float(needed.max()))),
-        p=parameters(nlp, data, scales, 1.0, relaxation),
-        **make_bounds(nlp, data, scales, Tightening.none(data, None), relaxation),
+        x0=pack(nlp, profile, units, max(1.0, 1.5 * float(needed.max()))),
+        p=parameters(nlp, data, units, 1.0, relaxation),
+        **make_bounds(nlp, data, units, Tightening.none(data, None), relaxation),
     )
     if not nlp.solver.stats()["success"]:
         return None
-    relaxed = unpack(nlp, data.grid, result["x"].full()[:, 0], scales)[1]
-    return candidate.value(relaxed, scales)
+    relaxed = unpack(nlp, data.grid, result["x"].full()[:, 0], units)[1]
+    return candidate.value(relaxed, units)
 
 
 def with_limit(curve: Curve, finger: int, key: str, value: float) -> Curve:

@@ -144,7 +144,8 @@ def make_grid(curve: Curve, intervals: int) -> Grid:
     ends = np.array([0.0, *(segment.stop for segment in curve.segments)])
     angles = np.arccos(1 - 2 * np.clip(ends / curve.length, 0.0, 1.0))
     solid = intervals - (len(ends) - 2)
-    counts = np.maximum(1, np.round(np.diff(angles) / np.pi * solid).astype(int))
+    # Halves go up whatever their last bit is.
+    counts = np.maximum(1, np.floor(np.diff(angles) / np.pi * solid + 0.5 + 1e-6).astype(int))
     while counts.sum() != solid:
         counts[np.argmax(counts)] += np.sign(solid - counts.sum())
     nodes = []

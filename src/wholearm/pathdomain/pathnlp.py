@@ -27,18 +27,35 @@ _MU = 1e-2
 """Complementarity of the first guess's multipliers: the barrier parameter to start from."""
 
 
-class Scales(NamedTuple):
-    """Units of the NLP: length [m], time [s] and force [N]."""
+class Units(NamedTuple):
+    """Units of the NLP, in which its numbers are near 1 whatever the scene's size and mass are.
+
+    Attributes
+    ----------
+    length : float, [m]
+    time : float, [s]
+    force : float, [N]
+    torque : ndarray, shape (2,), [N m]
+        Of each joint.
+    power : float, [(N m)^2]
+        Of the effort's integrand.
+    """
 
     length: float
     time: float
     force: float
+    torque: Array
+    power: float
 
     @property
     def profile(self) -> Array:
         """Units of (b, a, squeeze), shape (3,)."""
         speed = self.length / self.time
         return np.array([speed**2, speed / self.time, self.force])
+
+    def limits(self, n_held: int) -> Array:
+        """Units of H c, tau + limit and limit - tau, shape (n_held + 4,)."""
+        return np.append(np.full(n_held, self.force), np.tile(self.torque, 2))
 
 
 class Tightening(NamedTuple):
@@ -147,39 +164,40 @@ def build_path_nlp(
 def parameters(
     nlp: PathNLP,
     data: PhaseData,
-    scales: Scales,
+    units: Units,
     time_weight: float,
     relaxation: Relaxation | None = None,
 ) -> Array:
     """Parameters of the NLP, in its units; see `build_path_nlp` for their order."""
-    forces, (b_unit, a_unit, force) = data.nodes.forces, scales.profile
+    forces, (b_unit, a_unit, force) = data.nodes.forces, units.profile
+    torque = units.torque
     blocks = [
-        np.hstack([forces.Ca * a_unit / force, forces.Ta * a_unit]),
-        np.hstack([forces.Cb * b_unit / force, forces.Tb * b_unit]),
-        np.hstack([forces.Cl, forces.Tl * force]),
-        forces.Tv * np.sqrt(b_unit),
+        np.hstack([forces.Ca * a_unit / force, forces.Ta * a_unit / torque]),
+        np.hstack([forces.Cb * b_unit / force, forces.Tb * b_unit / torque]),
+        np.hstack([forces.Cl, forces.Tl * force / torque]),
+        forces.Tv * np.sqrt(b_unit) / torque,
     ]
     if nlp.objective is Objective.EFFORT:
-        blocks.append(forces.T0)
+        blocks += [forces.T0 / torque, torque**2 / units.power]
     if relaxation is not None:
-        units = np.append(np.full(nlp.n_held, force), np.ones(3))
+        rows = np.concatenate([np.full(nlp.n_held, force), torque, [1.0]])
         rates = data.relative_rates(data.nodes, relaxation.finger)
-        blocks += [relaxation.worth / units, rates**2 * b_unit]
-    steps = data.grid.steps / scales.length
-    return np.concatenate([[0.0, 0.0], steps, [time_weight], *(b.ravel("F") for b in blocks)])
+        blocks += [relaxation.worth / rows, rates**2 * b_unit]
+    steps, weight = data.grid.steps / units.length, time_weight / units.power
+    return np.concatenate([[0.0, 0.0], steps, [weight], *(b.ravel("F") for b in blocks)])
 
 
 def make_bounds(
     nlp: PathNLP,
     data: PhaseData,
-    scales: Scales,
+    units: Units,
     tightening: Tightening,
     relaxation: Relaxation | None = None,
 ) -> dict[str, Array]:
     """Bounds of the NLP, with every limit tightened."""
     tight, speed_share, duration = tightening
     n, n_h = len(data.grid.s), nlp.n_held
-    b_unit = scales.profile[0]
+    b_unit = units.profile[0]
     low, high = np.full((n, nlp.columns), -np.inf), np.full((n, nlp.columns), np.inf)
     low[:, 0] = LEAST_B
     relaxed = None if relaxation is None else relaxation.finger
@@ -187,9 +205,9 @@ def make_bounds(
     high[:, 0] = np.maximum(b_max * speed_share / b_unit, 2 * LEAST_B)
     low[:, 3:] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
     forces, limit = data.nodes.forces, data.torque_limit
-    c_low = (data.least + tight[:, :n_h] - forces.C0) / scales.force
-    t_low = tight[:, n_h : n_h + 2] - limit - forces.T0
-    t_high = limit - tight[:, n_h + 2 :] - forces.T0
+    c_low = (data.least + tight[:, :n_h] - forces.C0) / units.force
+    t_low = (tight[:, n_h : n_h + 2] - limit - forces.T0) / units.torque
+    t_high = (limit - tight[:, n_h + 2 :] - forces.T0) / units.torque
     free = np.full_like(t_low, np.inf)
     if nlp.objective in (Objective.ELASTIC, Objective.RELAX):
         t_low, t_high = np.hstack([t_low, -free]), np.hstack([free, t_high])
@@ -199,7 +217,7 @@ def make_bounds(
     rows_low, rows_high = np.hstack([c_low, t_low]), np.hstack([c_low * 0 + np.inf, t_high])
     last_low, last_high = [], []
     if nlp.objective is Objective.MARGIN:
-        last_low, last_high = [-np.inf], [(duration or np.inf) / scales.time]
+        last_low, last_high = [-np.inf], [(duration or np.inf) / units.time]
     return {
         "lbx": low[nlp.free],
         "ubx": high[nlp.free],
@@ -209,18 +227,18 @@ def make_bounds(
 
 
 def first_multipliers(
-    nlp: PathNLP, data: PhaseData, profile: Profile, scales: Scales
+    nlp: PathNLP, data: PhaseData, profile: Profile, units: Units
 ) -> dict[str, Array]:
     """Multipliers that put the first guess near the central path of the barrier problem."""
     if nlp.objective is not Objective.TIME:
         return {}
     n_h = nlp.n_held
     slack = data.slack(data.nodes, profile)
-    slack[:, :n_h] /= scales.force
+    slack /= units.limits(n_h)
     pull = _MU / np.maximum(slack, 1e-3)
     rows = np.hstack([-pull[:, :n_h], pull[:, n_h + 2 :] - pull[:, n_h : n_h + 2]])
     on_b = np.zeros((len(data.grid.s), nlp.columns))
-    on_b[:, 0] = -_MU / np.maximum(profile.b / scales.profile[0], 1e-3)
+    on_b[:, 0] = -_MU / np.maximum(profile.b / units.profile[0], 1e-3)
     return {
         "lam_x0": on_b[nlp.free],
         "lam_g0": np.concatenate([np.zeros(nlp.first), rows.ravel()]),
@@ -228,7 +246,7 @@ def first_multipliers(
 
 
 def pack(
-    nlp: PathNLP, profile: Profile, scales: Scales, margin: float, short: Array | None = None
+    nlp: PathNLP, profile: Profile, units: Units, margin: float, short: Array | None = None
 ) -> Array:
     """Unknowns of the NLP, in its units, from a profile and what its objective adds.
 
@@ -236,32 +254,32 @@ def pack(
     """
     table = np.zeros((len(profile.a), nlp.columns))
     if short is not None:
-        table[:, 3:] = short / np.repeat([scales.force, 1.0], [nlp.n_held, 2])
+        table[:, 3:] = short / units.limits(nlp.n_held)[:-2]
     elif nlp.objective in CHAINED:
-        table[:, 3] = margin / _margin_unit(nlp, scales)
-    table[:, :3] = np.column_stack([profile.b, profile.a, profile.squeeze]) / scales.profile
+        table[:, 3] = margin / _margin_unit(nlp, units)
+    table[:, :3] = np.column_stack([profile.b, profile.a, profile.squeeze]) / units.profile
     return np.asarray(table[nlp.free])
 
 
-def _margin_unit(nlp: PathNLP, scales: Scales) -> float:
-    return scales.force if nlp.objective is Objective.MARGIN else 1.0
+def _margin_unit(nlp: PathNLP, units: Units) -> float:
+    return units.force if nlp.objective is Objective.MARGIN else 1.0
 
 
-def unpack(nlp: PathNLP, grid: Grid, x: Array, scales: Scales) -> tuple[Profile, float]:
+def unpack(nlp: PathNLP, grid: Grid, x: Array, units: Units) -> tuple[Profile, float]:
     """Profile of a solution, and the least margin [N] or the relaxation if that is an unknown.
 
     b is integrated again from a, so that b' = 2 a holds to rounding and not to Ipopt's tolerance.
     """
     table = np.zeros((len(grid.s), nlp.columns))
     table[nlp.free] = x
-    a, squeeze = table[:, 1] * scales.profile[1], table[:, 2] * scales.profile[2]
+    a, squeeze = table[:, 1] * units.profile[1], table[:, 2] * units.profile[2]
     steps = grid.steps
     a = a - np.dot(steps, a[1:] + a[:-1]) / (2 * grid.s[-1])
     b = np.concatenate([[0.0], np.cumsum(steps * (a[1:] + a[:-1]))])
     # Where phases are joined at next to no speed, rounding can take b below zero.
     b = np.maximum(b, 0.0)
     b[-1] = 0.0
-    margin = x[-1] * _margin_unit(nlp, scales) if nlp.objective in CHAINED else 0.0
+    margin = x[-1] * _margin_unit(nlp, units) if nlp.objective in CHAINED else 0.0
     return Profile(a, b, squeeze), float(margin)
 
 

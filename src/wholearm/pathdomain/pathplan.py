@@ -23,8 +23,8 @@ from .pathdata import PhaseData, cut, fit_torque, join, name_phases, prepare
 from .pathmotion import Grid, PathMotion, Profile, draw_together, make_grid
 from .pathnlp import (
     PathNLP,
-    Scales,
     Tightening,
+    Units,
     build_path_nlp,
     first_multipliers,
     make_bounds,
@@ -34,14 +34,21 @@ from .pathnlp import (
     unpack,
 )
 
-MISS = 5e-7
-"""Largest miss of a force or torque limit between nodes [N or N m]; of b and T, relative."""
+MISS = 2.5e-7
+"""Largest miss of a limit between nodes.
+
+Over the scene's force for contact forces, relative for torques, the square of speeds and time.
+"""
 ROUNDS = 40
 """Most times that the NLP is solved for one phase."""
 _COARSE = 1.5e-4
-"""Miss, over the typical force, above which the grid is drawn together."""
+"""Miss, over the typical force or torque, above which the grid is drawn together."""
+_LEVER = 30.0
+"""Lever at which the typical force makes the typical torque, in radii of gyration."""
 _SLOW = -12
 """Height of the slowest guess, as a power of two times that of a fall."""
+_LIGHT = 0.5
+"""Least unit of force, over the scene's: where forces are next to nothing they do not count."""
 _OVER = 1.05
 """How much more than the miss a limit is tightened."""
 
@@ -181,12 +188,12 @@ def _plan(
     data = join(parts)
     first, intervals = curves[0].formation, len(data.grid.steps)
     nlp = build_path_nlp(first.n_contacts, intervals, options.goal, first.n_rolling)
-    profile, scales = guess(data)
+    profile, units = guess(data, options.time_weight)
     tightening = Tightening.none(data, duration)
-    solution = _Solution(profile, 0.0, first_multipliers(nlp, data, profile, scales), 0, 0.0)
+    solution = _Solution(profile, 0.0, first_multipliers(nlp, data, profile, units), 0, 0.0)
     for solves in range(1, ROUNDS + 1):
         try:
-            solution = _solve(nlp, data, scales, tightening, solution, options.time_weight)
+            solution = _solve(nlp, data, units, tightening, solution, options.time_weight)
         except _StoppedError as stop:
             raise _StuckError(parts, f"{name_phases(phases)}: {stop}") from None
         profile, margin = solution.profile, solution.margin
@@ -197,9 +204,9 @@ def _plan(
         short, speeding = data.misses(profile, margin)
         total = sum(motion.duration for motion in motions)
         late = max(0.0, total / duration - 1) if duration else 0.0
-        if max(short.max(), speeding.max(), late) <= MISS:
+        if max((short / data.spans).max(), speeding.max(), late) <= MISS:
             break
-        coarse = short.max(axis=1) / (_COARSE * scales.force)
+        coarse = _weigh(data, short, units)
         if solves == 1 and coarse.max() > 1:
             old = data.grid
             shares = np.split(coarse, np.cumsum([len(part.solid) for part in parts])[:-1])
@@ -217,8 +224,10 @@ def _plan(
             short, speeding = data.beside(short), data.beside(speeding)
             tightening = tightening.by(reach, _OVER * short, _OVER * speeding, _OVER * late)
     else:
-        missed = f"limits are still missed by {short.max():.2g} N between nodes"
-        if short.max() <= MISS:
+        worst = int((short / data.spans).max(axis=0).argmax())
+        unit = "N" if worst < len(data.least) else "N m"
+        missed = f"limits are still missed by {short[:, worst].max():.2g} {unit} between nodes"
+        if (short / data.spans).max() <= MISS:
             over = max(speeding.max(), late)
             missed = f"the speed limit or the duration is still exceeded by {over:.2g} of it"
         raise SolverError(
@@ -239,31 +248,38 @@ def _plan(
     return plans
 
 
+def _weigh(data: PhaseData, short: Array, units: Units) -> Array:
+    """How much each solid interval misses of what draws the grid together, shape (n_solid,)."""
+    count, lever = len(data.least), _LEVER * data.curve.formation.scene.scales.length
+    held, torque = short[:, :count].max(axis=1), short[:, count:].max(axis=1)
+    return np.asarray(np.maximum(held, torque / lever) / (_COARSE * units.force))
+
+
 def _solve(
     nlp: PathNLP,
     data: PhaseData,
-    scales: Scales,
+    units: Units,
     tightening: Tightening,
     start: _Solution,
     time_weight: float,
 ) -> _Solution:
     result = nlp.solver(
-        x0=pack(nlp, start.profile, scales, start.margin),
-        p=parameters(nlp, data, scales, time_weight),
-        **make_bounds(nlp, data, scales, tightening),
+        x0=pack(nlp, start.profile, units, start.margin),
+        p=parameters(nlp, data, units, time_weight),
+        **make_bounds(nlp, data, units, tightening),
         **start.multipliers,
     )
     stats = nlp.solver.stats()
     if not stats["success"]:
         raise _StoppedError(f"Ipopt stopped with {stats['return_status']}")
-    profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], scales)
+    profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], units)
     multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
     iterations = start.iterations + stats["iter_count"]
     seconds = start.seconds + stats["t_wall_total"]
     return _Solution(profile, margin, multipliers, iterations, seconds)
 
 
-def guess(data: PhaseData) -> tuple[Profile, Scales]:
+def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
     """Guess a motion: b a parabola in s as high as limits allow, the squeeze amid its range.
 
     Where limits forbid even a slow one, it is as quick as a fall: a plan, if there is one, is not
@@ -286,17 +302,17 @@ def guess(data: PhaseData) -> tuple[Profile, Scales]:
         else:
             high_power = power
     none = low_power == _SLOW
-    return _guess_at(data, 0.7 * fall * (1.0 if none else 2**low_power))
+    return _guess_at(data, 0.7 * fall * (1.0 if none else 2**low_power), time_weight)
 
 
-def guess_slowly(data: PhaseData) -> tuple[Profile, Scales]:
+def guess_slowly(data: PhaseData) -> tuple[Profile, Units]:
     """Guess a slow motion, whatever limits say."""
     return _guess_at(data, 0.7 * _fall(data) * 2.0**_SLOW)
 
 
 def _fall(data: PhaseData) -> float:
     """The b of a fall over the length of the curve [m^2/s^2]."""
-    return 2 * data.curve.formation.scene.gravity * float(data.grid.s[-1]) + 1e-9
+    return 2 * data.curve.formation.scene.scales.acceleration * float(data.grid.s[-1])
 
 
 def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
@@ -319,11 +335,15 @@ def _squeeze_range(data: PhaseData, height: float) -> tuple[Array, Array]:
     return low, high
 
 
-def _guess_at(data: PhaseData, height: float) -> tuple[Profile, Scales]:
+def _guess_at(data: PhaseData, height: float, time_weight: float = 0.0) -> tuple[Profile, Units]:
     low, high = _squeeze_range(data, height)
     middle = np.where(np.isfinite(low + high) & (low <= high), (low + high) / 2, 0.0)
     length = float(data.grid.s[-1])
     duration = np.pi / 2 * length / np.sqrt(height)
-    force = max(1.0, data.epsilon, float(np.abs(middle).mean()))
-    scales = Scales(length, 0.6 * duration, force)
-    return Profile(*_parabola(data, height), middle), scales
+    weight = data.curve.formation.scene.scales.force
+    force = max(_LIGHT * weight, data.epsilon, float(np.abs(middle).mean()))
+    profile = Profile(*_parabola(data, height), middle)
+    torque = data.torque_limit
+    squares = np.minimum(np.abs(data.nodes.forces.tau(*profile)), torque) ** 2
+    power = time_weight + float(squares.sum(axis=1).mean())
+    return profile, Units(length, 0.6 * duration, force, torque, power)

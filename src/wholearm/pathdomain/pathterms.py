@@ -47,11 +47,11 @@ def write_terms(
     The unknowns are (b, a, squeeze, extras) node by node, without b at the two ends. The extras
     are shortfalls for `elastic`, the least margin for `margin` and the relaxation for `relax`. The
     parameters are the speeds at the ends, the steps, the weight of time, and the coefficients of
-    `PathForces` but for C0 and T0, which are part of the bounds; for `relax` also what the
-    relaxation is worth for each limit, and b's coefficients in the speed limit. The rows are the N
-    of b' = 2 a, those that chain the margin or the relaxation, and the changes of a over the first
-    and the last interval; then node by node H c and tau, and the speed for `relax`; last T for
-    `margin`.
+    `PathForces` but for C0 and T0, which are part of the bounds; for `effort` also T0 and the
+    weight of each joint's torque, for `relax` what the relaxation is worth for each limit, and b's
+    coefficients in the speed limit. The rows are the N of b' = 2 a, those that chain the margin or
+    the relaxation, and the changes of a over the first and the last interval; then node by node H c
+    and tau, and the speed for `relax`; last T for `margin`.
 
     Parameters
     ----------
@@ -95,11 +95,11 @@ def write_terms(
         link_costs += interval_times
     elif objective is Objective.EFFORT:
         # The bounds hold T0, so the full torque is passed as a parameter for the integrand only.
-        T0 = ca.SX.sym("T0", n, 2)
-        coefficients.append(T0)
+        T0, joints = ca.SX.sym("T0", n, 2), ca.SX.sym("joints", 2)
+        coefficients += [T0, joints]
         full = tau + T0
         squares = full[:-1, :] ** 2 + full[:-1, :] * full[1:, :] + full[1:, :] ** 2
-        link_costs += interval_times * (ca.sum2(squares) / 3 + weight)
+        link_costs += interval_times * (squares @ joints / 3 + weight)
     elif objective is Objective.MARGIN:
         c_rows = held - extra @ ca.horzcat(ca.DM.ones(1, n_contacts), ca.DM(1, 2 * n_rolling))
         node_costs[0] -= extra[0]

@@ -121,13 +121,16 @@ def _list_of_stage(problem: Problem, stage: Stage, passed: float) -> list[Shortf
 
     short = np.hstack([flat(problem.epsilon - c_n), flat(np.abs(c_t) - grip), flat(over)])
     middles = passed + part.duration * (part.breaks[:-1] + part.fractions / 2)
+    spans = np.full(len(names), problem.scene.scales.force)
+    spans[-2:] = problem.scene.torque_limit
     found = []
     for column, name in enumerate(names):
         row = int(short[:count, column].argmax())
         if short[row, column] > SHORT:
             unit = "N m" if column >= len(names) - 2 else "N"
             where = f"t = {middles[row]:.4f} s, phase {stage.phase + 1}"
-            found.append(Shortfall(name, float(short[row, column]), unit, where))
+            amount = float(short[row, column])
+            found.append(Shortfall(name, amount, unit, where, amount / spans[column]))
     return found
 
 

@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from wholearm.benchmark.invariance import (
+    RETELLINGS,
+    Answer,
+    Retelling,
+    Units,
+    answer,
+    compare,
+    in_units,
+    mirrored,
+    renumbered,
+)
+from wholearm.outline import load
+from wholearm.path import trace_phases
+from wholearm.problem import Problem, build_problem
+
+PROBLEMS = Path(__file__).parents[1] / "problems"
+CASES = [("heptagon_impact", 2, 20), ("box_rolling", 1, 80)]
+"""Problems, how many of their phases are planned, the last of them to rest, and intervals."""
+
+
+@pytest.fixture(scope="module", params=CASES, ids=[case[0] for case in CASES])
+def case(request: pytest.FixtureRequest) -> tuple[str, int, int]:
+    found: tuple[str, int, int] = request.param
+    return found
+
+
+@pytest.fixture(scope="module")
+def problem(case: tuple[str, int, int]) -> Problem:
+    name, phases, _ = case
+    table = copy.deepcopy(dict(load(str(PROBLEMS / f"{name}.toml")).table))
+    table["phases"] = table["phases"][:phases]
+    table["phases"][-1]["end"] = "rest"
+    return build_problem(table)
+
+
+@pytest.fixture(scope="module")
+def answers(case: tuple[str, int, int], problem: Problem) -> dict[str, Answer]:
+    goals = ("time", "effort", "margin")
+    return {goal: answer(problem, goal, intervals=case[2]) for goal in goals}
+
+
+@pytest.mark.parametrize("telling", RETELLINGS, ids=lambda telling: telling.name)
+@pytest.mark.parametrize("objective", ["time", "effort", "margin"])
+def test_answers_do_not_depend_on_how_a_problem_is_told(
+    case: tuple[str, int, int],
+    problem: Problem,
+    answers: dict[str, Answer],
+    telling: Retelling,
+    objective: str,
+) -> None:
+    other = answer(telling.apply(problem), objective, telling, intervals=case[2])
+    difference = compare(answers[objective], other)
+    assert difference.value < 1e-8 and difference.torques < 1e-7
+
+
+@pytest.mark.parametrize("telling", RETELLINGS, ids=lambda telling: telling.name)
+def test_a_retelling_changes_what_it_says(problem: Problem, telling: Retelling) -> None:
+    """Configurations at the ends of phases are those of the first telling, in other words."""
+    other = telling.apply(problem)
+    scale = np.array([telling.units.length] * 2 + [1.0] * 3)
+    for one, same in zip(trace_phases(problem), trace_phases(other), strict=True):
+        z = scale * one.end
+        if telling.mirrored:
+            z = np.array([-z[0], z[1], -z[2], np.pi - z[4], np.pi - z[3]])
+        turns = (same.end - z) / (2 * np.pi) * [0, 0, 0, 1, 1]
+        np.testing.assert_allclose(same.end - 2 * np.pi * np.round(turns), z, atol=1e-11 * scale[0])
+        assert same.length == pytest.approx(telling.units.length * one.length, rel=1e-11)
+
+
+def test_retellings_turn_back(problem: Problem) -> None:
+    units = Units(7.0, 3.0, 2.0)
+    there, back = in_units(units), in_units(Units(*(1 / unit for unit in units)))
+    count = problem.scene.polygon.n_vertices
+    for one, other in [(there, back), (mirrored(), mirrored()), (renumbered(2), renumbered(-2))]:
+        table = other.table(one.table(problem.table))
+        assert table["phases"] == problem.table["phases"]
+        assert table["start"] == pytest.approx(problem.table["start"])
+        found, wanted = (np.array(own["object"]["vertices"]) for own in (table, problem.table))
+        assert found.shape == (count, 2)
+        np.testing.assert_allclose(found, wanted, rtol=1e-14)
+        for key in ("1", "2"):
+            finger, given = table["fingers"][key], problem.table["fingers"][key]
+            assert finger.pop("base") == pytest.approx(given["base"])
+            assert finger == pytest.approx({k: v for k, v in given.items() if k != "base"})
