@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..dynamics import energy
 from ..model import Array
 from ..problem import Phase, Problem
-from .stepper import Outputs
+from .layout import Outputs
 
 
 class EventKind(Enum):
@@ -23,7 +23,7 @@ class EventKind(Enum):
     REST = "rest"
     """The object comes to rest short of the end of the phase."""
     STICK = "stick"
-    """The object stays at rest."""
+    """Friction holds a contact or a joint while the rest moves, or the object stays at rest."""
     REVERSAL = "reversal"
     """A contact's sliding or a joint changes direction."""
     TORQUE_STEP = "torque step"
@@ -34,12 +34,11 @@ class EventKind(Enum):
     """The velocity jumps onto the next formation, which is taken if every contact presses."""
     RELEASE = "release"
     """The contacts that the next phase does not have are let go, and its formation is taken."""
-    HELD = "held"
-    """Friction holds a contact or a joint while the rest moves."""
     CONTACT_LOST = "contact lost"
     """A normal force falls to zero."""
     SLIP = "slip"
-    """A rolling contact leaves its friction cone."""
+    """Friction no longer holds a contact or a joint; if the phase lets that contact roll the motion
+    ends."""
     LIMIT = "limit"
     """The formation stops being valid in another way."""
     END = "end"
@@ -59,10 +58,11 @@ class Event:
     text : str
         What has happened, in words.
     contact : str
-        The contact or joint concerned, empty if there is none.
+        The contact or joint concerned, empty if it is the object or none.
     value : float
         Arrival: rate at which the distance to the phase's end closes [m/s or rad/s]; contact lost
-        and release: the c_n that the contact would need [N]; slip: its margin mu c_n - |c_t| [N];
+        and release: the c_n that the contact would need [N]; slip of a contact that the phase lets
+        roll: its margin mu c_n - |c_t| [N];
         impact: the least impulse, that of `contact` [N s]; end: the distance to the phase's end [m
         or rad], NaN if that is a release; NaN otherwise.
     """
@@ -245,7 +245,7 @@ def collect(
         contacts=tuple(contact.name for contact in contacts),
         c_n=c_n,
         c_t=c_t,
-        events=tuple(events),
+        events=tuple(sorted(events, key=lambda event: event.time)),
         energies=Energies(stored, y[:, 10], y[:, 11], y[:, 12], y[:, 13], impact),
         outcome=outcome,
         missed_by=missed_by,

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..problem import End
+from .choosing import choose_mode, note_change
 from .events import EventKind, Outcome
 from .locate import find_first
 from .replay import Replay
@@ -63,30 +64,56 @@ class Rested:
 Ending = Arrival | Released | Rested | Outcome
 
 
-def look_again(run: Replay, turned: Sequence[int] = ()) -> Ending | None:
+def look_again(
+    run: Replay, turned: Sequence[int] = (), *, time: float | None = None, enters: bool = False
+) -> Ending | None:
     """Record the forces after they jump; what ends the motion, if that does.
 
     Parameters
     ----------
     run : Replay
     turned : sequence of int
-        Rows of the event values that have just changed direction.
+        Contacts and then joints that have just come to rest.
+    time : float, optional, [s]
+        When that was, if not at present.
+    enters : bool
+        Whether a formation has just been entered.
     """
-    s = run.stepper
+    if _decide(run, turned, time=time, enters=enters):
+        return _come_to_rest(run)
     run.record()
-    held = find_held(run, turned)
-    if not held:
-        turned = _bridge(run)
-        held = find_held(run, turned)
+    if _bridge(run):
+        return _come_to_rest(run)
+    s = run.stepper
     if not s.outputs[s.to.ratio] > 0:
         run.fail_to_step(float(s.outputs[s.to.ratio]))
     forces = s.outputs[s.to.c_n]
     if forces.min() < -SLACK_FORCE:
         return let_go(run, np.flatnonzero(forces < -SLACK_FORCE).tolist())
-    cones = s.outputs[s.to.events][s.rows.cone]
-    if (cones < -SLACK_FORCE).any():
-        return slip(run)
-    return _hold(run, held[0]) if held else None
+    return slip(run) if find_slipping(s) else None
+
+
+def _decide(
+    run: Replay, turned: Sequence[int], *, time: float | None = None, enters: bool = False
+) -> bool:
+    """Find how contacts and joints at rest go on; whether all motion has ended.
+
+    With a single freedom whatever slides and turns does so for as long as there is motion.
+    """
+    if run.phase.formation.n_constraints < 4:
+        return choose_mode(run, turned, time=time, enters=enters)
+    s = run.stepper
+    for row in turned:
+        place = s.at.Xi.start + row
+        before = float(s.inputs[place])
+        s.inputs[place] = -before
+        note_change(run, row, before, -before, run.t if time is None else time)
+    return False
+
+
+def _come_to_rest(run: Replay) -> Rested:
+    run.note(EventKind.REST, f"the object comes to rest {run.when()}")
+    return Rested()
 
 
 def let_go(run: Replay, contacts: Sequence[int]) -> Released | Outcome:
@@ -99,8 +126,7 @@ def let_go(run: Replay, contacts: Sequence[int]) -> Released | Outcome:
     pulling = [s.formation.names[k] for k in contacts]
     if any(name in run.releasable for name in pulling):
         # Forces recorded after a jump are those of a formation that is given up.
-        times = run.sections[-1].times
-        if len(times) > 1 and times[-2] == run.t:
+        if run.repeats():
             run.drop()
         return Released(min(forces[name] for name in run.releasable))
     name = min(pulling, key=forces.__getitem__)
@@ -111,56 +137,56 @@ def slip(run: Replay) -> Released | Outcome:
     """End because a rolling contact slips, or starts to part where its release is planned."""
     s = run.stepper
     formation = s.formation
-    cones = s.outputs[s.to.events][s.rows.cone]
-    row = formation.rolling_rows[int(cones.argmin()) % formation.n_rolling]
+    cones = _measure_reserves(s)
+    declared = [k for k in range(len(cones)) if s.mode.declares(k)]
+    row = s.mode.holders[min(declared, key=cones.__getitem__)][0]
     if formation.names[row] in run.releasable:
         return let_go(run, [row])
     return run.slip(row, float(s.outputs[s.to.c_n][row]), float(s.outputs[s.to.c_t][row]))
 
 
-def turn(run: Replay, rows: Sequence[int]) -> Ending | None:
-    """Reverse contacts and joints whose speed has just come to zero; None if the motion goes on.
+def let_slip(run: Replay, events: Sequence[int]) -> Ending | None:
+    """Go on after friction has reached its bound for some of what it holds.
+
+    A contact that the phase lets roll must not slip.
+    """
+    s = run.stepper
+    count = len(s.mode.holders)
+    held = {(k - s.rows.cone.start) % count for k in events if k in _list_rows(s.rows.cone)}
+    if any(s.mode.declares(k) for k in held):
+        return slip(run)
+    return look_again(run, [k - s.rows.slide.start for k in events if k in _turning(s)])
+
+
+def _measure_reserves(s: Stepper) -> list[float]:
+    """What friction still has to give for each of what it holds [N, N m]."""
+    cones = s.outputs[s.to.events][s.rows.cone].reshape(2, -1)
+    return [float(least) for least in cones.min(axis=0)]
+
+
+def find_slipping(s: Stepper) -> list[int]:
+    """Which contacts that the phase lets roll are out of their cones."""
+    reserves = _measure_reserves(s) if s.mode.holders else []
+    return [k for k, least in enumerate(reserves) if least < -SLACK_FORCE and s.mode.declares(k)]
+
+
+def turn(run: Replay, events: Sequence[int]) -> Ending | None:
+    """Go on where contacts or joints have come to rest; None if the motion goes on.
 
     Planned torques step where friction does. If the step comes a little later, by rounding, it is
-    waited for with the old friction: the new one could hold what is to reverse.
+    waited for with the old friction.
     """
     s = run.stepper
     s.inputs[s.at.t] = now = run.t
-    window = SETTLING
-    if s.is_free:
-        if _is_settled(run):
-            return Arrival(-float(s.outputs[s.to.until_rate]), REST_WINDOW)
-        _flip(s, rows)
-        s.look()
-        if find_held(run, rows):
-            window = REST_WINDOW
-        _flip(s, rows)
-        s.look()
-    stepped = steps_within(run, window)
+    rows = [k - s.rows.slide.start for k in events if k in _turning(s)]
+    if s.formation.n_constraints < 4 and _is_settled(run):
+        return Arrival(-float(s.outputs[s.to.until_rate]), REST_WINDOW)
+    stepped = steps_within(run, SETTLING)
     if stepped:
         coast_to_step(run, hide=True)
         run.drop()
-    _flip(s, rows)
-    for row in rows:
-        _note_reversal(run, row, now)
-    if stepped:
         run.note(EventKind.TORQUE_STEP, f"the torques step {run.when()}")
-    return look_again(run, rows)
-
-
-def find_held(run: Replay, rows: Sequence[int]) -> list[int]:
-    """Which of the contacts and joints that start to slide or turn are pushed back by friction.
-
-    Only with two or more freedoms can one of them stop while the rest moves.
-    """
-    s = run.stepper
-    if not rows or not s.is_free:
-        return []
-    before = s.outputs[s.to.events].copy()
-    run.step_to(SETTLING)
-    after = s.outputs[s.to.events].copy()
-    s.look()
-    return [k for k in rows if after[k] < min(before[k], 0.0) - s.slack[k]]
+    return look_again(run, rows, time=now)
 
 
 def steps_within(run: Replay, window: float) -> bool:
@@ -193,15 +219,6 @@ def coast_to_step(run: Replay, hide: bool) -> None:
         run.stepper.inputs[run.stepper.at.t] = run.t
 
 
-def _hold(run: Replay, row: int) -> Rested | Outcome:
-    """End because friction holds a contact or a joint: at rest everything stops."""
-    s = run.stepper
-    if np.abs(run.y[5:10]).max() < SLOW:
-        run.note(EventKind.REST, f"the object comes to rest {run.when()}")
-        return Rested()
-    return run.stay(name_row(s, row))
-
-
 def _is_settled(run: Replay) -> bool:
     """Whether everything has all but stopped at the end of the phase, just before a torque break.
 
@@ -215,12 +232,12 @@ def _is_settled(run: Replay) -> bool:
     )
 
 
-def _bridge(run: Replay) -> list[int]:
+def _bridge(run: Replay) -> bool:
     """Pass over the instant between a reversal and the step of the torques that goes with it.
 
     Planned torques step where friction does, but by rounding the two come one after the other, and
     in between the forces are those of neither. That instant is integrated like any other, but its
-    forces are not recorded. Returns the rows that have changed direction.
+    forces are not recorded. Returns whether all motion has ended.
     """
     s = run.stepper
     if steps_within(run, SETTLING):
@@ -228,21 +245,20 @@ def _bridge(run: Replay) -> list[int]:
         coast_to_step(run, hide=True)
         run.drop()
         run.note(EventKind.TORQUE_STEP, f"the torques step {run.when()}")
-        run.record()
-        return []
-    start = run.sections[-1].rows[-1]
-    stretch = min(SETTLING, run.breaks[run.piece + 1] - run.t)
-    run.step_to(stretch)
-    rows = find_first(run, start, stretch, _turning(s))
-    if not rows:
-        s.look()
-        return []
-    _cross(run, run.t + float(s.inputs[s.at.h]))
-    _flip(s, rows)
-    for row in rows:
-        _note_reversal(run, row, run.t)
+        rows: list[int] = []
+    else:
+        start = s.outputs.copy()
+        stretch = min(SETTLING, run.breaks[run.piece + 1] - run.t)
+        run.step_to(stretch)
+        events = find_first(run, start, stretch, _turning(s))
+        if not events:
+            s.look()
+            return False
+        rows = [k - s.rows.slide.start for k in events]
+        _cross(run, run.t + float(s.inputs[s.at.h]))
+    ended = _decide(run, rows)
     run.record()
-    return rows
+    return ended
 
 
 def _cross(run: Replay, stop: float) -> None:
@@ -257,24 +273,5 @@ def _turning(s: Stepper) -> range:
     return range(s.rows.slide.start, s.rows.joint.stop)
 
 
-def name_row(s: Stepper, row: int) -> str:
-    """Name of the contact or the joint of a row that changes sign at a reversal."""
-    if row < s.rows.slide.stop:
-        return str(s.formation.names[row - s.rows.slide.start])
-    return f"joint {row - s.rows.joint.start + 1}"
-
-
-def _flip(s: Stepper, rows: Sequence[int]) -> None:
-    """Change the directions of contacts and joints."""
-    for row in rows:
-        if row < s.rows.slide.stop:
-            s.inputs[s.at.Xi.start + row - s.rows.slide.start] *= -1
-        else:
-            s.inputs[s.at.sigma.start + row - s.rows.joint.start] *= -1
-
-
-def _note_reversal(run: Replay, row: int, time: float) -> None:
-    name = name_row(run.stepper, row)
-    verb = "slides" if row < run.stepper.rows.slide.stop else "turns"
-    text = f"{name} {verb} the other way at t = {time:.5g} s, phase {run.phase.number}"
-    run.note(EventKind.REVERSAL, text, name, time=time)
+def _list_rows(rows: slice) -> range:
+    return range(rows.start, rows.stop)

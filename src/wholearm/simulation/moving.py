@@ -18,9 +18,10 @@ from .jumps import (
     Ending,
     Rested,
     coast_to_step,
+    find_slipping,
     let_go,
+    let_slip,
     look_again,
-    slip,
     steps_within,
     turn,
 )
@@ -37,18 +38,17 @@ SHORTEST_STEP = 1e-14
 
 def move(run: Replay) -> Ending:
     """Integrate until the motion rests, arrives, releases its contacts or fails."""
-    s = run.stepper
-    outputs, to = s.outputs, s.to
-    start = outputs.copy()
+    start = run.stepper.outputs.copy()
     run.h = min(run.h, FIRST_STEP)
     while True:
+        outputs, to = run.stepper.outputs, run.stepper.to
         target = min(run.breaks[run.piece + 1], run.wanted[run.next_wanted])
         h, whole = _try_step(run, target)
         if outputs[to.worst] < 0 and not (whole and _is_there(run, target)):
             ending = _stop_at_event(run, start, h)
             if ending is not None:
                 return ending
-            start = outputs.copy()
+            start = run.stepper.outputs.copy()
             continue
         start = run.accept(target if whole else run.t + h)
         if not whole:
@@ -59,7 +59,7 @@ def move(run: Replay) -> Ending:
             ending = _pass_break(run)
             if ending is not None:
                 return ending
-            start = outputs.copy()
+            start = run.stepper.outputs.copy()
 
 
 def _try_step(run: Replay, target: float) -> tuple[float, bool]:
@@ -102,10 +102,10 @@ def _is_there(run: Replay, t: float) -> bool:
     elif run.phase.end is End.IMPACT:
         coming = run.piece + 1
         speed = 0.0 if coming >= len(run.steps_at) or run.steps_at[coming] else speed
-    elif s.is_free:
+    elif s.formation.n_constraints < 4:
         speed = float(np.abs(s.outputs[s.to.y][5:10]).max())
-    held = s.outputs[s.to.events][: s.rows.cone.stop]
-    return speed < SLOW and bool(held.min() >= -SLACK_FORCE)
+    pressing = s.outputs[s.to.events][s.rows.force]
+    return speed < SLOW and bool(pressing.min() >= -SLACK_FORCE) and not find_slipping(s)
 
 
 def _pass_break(run: Replay) -> Ending | None:
@@ -140,7 +140,7 @@ def _stop_at_event(run: Replay, start: Array, h: float) -> Ending | None:
     if pulling:
         return let_go(run, pulling)
     if any(rows.cone.start <= k < rows.cone.stop for k in kinds):
-        return slip(run)
+        return let_slip(run, kinds)
     for k in kinds:
         if rows.limit.start <= k < rows.limit.stop:
             text = f"{run.limits[k - rows.limit.start]} {run.when()}"

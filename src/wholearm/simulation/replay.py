@@ -12,7 +12,9 @@ from ..model import Array
 from ..problem import Phase, Problem
 from ..torque import TorqueProfile
 from .events import Event, EventKind, Outcome, OutcomeKind, Section
-from .stepper import STATE, Stepper
+from .layout import STATE
+from .modes import FREE, Grips
+from .stepper import Stepper, build_stepper
 
 FIRST_STEP = 1e-3
 """Length of the first step tried from rest [s]."""
@@ -39,6 +41,8 @@ class Replay:
         What has happened when each of the stepper's limits is zero.
     releasable : tuple of str
         The contacts whose release ends the phase.
+    side : float
+        Sign of (coordinate - value) before the end of the phase, if that is a coordinate's value.
     moving : bool
         Whether the motion goes on into the phase that is entered.
     """
@@ -70,9 +74,29 @@ class Replay:
         self.hold = -math.inf
         self.impact = 0.0
         self.moving = False
+        self.side = 1.0
+        self.decided = (-math.inf, 0)
         self.sections: list[Section] = []
         self.events: list[Event] = []
         self.steps = self.rejected = 0
+
+    def take(self, grips: Grips = FREE) -> None:
+        """Go on with the steps of the phase's formation in which friction holds `grips`."""
+        degree = self.coefficients.shape[2] - 1
+        formation, until = self.phase.formation, self.phase.until
+        self.stepper = s = build_stepper(formation, until, self.side, degree, grips)
+        self.sections.append(Section(self.phase, s.to))
+        s.inputs[s.at.tolerance] = self.tolerance
+        s.inputs[s.at.kept] = s.mode.read_kept(self.y[:5])
+        self.load_piece()
+
+    def count_decision(self, most: int) -> None:
+        """Count one decision of friction; raise an error if there are `most` at one instant."""
+        count = self.decided[1] + 1 if self.t <= self.decided[0] else 1
+        self.decided = (self.t, count)
+        if count > most:
+            names = " ".join(self.phase.formation.names)
+            raise SimulationError(f"sticking and slipping of {names} do not end {self.where()}")
 
     def accept(self, t: float) -> Array:
         """Take the step just made, to time `t`, and record its end."""
@@ -122,9 +146,15 @@ class Replay:
 
     def drop(self) -> None:
         """Take back the last record."""
-        section = self.sections[-1]
+        section = next(section for section in reversed(self.sections) if section.times)
         for column in (section.times, section.rows, section.impacts):
             column.pop()
+
+    def repeats(self) -> bool:
+        """Whether the last two records are of the same instant of one phase."""
+        own = [section for section in self.sections if section.phase is self.phase]
+        times = [time for section in own[-2:] for time in section.times[-2:]]
+        return len(times) > 1 and times[-2] == self.t
 
     def note(
         self,
@@ -153,14 +183,6 @@ class Replay:
         text = f"{name} slips: |c_t| = {abs(c_t):.5g} N {how} mu c_n = {bound:.5g} N {self.when()}"
         self.note(EventKind.SLIP, text, name, bound - abs(c_t))
         return Outcome(OutcomeKind.SLIPS, text)
-
-    def stay(self, name: str) -> Outcome:
-        """End because friction holds a contact or a joint while the rest moves."""
-        joint = name.startswith("joint")
-        what = "held joints are not modelled" if joint else "the phase plans it as sliding"
-        text = f"friction holds {name} {self.when()}, while the rest moves: {what}"
-        self.note(EventKind.HELD, text, name)
-        return Outcome(OutcomeKind.HELD, text)
 
     def run_out(self) -> Outcome:
         """End because the torques end."""
@@ -198,6 +220,13 @@ class Replay:
         """When the torques step next, after the present piece, or infinity [s]."""
         k = bisect_left(self.step_times, self.breaks[self.piece + 1])
         return self.step_times[k] if k < len(self.step_times) else math.inf
+
+    def torque(self, t: float) -> Array:
+        """Torques of the present piece at time `t`, also beyond its end, shape (2,) [N m]."""
+        start, stop = self.breaks[self.piece], self.breaks[self.piece + 1]
+        coefficients = self.coefficients[self.piece]
+        x = (2 * t - start - stop) / (stop - start)
+        return np.asarray(coefficients @ x ** np.arange(coefficients.shape[1]))
 
     def fraction(self, t: float) -> float:
         """Where time `t` is on the present piece, from -1 to 1."""

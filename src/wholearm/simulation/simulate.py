@@ -198,8 +198,6 @@ def _collapse(run: Replay, rest: Rest, change: Collapse) -> Released | Outcome:
             f"{' '.join(rest.formation.names)} jams at rest {run.where()}: friction makes "
             "the reduced inertia vanish or turn negative"
         )
-    if change.held:
-        return run.stay(change.contact)
     if change.c_t is not None:
         row = run.phase.formation.names.index(change.contact)
         return run.slip(row, change.c_n, change.c_t)

@@ -1,8 +1,9 @@
 """A formation with two or more freedoms at rest: with which directions it could start to move.
 
-Each choice of the directions in which contacts slide and joints turn makes the accelerations affine
-in the torques. A choice is consistent if contacts and joints then accelerate in those directions,
-every contact presses, and nothing that touches closes further.
+Each choice of the directions in which contacts slide and joints turn, and of what sticks and is
+held, makes the accelerations affine in the torques. A choice is consistent if contacts and joints
+then accelerate in those directions, friction can hold the others, every contact presses, and
+nothing that touches closes further. Choices in which nothing is held are tried first.
 """
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cones import hold_rows
-from ..dynamics import Directions, force_rows, reduced_inertia
+from ..dynamics import Directions
 from ..formation import Formation, Kinematics
 from ..model import Array
+from .modes import Mode, Response, Rows, find_grips, list_units, respond
 from .stepper import SLACK_FORCE
 
 STILL = 1e-9
@@ -83,6 +84,7 @@ class Pattern:
     Attributes
     ----------
     directions : Directions
+        Zero for what friction holds.
     mass : ndarray, shape (5,)
         Diagonal of M5.
     acceleration : ndarray, shape (5, 3)
@@ -91,6 +93,8 @@ class Pattern:
         What has to be positive for the contacts to hold, H c (`wholearm.cones`).
     slips : ndarray, shape (n_c + 2, 3)
         Accelerations of the contacts' sliding and of the joints, along `directions`.
+    grips : ndarray, shape (2 k, 3), [N, N m]
+        What has to be positive for friction to hold what has no direction.
     openings : ndarray, shape (k, 3), [m/s^2]
         Accelerations of the gaps of what touches but is not in the formation.
     ratio : float
@@ -101,13 +105,19 @@ class Pattern:
     acceleration: Array
     holds: Array
     slips: Array
+    grips: Array
     openings: Array
     ratio: float
 
     @property
     def margins(self) -> list[tuple[Array, float]]:
         """Rows r and offsets d with r @ (1, tau_1, tau_2) + d >= 0 while it moves this way."""
-        kinds = (self.slips, STILL), (self.openings, CLOSING), (self.holds, SLACK_FORCE)
+        kinds = (
+            (self.slips, STILL),
+            (self.openings, CLOSING),
+            (self.holds, SLACK_FORCE),
+            (self.grips, SLACK_FORCE),
+        )
         return [(row, slack) for rows, slack in kinds for row in rows]
 
     def drive(self, tau: Array) -> float:
@@ -115,17 +125,14 @@ class Pattern:
         acceleration = self.acceleration @ [1.0, *tau]
         return float(np.sqrt(self.mass @ acceleration**2))
 
-    def find_held(self, tau: Array) -> NDArray[np.int64]:
-        """Contacts and then joints that would have to accelerate against their direction."""
-        return np.flatnonzero(self.slips @ [1.0, *tau] < -STILL)
-
     def slides(self, tau: Array) -> bool:
         """Whether contacts and joints accelerate in their directions and nothing closes."""
         load = [1.0, *tau]
         return (
             self.ratio > 0
             and self.drive(tau) > STILL
-            and not len(self.find_held(tau))
+            and bool((self.slips @ load >= -STILL).all())
+            and bool((self.grips @ load >= -SLACK_FORCE).all())
             and bool((self.openings @ load >= -CLOSING).all())
         )
 
@@ -139,7 +146,9 @@ class Pattern:
         return Departure(x, heading, self.directions)
 
 
-def find_patterns(formation: Formation, z: Array, near: NDArray[np.bool_]) -> tuple[Pattern, ...]:
+def find_patterns(
+    formation: Formation, z: Array, near: NDArray[np.bool_], held: bool
+) -> tuple[Pattern, ...]:
     """Every choice of directions at a configuration at rest; contacts that roll have none.
 
     Parameters
@@ -148,6 +157,8 @@ def find_patterns(formation: Formation, z: Array, near: NDArray[np.bool_]) -> tu
     z : ndarray, shape (5,)
     near : ndarray of bool, shape (n_limits,)
         Which limits of the formation are zero at `z`.
+    held : bool
+        Whether to return those in which friction holds something, the least first, or the others.
     """
     kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
     gradient = np.zeros((0, 5))
@@ -155,48 +166,45 @@ def find_patterns(formation: Formation, z: Array, near: NDArray[np.bool_]) -> tu
         steps = _STEP * np.concatenate([np.eye(5), -np.eye(5)])
         values = formation.evaluate_limits(z + steps)[:, near]
         gradient = (values[:5] - values[5:]).T / (2 * _STEP)
-    count = formation.n_contacts
-    choices: list[tuple[float, ...]] = [(1.0, -1.0)] * (count + 2)
-    for row in formation.rolling_rows:
-        choices[row] = (0.0,)
-    return tuple(
-        _build_pattern(
-            formation, Directions(np.array(s[:count]), np.array(s[count:])), kinematics, gradient
-        )
-        for s in product(*choices)
-    )
+    units = list_units(formation)
+    choices = [(1.0, -1.0, 0.0) if held and unit.grips else (1.0, -1.0) for unit in units]
+    patterns = []
+    for options in sorted(product(*choices), key=lambda options: options.count(0.0)):
+        count = options.count(0.0)
+        if (count > 0) != held or formation.n_constraints + count > 4:
+            continue
+        signs = np.zeros(formation.n_contacts + 2)
+        for unit, sign in zip(units, options, strict=True):
+            signs[list(unit.rows)] = sign
+        pattern = _build_pattern(formation, signs, kinematics, gradient)
+        if pattern is not None:
+            patterns.append(pattern)
+    return tuple(patterns)
 
 
-def solve_at_rest(
-    formation: Formation, directions: Directions, kinematics: Kinematics
-) -> tuple[Array, Array, float]:
-    """Accelerations (5, 3) and H c (n_c + 2 R, 3), affine in the torques, and the ratio."""
-    scene, P = formation.scene, kinematics.P[0]
-    G = force_rows(formation, kinematics, directions)[0]
-    inverse_mass = 1 / scene.mass_diagonal
-    applied = np.zeros((5, 3))
-    applied[:, 0] = scene.applied_force
-    applied[3:, 0] -= scene.dry[3:] * directions.sigma
-    applied[3:, 1:] = np.eye(2)
-    ratio = float(reduced_inertia(formation, kinematics, directions)[0])
-    c = np.zeros((len(P), 3))
-    if abs(ratio) > 1e-12:
-        c = np.linalg.solve((P * inverse_mass) @ G.T, -(P * inverse_mass) @ applied)
-    return inverse_mass[:, None] * (applied + G.T @ c), hold_rows(formation) @ c, ratio
+def respond_at_rest(mode: Mode, signs: Array, kinematics: Kinematics) -> Response | None:
+    """How a mode at rest answers to torques; None if its forces are not determined."""
+    none = np.zeros(mode.formation.n_contacts)
+    rows = Rows(kinematics.A[0], kinematics.A_t[0], none, none)
+    return respond(mode, signs, rows, np.zeros(5))
 
 
 def _build_pattern(
-    formation: Formation, directions: Directions, kinematics: Kinematics, gradient: Array
-) -> Pattern:
-    acceleration, holds, ratio = solve_at_rest(formation, directions, kinematics)
-    rates = np.concatenate([kinematics.A_t[0] @ acceleration, acceleration[3:]])
-    signs = np.concatenate(directions)
+    formation: Formation, signs: Array, kinematics: Kinematics, gradient: Array
+) -> Pattern | None:
+    mode, count = Mode(formation, find_grips(formation, signs)), formation.n_contacts
+    response = respond_at_rest(mode, signs, kinematics)
+    if response is None:
+        return None
+    declared = np.array([mode.declares(k) for k in range(len(mode.holders))] * 2, dtype=bool)
+    cones = response.holds[count:]
     return Pattern(
-        directions=directions,
+        directions=Directions(signs[:count], signs[count:]),
         mass=formation.scene.mass_diagonal,
-        acceleration=acceleration,
-        holds=holds,
-        slips=signs[:, None] * rates,
-        openings=gradient @ acceleration,
-        ratio=ratio,
+        acceleration=response.acceleration,
+        holds=np.vstack([response.holds[:count], cones[declared]]),
+        slips=signs[:, None] * response.rates,
+        grips=cones[~declared],
+        openings=gradient @ response.acceleration,
+        ratio=response.ratio,
     )

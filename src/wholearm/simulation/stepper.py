@@ -1,4 +1,4 @@
-"""Steps of the simulation, compiled for one contact formation.
+"""Steps of the simulation, compiled for one contact formation and what friction holds in it.
 
 A whole Runge-Kutta step, with the projection on the contacts and everything that events are found
 from, is one CasADi function of one packed vector, so that a step costs one call.
@@ -8,21 +8,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from ..cones import hold_rows
 from ..contact import Expression, Limit, build_features, build_gap
-from ..dynamics import build_force_rows
 from ..formation import Formation
 from ..model import Array
 from ..problem import Until
+from .layout import STATE, EventRows, Inputs, Outputs, lay_out
+from .modes import FREE, Grips, Mode
 from .rungekutta import build_error, build_step
 
-STATE = 14
-"""Length of the integrated vector: z, z', then work, viscous, dry and contact losses."""
 SLACK_FORCE = 1e-9
 """How far below zero c_n counts as rounding [N]."""
 SLACK_LIMIT = 1e-9
@@ -34,126 +32,15 @@ SLACK_SPEED = 1e-13
 """How far below zero a speed counts as rounding [m/s, rad/s]."""
 
 
-class Inputs(NamedTuple):
-    """Where each input of a step is in its packed vector.
-
-    Attributes
-    ----------
-    y : slice
-        State, shape (STATE,).
-    t, h, tolerance : int
-        Time and step [s]; largest error of z and z' over the step [m, rad, m/s, rad/s].
-    Xi, sigma : slice
-        Directions of sliding and of the joints.
-    slip : slice
-        Slip coordinates that rolling contacts keep, shape (R,) [m].
-    heading : slice
-        Velocity at the start of the step, scaled to one in the metric M5 (or the impending one).
-    piece : slice
-        Start and end of the torque's piece [s].
-    torque : slice
-        Its coefficients, joint by joint, as in `TorqueProfile`.
-    size : int
-    """
-
-    y: slice
-    t: int
-    h: int
-    tolerance: int
-    Xi: slice
-    sigma: slice
-    slip: slice
-    heading: slice
-    piece: slice
-    torque: slice
-    size: int
-
-
-class Outputs(NamedTuple):
-    """Where each output of a step is in its packed vector; all but `error` hold at its end.
-
-    Attributes
-    ----------
-    y : slice
-        State, shape (STATE,).
-    acceleration : slice
-        z'', shape (5,).
-    c_n, c_t : slice
-        Forces [N].
-    tau : slice
-        Torques [N m].
-    heading : slice
-        The velocity scaled to one in the metric M5.
-    ratio : int
-        Reduced inertia over that without friction.
-    error : int
-        Estimated error over the tolerance; accept at 1 and below.
-    worst : int
-        Least of the event values plus their slacks: below zero something has happened.
-    dip : int
-        Least c_n and margin to slipping at the stages within the step [N].
-    until_rate : int
-        Time derivative of the distance to the phase's end.
-    events : slice
-        Values that are positive until something happens; see `EventRows`.
-    size : int
-    """
-
-    y: slice
-    acceleration: slice
-    c_n: slice
-    c_t: slice
-    tau: slice
-    heading: slice
-    ratio: int
-    error: int
-    worst: int
-    dip: int
-    until_rate: int
-    events: slice
-    size: int
-
-
-class EventRows(NamedTuple):
-    """Where each kind of event value is among `Outputs.events`.
-
-    Attributes
-    ----------
-    force : slice
-        c_n [N].
-    cone : slice
-        Margins of rolling contacts to slipping, mu c_n - c_t, then mu c_n + c_t [N].
-    slide, joint : slice
-        Sliding velocities times Xi [m/s], joint speeds times sigma [rad/s].
-    limit : slice
-        The formation's limits [m]; that of the contact to be gained counts as `until` instead.
-    until : int
-        Distance to the end of the phase [m or rad]; one if that is a release.
-    speed : int
-        Speed along the heading, in the metric M5; one with more than one freedom, where contacts
-        and joints reverse one by one.
-    size : int
-    """
-
-    force: slice
-    cone: slice
-    slide: slice
-    joint: slice
-    limit: slice
-    until: int
-    speed: int
-    size: int
-
-
 @dataclass(frozen=True, eq=False)
 class Stepper:
-    """The compiled steps of one formation.
+    """The compiled steps of one formation, with what sticks and is held in it.
 
     Calling `step` or `look` reads `inputs` and overwrites `outputs`. Each simulation has its own.
 
     Attributes
     ----------
-    formation : Formation
+    mode : Mode
     inputs, outputs : ndarray
         Packed vectors.
     at, to : Inputs, Outputs
@@ -165,7 +52,7 @@ class Stepper:
         A step of length h; the same outputs at the state given, without a step.
     """
 
-    formation: Formation
+    mode: Mode
     inputs: Array
     outputs: Array
     at: Inputs
@@ -177,12 +64,19 @@ class Stepper:
     _keep: Any
 
     @property
+    def formation(self) -> Formation:
+        """The phase's formation."""
+        return self.mode.formation
+
+    @property
     def is_free(self) -> bool:
-        """Whether there is more than one freedom."""
-        return self.formation.n_constraints < 4
+        """Whether more than one freedom is left."""
+        return self.mode.n_constraints < 4
 
 
-def build_stepper(formation: Formation, until: Until, side: float, degree: int) -> Stepper:
+def build_stepper(
+    formation: Formation, until: Until, side: float, degree: int, grips: Grips = FREE
+) -> Stepper:
     """Return the steps of a formation for torques of a polynomial degree, compiled when first used.
 
     Parameters
@@ -194,8 +88,10 @@ def build_stepper(formation: Formation, until: Until, side: float, degree: int) 
         +1 or -1: the sign of (coordinate - value) before the end, when `until` is a coordinate.
     degree : int
         Of the torque's polynomials.
+    grips : Grips
+        What friction holds meanwhile.
     """
-    functions, at, to, rows = _compile(formation, until, side, degree)
+    mode, functions, at, to, rows = _compile(formation, until, side, degree, grips)
     slack = _slack(rows)
     inputs, results = np.zeros(at.size), np.zeros(to.size)
     buffers = [function.buffer() for function in functions]
@@ -203,7 +99,7 @@ def build_stepper(formation: Formation, until: Until, side: float, degree: int) 
         buffer.set_arg(0, inputs.data)
         buffer.set_res(0, results.data)
     step, look = (call for _, call in buffers)
-    return Stepper(formation, inputs, results, at, to, rows, slack, step, look, buffers)
+    return Stepper(mode, inputs, results, at, to, rows, slack, step, look, buffers)
 
 
 def _slack(rows: EventRows) -> Array:
@@ -214,27 +110,28 @@ def _slack(rows: EventRows) -> Array:
     return slack
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=64)
 def _compile(
-    formation: Formation, until: Until, side: float, degree: int
-) -> tuple[list[Expression], Inputs, Outputs, EventRows]:
-    n_c, rolls = formation.n_contacts, formation.n_rolling
-    at = Inputs(*_layout(STATE, None, None, None, n_c, 2, rolls, 5, 2, 2 * (degree + 1)))
+    formation: Formation, until: Until, side: float, degree: int, grips: Grips
+) -> tuple[Mode, list[Expression], Inputs, Outputs, EventRows]:
+    mode = Mode(formation, grips)
+    n_c, held = formation.n_contacts, len(mode.holders)
+    at = Inputs(*lay_out(STATE, None, None, None, n_c, 2, held, 5, 2, 2 * (degree + 1)))
     packed = ca.SX.sym("packed", at.size)
-    model = _Model(formation, until, side, packed, at)
+    model = _Model(mode, until, side, packed, at)
     y, forces = packed[at.y], []
 
     def rate(state: Expression, t: Expression) -> Expression:
         rates, c, *_ = model.dynamics(state, t, packed)
-        forces.append(model.holds @ c)
+        forces.append(model.hold(c))
         return rates
 
     end, fifth, third = build_step(rate, y, packed[at.t], packed[at.h])
     error = build_error(fifth[:10], third[:10], y[:10], packed[at.tolerance])
     dip = ca.mmin(ca.vertcat(*forces))
-    end = _project(formation, end, packed[at.slip])
+    end = _project(mode, end, packed[at.kept])
     limits = len(open_limits(formation, until))
-    rows = EventRows(*_layout(n_c, 2 * rolls, n_c, 2, limits, None, None))
+    rows = EventRows(*lay_out(n_c, 2 * held, n_c, 2, limits, None, None))
     time = packed[at.t] + packed[at.h]
     at_end = ca.SX.sym("state", STATE), ca.SX.sym("time"), ca.SX.sym("error"), ca.SX.sym("dip")
     outputs, to = model.outputs(*at_end, _slack(rows))
@@ -244,18 +141,18 @@ def _compile(
         ca.Function(name, [packed], [result])
         for name, result in zip(("step", "look"), results, strict=True)
     ]
-    return functions, at, to, rows
+    return mode, functions, at, to, rows
 
 
 class _Model:
-    """Right-hand side and events of a formation, as expressions of the packed inputs."""
+    """Right-hand side and events of a mode, as expressions of the packed inputs."""
 
     def __init__(
-        self, formation: Formation, until: Until, side: float, packed: Expression, at: Inputs
+        self, mode: Mode, until: Until, side: float, packed: Expression, at: Inputs
     ) -> None:
-        self.formation, self.packed, self.at = formation, packed, at
+        self.mode, self.packed, self.at = mode, packed, at
         self.Xi, self.sigma = packed[at.Xi], packed[at.sigma]
-        self.holds = ca.sparsify(ca.DM(hold_rows(formation)))
+        formation = mode.formation
         z = build_features(formation.scene).z
         limits = formation.limits
         gained = [limit for limit in limits if limit.gained == until.contact]
@@ -274,6 +171,11 @@ class _Model:
         state, time = ca.SX.sym("state", STATE), ca.SX.sym("time")
         self.dynamics = ca.Function("dynamics", [state, time, packed], self._move(state, time))
 
+    def hold(self, c: Expression) -> Expression:
+        """What has to be positive for everything to hold, from the forces c."""
+        H, h = self.mode.hold_rows
+        return ca.sparsify(ca.DM(H)) @ c + ca.DM(h)
+
     def torque(self, t: Expression) -> Expression:
         """Torques at time t, shape (2,)."""
         start, stop = self.packed[self.at.piece][0], self.packed[self.at.piece][1]
@@ -286,13 +188,12 @@ class _Model:
 
     def _move(self, y: Expression, t: Expression) -> list[Expression]:
         """Rates of the state, c, v_t, tau, K and P at (z, z') = y[:10]."""
-        formation = self.formation
-        scene = formation.scene
+        mode, scene = self.mode, self.mode.formation.scene
         v = y[5:10]
-        _, P, P_dot_v, A_t = formation.build_constraints(y[:5], v)
+        _, P, P_dot_v, A_t = mode.build_constraints(y[:5], v)
         tau = self.torque(t)
         inverse_mass = ca.DM(1 / scene.mass_diagonal)
-        G = build_force_rows(formation, P, A_t, self.Xi)
+        G = mode.build_force_rows(P, A_t, self.Xi)
         viscous = ca.DM(scene.viscous[3:]) * v[3:]
         dry = ca.DM(scene.dry[3:]) * self.sigma
         applied = ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau - viscous - dry)
@@ -300,7 +201,7 @@ class _Model:
         c = ca.solve(K, -P_dot_v - P @ (inverse_mass * applied))
         acceleration = inverse_mass * (applied + G.T @ c)
         v_t = A_t @ v
-        drag = ca.DM(formation.sliding_friction) * self.Xi * c[: formation.n_contacts]
+        drag = ca.DM(mode.rolled.sliding_friction) * self.Xi * c[: mode.formation.n_contacts]
         powers = [ca.dot(force, v[3:]) for force in (tau, viscous, dry)]
         powers.append(ca.dot(drag, v_t))
         return [ca.vertcat(v, acceleration, *powers), c, v_t, tau, K, P]
@@ -309,12 +210,10 @@ class _Model:
         self, y: Expression, t: Expression, error: Expression, dip: Expression, slack: Array
     ) -> tuple[Expression, Outputs]:
         """All outputs at a state, packed, and their layout."""
-        formation = self.formation
+        mode, formation = self.mode, self.mode.formation
         rates, c, v_t, tau, K, P = self.dynamics(y, t, self.packed)
         c_n = c[: formation.n_contacts]
-        c_t = -ca.DM(formation.sliding_friction) * self.Xi * c_n
-        if formation.rolling:
-            c_t[list(formation.rolling_rows)] = c[formation.n_contacts :]
+        c_t = mode.build_tangential(c, self.Xi)
         mass = formation.scene.mass_diagonal
         frictionless = P @ (ca.DM(1 / mass) * P.T)
         v = y[5:10]
@@ -322,9 +221,9 @@ class _Model:
         heading = ca.if_else(size > 0, v / ca.fmax(size, 1e-300), self.packed[self.at.heading])
         values, distance, gradient = self.geometry(y[:5])
         speed = ca.SX(1)
-        if formation.n_constraints >= 4:
+        if mode.n_constraints >= 4:
             speed = ca.dot(self.packed[self.at.heading], ca.DM(mass) * v)
-        held = self.holds @ c
+        held = self.hold(c)
         events = ca.vertcat(held, self.Xi * v_t, self.sigma * v[3:], values, distance, speed)
         parts = [
             y,
@@ -341,7 +240,7 @@ class _Model:
             events,
         ]
         sizes = [None if k in (6, 7, 8, 9, 10) else part.shape[0] for k, part in enumerate(parts)]
-        return ca.densify(ca.vertcat(*parts)), Outputs(*_layout(*sizes))
+        return ca.densify(ca.vertcat(*parts)), Outputs(*lay_out(*sizes))
 
 
 def open_limits(formation: Formation, until: Until) -> list[Limit]:
@@ -351,29 +250,19 @@ def open_limits(formation: Formation, until: Until) -> list[Limit]:
     ]
 
 
-def _project(formation: Formation, y: Expression, slip: Expression) -> Expression:
-    """Move z to closed gaps and the given slip, and z' to P z' = 0, the shortest way in metric M5.
+def _project(mode: Mode, y: Expression, kept: Expression) -> Expression:
+    """Move z to closed gaps and what is kept, and z' to P z' = 0, the shortest way in metric M5.
 
     A step leaves gaps of the size of its error, so one Newton iteration closes them to rounding.
     """
-    inverse_mass = ca.DM(1 / formation.scene.mass_diagonal)
-    kept = ca.vertcat(ca.SX(formation.n_contacts, 1), slip)
+    inverse_mass = ca.DM(1 / mode.formation.scene.mass_diagonal)
+    kept = ca.vertcat(ca.SX(mode.formation.n_contacts, 1), kept)
 
     def correct(z: Expression, of_gaps: bool, v: Expression) -> Expression:
-        held, P, _, _ = formation.build_constraints(z, v)
+        held, P, _, _ = mode.build_constraints(z, v)
         lift = inverse_mass * P.T
         return lift @ ca.solve(P @ lift, held - kept if of_gaps else P @ v)
 
     z = y[:5] - correct(y[:5], True, ca.SX(5, 1))
     v = y[5:10] - correct(z, False, y[5:10])
     return ca.vertcat(z, v, y[10:])
-
-
-def _layout(*sizes: int | None) -> tuple[Any, ...]:
-    """Consecutive slices of the given sizes, an index where None is given, and the total."""
-    places: list[Any] = []
-    stop = 0
-    for size in sizes:
-        places.append(stop if size is None else slice(stop, stop + size))
-        stop += 1 if size is None else size
-    return (*places, stop)

@@ -1,18 +1,18 @@
 """A formation at rest: which way it starts to move, and when.
 
 At rest friction can take either sign. With one freedom each of the two ways along the free
-direction is tried with the friction that would oppose it; with more, every choice of directions is
-(`starting`). The formation moves that way if it then accelerates that way, presses on
-every contact and closes no other. If no way does, it sticks; its forces are then indeterminate, and
-all that can be asked is whether any inside the friction cones balance.
+direction is tried with the friction that would oppose it; with more, every choice of directions
+and of what friction holds is (`starting`). The formation moves that way if it then accelerates that
+way, presses on every contact and closes no other. If no way does, it sticks; its forces are then
+indeterminate, and all that can be asked is whether any inside the friction cones balance.
 Accelerations and normal forces at rest are affine in the torques, so on one polynomial piece of
 them the instant of starting is a root of a polynomial.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,8 @@ from ..dynamics import Directions
 from ..errors import SimulationError
 from ..formation import TOUCHING, Formation, Kinematics
 from ..model import Array
-from .starting import STILL, Departure, Pattern, Way, find_patterns, solve_at_rest
+from .modes import Mode
+from .starting import STILL, Departure, Way, find_patterns, respond_at_rest
 from .statics import balances, find_pulls
 from .stepper import SLACK_FORCE, SLACK_LIMIT
 
@@ -89,9 +90,8 @@ class Collapse:
     ----------
     x : float
     contact : str
-        The contact that would have to pull most, that cannot start to slide, or that slips.
+        The contact that would have to pull most, or that slips.
     c_n : float, [N]
-        NaN if the contact cannot start to slide.
     jammed : bool
         Whether friction jams one of the ways.
     c_t : float or None, [N]
@@ -104,11 +104,6 @@ class Collapse:
     jammed: bool
     c_t: float | None = None
 
-    @property
-    def held(self) -> bool:
-        """Whether the rest would start to move while friction holds the contact or joint."""
-        return math.isnan(self.c_n)
-
 
 @dataclass(frozen=True, eq=False)
 class Rest:
@@ -119,15 +114,26 @@ class Rest:
     formation : Formation
     z : ndarray, shape (5,)
     ways : tuple of Way
-        The ways it could move: two with one freedom, every choice of directions with more.
+        The ways it could move with nothing held: two with one freedom, every choice of directions
+        with more.
     touching : tuple of Contact
         Every contact that touches, in the formation or not.
+    near : ndarray of bool, shape (n_limits,)
+        Which limits of the formation are zero here.
     """
 
     formation: Formation
     z: Array
     ways: tuple[Way, ...]
     touching: tuple[Contact, ...]
+    near: NDArray[np.bool_]
+
+    @cached_property
+    def all_ways(self) -> tuple[Way, ...]:
+        """The ways it could move, with those in which friction holds some contact or joint."""
+        if self.formation.n_constraints >= 4:
+            return self.ways
+        return self.ways + find_patterns(self.formation, self.z, self.near, held=True)
 
     def wait(self, coefficients: Array, x: float) -> Departure | Collapse | None:
         """Find what ends the rest on one piece of the torques, from `x` on.
@@ -148,11 +154,14 @@ class Rest:
         for way in self.ways:
             if way.moves(tau):
                 return way.depart(x, tau)
+        for way in self.all_ways:
+            if way.moves(tau):
+                return way.depart(x, tau)
         ends = self._changes(coefficients, x)
         for start, stop in zip(ends, [*ends[1:], 1.0], strict=True):
             middle = (start + stop) / 2
             tau = _evaluate(coefficients, middle)
-            ways = sorted(self.ways, key=lambda way: -way.drive(tau))
+            ways = sorted(self.all_ways, key=lambda way: -way.drive(tau))
             for way in ways:
                 if way.moves(tau):
                     return way.depart(start, tau)
@@ -165,12 +174,13 @@ class Rest:
 
     def _changes(self, coefficients: Array, x: float) -> list[float]:
         """Where on the piece an acceleration or a normal force changes sign, from `x` on."""
+        margins = [margin for way in self.all_ways for margin in way.margins]
+        rows = np.array([row for row, _ in margins])
+        polynomials = rows[:, 1:] @ coefficients
+        polynomials[:, 0] += rows[:, 0] + [offset for _, offset in margins]
         places = {x}
-        for way in self.ways:
-            for row, offset in way.margins:
-                polynomial = row[1:] @ coefficients
-                polynomial[0] += row[0] + offset
-                places |= {root for root in _roots(polynomial) if x < root < 1}
+        for polynomial in np.unique(polynomials, axis=0):
+            places |= {root for root in _roots(polynomial) if x < root < 1}
         return sorted(places)
 
     def _balances(self, coefficients: Array, x: float) -> bool:
@@ -184,12 +194,10 @@ class Rest:
             middle = (low + high) / 2
             low, high = (middle, high) if self._balances(coefficients, middle) else (low, middle)
         tau = _evaluate(coefficients, high)
-        free = [way for way in self.ways if way.slides(tau)]
-        if not free and isinstance(self.ways[0], Pattern):
-            return Collapse(high, self._find_held(tau), math.nan, self._jams)
-        load = np.array([1.0, *tau])
+        free = [way for way in self.all_ways if way.slides(tau)]
         pulls = find_pulls(self.formation.scene, self.touching, self.z, tau)
         if free or np.isinf(pulls).all():
+            load = np.array([1.0, *tau])
             weakest = min((way.holds @ load for way in free or self.ways), key=np.min)
             row, least, c_t = find_weakest(self.formation, weakest)
             return Collapse(high, self.formation.names[row], least, self._jams, c_t)
@@ -200,16 +208,7 @@ class Rest:
     def _jams(self) -> bool:
         """Whether friction jams one of the two ways, or every choice of directions."""
         jammed = [way.ratio <= 0 for way in self.ways]
-        return all(jammed) if isinstance(self.ways[0], Pattern) else any(jammed)
-
-    def _find_held(self, tau: Array) -> str:
-        """The contact or joint that stays, by the choice of directions with fewest that do."""
-        patterns = [way for way in self.ways if isinstance(way, Pattern)]
-        pressing = [p for p in patterns if (p.holds @ [1.0, *tau] >= -SLACK_FORCE).all()]
-        found = [p.find_held(tau) for p in pressing or patterns]
-        names = (*self.formation.names, "joint 1", "joint 2")
-        fewest = min((held for held in found if len(held)), key=len, default=np.zeros(1, int))
-        return names[int(fewest[0])]
+        return all(jammed) if self.formation.n_constraints < 4 else any(jammed)
 
 
 def find_rest(formation: Formation, z: Array) -> Rest:
@@ -232,8 +231,8 @@ def find_rest(formation: Formation, z: Array) -> Rest:
         )
     if rank < 4:
         near = np.abs(formation.evaluate_limits(z[None])[0]) < TOUCHING
-        patterns = find_patterns(formation, z, near)
-        return Rest(formation, z, patterns, formation.contacts + _gained(formation, near))
+        patterns = find_patterns(formation, z, near, held=False)
+        return Rest(formation, z, patterns, formation.contacts + _gained(formation, near), near)
     heading = right[4] / root
     step = _AHEAD / np.abs(heading).max()
     limits = formation.evaluate_limits(z + step * np.array([[0.0], [1.0], [-1.0]]) * heading)
@@ -253,7 +252,7 @@ def find_rest(formation: Formation, z: Array) -> Rest:
         _build_way(formation, side * heading, Directions(s[:-2], s[-2:]), kinematics, close)
         for side, s, close in zip((1.0, -1.0), signs, closes, strict=True)
     )
-    return Rest(formation, z, ways, formation.contacts + _gained(formation, near))
+    return Rest(formation, z, ways, formation.contacts + _gained(formation, near), near)
 
 
 def _gained(formation: Formation, near: NDArray[np.bool_]) -> tuple[Contact, ...]:
@@ -269,9 +268,10 @@ def _build_way(
     kinematics: Kinematics,
     closes: bool,
 ) -> RestDirection:
-    acceleration, holds, ratio = solve_at_rest(formation, directions, kinematics)
-    drive = heading * formation.scene.mass_diagonal @ acceleration
-    return RestDirection(heading, directions, drive, holds, ratio, closes)
+    answer = respond_at_rest(Mode(formation), np.concatenate(directions), kinematics)
+    assert answer is not None
+    drive = heading * formation.scene.mass_diagonal @ answer.acceleration
+    return RestDirection(heading, directions, drive, answer.holds, answer.ratio, closes)
 
 
 def _rates(formation: Formation, z: Array, step: float, heading: Array) -> Array:

@@ -12,16 +12,15 @@ from ..formation import Formation
 from ..impact import Obstacle, strike, transfer
 from ..model import Array
 from ..problem import End, Phase
-from .events import EventKind, Outcome, OutcomeKind, Section
-from .jumps import REACHED, Ending, find_held, look_again
+from .choosing import STANDING, is_standing, measure_rates
+from .events import EventKind, Outcome, OutcomeKind
+from .jumps import REACHED, Ending, look_again
+from .modes import find_grips, list_units
 from .replay import Replay
 from .starting import Departure
-from .stepper import build_stepper, open_limits
+from .stepper import open_limits
 from .sticking import close_contacts
 
-STANDING = 1e-9
-"""Speed that counts as none where a formation is entered [m/s or rad/s]: the integration's error
-may give it either sign."""
 _OUTCOMES = {
     Obstacle.PULL: OutcomeKind.CONTACT_LOST,
     Obstacle.SLIP: OutcomeKind.SLIPS,
@@ -37,21 +36,16 @@ def enter(run: Replay, phase: Phase, following: Phase | None) -> None:
     run.y[:5] = _close(run, phase.formation)
     if run.moving:
         run.y[5:10] = project_velocity(phase.formation, run.y[:5], run.y[5:10])
-        run.moving = bool(np.abs(run.y[5:10]).max() > STANDING)
+        run.moving = not is_standing(run.problem.scene, run.y[5:10])
     if not run.moving:
         run.y[5:10] = 0.0
     run.impact += before - run.stored
-    until, side = phase.until, 1.0
+    until, run.side = phase.until, 1.0
     if until.value is not None:
-        side = math.copysign(1.0, run.y[0 if until.coordinate == "x" else 2] - until.value)
-    degree = run.coefficients.shape[2] - 1
-    run.stepper = build_stepper(phase.formation, until, side, degree)
-    run.sections.append(Section(phase, run.stepper.to))
+        run.side = math.copysign(1.0, run.y[0 if until.coordinate == "x" else 2] - until.value)
+    run.take()
     run.limits = [limit.text for limit in open_limits(phase.formation, until)]
     run.releasable = find_releasable(phase, following)
-    run.stepper.inputs[run.stepper.at.tolerance] = run.tolerance
-    run.stepper.inputs[run.stepper.at.slip] = phase.formation.evaluate_slip(run.y[None, :5])[0]
-    run.load_piece()
 
 
 def _close(run: Replay, formation: Formation) -> Array:
@@ -99,6 +93,9 @@ def project_velocity(formation: Formation, z: Array, v: Array) -> Array:
 
 def set_off(run: Replay, departure: Departure) -> None:
     """Give the stepper the directions of a motion that starts from rest."""
+    grips = find_grips(run.phase.formation, np.concatenate(departure.directions))
+    if grips != run.stepper.mode.grips:
+        run.take(grips)
     s = run.stepper
     s.inputs[s.at.Xi], s.inputs[s.at.sigma] = departure.directions
     s.inputs[s.at.heading] = departure.heading
@@ -108,7 +105,8 @@ def set_off(run: Replay, departure: Departure) -> None:
 def go_on(run: Replay) -> Ending | None:
     """Give the stepper the directions of the present velocity; what ends the motion at once.
 
-    What does not slide or turn here takes the direction in which it accelerates.
+    Friction decides for what does not slide or turn here; with one freedom that takes the first
+    direction that does not jam, as it has to go one way just after.
     """
     s = run.stepper
     y, formation = run.y, run.phase.formation
@@ -118,20 +116,26 @@ def go_on(run: Replay) -> Ending | None:
     s.inputs[s.at.heading] = v / np.sqrt(mass @ v**2)
     rates = np.concatenate([formation.evaluate(y[None, :5], v[None]).A_t[0] @ v, v[3:]])
     signs = np.where(rates < 0, -1.0, 1.0)
-    signs[list(formation.rolling_rows)] = 0.0
-    still = np.flatnonzero((np.abs(rates) < STANDING) & (signs != 0)).tolist()
-    rows = [s.rows.slide.start + k for k in still]
-    choices = product((1.0, -1.0), repeat=len(still))
+    signs[[row for row in range(len(signs)) if row not in _list_rows(formation)]] = 0.0
     _point(run, signs)
-    for choice in choices if still else ():
+    if s.is_free:
+        return look_again(run, enters=True)
+    slow = STANDING * measure_rates(run.problem.scene, formation.n_contacts)
+    still = np.flatnonzero((np.abs(rates) < slow) & (signs != 0)).tolist()
+    for choice in product((1.0, -1.0), repeat=len(still)):
         tried = signs.copy()
         tried[still] *= choice
         _point(run, tried)
-        if s.outputs[s.to.ratio] > 0 and not find_held(run, rows):
+        if s.outputs[s.to.ratio] > 0:
             break
     else:
         _point(run, signs)
-    return look_again(run, rows)
+    return look_again(run)
+
+
+def _list_rows(formation: Formation) -> set[int]:
+    """Contacts and joints that may slide or turn."""
+    return {row for unit in list_units(formation) for row in unit.rows}
 
 
 def _point(run: Replay, signs: Array) -> None:

@@ -1,0 +1,275 @@
+"""Whether what comes to rest in a moving formation sticks, turns back or goes on: Coulomb's law.
+
+Where a sliding speed or a joint's speed is zero, friction is whatever is consistent: a contact may
+slide either way if it then accelerates that way, or stick if its c_t stays in the cone; a joint
+likewise. Each combination for everything that stands still is one linear system, and the contacts
+have to press. Each is judged a moment later, by what its accelerations and forces lead to until
+then, so that a force that leaves its cone is told from one that comes back into it.
+
+Where friction is moderate exactly one combination is consistent. The first one is taken that is so
+by more than rounding, in this order for each: turn back, stick, go on; what holds already goes on
+holding, unless its cone is just reached, then it slips. If none is clear, as where an acceleration
+vanishes with all its derivatives, the best one is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import JammingError
+from ..formation import Formation
+from ..model import Array, Scene
+from .events import EventKind
+from .modes import Mode, Response, Rows, Unit, find_grips, list_units, respond
+from .replay import Replay
+
+STANDING = 1e-9
+"""Speed that counts as none, relative to the scene's: the integration's error may give it either
+sign."""
+CLEAR = 1e-8
+"""Least margin of a clear decision, relative to the scene's forces, torques or accelerations."""
+AHEAD = 2e-5
+"""How much later a decision is judged, relative to the scene's time."""
+TRIES = 50
+"""How often in a row decisions may be made without any time passing."""
+
+
+class Choice(NamedTuple):
+    """A combination of directions, and how far it is from being inconsistent.
+
+    Attributes
+    ----------
+    signs : ndarray, shape (n_c + 2,)
+        Directions of contacts and joints, zero for what is held or rolls.
+    margin : float
+        Least of the relative accelerations along the directions and reserves of friction.
+    pressing : float
+        Least c_n over the scene's force.
+    """
+
+    signs: Array
+    margin: float
+    pressing: float
+
+
+def choose_mode(
+    run: Replay, turned: Sequence[int] = (), *, time: float | None = None, enters: bool = False
+) -> bool:
+    """Let friction decide for everything that stands still; whether the motion has ended.
+
+    Parameters
+    ----------
+    run : Replay
+    turned : sequence of int
+        Contacts, then joints, whose speed has just come to zero.
+    time : float, optional, [s]
+        When that was, if not at present.
+    enters : bool
+        Whether the directions so far are a guess, as a formation is entered.
+    """
+    s = run.stepper
+    formation, scene = run.phase.formation, run.problem.scene
+    signs = np.concatenate([s.inputs[s.at.Xi], s.inputs[s.at.sigma]])
+    s.inputs[s.at.y], s.inputs[s.at.t] = run.y, run.t
+    s.look()
+    speeds = np.abs(s.outputs[s.to.events][s.rows.slide.start : s.rows.joint.stop])
+    units = list_units(formation)
+    slow = STANDING * measure_rates(scene, formation.n_contacts)
+    still = [
+        unit
+        for unit in units
+        if set(unit.rows) & set(turned)
+        or (unit.grips and (speeds[list(unit.rows)] < slow[list(unit.rows)]).any())
+    ]
+    if not still:
+        return False
+    if is_standing(scene, run.y[5:10]):
+        return True
+    run.count_decision(TRIES)
+    orders = [_list_options(run, unit, float(signs[unit.rows[0]])) for unit in still]
+    chosen = _choose(run, signs, still, orders)
+    _take(run, chosen, still)
+    for unit in still:
+        before, after = float(signs[unit.rows[0]]), float(chosen[unit.rows[0]])
+        for row in unit.rows if before != after and not (enters and after) else ():
+            note_change(run, row, before, after, run.t if time is None else time)
+    return False
+
+
+def measure_rates(scene: Scene, count: int) -> Array:
+    """The scene's speed for `count` contacts, then that of joints, shape (count + 2,)."""
+    scales = scene.scales
+    return np.repeat([scales.speed, 1 / scales.time], [count, 2])
+
+
+def is_standing(scene: Scene, v: Array) -> bool:
+    """Whether the velocity z', shape (5,), is none but for rounding."""
+    scales = scene.scales
+    units = np.array([scales.speed, scales.speed, 1, 1, 1]) / np.array([1, 1, *[scales.time] * 3])
+    return bool((np.abs(v) < STANDING * units).all())
+
+
+def note_change(run: Replay, row: int, before: float, after: float, time: float) -> None:
+    """Record that a contact or joint sticks, slips or turns back."""
+    formation = run.phase.formation
+    contact = row < formation.n_contacts
+    name = formation.names[row] if contact else f"joint {row - formation.n_contacts + 1}"
+    when = f"at t = {time:.5g} s, phase {run.phase.number}"
+    if after == 0:
+        kind, text = EventKind.STICK, f"{name} sticks" if contact else f"friction holds {name}"
+    elif before == 0:
+        kind, text = EventKind.SLIP, f"{name} slips" if contact else f"{name} starts to turn"
+    else:
+        verb = "slides" if contact else "turns"
+        kind, text = EventKind.REVERSAL, f"{name} {verb} the other way"
+    run.note(kind, f"{text} {when}", name, time=time)
+
+
+def _list_options(run: Replay, unit: Unit, present: float) -> tuple[float, ...]:
+    """Directions to try for one unit, in the order in which the first clear one is taken."""
+    if present != 0:
+        return (-present, 0.0, present) if unit.grips else (-present, present)
+    s = run.stepper
+    cones = s.outputs[s.to.events][s.rows.cone].reshape(2, -1)
+    low, high = cones[:, s.mode.holders.index(unit.rows)]
+    way = 1.0 if high < low else -1.0
+    # Friction is at the edge of its cone and opposes the slip to come.
+    edge = min(low, high) < s.slack[s.rows.cone.start]
+    return (way, -way, 0.0) if edge else (0.0, way, -way)
+
+
+def _choose(
+    run: Replay, signs: Array, still: Sequence[Unit], orders: Sequence[tuple[float, ...]]
+) -> Array:
+    """Directions of the first clear combination, or of the best.
+
+    Raises
+    ------
+    JammingError
+        If no combination is consistent, and it is not that a contact would have to pull.
+    """
+    judge = _Judge(run, still)
+    found: list[Choice] = []
+    for options in product(*orders):
+        tried = signs.copy()
+        for unit, sign in zip(still, options, strict=True):
+            tried[list(unit.rows)] = sign
+        choice = judge.judge(tried)
+        if choice is None:
+            continue
+        if choice.margin > CLEAR and choice.pressing > -CLEAR:
+            return choice.signs
+        found.append(choice)
+    pressing = [choice for choice in found if choice.pressing > -CLEAR]
+    best = max(pressing, key=lambda choice: choice.margin, default=None)
+    if best is not None and best.margin > -CLEAR:
+        return best.signs
+    # A contact is about to be lost, and its forces say which.
+    pulling = [choice for choice in found if choice.pressing <= -CLEAR]
+    if pulling:
+        return max(pulling, key=lambda choice: choice.margin).signs
+    if judge.worst <= 0:
+        run.fail_to_step(judge.worst)
+    names = " ".join(run.phase.formation.names)
+    raise JammingError(
+        f"{names} jams {run.where()}: no combination of sliding and sticking is consistent"
+    )
+
+
+class _Judge:
+    """Looks at combinations of directions at the present state."""
+
+    def __init__(self, run: Replay, still: Sequence[Unit]) -> None:
+        self.formation, self.still = run.phase.formation, still
+        self.scene = run.problem.scene
+        self.h = AHEAD * self.scene.scales.time
+        self.z, self.v = run.y[:5].copy(), run.y[5:10].copy()
+        self.load, self.later = (np.array([1.0, *run.torque(t)]) for t in (run.t, run.t + self.h))
+        self.rows = evaluate_rows(self.formation, self.z, self.v)
+        self.worst = 1.0
+
+    def judge(self, signs: Array) -> Choice | None:
+        """Judge one combination; None if it jams or leaves its forces open."""
+        mode = Mode(self.formation, find_grips(self.formation, signs))
+        if mode.n_constraints > 4:
+            return None
+        now = self._respond(mode, signs, self.rows, self.v)
+        if now is None:
+            return None
+        acceleration = now.acceleration @ self.load
+        v = self.v + self.h * acceleration
+        z = self.z + self.h * (self.v + v) / 2
+        then = self._respond(mode, signs, evaluate_rows(self.formation, z, v), v)
+        if then is None:
+            return None
+        return Choice(signs, *self._measure(mode, signs, now, then))
+
+    def _respond(self, mode: Mode, signs: Array, rows: Rows, v: Array) -> Response | None:
+        response = respond(mode, signs, rows, v)
+        if response is not None and not response.ratio > 0:
+            self.worst = min(self.worst, response.ratio)
+            return None
+        return response
+
+    def _measure(
+        self, mode: Mode, signs: Array, now: Response, then: Response
+    ) -> tuple[float, float]:
+        """The least margin of what stands still, and the least c_n."""
+        scales, count = self.scene.scales, self.formation.n_contacts
+        gained = (now.rates @ self.load + then.rates @ self.later) / 2
+        gained = signs * gained / (measure_rates(self.scene, count) / scales.time)
+        holds = then.holds @ self.later
+        cones = holds[count:].reshape(2, -1).min(axis=0)
+        margins = []
+        for unit in self.still:
+            row = unit.rows[0]
+            if signs[row] != 0:
+                margins.append(gained[row])
+            else:
+                unit_of_force = scales.force if row < count else scales.torque
+                margins.append(cones[mode.holders.index(unit.rows)] / unit_of_force)
+        return float(min(margins)), float(holds[:count].min() / scales.force)
+
+
+def evaluate_rows(formation: Formation, z: Array, v: Array) -> Rows:
+    """Constraint rows of a formation at one state."""
+    kinematics = _roll_all(formation).evaluate(z[None], v[None])
+    normal, tangential = np.split(kinematics.P_dot_v[0], 2)
+    return Rows(kinematics.A[0], kinematics.A_t[0], normal, tangential)
+
+
+@lru_cache(maxsize=64)
+def _roll_all(formation: Formation) -> Formation:
+    return replace(formation, rolling=formation.contacts)
+
+
+def _take(run: Replay, signs: Array, still: Sequence[Unit]) -> None:
+    """Go on with the directions chosen; rounding of speeds against them is taken away."""
+    formation = run.phase.formation
+    count, v = formation.n_contacts, run.y[5:10]
+    kinematics = formation.evaluate(run.y[None, :5], v[None])
+    gradients = np.vstack([kinematics.A_t[0], np.eye(5)[3:]])
+    wrong = [
+        unit.rows[0]
+        for unit in still
+        if signs[unit.rows[0]] == 0 or signs[unit.rows[0]] * (gradients[unit.rows[0]] @ v) < 0
+    ]
+    root = np.sqrt(formation.scene.mass_diagonal)
+    before = run.stored
+    rows = np.vstack([kinematics.P[0], gradients[wrong]]) / root
+    run.y[5:10] -= np.linalg.lstsq(rows, rows @ (root * v))[0] / root
+    run.impact += before - run.stored
+    grips = find_grips(formation, signs)
+    if grips != run.stepper.mode.grips:
+        run.take(grips)
+    s = run.stepper
+    s.inputs[s.at.Xi], s.inputs[s.at.sigma] = signs[:count], signs[count:]
+    v = run.y[5:10]
+    s.inputs[s.at.y], s.inputs[s.at.t] = run.y, run.t
+    s.inputs[s.at.heading] = v / np.sqrt(root**2 @ v**2)

@@ -1,0 +1,265 @@
+"""What slides, what sticks and what is held in a formation that moves.
+
+A formation with two or more freedoms goes on moving while friction holds some of its sliding
+contacts, or joints with dry friction. A stuck contact is integrated like a rolling one, v_t = 0
+with c_t free, and a held joint with theta_i' = 0 and a friction torque f that is free:
+
+    P = [A; A_t(rolling); A_t(stuck); e(held)],    |c_t| <= mu c_n,    |f| <= D.
+
+The vertices of an edge that lies flush slide and stick as one, since their v_t is one and the same.
+Only the sum T of their c_t is determined, and may be as large as their cones together, |T| <= sum
+mu c_n. It is shared out in proportion to c_n, which does not matter for the motion.
+A contact that lies flush with one which its phase lets roll has no friction of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from ..contact import Expression
+from ..dynamics import build_force_rows
+from ..formation import Formation
+from ..model import Array
+
+INDEPENDENT = 1e-9
+"""Least singular value of constraints, each of length one, for forces to be determined."""
+
+
+@dataclass(frozen=True)
+class Grips:
+    """What friction holds although the phase lets it slide or turn.
+
+    Attributes
+    ----------
+    contacts : tuple of tuple of int
+        Contacts that stick, those of a flush edge together.
+    joints : tuple of int
+        Joints that are held.
+    """
+
+    contacts: tuple[tuple[int, ...], ...] = ()
+    joints: tuple[int, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.contacts) + len(self.joints)
+
+
+FREE = Grips()
+"""Nothing is held."""
+
+
+class Unit(NamedTuple):
+    """What slides or turns, and sticks or is held, as one.
+
+    Attributes
+    ----------
+    rows : tuple of int
+        Among the contacts and then the joints.
+    grips : bool
+        Whether there is friction to hold it.
+    """
+
+    rows: tuple[int, ...]
+    grips: bool
+
+
+def list_units(formation: Formation) -> tuple[Unit, ...]:
+    """Everything that may slide or turn, contacts first; no contacts flush with a rolling one."""
+    friction = np.concatenate([formation.friction, formation.scene.dry[3:]])
+    groups = dict.fromkeys(formation.turn_with(row) for row in range(len(friction)))
+    return tuple(
+        Unit(rows, bool(friction[rows[0]] > 0))
+        for rows in groups
+        if not set(rows) & set(formation.rolling_rows)
+    )
+
+
+def find_grips(formation: Formation, signs: Array) -> Grips:
+    """What is held where `signs`, shape (n_c + 2,), of its sliding and turning are zero.
+
+    With a single freedom nothing can be held while the rest moves.
+    """
+    if formation.n_constraints >= 4:
+        return FREE
+    held = [unit.rows for unit in list_units(formation) if signs[unit.rows[0]] == 0]
+    count = formation.n_contacts
+    return Grips(
+        tuple(rows for rows in held if rows[0] < count),
+        tuple(rows[0] - count for rows in held if rows[0] >= count),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """A formation with some of its contacts stuck and joints held."""
+
+    formation: Formation
+    grips: Grips = FREE
+
+    @cached_property
+    def rolled(self) -> Formation:
+        """The formation in which one contact of each group that sticks rolls."""
+        if not self.grips.contacts:
+            return self.formation
+        stuck = tuple(self.formation.contacts[rows[0]] for rows in self.grips.contacts)
+        return replace(self.formation, rolling=self.formation.rolling + stuck)
+
+    @property
+    def n_constraints(self) -> int:
+        """Number of constraints, and of independent forces c = [c_n; c_t or T; f]."""
+        return self.formation.n_constraints + len(self.grips)
+
+    @cached_property
+    def holders(self) -> tuple[tuple[int, ...], ...]:
+        """Rows, among contacts and joints, of what each force after c_n holds."""
+        groups = {rows[0]: rows for rows in self.grips.contacts}
+        held = [groups.get(row, (row,)) for row in self.rolled.rolling_rows]
+        count = self.formation.n_contacts
+        return (*held, *((count + joint,) for joint in self.grips.joints))
+
+    def declares(self, holder: int) -> bool:
+        """Whether the phase asks for what the `holder`-th force after c_n holds."""
+        return self.holders[holder][0] in self.formation.rolling_rows
+
+    @cached_property
+    def hold_rows(self) -> tuple[Array, Array]:
+        """H, shape (n_c + 2 K, n_c + K), and h: the contacts hold where H c + h >= 0.
+
+        Every c_n, then both sides of the cones of the K that are held (see `EventRows.cone`).
+        """
+        formation, count = self.formation, self.formation.n_contacts
+        unit = np.eye(self.n_constraints)
+        edge, most = np.zeros((len(self.holders), len(unit))), np.zeros(len(self.holders))
+        for k, rows in enumerate(self.holders):
+            if rows[0] < count:
+                edge[k, list(rows)] = formation.friction[list(rows)]
+            else:
+                most[k] = formation.scene.dry[3 + rows[0] - count]
+        normal, tangential = unit[:count], unit[count:]
+        H = np.vstack([normal, edge - tangential, edge + tangential])
+        return H, np.concatenate([np.zeros(count), most, most])
+
+    def build_constraints(self, z: Expression, v: Expression) -> tuple[Expression, ...]:
+        """Expressions as of `Formation.build_constraints`, with the angles of held joints."""
+        held, P, P_dot_v, A_t = self.rolled.build_constraints(z, v)
+        if self.grips.joints:
+            joints = [3 + joint for joint in self.grips.joints]
+            held = ca.vertcat(held, z[joints])
+            P = ca.vertcat(P, ca.DM(np.eye(5)[joints]))
+            P_dot_v = ca.vertcat(P_dot_v, ca.SX(len(joints), 1))
+        return held, P, P_dot_v, A_t
+
+    def build_force_rows(self, P: Expression, A_t: Expression, Xi: Expression) -> Expression:
+        """G from P, A_t and Xi, which is zero for what sticks."""
+        count = self.rolled.n_constraints
+        G = build_force_rows(self.rolled, P[:count, :], A_t, Xi)
+        return ca.vertcat(G, P[count:, :]) if self.grips.joints else G
+
+    def build_tangential(self, c: Expression, Xi: Expression) -> Expression:
+        """c_t of every contact from the forces c, shape (n_c,)."""
+        count = self.formation.n_contacts
+        c_n = c[:count]
+        c_t = -ca.DM(self.rolled.sliding_friction) * Xi * c_n
+        for k, rows in enumerate(self.holders):
+            if rows[0] >= count:
+                continue
+            total = ca.fmax(ca.sum1(c_n[list(rows)]), 1e-300)
+            for row in rows:
+                share = 1 if len(rows) == 1 else c_n[row] / total
+                c_t[row] = c[count + k] * share
+        return c_t
+
+    def read_kept(self, z: Array) -> Array:
+        """What rolling and stuck contacts and held joints keep from `z`, shape (K,) [m, rad]."""
+        slip = self.rolled.evaluate_slip(z[None])[0]
+        return np.concatenate([slip, z[[3 + joint for joint in self.grips.joints]]])
+
+
+class Rows(NamedTuple):
+    """Constraint rows at one state.
+
+    Attributes
+    ----------
+    A, A_t : ndarray, shape (n_c, 5)
+    A_dot_v, A_t_dot_v : ndarray, shape (n_c,)
+    """
+
+    A: Array
+    A_t: Array
+    A_dot_v: Array
+    A_t_dot_v: Array
+
+
+class Response(NamedTuple):
+    """How a mode answers to torques; quantities are rows @ (1, tau_1, tau_2).
+
+    Attributes
+    ----------
+    acceleration : ndarray, shape (5, 3)
+    rates : ndarray, shape (n_c + 2, 3)
+        Accelerations of the contacts' sliding and of the joints.
+    holds : ndarray, shape (n_c + 2 K, 3), [N, N m]
+        What has to be positive for everything to hold, H c + h.
+    ratio : float
+        Reduced inertia over that without friction; jammed at zero and below.
+    """
+
+    acceleration: Array
+    rates: Array
+    holds: Array
+    ratio: float
+
+
+def respond(mode: Mode, signs: Array, rows: Rows, v: Array) -> Response | None:
+    """Solve the equations of motion; None if the constraints are not independent.
+
+    Parameters
+    ----------
+    signs : ndarray, shape (n_c + 2,)
+        Directions of contacts and joints, zero for what is held or rolls.
+    rows : Rows
+        At the state.
+    v : ndarray, shape (5,)
+        Its velocity.
+    """
+    formation, scene = mode.formation, mode.formation.scene
+    count, rolling = formation.n_contacts, list(mode.rolled.rolling_rows)
+    joints = [3 + joint for joint in mode.grips.joints]
+    P = np.vstack([rows.A, rows.A_t[rolling], np.eye(5)[joints]])
+    bend = np.concatenate([rows.A_dot_v, rows.A_t_dot_v[rolling], np.zeros(len(joints))])
+    inverse_mass = 1 / scene.mass_diagonal
+    if not _are_independent(P * np.sqrt(inverse_mass)):
+        return None
+    slip = mode.rolled.sliding_friction * signs[:count]
+    G = np.vstack([rows.A - slip[:, None] * rows.A_t, P[count:]])
+    applied = np.zeros((5, 3))
+    applied[:, 0] = scene.applied_force - scene.viscous * v
+    applied[3:, 0] -= scene.dry[3:] * signs[count:]
+    applied[3:, 1:] = np.eye(2)
+    K = (P * inverse_mass) @ G.T
+    ratio = float(np.linalg.det(K) / np.linalg.det((P * inverse_mass) @ P.T))
+    c = np.zeros((len(P), 3))
+    if abs(ratio) > 1e-12:
+        right = -(P * inverse_mass) @ applied
+        right[:, 0] -= bend
+        c = np.linalg.solve(K, right)
+    acceleration = inverse_mass[:, None] * (applied + G.T @ c)
+    rates = np.vstack([rows.A_t @ acceleration, acceleration[3:]])
+    rates[:count, 0] += rows.A_t_dot_v
+    H, h = mode.hold_rows
+    holds = H @ c
+    holds[:, 0] += h
+    return Response(acceleration, rates, holds, ratio)
+
+
+def _are_independent(rows: Array) -> bool:
+    """Whether rows, in the metric of masses, leave forces that are determined."""
+    if len(rows) > 5:
+        return False
+    unit = rows / np.linalg.norm(rows, axis=1)[:, None]
+    return bool(np.linalg.svd(unit, compute_uv=False)[-1] > INDEPENDENT)
