@@ -7,9 +7,14 @@ have to press. Each is judged a moment later, by what its accelerations and forc
 then, so that a force that leaves its cone is told from one that comes back into it.
 
 Where friction is moderate exactly one combination is consistent. The first one is taken that is so
-by more than rounding, in this order for each: turn back, stick, go on; what holds already goes on
-holding, unless its cone is just reached, then it slips. If none is clear, as where an acceleration
-vanishes with all its derivatives, the best one is taken.
+by more than rounding. What has just come to rest tries to turn back, then to stick, then to go on;
+all else tries to go on as it does, and what friction holds, if its cone is just reached, to slip.
+If none is clear the best one is taken.
+
+Where what is stuck lets something else not move either, as a finger that leans on a stuck object,
+that has no independent constraint. Its friction is indeterminate, and may be taken as that of
+either direction: some such choice is consistent for as long as any friction is, since what friction
+has left elsewhere is a monotonic function of each. It counts as stuck, too.
 """
 
 from __future__ import annotations
@@ -21,6 +26,7 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import JammingError
 from ..formation import Formation
@@ -47,6 +53,8 @@ class Choice(NamedTuple):
     ----------
     signs : ndarray, shape (n_c + 2,)
         Directions of contacts and joints, zero for what is held or rolls.
+    moves : ndarray of bool, shape (n_c + 2,)
+        Whether each starts to move.
     margin : float
         Least of the relative accelerations along the directions and reserves of friction.
     pressing : float
@@ -54,6 +62,7 @@ class Choice(NamedTuple):
     """
 
     signs: Array
+    moves: NDArray[np.bool_]
     margin: float
     pressing: float
 
@@ -92,13 +101,17 @@ def choose_mode(
     if is_standing(scene, run.y[5:10]):
         return True
     run.count_decision(TRIES)
-    orders = [_list_options(run, unit, float(signs[unit.rows[0]])) for unit in still]
-    chosen = _choose(run, signs, still, orders)
-    _take(run, chosen, still)
+    orders = [_list_options(run, unit, float(signs[unit.rows[0]]), turned) for unit in still]
+    choice = _choose(run, signs, still, orders)
+    _take(run, choice.signs, still)
     for unit in still:
-        before, after = float(signs[unit.rows[0]]), float(chosen[unit.rows[0]])
-        for row in unit.rows if before != after and not (enters and after) else ():
+        row = unit.rows[0]
+        before = 0.0 if row in run.stuck else float(signs[row])
+        after = float(choice.signs[row]) if choice.moves[row] else 0.0
+        changes = before != after and not (enters and after) and unit.grips
+        for row in unit.rows if changes else ():
             note_change(run, row, before, after, run.t if time is None else time)
+        run.stuck = (run.stuck - set(unit.rows)) | set(() if after else unit.rows)
     return False
 
 
@@ -131,10 +144,13 @@ def note_change(run: Replay, row: int, before: float, after: float, time: float)
     run.note(kind, f"{text} {when}", name, time=time)
 
 
-def _list_options(run: Replay, unit: Unit, present: float) -> tuple[float, ...]:
+def _list_options(
+    run: Replay, unit: Unit, present: float, turned: Sequence[int]
+) -> tuple[float, ...]:
     """Directions to try for one unit, in the order in which the first clear one is taken."""
     if present != 0:
-        return (-present, 0.0, present) if unit.grips else (-present, present)
+        first = -present if set(unit.rows) & set(turned) else present
+        return (first, 0.0, -first) if unit.grips else (first, -first)
     s = run.stepper
     cones = s.outputs[s.to.events][s.rows.cone].reshape(2, -1)
     low, high = cones[:, s.mode.holders.index(unit.rows)]
@@ -146,8 +162,8 @@ def _list_options(run: Replay, unit: Unit, present: float) -> tuple[float, ...]:
 
 def _choose(
     run: Replay, signs: Array, still: Sequence[Unit], orders: Sequence[tuple[float, ...]]
-) -> Array:
-    """Directions of the first clear combination, or of the best.
+) -> Choice:
+    """The directions of the first clear combination, or of the best.
 
     Raises
     ------
@@ -164,16 +180,16 @@ def _choose(
         if choice is None:
             continue
         if choice.margin > CLEAR and choice.pressing > -CLEAR:
-            return choice.signs
+            return choice
         found.append(choice)
     pressing = [choice for choice in found if choice.pressing > -CLEAR]
     best = max(pressing, key=lambda choice: choice.margin, default=None)
     if best is not None and best.margin > -CLEAR:
-        return best.signs
+        return best
     # A contact is about to be lost, and its forces say which.
     pulling = [choice for choice in found if choice.pressing <= -CLEAR]
     if pulling:
-        return max(pulling, key=lambda choice: choice.margin).signs
+        return max(pulling, key=lambda choice: choice.margin)
     if judge.worst <= 0:
         run.fail_to_step(judge.worst)
     names = " ".join(run.phase.formation.names)
@@ -208,7 +224,7 @@ class _Judge:
         then = self._respond(mode, signs, evaluate_rows(self.formation, z, v), v)
         if then is None:
             return None
-        return Choice(signs, *self._measure(mode, signs, now, then))
+        return self._measure(mode, signs, now, then)
 
     def _respond(self, mode: Mode, signs: Array, rows: Rows, v: Array) -> Response | None:
         response = respond(mode, signs, rows, v)
@@ -217,24 +233,23 @@ class _Judge:
             return None
         return response
 
-    def _measure(
-        self, mode: Mode, signs: Array, now: Response, then: Response
-    ) -> tuple[float, float]:
-        """The least margin of what stands still, and the least c_n."""
+    def _measure(self, mode: Mode, signs: Array, now: Response, then: Response) -> Choice:
+        """Compare accelerations with directions, and what friction gives with what it can give."""
         scales, count = self.scene.scales, self.formation.n_contacts
         gained = (now.rates @ self.load + then.rates @ self.later) / 2
         gained = signs * gained / (measure_rates(self.scene, count) / scales.time)
+        moves = np.abs(gained) > CLEAR
         holds = then.holds @ self.later
         cones = holds[count:].reshape(2, -1).min(axis=0)
-        margins = []
+        margins = [np.inf]
         for unit in self.still:
             row = unit.rows[0]
-            if signs[row] != 0:
+            if signs[row] == 0:
+                force = scales.force if row < count else scales.torque
+                margins.append(cones[mode.holders.index(unit.rows)] / force)
+            elif moves[row]:
                 margins.append(gained[row])
-            else:
-                unit_of_force = scales.force if row < count else scales.torque
-                margins.append(cones[mode.holders.index(unit.rows)] / unit_of_force)
-        return float(min(margins)), float(holds[:count].min() / scales.force)
+        return Choice(signs, moves, float(min(margins)), float(holds[:count].min() / scales.force))
 
 
 def evaluate_rows(formation: Formation, z: Array, v: Array) -> Rows:

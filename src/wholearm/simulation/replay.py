@@ -45,6 +45,8 @@ class Replay:
         Sign of (coordinate - value) before the end of the phase, if that is a coordinate's value.
     moving : bool
         Whether the motion goes on into the phase that is entered.
+    stuck : set of int
+        Contacts, then joints, of the phase's formation that stay while the rest moves.
     """
 
     stepper: Stepper
@@ -75,6 +77,7 @@ class Replay:
         self.impact = 0.0
         self.moving = False
         self.side = 1.0
+        self.stuck: set[int] = set()
         self.decided = (-math.inf, 0)
         self.sections: list[Section] = []
         self.events: list[Event] = []

@@ -43,6 +43,7 @@ def enter(run: Replay, phase: Phase, following: Phase | None) -> None:
     until, run.side = phase.until, 1.0
     if until.value is not None:
         run.side = math.copysign(1.0, run.y[0 if until.coordinate == "x" else 2] - until.value)
+    run.stuck = set()
     run.take()
     run.limits = [limit.text for limit in open_limits(phase.formation, until)]
     run.releasable = find_releasable(phase, following)
@@ -93,7 +94,18 @@ def project_velocity(formation: Formation, z: Array, v: Array) -> Array:
 
 def set_off(run: Replay, departure: Departure) -> None:
     """Give the stepper the directions of a motion that starts from rest."""
-    grips = find_grips(run.phase.formation, np.concatenate(departure.directions))
+    formation, heading = run.phase.formation, departure.heading
+    grips = find_grips(formation, np.concatenate(departure.directions))
+    rates = np.concatenate(
+        [formation.evaluate(run.y[None, :5], run.y[None, :5]).A_t[0] @ heading, heading[3:]]
+    )
+    slow = STANDING * measure_rates(run.problem.scene, formation.n_contacts)
+    run.stuck = {
+        row
+        for unit in list_units(formation)
+        for row in unit.rows
+        if unit.grips and abs(rates[row]) < slow[row]
+    }
     if grips != run.stepper.mode.grips:
         run.take(grips)
     s = run.stepper

@@ -1,0 +1,346 @@
+"""Contacts and joints that come to rest while the rest moves: they stick, and slip again."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from plane import accelerate, make_formation, make_scene, measure_slip, place_corners, stack_rows
+from stepping import march
+from test_simulate_rolling import fall
+from tipping import constant, falling
+from wholearm.formation import close_finger, place_flush
+from wholearm.model import Array, Friction, Scene
+from wholearm.problem import Phase, Problem, Until
+from wholearm.simulation.events import EventKind, Simulation
+from wholearm.simulation.simulate import simulate
+from wholearm.simulation.statics import balances
+from wholearm.torque import TorqueProfile
+
+FAR = Until(coordinate="x", value=-0.3)
+"""An end that is never reached."""
+CHANGES = (EventKind.STICK, EventKind.SLIP, EventKind.REVERSAL)
+
+
+def linear(
+    times: Sequence[float], first: Sequence[float], second: Sequence[float]
+) -> TorqueProfile:
+    """Torques linear between instants [s, N m]; a time given twice is a step."""
+    t, tau = np.array(times), np.array([first, second]).T
+    pieces = np.flatnonzero(np.diff(t) > 0)
+    middle, half = (tau[1:] + tau[:-1])[pieces] / 2, (tau[1:] - tau[:-1])[pieces] / 2
+    breaks = np.append(t[pieces], t[-1])
+    return TorqueProfile(breaks, np.stack([middle, half], axis=2))
+
+
+def evaluate(torque: TorqueProfile, t: float) -> Array:
+    """Torques at one instant, shape (2,)."""
+    k = min(int(np.searchsorted(torque.breaks, t, side="right")) - 1, len(torque.coefficients) - 1)
+    start, stop = torque.breaks[k : k + 2]
+    x = (2 * t - start - stop) / (stop - start)
+    return np.asarray(torque.coefficients[k] @ x ** np.arange(torque.coefficients.shape[2]))
+
+
+def pushed(mu: float = 0.3, contacts: str = "v0-palm v1-palm v2-finger1") -> Problem:
+    """A box on the palm that finger 1 leans on, and finger 2 far off; both slide freely.
+
+    Finger 1 has dry friction, which finger 2 has not: that swings as its torque wants.
+    """
+    scene = make_scene(base=0.1)
+    left = dataclasses.replace(scene.fingers[1], base=[-0.5, -0.01], viscous=0.0, dry=0.0)
+    scene = Scene(scene.polygon, (scene.fingers[0], left), Friction(mu, 0.1, 0.1))
+    q = place_flush(scene, 0, 0.0)
+    z = np.array([*q, close_finger(scene, q, 0), np.pi / 2])
+    phase = Phase(0, make_formation(scene, contacts), FAR)
+    return Problem("pushed box", scene, 0.0, z, (phase,))
+
+
+def list_changes(simulation: Simulation) -> list[tuple[str, str]]:
+    """What sticks, slips or turns back, in order, by kind and name; not the object as a whole."""
+    return [(e.kind.value, e.contact) for e in simulation.events if e.kind in CHANGES and e.contact]
+
+
+def assert_balanced(simulation: Simulation) -> None:
+    energies = simulation.energies
+    size = np.abs(energies.work).max() + np.ptp(energies.stored)
+    assert np.abs(energies.residual).max() < 1e-9 * size
+
+
+@pytest.mark.parametrize("mu, sign", [(0.25, 1.0), (0.36, 1.0), (0.6, -1.0)])
+def test_a_falling_box_sticks_until_its_cone_is_left(mu: float, sign: float) -> None:
+    """In closed form the vertex sticks as it would roll, then slips against its last force."""
+    problem = falling(mu, 0.2)
+    (phase,) = problem.phases
+    slides = dataclasses.replace(phase.formation, rolling=())
+    problem = dataclasses.replace(problem, phases=(dataclasses.replace(phase, formation=slides),))
+    time, lean, c_t = fall(mu, 0.2)
+    simulation = simulate(problem, constant((-0.01, 0.01), 1.0), tolerance=1e-12)
+    slip = simulation.find(EventKind.SLIP)[0]
+    assert (slip.contact, slip.text) == ("v1-palm", f"v1-palm slips at t = {time:.5g} s, phase 1")
+    assert slip.time == pytest.approx(time, abs=1e-9)
+    before, after = np.flatnonzero(simulation.t == slip.time)
+    (start,) = (e for e in simulation.events if e.time < slip.time)
+    assert start.kind is EventKind.START
+    assert problem.start[2] - simulation.z[before, 2] == pytest.approx(lean - 0.2, abs=1e-9)
+    assert simulation.c_t[before, 0] == pytest.approx(c_t, abs=1e-8)
+    # The force goes on from one side of the jump to the other.
+    assert simulation.c_t[after, 0] == pytest.approx(c_t, abs=1e-8)
+    corner = np.array([place_corners(problem.scene, z)[1] for z in simulation.z])
+    assert np.abs(corner - corner[0])[: before + 1].max() < 1e-13
+    rows = slice(after + 1, None)
+    slipping = [
+        measure_slip(slides, z, v)[0]
+        for z, v in zip(simulation.z[rows], simulation.z_dot[rows], strict=True)
+    ]
+    assert np.sign(c_t) == sign and (np.sign(slipping[:3]) == -sign).all()
+    assert not simulation.energies.contact[: after + 1].any()
+    assert simulation.energies.contact[-1] > 0
+    assert_balanced(simulation)
+
+
+def test_a_swinging_joint_is_held_while_its_dry_friction_allows() -> None:
+    """Piecewise cubics: J theta'' = tau - D sgn(theta'), and rest where |tau| <= D."""
+    problem = pushed(contacts="v0-palm v1-palm")
+    scene = problem.scene
+    swings = dataclasses.replace(scene.fingers[0], viscous=0.0)
+    scene = dataclasses.replace(scene, fingers=(swings, scene.fingers[1]))
+    (phase,) = problem.phases
+    away = problem.start - 0.6 * np.eye(5)[3]
+    phase = dataclasses.replace(phase, formation=make_formation(scene, "v0-palm v1-palm"))
+    problem = dataclasses.replace(problem, scene=scene, start=away, phases=(phase,))
+    D, J = swings.dry, swings.inertia
+    torque = linear([0.0, 0.1, 0.3, 0.4], [0.0, 2 * D, -2 * D, -2 * D], [1e-3] * 4)
+    simulation = simulate(problem, torque, tolerance=1e-12)
+    # It starts at tau = D, is fastest when tau is D again, and is as slow when it has lost that.
+    peak = 2 * 0.5 * D / J * 0.05
+    stop = 0.15 + np.sqrt(2 * peak * J / (4 * D / 0.2))
+    assert list_changes(simulation) == [
+        ("slip", "joint 1"), ("stick", "joint 1"), ("slip", "joint 1"),
+    ]  # fmt: skip
+    times = [e.time for e in simulation.events if e.contact]
+    assert times == pytest.approx([0.05, stop, 0.25], abs=1e-9)
+    last = simulation.z_dot[-1, 3]
+    assert last == pytest.approx(-D / J * (0.05 / 2 + 0.1), rel=1e-9)
+    held = (simulation.t > stop) & (simulation.t < 0.25)
+    assert np.abs(simulation.z_dot[held, 3]).max() < 1e-14 and held.sum() > 1
+    # Finger 2 moves and the box lies still all the time.
+    theta = simulation.z[:, 4] - away[4]
+    assert np.allclose(theta, 1e-3 / J * simulation.t**2 / 2, atol=1e-12, rtol=0)
+    assert np.abs(simulation.z[:, :3] - away[:3]).max() < 1e-15
+    assert simulation.energies.dry[-1] == pytest.approx(
+        D * np.abs(np.diff(np.interp(times + [0.4], simulation.t, simulation.z[:, 3]))).sum(),
+        rel=1e-9,
+    )
+    assert_balanced(simulation)
+
+
+def find_slipping_torque(problem: Problem) -> float:
+    """Torque of finger 1 from which on nothing holds the box at rest, by linear programmes."""
+    contacts = problem.phases[0].formation.contacts
+
+    def holds(tau: float) -> bool:
+        return balances(problem.scene, contacts, problem.start, np.array([tau, 0.0]))
+
+    low, high = 0.0, 0.2
+    assert holds(low) and not holds(high)
+    while high - low > 1e-9:
+        middle = (low + high) / 2
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return high
+
+
+def test_a_rising_push_slips_a_flush_edge_when_both_cones_are_left() -> None:
+    problem = pushed()
+    rate = 0.5
+    # Finger 2 keeps moving, so that the box is stuck and not at rest.
+    torque = linear([0.0, 1.0], [0.0, rate], [1e-3, 1e-3])
+    simulation = simulate(problem, torque, tolerance=1e-11)
+    slips = simulation.find(EventKind.SLIP)
+    # The finger leans on the box, so that all of it starts to move at once.
+    assert {e.contact for e in slips[:4]} == {"v0-palm", "v1-palm", "v2-finger1", "joint 1"}
+    assert {e.time for e in slips[:4]} == {slips[0].time}
+    assert slips[0].time * rate == pytest.approx(find_slipping_torque(problem), rel=1e-5)
+    row = int(np.flatnonzero(simulation.t == slips[0].time)[0])
+    c_n, c_t = simulation.c_n[row, :2], simulation.c_t[row, :2]
+    assert np.abs(c_t).sum() == pytest.approx(0.3 * c_n.sum(), rel=1e-9)
+    assert np.allclose(c_t / c_n, c_t.sum() / c_n.sum(), rtol=1e-12)
+    assert_balanced(simulation)
+
+
+def rocking(scale: float = 1.0) -> TorqueProfile:
+    """Finger 1 pushes the box until it slides, eases off until it sticks, and does so again."""
+    share = np.array([0.0, 1.4, 1.3, 0.35, 0.35, 1.5, 0.4])
+    return linear(np.arange(7) / 10, 0.14 * scale * share, [1e-3] * 7)
+
+
+def test_time_stepping_agrees_while_a_box_is_pushed_and_sticks() -> None:
+    """Moreau's steps know no modes; their error falls with their length."""
+    problem = pushed()
+    simulation = simulate(problem, rocking(), tolerance=1e-12)
+    changes = list_changes(simulation)
+    order = ["slip", "stick", "slip", "stick"]
+    for name in ("v0-palm", "v1-palm", "v2-finger1", "joint 1"):
+        assert [kind for kind, own in changes if own == name] == order
+    assert_balanced(simulation)
+    moved = simulation.z[-1, 0] - problem.start[0]
+    assert moved < -0.005
+    errors = []
+    for n in (150, 300, 600):
+        z, _ = march(
+            problem.phases[0].formation, problem.start, np.zeros(5),
+            lambda t: evaluate(rocking(), t), 0.6, n,
+        )  # fmt: skip
+        errors.append(float(np.abs(z[-1] - simulation.z[-1]).max()))
+    assert errors[2] < 0.65 * errors[1] < 0.42 * errors[0] < 0.02 * abs(moved)
+
+
+def mirror(problem: Problem, torque: TorqueProfile) -> tuple[Problem, TorqueProfile]:
+    """Left and right exchanged; for formations of vertex contacts."""
+    scene, count = problem.scene, problem.scene.polygon.n_vertices
+    flip = np.array([-1.0, 1.0])
+    body = dataclasses.replace(
+        scene.polygon, points=(np.asarray(scene.polygon.points) * flip)[::-1]
+    )
+    fingers = [dataclasses.replace(f, base=np.asarray(f.base) * flip) for f in scene.fingers]
+    friction = Friction(scene.friction.palm, scene.friction.finger2, scene.friction.finger1)
+    scene = dataclasses.replace(
+        scene, polygon=body, fingers=(fingers[1], fingers[0]), friction=friction
+    )
+
+    def reflect(name: str) -> str:
+        vertex, part = name[1:].split("-")
+        other = {"finger1": "finger2", "finger2": "finger1"}.get(part, part)
+        return f"v{count - 1 - int(vertex)}-{other}"
+
+    phases = []
+    for phase in problem.phases:
+        names = " ".join(reflect(name) for name in phase.formation.names)
+        until = dataclasses.replace(phase.until, value=-phase.until.value)  # type: ignore[operator]
+        formation = make_formation(scene, names)
+        phases.append(dataclasses.replace(phase, formation=formation, until=until))
+    x, y, phi, first, second = problem.start
+    start = np.array([-x, y, -phi, np.pi - second, np.pi - first])
+    mirrored = dataclasses.replace(problem, scene=scene, start=start, phases=tuple(phases))
+    return mirrored, TorqueProfile(torque.breaks, -torque.coefficients[:, ::-1])
+
+
+def test_the_mirror_image_sticks_and_slips_alike() -> None:
+    problem = pushed()
+    simulation = simulate(problem, rocking())
+    image = simulate(*mirror(problem, rocking()))
+    times = [[e.time for e in s.events] for s in (simulation, image)]
+    assert times[1] == pytest.approx(times[0], abs=1e-10)
+    x, y, phi, first, second = simulation.z[-1]
+    expected = [-x, y, -phi, np.pi - second, np.pi - first]
+    assert np.allclose(image.z[-1], expected, atol=1e-11, rtol=0)
+
+
+def test_a_tipped_box_sticks_slips_and_sticks_again() -> None:
+    """A box that falls over a vertex, which sticks, and slides either way, as it must."""
+    problem = falling(0.36, 0.2)
+    (phase,) = problem.phases
+    slides = dataclasses.replace(phase.formation, rolling=())
+    free = dataclasses.replace(problem, phases=(dataclasses.replace(phase, formation=slides),))
+    torque = constant((-0.01, 0.01), 1.0)
+    simulation = simulate(free, torque, tolerance=1e-12)
+    kinds = [kind for kind, _ in list_changes(simulation)]
+    assert kinds[:2] == ["slip", "stick"] or kinds[:2] == ["slip", "reversal"]
+    assert_balanced(simulation)
+    stop, errors = float(simulation.t[-1]) - 1e-3, []
+    end = simulate(free, torque, tolerance=1e-12, times=[stop]).at(stop)
+    for n in (200, 400):
+        z, _ = march(slides, free.start, np.zeros(5), lambda t: np.array([-0.01, 0.01]), stop, n)
+        errors.append(float(np.abs(z[-1] - end[:5]).max()))
+    assert errors[1] < 0.65 * errors[0] < 0.01
+
+
+class Push:
+    """The box of `pushed` moved by plan: twice to the left by `run` [m], and still between.
+
+    The torques of finger 1 follow by inverse dynamics, from the plain dynamics of the tests.
+    """
+
+    def __init__(self, soft: bool, run: float = 0.004) -> None:
+        self.problem, self.soft, self.run = pushed(), soft, run
+        self.times = (0.0, 0.2, 0.3, 0.5)
+
+    def law(self, t: float, stage: int) -> tuple[float, float, float]:
+        """x, x' and x'' at a time of a stage."""
+        start, rate = self.times[stage], 2 * np.pi / (self.times[stage + 1] - self.times[stage])
+        x = self.problem.start[0] - (self.run if stage else 0.0)
+        if stage == 1:
+            return x, 0.0, 0.0
+        u, run = rate * (t - start), self.run
+        if self.soft:
+            share = run / (2 * np.pi)
+            return (
+                x - share * (u - np.sin(u)),
+                -share * rate * (1 - np.cos(u)),
+                -share * rate**2 * np.sin(u),
+            )
+        u, rate = u / 2, rate / 2
+        return (
+            x - run / 2 * (1 - np.cos(u)),
+            -run / 2 * rate * np.sin(u),
+            -run / 2 * rate**2 * np.cos(u),
+        )
+
+    def torque(self, t: float, stage: int) -> float:
+        """Torque of finger 1 [N m]; within the cone while the box is still."""
+        if stage == 1:
+            return 0.07
+        problem = self.problem
+        x, x_dot, x_ddot = self.law(t, stage)
+        q = place_flush(problem.scene, 0, x)
+        z = np.array([*q, close_finger(problem.scene, q, 0), problem.start[4]])
+        formation = problem.phases[0].formation
+        normal, tangent = stack_rows(formation, z)
+        turn = -normal[2, 0] * x_dot / normal[2, 3]
+        v = np.array([x_dot, 0.0, 0.0, turn, 0.0])
+        ahead = np.array([-1.0, 0.0, 0.0, normal[2, 0] / normal[2, 3], 0.0])
+        Xi, sigma = np.sign(tangent @ ahead), np.array([np.sign(ahead[3]), 1.0])
+        first, second = (
+            accelerate(formation, z, v, np.array([tau, 1e-3]), Xi, sigma)[0][0]
+            for tau in (0.0, 1.0)
+        )
+        return float((x_ddot - first) / (second - first))
+
+    def fit(self, pieces: int = 6, degree: int = 7) -> TorqueProfile:
+        """The torques as polynomials, which may step between the stages."""
+        breaks, coefficients = [0.0], []
+        nodes = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
+        for stage in range(3):
+            edges = np.linspace(self.times[stage], self.times[stage + 1], pieces + 1)
+            for low, high in zip(edges, edges[1:], strict=False):
+                t = (low + high + nodes * (high - low)) / 2
+                values = [self.torque(float(one), stage) for one in t]
+                own = np.polynomial.polynomial.polyfit(nodes, values, degree)
+                coefficients.append([own, [1e-3] + [0.0] * degree])
+                breaks.append(high)
+        return TorqueProfile(np.array(breaks), np.array(coefficients))
+
+
+@pytest.mark.parametrize("soft", [False, True])
+@pytest.mark.parametrize("off", [0.0, 3e-9, -3e-9])
+def test_a_planned_stop_and_start_are_kept_though_rounding_disturbs_them(
+    soft: bool, off: float
+) -> None:
+    """Sliding ends by plan with v_t exactly zero where the torques step, or nearly so."""
+    push = Push(soft)
+    exact = push.fit()
+    inner = np.where((exact.breaks > 0) & (exact.breaks < 0.5), off, 0.0)
+    torque = TorqueProfile(exact.breaks + inner, exact.coefficients * (1 + off))
+    simulation = simulate(push.problem, torque)
+    palm = [e for e in simulation.events if e.contact == "v0-palm"]
+    # With vanishing acceleration a speed of 1e-12 decides when it ends.
+    near = 1e-4 if soft else 1e-6
+    assert [e.kind for e in palm][:2] == [EventKind.STICK, EventKind.SLIP]
+    assert palm[0].time == pytest.approx(0.2, abs=near)
+    assert palm[1].time == pytest.approx(0.3, abs=near)
+    row = int(np.flatnonzero(simulation.t > 0.3 + near)[0])
+    assert simulation.z_dot[row, 0] < 0
+    assert simulation.z[-1, 0] == pytest.approx(push.problem.start[0] - 2 * push.run, abs=1e-7)
+    assert_balanced(simulation)
