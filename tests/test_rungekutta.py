@@ -6,7 +6,8 @@ import pytest
 
 from planned import plan
 from wholearm.simulation import rungekutta
-from wholearm.simulation.stepper import STATE, build_stepper
+from wholearm.simulation.layout import STATE
+from wholearm.simulation.stepper import build_stepper
 
 
 def test_rows_sum_to_nodes() -> None:
