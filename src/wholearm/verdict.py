@@ -73,8 +73,7 @@ def describe_overlap(scene: Scene, gap: FingerGap | None) -> list[str]:
 def judge_end(problem: Problem, simulation: Simulation, allowance: Allowance) -> tuple[bool, str]:
     """Whether the goal is reached, and the sentence that says how the replay ended.
 
-    By rounding the last speeds fall to zero one after the other, so that friction may hold a
-    contact, or the torques end, within a hair of the goal.
+    By rounding the torques may end within a hair of the goal.
     """
     outcome, last = simulation.outcome, problem.phases[-1]
     if outcome.reached:
@@ -82,7 +81,7 @@ def judge_end(problem: Problem, simulation: Simulation, allowance: Allowance) ->
     missed = abs(simulation.missed_by)
     is_angle = last.until.coordinate == "phi"
     near = (
-        outcome.kind in (OutcomeKind.GOAL_MISSED, OutcomeKind.HELD)
+        outcome.kind is OutcomeKind.GOAL_MISSED
         and int(simulation.phase[-1]) == last.index
         and missed <= GOAL * (1.0 if is_angle else problem.scene.scales.length)
         and measure_speed(problem.scene, simulation.z_dot[-1])
