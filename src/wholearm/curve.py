@@ -17,7 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from .formation import Formation, Kinematics
-from .model import Array, Scene
+from .metric import measure_speed as measure_speed
+from .metric import metric_weights as metric_weights
+from .model import Array
 
 REFINE = 3
 """Places per node of a panel at which limits and reversals are looked for."""
@@ -206,17 +208,6 @@ def border(P: Array, last: Array) -> Array:
     """Append a row to each P: (n, 4, 5) and (5,) or (n, 5) to (n, 5, 5)."""
     last = np.broadcast_to(last, (len(P), 5))
     return np.concatenate([P, last[:, None, :]], axis=1)
-
-
-def metric_weights(scene: Scene) -> Array:
-    """Diagonal of the metric of arc length, shape (5,): 1 for lengths, rho^2 for angles."""
-    rho = scene.polygon.gyration_radius
-    return np.array([1.0, 1.0, rho**2, rho**2, rho**2])
-
-
-def measure_speed(scene: Scene, v: Array) -> float:
-    """Speed of a velocity, shape (5,), in the metric of curves [m/s]."""
-    return float(np.sqrt(metric_weights(scene) @ v**2))
 
 
 def tangent_basis(formation: Formation, z: Array) -> Array:

@@ -24,9 +24,9 @@ from typing import NamedTuple
 import numpy as np
 
 from .cones import hold_rows
-from .curve import measure_speed, metric_weights
 from .dynamics import Directions, force_rows, reduced_inertia
 from .formation import Formation
+from .metric import measure_speed, metric_weights
 from .model import Array
 
 ROUNDING = 1e-6
