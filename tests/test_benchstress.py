@@ -20,9 +20,7 @@ def test_small_changes_leave_a_plan(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_has_no_plan_is_counted_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(benchstress, "TRIALS", 1)
     monkeypatch.setattr(benchstress, "SPREADS", (0.05,))
-    problem = load(str(HEPTAGON))
-    table = {**problem.table, "epsilon": 50.0}
-    (row,) = measure_stress(replace(problem, table=table))
+    (row,) = measure_stress(load(str(HEPTAGON)).with_(epsilon=50.0))
     assert row.error == 1.0 and row.note.startswith("0 of 1 planned and verified; time: phase ")
 
 

@@ -255,6 +255,10 @@ def test_pointed_tip_has_no_arc() -> None:
 
 def test_features_last_as_long_as_their_scene(heptagon: Problem) -> None:
     first = build_features(heptagon.scene)
-    others = [replace(heptagon.scene, gravity=float(g)) for g in range(1, 60)]
+    right, left = heptagon.scene.fingers
+    others = [
+        replace(heptagon.scene, fingers=(replace(right, length=0.1 + k / 500), left))
+        for k in range(60)
+    ]
     assert len({id(build_features(scene)) for scene in others}) == len(others)
     assert build_features(heptagon.scene) is first

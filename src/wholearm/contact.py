@@ -25,14 +25,13 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
 
 from .errors import InputError
 from .model import Array, Scene
-from .sharing import retire_with
+from .sharing import Store
 
 Expression = Any
 """A CasADi SX expression (CasADi has no type stubs)."""
@@ -167,9 +166,6 @@ class Limit(NamedTuple):
     gained: Contact | None = None
 
 
-_FEATURES: WeakKeyDictionary[Scene, Features] = WeakKeyDictionary()
-
-
 def parse_contact(name: object, scene: Scene) -> Contact:
     """Return the contact called `name`.
 
@@ -215,15 +211,12 @@ def candidate_contacts(scene: Scene, finger: int | None) -> list[Contact]:
 
 
 def build_features(scene: Scene) -> Features:
-    """Return the scene's features as expressions; built once per scene.
+    """Return the scene's features as expressions, the same for scenes of one shape.
 
     Expressions of different contacts only fit together if they share one symbol z, so the features
     are kept for as long as the scene lives.
     """
-    if scene not in _FEATURES:
-        _FEATURES[scene] = _build_features(scene)
-        retire_with(scene, _FEATURES[scene])
-    return _FEATURES[scene]
+    return _FEATURES(scene)
 
 
 def _build_features(scene: Scene) -> Features:
@@ -238,6 +231,9 @@ def _build_features(scene: Scene) -> Features:
     normals = ca.vertcat(-along[1, :], along[0, :])
     links = tuple(_build_link(scene, finger, z, vertices, along, normals) for finger in range(2))
     return Features(z, vertices, normals, lengths, (links[0], links[1]))
+
+
+_FEATURES = Store(_build_features, lambda scene: scene.shape)
 
 
 def _build_link(

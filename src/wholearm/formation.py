@@ -41,7 +41,7 @@ from .contact import (
 from .errors import InputError
 from .links import build_finger_limit
 from .model import Array, Scene
-from .sharing import Keeper, exclusive, kept_property
+from .sharing import Keeper, Store, exclusive, kept_property
 from .slip import build_slip
 
 TOUCHING = 1e-7
@@ -320,15 +320,20 @@ def close_finger(scene: Scene, q: Array, finger: int) -> float:
 @exclusive
 def find_touching(scene: Scene, z: Array) -> tuple[Contact, ...]:
     """Return the contacts that touch at `z`, in the order palm, finger 1, finger 2."""
-    touching = []
-    for finger in (None, 0, 1):
-        candidates = candidate_contacts(scene, finger)
-        clearances = [build_clearance(c, scene, touching=False).value for c in candidates]
-        values = ca.Function("touching", [build_features(scene).z], [ca.vertcat(*clearances)])
-        for contact, value in zip(candidates, values(z).full()[:, 0], strict=True):
-            if abs(value) < scene.touching:
-                touching.append(contact)
-    return tuple(touching)
+    candidates, function = _CLEARANCES(scene)
+    values = function(z).full()[:, 0]
+    near = np.abs(values) < scene.touching
+    return tuple(c for c, touches in zip(candidates, near, strict=True) if touches)
+
+
+def _build_clearances(scene: Scene) -> tuple[tuple[Contact, ...], Expression]:
+    """Every contact that a scene's object can have, and a function z -> their clearances [m]."""
+    candidates = tuple(c for part in (None, 0, 1) for c in candidate_contacts(scene, part))
+    values = ca.vertcat(*(build_clearance(c, scene, touching=False).value for c in candidates))
+    return candidates, ca.Function("clearances", [build_features(scene).z], [ca.densify(values)])
+
+
+_CLEARANCES = Store(_build_clearances, lambda scene: scene.shape)
 
 
 def describe(contacts: Sequence[Contact]) -> str:

@@ -11,13 +11,12 @@ is the distance of the two capsules when apart, minus the depth when they overla
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import casadi as ca
 import numpy as np
 
 from .contact import Expression, Limit, build_features, rotate_quarter
 from .model import Array, Scene
+from .sharing import Store, exclusive
 
 FINGERS_TOUCH = "finger 1 touches finger 2"
 """What has happened where the gap of the fingers is zero."""
@@ -52,11 +51,14 @@ def build_finger_limit(scene: Scene) -> list[Limit]:
     return [Limit(build_finger_gap(scene), FINGERS_TOUCH)] if scene.fingers_collide else []
 
 
-@lru_cache(maxsize=16)
-def _gap_function(scene: Scene) -> Expression:
+def _build_gap_function(scene: Scene) -> Expression:
     return ca.Function("finger_gap", [build_features(scene).z], [build_finger_gap(scene)])
 
 
+_GAP_FUNCTIONS = Store(_build_gap_function, lambda scene: scene.shape)
+
+
+@exclusive
 def evaluate_finger_gap(scene: Scene, z: Array) -> Array:
     """Gap between the two links at n configurations, shape (n,) [m], negative where they overlap.
 
@@ -68,4 +70,4 @@ def evaluate_finger_gap(scene: Scene, z: Array) -> Array:
     """
     if not len(z):
         return np.zeros(0)
-    return np.asarray(_gap_function(scene)(z.T).full()[0])
+    return np.asarray(_GAP_FUNCTIONS(scene)(z.T).full()[0])

@@ -322,6 +322,13 @@ class Scene:
         force = max(mass * self.gravity, press / 100)
         return Scales(self.polygon.gyration_radius, mass, force)
 
+    @cached_property
+    def shape(self) -> tuple[object, ...]:
+        """Equal for scenes whose object and links have the same shapes and joints."""
+        joints = [np.asarray(finger.base).tobytes() for finger in self.fingers]
+        sizes = [(finger.length, finger.radius) for finger in self.fingers]
+        return (self.polygon.vertices.tobytes(), *joints, *sizes)
+
     @property
     def touching(self) -> float:
         """Gap below which features count as touching [m]: above rounding, below real clearance."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, TypeVar
 
@@ -19,6 +19,7 @@ from .errors import InputError
 from .formation import TOUCHING, Formation, close_finger, describe, find_touching, place_flush
 from .links import evaluate_finger_gap
 from .model import Array, Finger, Friction, Polygon, Scene, require_number
+from .problemtable import change_table, match_table, name_keys
 from .sharing import exclusive
 
 _T = TypeVar("_T")
@@ -116,6 +117,12 @@ class Phase:
         """The phase's number for people, from 1."""
         return self.index + 1
 
+    def move_to(self, scene: Scene) -> Phase:
+        """The phase in another scene."""
+        if self.formation.scene is scene:
+            return self
+        return replace(self, formation=replace(self.formation, scene=scene))
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -133,7 +140,13 @@ class Problem:
     source : str
         The file this was read from.
     table : mapping
-        The contents of that file, which trajectory files carry along.
+        The contents of that file, which trajectory files carry along; in step with the rest, or
+        empty if there is none.
+
+    Notes
+    -----
+    Formations of the phases are those of `scene`, whichever they were made for, so that
+    `dataclasses.replace` makes another problem of one scene. `with_` also checks the values.
     """
 
     name: str
@@ -143,6 +156,40 @@ class Problem:
     phases: tuple[Phase, ...]
     source: str = ""
     table: Mapping[str, Any] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        phases = tuple(phase.move_to(self.scene) for phase in self.phases)
+        object.__setattr__(self, "phases", phases)
+        object.__setattr__(self, "table", match_table(self))
+
+    def with_(self, changes: Mapping[str, Any] | None = None, /, **named: Any) -> Problem:
+        """Return the problem with other values, checked like those of a file.
+
+        Parameters
+        ----------
+        changes : mapping, optional
+            New values by dotted keys as messages write them, such as ``fingers.1.base`` or
+            ``phases[2].until``, or by the short names of `named`.
+        **named
+            `name`, `epsilon`, `gravity` and the other keys at the top of a problem file; `mass`,
+            `inertia`, `vertices` of the object; `friction` of all parts, or `friction_palm`,
+            `friction_finger1`, `friction_finger2`; `flush`, `x` of the start; `length`, `radius`,
+            `finger_inertia`, `viscous`, `dry`, `torque_limit`, `speed_limit` of both fingers, or of
+            one as in `torque_limit1`; `base1`, `base2`. None leaves out what is optional.
+
+        Raises
+        ------
+        InputError
+            If a name is unknown, a value is not allowed, or the problem has no table.
+        """
+        if not self.table:
+            raise InputError(self.source, "", "the problem has no table that could be changed")
+        given = {**(changes or {}), **named}
+        try:
+            table = change_table(self.table, given, name_keys(_TOP, _FINGER))
+        except InputError as error:
+            raise InputError(self.source, error.key, error.problem) from None
+        return _build(table, self.source)
 
     @property
     def contacts(self) -> tuple[Contact, ...]:
@@ -166,12 +213,17 @@ def read_problem(path: str) -> Problem:
         raise InputError(str(path), "", f"cannot be read: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(str(path), "", f"is not TOML: {error}") from None
+    return _build(table, str(path))
+
+
+def _build(table: Mapping[str, Any], source: str) -> Problem:
+    """Build a problem, with errors that name its source."""
     try:
-        return build_problem(table, str(path))
+        return build_problem(table, source)
     except InputError as error:
         if error.source:
             raise
-        raise InputError(str(path), error.key, error.problem) from None
+        raise InputError(source, error.key, error.problem) from None
 
 
 @exclusive

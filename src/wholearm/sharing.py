@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from functools import wraps
 from threading import RLock
 from typing import Any, Generic, ParamSpec, TypeVar, overload
-from weakref import finalize
+from weakref import WeakKeyDictionary, WeakValueDictionary, finalize
 
 _T = TypeVar("_T")
 _P = ParamSpec("_P")
@@ -94,6 +94,33 @@ class Keeper:
 def retire_with(owner: object, value: object) -> None:
     """Have `value` set aside, and not deleted, when its owner is."""
     finalize(owner, _retired.append, value).atexit = False
+
+
+class Store(Generic[_T]):
+    """Values made of CasADi objects that several owners share, for as long as one of them lives.
+
+    Parameters
+    ----------
+    build : callable
+        Makes the value of an owner.
+    identify : callable
+        Owners for which this is equal share one value.
+    """
+
+    def __init__(self, build: Callable[[Any], _T], identify: Callable[[Any], Hashable]) -> None:
+        self._build, self._identify = build, identify
+        self._values: WeakKeyDictionary[Any, _T] = WeakKeyDictionary()
+        self._firsts: WeakValueDictionary[Hashable, Any] = WeakValueDictionary()
+
+    @exclusive
+    def __call__(self, owner: object) -> _T:
+        """Return the value of `owner`."""
+        if owner not in self._values:
+            first = self._firsts.setdefault(self._identify(owner), owner)
+            value = self._values[first] if first in self._values else self._build(owner)
+            self._values[owner] = value
+            retire_with(owner, value)
+        return self._values[owner]
 
 
 def _drop_locals(error: BaseException) -> None:

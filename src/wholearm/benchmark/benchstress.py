@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 
 from ..errors import WholearmError
 from ..plan import solve
-from ..problem import Problem, build_problem
+from ..problem import Problem
 from ..verify import verify
 from .benchreport import Row
 
@@ -32,9 +31,9 @@ def measure_stress(problem: Problem) -> list[Row]:
         started, failures = time.perf_counter(), []
         for trial in range(TRIALS):
             goal = ("time", "effort", "margin")[trial % 3]
-            changed = _change(problem.table, spread, random)
+            changes = _change(problem.table, spread, random)
             try:
-                other = build_problem(changed, problem.source)
+                other = problem.with_(changes)
                 report = verify(other, solve(other, goal))
                 failures += [f"{goal}: {text}" for text in report.failures[:1]]
             except WholearmError as error:
@@ -49,17 +48,15 @@ def measure_stress(problem: Problem) -> list[Row]:
 
 
 def _change(table: Mapping[str, Any], spread: float, random: np.random.Generator) -> dict[str, Any]:
-    """The table of a problem file with numbers changed by up to `spread`."""
-    changed = copy.deepcopy(dict(table))
-
-    def factor() -> float:
-        return 1 + spread * float(random.uniform(-1, 1))
-
-    changed["object"]["mass"] *= factor()
-    for finger in changed["fingers"].values():
-        for key in _FINGER:
-            if key in finger:
-                finger[key] *= factor()
-    for part in changed["friction"]:
-        changed["friction"][part] *= factor()
+    """Numbers of a problem file changed by up to `spread`, by their dotted keys."""
+    keys = ["object.mass"]
+    for number, finger in table["fingers"].items():
+        keys += [f"fingers.{number}.{key}" for key in _FINGER if key in finger]
+    keys += [f"friction.{part}" for part in table["friction"]]
+    changed = {}
+    for key in keys:
+        place: Any = table
+        for step in key.split("."):
+            place = place[step]
+        changed[key] = place * (1 + spread * float(random.uniform(-1, 1)))
     return changed

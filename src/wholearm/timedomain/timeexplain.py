@@ -142,6 +142,4 @@ def change_limit(problem: Problem, index: int, value: float) -> Problem:
         replace(link, torque_limit=value) if k == index else link
         for k, link in enumerate(problem.scene.fingers)
     )
-    scene = replace(problem.scene, fingers=(right, left))
-    phases = [replace(p, formation=replace(p.formation, scene=scene)) for p in problem.phases]
-    return replace(problem, scene=scene, phases=tuple(phases))
+    return replace(problem, scene=replace(problem.scene, fingers=(right, left)))
