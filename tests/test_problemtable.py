@@ -86,6 +86,7 @@ def test_both_ways_to_another_friction_plan_the_same(heptagon: Problem) -> None:
         ({"name": "other"}, "name", "other"),
         ({"epsilon": 0.01}, "epsilon", 0.01),
         ({"gravity": 1.62}, "gravity", 1.62),
+        ({"fingers_collide": False}, "fingers_collide", False),
         ({"mass": np.float64(0.3)}, "object.mass", 0.3),
         ({"inertia": 2e-4}, "object.inertia", 2e-4),
         ({"friction_finger1": 0.3}, "friction.finger1", 0.3),
