@@ -32,142 +32,21 @@ S. L. Yeap and J. C. Trinkle, "Dynamic Whole-Arm Dexterous Manipulation in the P
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from .errors import InputError
-
-Array = NDArray[np.float64]
+from .polygon import Polygon as Polygon
+from .require import Array as Array
+from .require import require_number as require_number
+from .require import require_vector
 
 TOUCHING = 3e-6
 """Gap below which features count as touching, in radii of gyration of the object."""
-
-
-def require_number(
-    value: object, key: str, *, positive: bool = False, nonnegative: bool = False
-) -> float:
-    """Return `value` as a finite float, or raise `InputError` naming `key`."""
-    allowed = "a positive number" if positive else "a number >= 0" if nonnegative else "a number"
-    real = isinstance(value, int | float | np.integer | np.floating)
-    try:
-        result = float(value) if real and not isinstance(value, bool) else math.nan  # type: ignore[arg-type]
-    except OverflowError:
-        result = math.inf
-    if not math.isfinite(result):
-        raise InputError("", key, f"{value!r} is not {allowed} (finite)")
-    if (positive and result <= 0) or (nonnegative and result < 0):
-        raise InputError("", key, f"{value!r} is not {allowed}")
-    return result
-
-
-def require_vector(value: object, key: str, size: int) -> Array:
-    """Return `value` as a read-only float array of `size` finite numbers, or raise `InputError`."""
-    if not isinstance(value, list | tuple | np.ndarray) or len(value) != size:
-        raise InputError("", key, f"{value!r} is not a list of {size} numbers")
-    return _frozen([require_number(item, key) for item in value])
-
-
-def _frozen(value: ArrayLike) -> Array:
-    array = np.array(value, dtype=float)
-    array.setflags(write=False)
-    return array
-
-
-@dataclass(frozen=True, eq=False)
-class Polygon:
-    """The object: a rigid convex polygon.
-
-    Parameters
-    ----------
-    points : array_like, shape (n_v, 2), [m]
-        Corners, anticlockwise, in any frame.
-    mass : float, [kg]
-    inertia : float, optional, [kg m^2]
-        About the centroid; that of uniform density when left out.
-
-    Attributes
-    ----------
-    vertices : ndarray, shape (n_v, 2), [m]
-        Corners relative to the centroid, in the orientation phi = 0.
-    centroid : ndarray, shape (2,), [m]
-        The centroid in the frame of `points`.
-
-    Raises
-    ------
-    InputError
-        If the corners are not those of a convex anticlockwise polygon, or a number is not positive.
-    """
-
-    points: ArrayLike
-    mass: float
-    inertia: float | None = None
-    vertices: Array = field(init=False, repr=False)
-    centroid: Array = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        given = self.points
-        if not isinstance(given, list | tuple | np.ndarray) or len(given) < 3:
-            raise InputError("", "object.vertices", f"{given!r} is not a list of 3 or more points")
-        corners = np.array(
-            [require_vector(p, f"object.vertices[{i}]", 2) for i, p in enumerate(given)]
-        )
-        edges = np.roll(corners, -1, axis=0) - corners
-        cross = _cross(corners, np.roll(corners, -1, axis=0))
-        area = cross.sum() / 2
-        if area <= 0:
-            raise InputError(
-                "",
-                "object.vertices",
-                f"the polygon is clockwise or flat (signed area {area:.3g} m^2); "
-                "list its corners anticlockwise",
-            )
-        turns = _cross(np.roll(edges, 1, axis=0), edges)
-        headings = np.arctan2(turns, np.sum(np.roll(edges, 1, axis=0) * edges, axis=1))
-        reflex = np.flatnonzero(turns <= 1e-9 * area)
-        if reflex.size:
-            raise InputError(
-                "",
-                f"object.vertices[{reflex[0]}]",
-                f"the polygon is not strictly convex at {corners[reflex[0]].tolist()}; "
-                "every corner must turn left",
-            )
-        if headings.sum() > 2 * np.pi + 1e-6:
-            raise InputError("", "object.vertices", "the polygon crosses itself; it must be convex")
-        neighbours = corners + np.roll(corners, -1, axis=0)
-        centroid = (neighbours * cross[:, None]).sum(axis=0) / (6 * area)
-        vertices = corners - centroid
-        mass = require_number(self.mass, "object.mass", positive=True)
-        if self.inertia is None:
-            after = np.roll(vertices, -1, axis=0)
-            squares = (vertices**2 + vertices * after + after**2).sum(axis=1)
-            inertia = mass * float(_cross(vertices, after) @ squares) / (12 * area)
-        else:
-            inertia = require_number(self.inertia, "object.inertia", positive=True)
-        object.__setattr__(self, "points", _frozen(corners))
-        object.__setattr__(self, "vertices", _frozen(vertices))
-        object.__setattr__(self, "centroid", _frozen(centroid))
-        object.__setattr__(self, "mass", mass)
-        object.__setattr__(self, "inertia", inertia)
-
-    @property
-    def n_vertices(self) -> int:
-        """Number of corners, which is also the number of edges."""
-        return len(self.vertices)
-
-    @property
-    def gyration_radius(self) -> float:
-        """Radius of gyration about the centroid [m], which weighs angles against lengths."""
-        assert self.inertia is not None
-        return math.sqrt(self.inertia / self.mass)
-
-    def flush_angle(self, edge: int) -> float:
-        """Angle phi in (-pi, pi] at which `edge` lies on the palm below the object [rad]."""
-        run = self.vertices[(edge + 1) % self.n_vertices] - self.vertices[edge]
-        return -math.atan2(run[1], run[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,8 +245,3 @@ class Scene:
     def speed_limit(self) -> Array:
         """Joint speed limits, shape (2,) [rad/s], infinite where there is none."""
         return np.array([finger.speed_limit for finger in self.fingers])
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Plane cross product a_x b_y - a_y b_x along the last axis."""
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

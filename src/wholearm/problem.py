@@ -20,6 +20,7 @@ from .formation import TOUCHING, Formation, close_finger, describe, find_touchin
 from .links import evaluate_finger_gap
 from .model import Array, Finger, Friction, Polygon, Scene, require_number
 from .problemtable import change_table, match_table, name_keys
+from .ranges import TURN, check_epsilon, check_place, check_ranges
 from .sharing import exclusive
 
 _T = TypeVar("_T")
@@ -235,6 +236,8 @@ def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
         raise InputError("", "name", f"{name!r} is not a string")
     epsilon = require_number(table["epsilon"], "epsilon", nonnegative=True)
     scene = _read_scene(table)
+    check_ranges(scene)
+    check_epsilon(scene, epsilon)
     start = _read_start(scene, _table(table, "start"))
     given = table["phases"]
     if not isinstance(given, list) or not given:
@@ -281,7 +284,9 @@ def _read_start(scene: Scene, start: Mapping[str, Any]) -> Array:
         raise InputError(
             "", "start.flush", f"{edge!r} is not an edge; allowed are 0 to {count - 1}"
         )
-    q = place_flush(scene, edge, require_number(start["x"], "start.x"))
+    x = require_number(start["x"], "start.x")
+    check_place(scene, "start.x", x)
+    q = place_flush(scene, edge, x)
     z = np.array([*q, close_finger(scene, q, 0), close_finger(scene, q, 1)])
     z.setflags(write=False)
     return z
@@ -357,7 +362,9 @@ def _read_until(scene: Scene, given: object) -> Until:
     ((key, value),) = given.items()
     number = require_number(value, "")
     if key == "x":
+        check_place(scene, "", number)
         return Until(coordinate="x", value=number)
+    TURN.check("", number, "degrees")
     return Until(coordinate="phi", value=math.radians(number))
 
 
