@@ -159,11 +159,19 @@ class Limit(NamedTuple):
         What has happened when it is zero.
     gained : Contact or None
         The contact that is gained there, if any.
+    also : tuple of Contact
+        Others that may be gained there: a pointed tip at a vertex may go on along either edge,
+        or along the link.
     """
 
     value: Expression
     text: str
     gained: Contact | None = None
+    also: tuple[Contact, ...] = ()
+
+    def gains(self, contact: Contact | None) -> bool:
+        """Whether a contact is gained there."""
+        return contact is not None and (contact == self.gained or contact in self.also)
 
 
 def parse_contact(name: object, scene: Scene) -> Contact:
@@ -328,24 +336,32 @@ def build_limits(contact: Contact, scene: Scene) -> list[Limit]:
     i, part, count = contact.index, contact.part, len(lengths)
     before, after = (i - 1) % count, (i + 1) % count
 
+    pointed = scene.fingers[finger].radius == 0
+
     def gains(feature: str, index: int, surface: str = "tip") -> Contact | None:
-        if (feature, surface) == ("v", "tip") and scene.fingers[finger].radius == 0:
+        if (feature, surface) == ("v", "tip") and pointed:
             return None
         return Contact(feature, index, surface, finger)
+
+    def meeting(vertex: int) -> tuple[Contact, ...]:
+        """What else a pointed tip touches at a vertex."""
+        side = Contact("v", vertex, "finger", finger)
+        edges = [Contact("e", (vertex - k) % count, "tip", finger) for k in (0, 1)]
+        return tuple(c for c in (side, *edges) if c != contact) if pointed else ()
 
     if contact.surface == "finger":
         run = link.vertex_run[i]
         off = f"v{i} runs off {part} at its"
         return [
             Limit(run, f"{off} base"),
-            Limit(scene.fingers[finger].length - run, f"{off} tip", gains("v", i)),
+            Limit(scene.fingers[finger].length - run, f"{off} tip", gains("v", i), meeting(i)),
         ]
     if contact.feature == "e":
         run = link.edge_run[i]
         off = f"{part} runs off edge {i} at v"
         return [
-            Limit(run, f"{off}{i}", gains("v", i)),
-            Limit(lengths[i] - run, f"{off}{after}", gains("v", after)),
+            Limit(run, f"{off}{i}", gains("v", i), meeting(i)),
+            Limit(lengths[i] - run, f"{off}{after}", gains("v", after), meeting(after)),
         ]
     return [
         Limit(

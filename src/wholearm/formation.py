@@ -40,7 +40,7 @@ from .contact import (
 )
 from .errors import InputError
 from .links import build_finger_limit
-from .model import Array, Scene
+from .model import Array, Finger, Scene
 from .sharing import Keeper, Store, exclusive, kept_property
 from .slip import build_slip
 
@@ -281,11 +281,12 @@ def close_finger(scene: Scene, q: Array, finger: int) -> float:
     sign = 1.0 if finger == 0 else -1.0
     base = np.asarray(link.base)
     corners = q[:2] + np.array([_rotate(q[2], v) for v in scene.polygon.vertices]) - base
-    if _distance_from_origin(corners) <= link.radius:
+    if _distance_from_origin(corners) <= link.radius or _hangs_into(link, corners):
         raise InputError(
             "",
             f"fingers.{finger + 1}.base",
-            f"{base.tolist()} is inside the object or nearer to it than the link's radius",
+            f"{base.tolist()} is inside the object or nearer to it than the link's radius, "
+            "or right above it",
         )
     angles: list[float] = []
     for corner in corners:
@@ -339,6 +340,17 @@ _CLEARANCES = Store(_build_clearances, lambda scene: scene.shape)
 def describe(contacts: Sequence[Contact]) -> str:
     """Names of the contacts in one line."""
     return " ".join(sorted(contact.name for contact in contacts)) or "nothing"
+
+
+def _hangs_into(link: Finger, corners: Array) -> bool:
+    """Whether a link that points down, from where it closes, overlaps the object."""
+    hanging = np.array([0.0, -link.length])
+    for (x, y), (x_after, y_after) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if abs(x) < link.radius and -link.length < y < 0:
+            return True
+        if x * x_after < 0 and -link.length < y - x * (y_after - y) / (x_after - x) < 0:
+            return True
+    return _distance_from_origin(corners - hanging) < link.radius
 
 
 def _distance_from_origin(corners: Array) -> float:

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .contact import build_limits
 from .curve import Curve, metric_weights, tangent_basis
 from .dynamics import Directions
 from .errors import InputError
+from .explore import Ending, close, explore
 from .formation import TOUCHING, Formation
 from .model import Array
 from .path import require_touching, runs_on_curve, trace_phase, trace_phases
@@ -25,8 +27,6 @@ _AHEAD = (0.25, 0.5, 1.0, 2.0)
 """How far ahead ends are looked for, over the distance to the nearest."""
 _TURNS = np.linspace(-1.0, 1.0, 21)
 """How far the object is turned to look for an end that is not the nearest [rad]."""
-_STEP = 1e-6
-"""Step of the differences that give the gradients of limits [m or rad]."""
 
 
 @exclusive
@@ -120,34 +120,57 @@ def count_freedoms(formation: Formation, z: Array) -> int:
 
 def _find_goal(problem: Problem, phase: Phase, z: Array) -> Array:
     """Nearest configuration at which the phase ends."""
-    formation, until = phase.formation, phase.until
     key = f"phases[{phase.number}].until"
-    fixed = None
-    if until.contact is not None:
-        formation = _end_formation(phase)
-    elif until.value is not None:
-        fixed = (0 if until.coordinate == "x" else 2, until.value)
-    else:
+    if phase.until.is_release:
         raise InputError(problem.source, key, "is missing; only one freedom needs none")
-    active: tuple[int, ...] = ()
-    reason = ""
-    slip = formation.evaluate_slip(z[None])[0]
-    goal = close(formation, z, slip, fixed)
+    slip, reasons, goals = phase.formation.evaluate_slip(z[None])[0], [], []
+    ends = _list_ends(phase)
+    for end in ends:
+        goal, reason = _settle(end, z, slip)
+        reasons.append(reason)
+        goals += [goal] if goal is not None else []
+    if not goals and phase.until.contact is not None:
+        found = _look_around(phase.formation, _end_formation(phase), z, slip)
+        goals = [found] if found is not None else []
+    if not goals:
+        found = explore(phase.formation, z, slip, ends)
+        goals = [found] if found is not None else []
+    if goals:
+        metric = metric_weights(problem.scene)
+        return min(goals, key=lambda goal: float(metric @ (goal - z) ** 2))
+    text = f"{phase.until} cannot be reached with these contacts{reasons[0]}"
+    raise InputError(problem.source, key, text)
+
+
+def _list_ends(phase: Phase) -> list[Ending]:
+    """What has to hold where a phase ends; a contact may be gained in more than one way."""
+    formation, until = phase.formation, phase.until
+    if until.value is not None:
+        return [Ending(formation, (0 if until.coordinate == "x" else 2, until.value))]
+    own = sum(len(build_limits(c, formation.scene)) for c in formation.contacts)
+    gaining = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
+    # Where a contact changes its name its gap has no slope, but the end of its range has.
+    ends = [Ending(formation, active=(k,)) for k in gaining if k < own]
+    if not ends or any(k >= own for k in gaining):
+        ends.append(Ending(_end_formation(phase)))
+    return ends
+
+
+def _settle(end: Ending, z: Array, slip: Array) -> tuple[Array | None, str]:
+    """The end nearest to `z`, up to `_MOST_ACTIVE` limits met exactly, or what is in the way."""
+    formation, active, reason = end.formation, end.active, ""
+    goal = close(formation, z, slip, end.fixed, active)
     while goal is not None:
         limits = formation.evaluate_limits(goal[None])[0]
         if limits.min() > -TOUCHING:
-            return goal
+            return goal, ""
         worst = int(limits.argmin())
         reason = f": {formation.limits[worst].text} first"
-        if worst in active or len(active) == _MOST_ACTIVE:
+        if worst in active or len(active) == _MOST_ACTIVE + len(end.active):
             break
         active = (*active, worst)
-        goal = close(formation, goal, slip, fixed, active)
-    goal = _look_around(phase.formation, formation, z, slip) if fixed is None else None
-    if goal is not None:
-        return goal
-    text = f"{until} cannot be reached with these contacts{reason}"
-    raise InputError(problem.source, key, text)
+        goal = close(formation, goal, slip, end.fixed, active)
+    return None, reason
 
 
 def outline_onwards(phase: Phase, before: Outline) -> list[Outline]:
@@ -193,50 +216,6 @@ def _look_around(formation: Formation, ending: Formation, z: Array, slip: Array)
         if distance < least:
             best, least = goal, distance
     return best
-
-
-def close(
-    formation: Formation,
-    z: Array,
-    slip: Array,
-    fixed: tuple[int, float] | None = None,
-    active: tuple[int, ...] = (),
-) -> Array | None:
-    """Nearest configuration with all contacts closed, by Gauss-Newton; None if there is none.
-
-    Parameters
-    ----------
-    formation : Formation
-    z : ndarray, shape (5,)
-        Where to start.
-    slip : ndarray, shape (R,), [m]
-        Slip coordinates that rolling contacts keep.
-    fixed : (int, float), optional
-        Row of z and the value that it has to take.
-    active : tuple of int
-        Limits of the formation that are met exactly.
-    """
-    metric = metric_weights(formation.scene)
-    for _ in range(50):
-        kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
-        slipped = formation.evaluate_slip(z[None])[0] - slip
-        residual, rows = np.append(kinematics.C[0], slipped), kinematics.P[0]
-        if fixed is not None:
-            residual = np.append(residual, z[fixed[0]] - fixed[1])
-            rows = np.vstack([rows, np.eye(5)[fixed[0]]])
-        if active:
-            residual = np.append(residual, formation.evaluate_limits(z[None])[0, active])
-            steps = np.vstack([_STEP * np.eye(5), -_STEP * np.eye(5)])
-            ahead, behind = np.split(formation.evaluate_limits(z + steps)[:, active], 2)
-            rows = np.vstack([rows, (ahead - behind).T / (2 * _STEP)])
-        lift = (rows / metric).T
-        change = lift @ np.linalg.lstsq(rows @ lift, residual, rcond=1e-12)[0]
-        # Long steps overshoot where links turn; a tenth of a radian keeps to one branch.
-        change *= min(1.0, 0.1 / max(np.abs(change[2:]).max(), 1e-12))
-        z = z - change
-        if np.abs(residual).max() < 1e-12:
-            return z
-    return None
 
 
 def _connect(formation: Formation, start: Array, goal: Array) -> Outline:

@@ -111,7 +111,7 @@ def require_touching(problem: Problem, phase: Phase, z: Array) -> None:
 def _trace_phase(problem: Problem, phase: Phase, z: Array) -> Curve:
     formation, until = phase.formation, phase.until
     key = f"phases[{phase.number}].until"
-    if abs(until_distance(formation, until, z[None])[0]) < HELD:
+    if _holds(formation, until, z):
         raise InputError(problem.source, key, f"{until} holds already at the start of the phase")
     reason = []
     for heading in _headings(formation, z, until):
@@ -124,6 +124,18 @@ def _trace_phase(problem: Problem, phase: Phase, z: Array) -> Curve:
         key,
         f"{until} is never reached: going one way {reason[0]}, going the other way {reason[1]}",
     )
+
+
+def _holds(formation: Formation, until: Until, z: Array) -> bool:
+    """Whether `until` holds at `z`.
+
+    Of a contact counts where it can be gained: a tip on the line of an edge that it is beyond, as
+    where the edge lies flush on the link, does not touch the edge.
+    """
+    if until.contact is None:
+        return bool(abs(until_distance(formation, until, z[None])[0]) < HELD)
+    gaining = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
+    return bool((np.abs(formation.evaluate_limits(z[None])[0, gaining]) < HELD).any())
 
 
 def _is_regular(curve: Curve) -> bool:
@@ -161,7 +173,7 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
     """
     rho = formation.scene.polygon.gyration_radius
     names = [limit.text for limit in formation.limits] + [str(until)]
-    wanted = [k for k, limit in enumerate(formation.limits) if limit.gained == until.contact]
+    wanted = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
     wanted = [len(names) - 1] if until.contact is None else wanted
 
     def margins(points: Array) -> Array:

@@ -6,6 +6,7 @@ The same state of the generator gives the same scene and the same route.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -118,7 +119,7 @@ def random_route(rng: np.random.Generator, problem: Problem) -> list[tuple[float
     """
     here = problem.start[[0, 2]]
     poses = [here]
-    pieces = _find_pieces(problem, here)
+    pieces = _find_pieces(problem)
     fuzz = float(rng.choice([0.0, 0.0, 0.2])) * np.array([0.01, 0.005])
     for _ in range(int(rng.integers(1, 5))):
         kind = rng.choice(["along", "along", "end", "back", "cell", "border", "beside"])
@@ -133,9 +134,10 @@ def random_route(rng: np.random.Generator, problem: Problem) -> list[tuple[float
     return [(float(x), float(phi)) for x, phi in poses]
 
 
-def _find_pieces(problem: Problem, here: Array) -> list[Piece]:
-    """Borders of the problem's map where an edge is flush, about `here`."""
-    scene = problem.scene
+@lru_cache(maxsize=8)
+def _find_pieces(problem: Problem) -> list[Piece]:
+    """Borders of the problem's map where an edge is flush, about its start."""
+    scene, here = problem.scene, problem.start[[0, 2]]
     size = float(np.hypot(*scene.polygon.vertices.T).max())
     reach = max(size + f.length + f.radius for f in scene.fingers)
     around = Window((0.0, 0.0), (here[1] - 7.0, here[1] + 7.0))

@@ -17,15 +17,16 @@ from numpy.typing import NDArray
 
 from ..contact import Contact, candidate_contacts
 from ..formation import Formation
-from ..links import evaluate_finger_gap
+from ..links import FINGERS_TOUCH, evaluate_finger_gap
 from ..model import Array, Finger, Scene
 
 Numbers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 TOO_SHORT, JOINT_COVERED, FINGERS_CROSS = 1, 2, 3
-"""Why a finger cannot close: it reaches no part of the object, its joint is in the object, or the
-other finger, closed, is in its way."""
+"""Why a finger cannot close: it reaches no part of the object; its joint is in the object or right
+above it, so that the link overlaps the object before it closes; the other finger, closed, is in its
+way."""
 
 
 class Closed(NamedTuple):
@@ -96,6 +97,7 @@ def close(scene: Scene, x: Array, phi: Array) -> Closed:
     for finger, link in enumerate(scene.fingers):
         angle, feature = _close_finger(link, finger, corners - np.asarray(link.base))
         covered = _distance(corners - np.asarray(link.base)) <= link.radius
+        covered |= _hangs_into(link, corners - np.asarray(link.base))
         obstacle[:, finger] = np.where(covered, JOINT_COVERED, np.where(feature < 0, TOO_SHORT, 0))
         closed = obstacle[:, finger] == 0
         z[:, 3 + finger] = np.where(closed, angle, np.nan)
@@ -103,6 +105,19 @@ def close(scene: Scene, x: Array, phi: Array) -> Closed:
     if scene.fingers_collide:
         obstacle[evaluate_finger_gap(scene, z) < 0] = FINGERS_CROSS
     return Closed(z, touched, obstacle)
+
+
+def describe_obstacle(closed: Closed) -> str:
+    """Why the first of some poses cannot be closed, in words; empty where it can."""
+    text = ""
+    for number, obstacle in enumerate(closed.obstacle[0].tolist(), start=1):
+        if obstacle:
+            text = {
+                TOO_SHORT: f"finger {number} is too short",
+                JOINT_COVERED: f"the joint of finger {number} is in the object or above it",
+                FINGERS_CROSS: FINGERS_TOUCH,
+            }[obstacle]
+    return text
 
 
 def _close_finger(link: Finger, finger: int, corners: Array) -> tuple[Array, Numbers]:
@@ -143,6 +158,18 @@ def _close_finger(link: Finger, finger: int, corners: Array) -> tuple[Array, Num
     reached = np.isfinite(least)
     angle = outside + sign * np.where(reached, least, 0.0)
     return angle, np.where(reached, feature, -1)
+
+
+def _hangs_into(link: Finger, corners: Array) -> Flags:
+    """Whether a link that points down, from where it closes, overlaps the object, shape (n,)."""
+    x, y = corners[..., 0], corners[..., 1]
+    after = np.roll(corners, -1, axis=1)
+    beside = (np.abs(x) < link.radius) & (y < 0) & (y > -link.length)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        height = y - x * (after[..., 1] - y) / (after[..., 0] - x)
+    crossed = (x * after[..., 0] < 0) & (height < 0) & (height > -link.length)
+    tip = _distance(corners + np.array([0.0, link.length])) < link.radius
+    return np.asarray(beside.any(axis=1) | crossed.any(axis=1) | tip)
 
 
 def _distance(corners: Array) -> Array:

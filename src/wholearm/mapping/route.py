@@ -4,38 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import overload
 
 import numpy as np
 
 from ..contact import Contact
-from ..curve import describe_pose
 from ..errors import InputError
-from ..links import FINGERS_TOUCH
-from ..model import Array, Scene
+from ..formation import close_finger, place_flush
+from ..model import Array
 from ..outline import outline_phase
 from ..path import trace_phases
 from ..problem import Problem, Until
 from ..sharing import exclusive
-from .borders import (
-    Piece,
-    Track,
-    Window,
-    flush_track,
-    label_cells,
-    name_contacts,
-    palm_track,
-)
-from .closing import FINGERS_CROSS, JOINT_COVERED, TOO_SHORT, close, contact_table
-from .pieces import cut
-
-NEAR = np.array([5e-4, np.radians(0.5)])
-"""Distance in x [m] and phi [rad] within which a route snaps to borders and crossings."""
-SAME_PLACE = 1e-3
-"""Length of a stretch over `NEAR` below which its ends are one crossing."""
-PLACES = 401
-"""Places along a leg at which contacts are looked up."""
-BESIDE = 1e-7
-"""Gap in the parameter of a leg above which part of it cannot be reached."""
+from .borders import Window
+from .legs import describe_miss, describe_place, find_miss, tolerance
+from .walk import Walked, format_until, walk_leg
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,30 +40,60 @@ class Stretch:
     start: Array
     stop: Array
 
-    def to_toml(self) -> str:
+    def to_toml(self, number: int) -> str:
         """The stretch as one ``[[phases]]`` table of a problem file."""
         names = ", ".join(f'"{contact}"' for contact in self.contacts)
-        until = self.until
-        end = f'"{until.contact}"'
-        if until.value is not None:
-            angle = until.coordinate == "phi"
-            value = round(np.degrees(until.value), 4) if angle else round(until.value, 6)
-            end = f"{{ {'phi_deg' if angle else 'x'} = {float(value) + 0.0} }}"
-        return f"[[phases]]\ncontacts = [{names}]\nuntil = {end}\n"
+        return (
+            f"[[phases]]                     # {number}: to {describe_place(self.stop)}\n"
+            f"contacts = [{names}]\nuntil = {format_until(self.until)}\n"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Route(Sequence[Stretch]):
+    """The stretches of a route, which load as the phases of a problem file.
+
+    Attributes
+    ----------
+    stretches : tuple of Stretch
+    start : tuple (int, float), or None
+        Flush edge and x [m] of the ``[start]`` that the route needs; None where it is the
+        problem's own.
+    notes : tuple of str
+        What the reader should know, such as borders that were missed by little.
+    """
+
+    stretches: tuple[Stretch, ...]
+    start: tuple[int, float] | None = None
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.stretches)
+
+    @overload
+    def __getitem__(self, index: int) -> Stretch: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Stretch, ...]: ...
+
+    def __getitem__(self, index: int | slice) -> Stretch | tuple[Stretch, ...]:
+        return self.stretches[index]
 
 
 @exclusive
-def list_formations(problem: Problem, *poses: Sequence[float]) -> list[Stretch]:
+def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
     """List the contact formations along a route of straight legs.
 
-    A leg with both ends within `NEAR` of one border follows the border, and ends that near a
-    change of contacts are moved to it.
+    A leg with both ends near one border (`legs.NEAR`) follows the border, and ends that near a
+    change of contacts are moved to it. Each phase is carried out as when the list is loaded: on
+    a border along its curve, in a cell to the nearest end.
 
     Parameters
     ----------
     problem : Problem
     *poses : (x, phi), [m, rad]
-        Two or more: where the route starts, turns and stops.
+        Two or more: where the route starts, turns and stops. One that starts neither at the
+        problem's start nor with an edge flush on the palm is led to from the problem's start.
 
     Raises
     ------
@@ -88,24 +102,81 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> list[Stretch]:
     """
     if len(poses) < 2:
         raise InputError("", "route", f"{len(poses)} pose given; two or more are needed")
-    stretches: list[Stretch] = []
-    here = np.array(poses[0], dtype=float)
-    for pose in poses[1:]:
-        there = np.array(pose, dtype=float)
-        if not (np.abs(there - here) > NEAR).any():
-            raise InputError("", "route", f"two poses at {_describe(here)} are the same place")
-        for stretch in _list_leg(problem.scene, here, there):
-            if stretches and stretches[-1].contacts == stretch.contacts:
-                stretch = replace(stretch, start=stretches.pop().start)
-            stretches.append(stretch)
-        here = stretches[-1].stop
-    return stretches
+    given = [np.array(pose, dtype=float) for pose in poses]
+    near = tolerance(problem.scene)
+    for one, two in pairwise(given):
+        if not (np.abs(two - one) > near).any():
+            text = f"two poses at {describe_place(one)} are the same place"
+            raise InputError("", "route", text)
+    z, start, given, notes = _begin(problem, given)
+    here, stretches, legs = z[[0, 2]], list[Stretch](), list[int]()
+    for leg, there in enumerate(given):
+        miss = find_miss(problem.scene, here, there)
+        note = "" if miss is None else describe_miss(problem.scene, miss)
+        try:
+            walked = walk_leg(problem, len(stretches), z, here, there)
+        except InputError as error:
+            text = f"leg {leg + 1} {error.problem}" + (f"; {note}" if note else "")
+            raise InputError("", "route", text) from None
+        if note:
+            notes.append(f"leg {leg + 1} goes through cells: {note}")
+        for entry in walked:
+            _append(stretches, legs, leg, entry)
+        z = walked[-1][2]
+        here = z[[0, 2]]
+    return Route(tuple(stretches), start, tuple(notes))
 
 
-def format_route(stretches: Sequence[Stretch]) -> str:
-    """The stretches as ``[[phases]]`` with comments, ready to paste into a problem file."""
-    first, last = _describe(stretches[0].start), _describe(stretches[-1].stop)
-    return "\n".join([f"# from {first} to {last}", *(s.to_toml() for s in stretches)])
+def _append(stretches: list[Stretch], legs: list[int], leg: int, entry: Walked) -> None:
+    part, (contacts, until), _ = entry
+    stretch = Stretch(contacts, until, part.start, part.stop)
+    before = stretches[-1] if stretches and legs[-1] != leg else None
+    # On a border a leg may go on where the one before it stopped; a turn back is a phase.
+    if before is not None and len(contacts) == 4 and set(before.contacts) == set(contacts):
+        onwards = (before.stop - before.start) * (stretch.stop - stretch.start)
+        if onwards.max() > 0 and before.until.contact is None:
+            stretches.pop()
+            stretch = replace(stretch, contacts=before.contacts, start=before.start)
+    stretches.append(stretch)
+    legs.append(leg)
+
+
+def _begin(
+    problem: Problem, given: list[Array]
+) -> tuple[Array, tuple[int, float] | None, list[Array], list[str]]:
+    """Start configuration, its ``[start]``, the poses that follow and notes."""
+    scene, near, first = problem.scene, tolerance(problem.scene), given[0]
+    own = problem.start[[0, 2]]
+    if (np.abs(first - own) < near).all():
+        return problem.start, None, given[1:], []
+    around = Window((0.0, 0.0), (float(first[1] - near[1]), float(first[1] + near[1])))
+    for angle, edge in around.flush_angles(scene):
+        q = place_flush(scene, edge, float(first[0]))
+        try:
+            z = np.array([*q, close_finger(scene, q, 0), close_finger(scene, q, 1)])
+        except InputError as error:
+            text = f"cannot start at {describe_place(first)}: {error.problem}"
+            raise InputError("", "route", text) from None
+        # A problem starts with phi in one turn; so does the route.
+        shift = np.array([0.0, float(q[2]) - angle])
+        note = "the [start] below takes the place of the problem's own"
+        return z, (edge, float(first[0])), [pose + shift for pose in given[1:]], [note]
+    note = (
+        f"starts with leg 1 from the problem's start to {describe_place(first)}, "
+        "where no edge is flush on the palm"
+    )
+    return problem.start, None, given, [note]
+
+
+def format_route(route: Route) -> str:
+    """The route as ``[[phases]]`` with comments, ready to paste into a problem file."""
+    first, last = describe_place(route[0].start), describe_place(route[-1].stop)
+    lines = [f"# from {first} to {last}", *(f"# {note}" for note in route.notes)]
+    if route.start is not None:
+        edge, x = route.start
+        lines.append(f"[start]\nflush = {edge}\nx = {x!r}\n")
+    lines += [stretch.to_toml(number) for number, stretch in enumerate(route, start=1)]
+    return "\n".join(lines)
 
 
 def trace_problem(problem: Problem) -> list[Array]:
@@ -123,120 +194,3 @@ def trace_problem(problem: Problem) -> list[Array]:
     except InputError:
         pass  # The map is how phases that cannot be carried out are mended.
     return paths
-
-
-def _list_leg(scene: Scene, start: Array, stop: Array) -> list[Stretch]:
-    track, low, high, near = _choose_track(scene, start, stop)
-    forwards = low <= high
-    pieces = cut(track)
-    low, high = min(low, high), max(low, high)
-    ends = np.array([[piece.places[0], piece.places[-1]] for piece in pieces]).reshape(-1, 2)
-    kept = [
-        piece
-        for piece, (first, last) in zip(pieces, ends.tolist(), strict=True)
-        if last > low + near and first < high - near
-    ]
-    _require_reached(scene, track, kept, low, high, near)
-    table = contact_table(scene)
-    if not forwards:
-        kept, pieces = kept[::-1], pieces[::-1]
-    stretches = []
-    for piece in kept:
-        first, last = piece.places[0], piece.places[-1]
-        # The track goes on a little beyond the leg; a change of contacts that near ends the leg.
-        first = low if first < low - near or first == track.places[0] else first
-        last = high if last > high + near or last == track.places[-1] else last
-        index = pieces.index(piece)
-        following = pieces[index + 1] if index + 1 < len(pieces) else None
-        mine = name_contacts(table, piece.label)
-        if not forwards:
-            first, last = last, first
-        at_change = last == (piece.places[-1] if forwards else piece.places[0])
-        begin, end = (np.array(track.pose(np.array([s]))).ravel() for s in (first, last))
-        if (np.abs(end - begin) < SAME_PLACE * NEAR).all():
-            raise _crossing(end, mine)
-        until = _until(mine, following, table, end) if at_change and following else None
-        stretches.append(Stretch(mine, until or _coordinate(track, begin, end), begin, end))
-    return stretches
-
-
-def _choose_track(scene: Scene, start: Array, stop: Array) -> tuple[Track, float, float, float]:
-    """The border that both ends are near, or a straight line; both ends on it, and `NEAR` there."""
-    line = np.stack([start, stop])
-    x, phi = (sorted(column) for column in line.T.tolist())
-    wide = Window((x[0], x[1]), (phi[0] - 2 * NEAR[1], phi[1] + 2 * NEAR[1]))
-
-    def spread(low: float, high: float, near: float) -> Array:
-        return np.linspace(low - near, high + near, PLACES)
-
-    for angle, edge in wide.flush_angles(scene):
-        if (np.abs(line[:, 1] - angle) < NEAR[1]).all() and x[1] - x[0] > NEAR[0]:
-            places = spread(x[0], x[1], NEAR[0])
-            return palm_track(scene, edge, angle, places), start[0], stop[0], NEAR[0]
-    far = Window((x[0], x[1]), (phi[0] - np.pi, phi[1] + np.pi))
-    for low, high, vertex in far.bands(scene):
-        if not (low - NEAR[1] < phi[0] and phi[1] < high + NEAR[1]) or phi[1] - phi[0] < NEAR[1]:
-            continue
-        places = np.clip(spread(phi[0], phi[1], NEAR[1]), low, high)
-        for finger in (0, 1):
-            for edge in range(scene.polygon.n_vertices):
-                track = flush_track(scene, finger, edge, vertex, np.unique(places))
-                ends = np.clip(line[:, 1], low, high)
-                if (np.abs(track.pose(ends)[0] - line[:, 0]) < NEAR[0]).all() and cut(track):
-                    return track, float(ends[0]), float(ends[1]), NEAR[1]
-
-    def pose(s: Array) -> tuple[Array, Array]:
-        points = start + s[:, None] * (stop - start)
-        return points[:, 0], points[:, 1]
-
-    near = float(1 / (np.abs(stop - start) / NEAR).max())
-    places = spread(0.0, 1.0, near)
-    track = Track(pose, lambda x, phi: label_cells(scene, x, phi), places)
-    return track, 0.0, 1.0, near
-
-
-def _require_reached(
-    scene: Scene, track: Track, kept: list[Piece], low: float, high: float, near: float
-) -> None:
-    ends = [low + near, *(s for piece in kept for s in piece.places[[0, -1]]), high - near]
-    for before, after in zip(ends[::2], ends[1::2], strict=True):
-        if after - before > BESIDE:
-            pose = track.pose(np.array([(before + after) / 2]))
-            closed = close(scene, *pose)
-            text = "there the border has ended"
-            for finger, obstacle in enumerate(closed.obstacle[0].tolist()):
-                if obstacle:
-                    text = {
-                        TOO_SHORT: f"finger {finger + 1} is too short",
-                        JOINT_COVERED: f"the joint of finger {finger + 1} is in the object",
-                        FINGERS_CROSS: FINGERS_TOUCH,
-                    }[obstacle]
-            where = _describe(np.array(pose).ravel())
-            raise InputError("", "route", f"cannot be followed at {where}: {text}")
-
-
-def _until(
-    mine: tuple[Contact, ...], following: Piece, table: tuple[Contact, ...], place: Array
-) -> Until:
-    gained = [c for c in name_contacts(table, following.label) if c not in mine]
-    if len(gained) != 1:
-        raise _crossing(place, gained)
-    return Until(contact=gained[0])
-
-
-def _crossing(place: Array, contacts: Sequence[Contact]) -> InputError:
-    names = ", ".join(contact.name for contact in contacts)
-    text = f"runs through a crossing of borders at {_describe(place)}, at {names}"
-    return InputError("", "route", f"{text}; go around it, or stop there")
-
-
-def _coordinate(track: Track, start: Array, stop: Array) -> Until:
-    """The coordinate at `stop` that changes most, or the one that a border is followed by."""
-    index = int((np.abs(stop - start) / NEAR).argmax())
-    if track.flush is not None:
-        index = 0 if track.flush[0] is None else 1
-    return Until(coordinate=("x", "phi")[index], value=float(stop[index]))
-
-
-def _describe(point: Array) -> str:
-    return describe_pose(np.array([point[0], 0.0, point[1]]))

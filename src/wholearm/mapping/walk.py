@@ -1,0 +1,188 @@
+"""Walking a leg the way a problem file is loaded: each phase from the end of the one before."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import lru_cache
+from itertools import permutations
+
+import numpy as np
+
+from ..contact import Contact
+from ..curve import describe_pose, metric_weights
+from ..errors import InputError
+from ..explore import STILL
+from ..formation import TOUCHING, Formation
+from ..model import Array, Scene
+from ..outline import outline_phase
+from ..path import runs_on_curve, trace_phase
+from ..problem import Phase, Problem, Until
+from .legs import Part, split_leg, tolerance
+
+DIGITS = 1e-5
+"""Coordinates that end a phase are rounded to this, in radii of gyration and radians."""
+REPLANS = 12
+"""Most times that the rest of a leg is looked at anew from where its phases so far end."""
+BEFORE = 0.98
+"""Share of a part at which phases that guide it end: short of the change of contacts."""
+
+Step = tuple[tuple[Contact, ...], Until]
+"""One phase: its contacts and what ends it."""
+Walked = tuple[Part, Step, Array]
+"""A part, a phase for it, and the configuration in which that ends."""
+
+
+def advance(problem: Problem, index: int, z: Array, step: Step) -> Array:
+    """Configuration in which a phase that starts at `z` ends when its problem file is loaded.
+
+    Raises
+    ------
+    InputError
+        If the phase cannot be carried out geometrically.
+    """
+    contacts, until = step
+    phase = Phase(index, _form(problem.scene, contacts), until)
+    if runs_on_curve(phase):
+        return trace_phase(problem, phase, z).end
+    return np.asarray(outline_phase(problem, phase, z)[-1].z[-1])
+
+
+def walk_leg(problem: Problem, index: int, z: Array, start: Array, stop: Array) -> list[Walked]:
+    """Phases along a leg, with what each ends in.
+
+    A phase with two freedoms ends where the end is nearest, not where the leg has it. Where the
+    phases of the leg do not go on from there, the rest of the leg starts from there.
+
+    Parameters
+    ----------
+    index : int
+        Number of the first phase, from 0.
+    z : ndarray, shape (5,)
+        Configuration at the start.
+    start, stop : ndarray, shape (2,), [m, rad]
+        x and phi at the ends of the leg.
+
+    Raises
+    ------
+    InputError
+        If the leg cannot be followed.
+    """
+    walked: list[Walked] = []
+    parts, replans = split_leg(problem.scene, start, stop), 0
+    while parts:
+        parts = _skip_sliver(problem.scene, z, parts)
+        try:
+            walked += _walk_part(problem, index + len(walked), z, parts[0])
+        except InputError as error:
+            moved = (np.abs(z[[0, 2]] - parts[0].start) > 1e-3 * tolerance(problem.scene)).any()
+            if not moved or replans == REPLANS:
+                raise InputError("", "route", error.problem) from None
+            parts, replans = split_leg(problem.scene, z[[0, 2]], stop), replans + 1
+            continue
+        z, parts = walked[-1][2], parts[1:]
+    return walked
+
+
+def _skip_sliver(scene: Scene, z: Array, parts: list[Part]) -> list[Part]:
+    """Leave out a first part within `NEAR` where what follows touches already."""
+    while len(parts) > 1:
+        first, following = parts[:2]
+        short = (np.abs(first.stop - first.start) < tolerance(scene)).all()
+        if not short or _list_missing(scene, z, following.contacts):
+            break
+        parts = parts[1:]
+    return parts
+
+
+def _list_missing(scene: Scene, z: Array, contacts: tuple[Contact, ...]) -> list[Contact]:
+    """Those of some contacts that do not touch at `z`."""
+    gaps = _form(scene, contacts).evaluate(z[None], z[None]).C[0]
+    return [c for c, gap in zip(contacts, gaps, strict=True) if abs(gap) > TOUCHING]
+
+
+def _walk_part(problem: Problem, index: int, z: Array, part: Part) -> list[Walked]:
+    """The first of the ways through a part that can be carried out."""
+    first: InputError | None = None
+    for steps in _list_ways(problem.scene, z, part):
+        here = z
+        walked: list[Walked] = []
+        try:
+            for step in steps:
+                there = advance(problem, index + len(walked), here, step)
+                _require_motion(problem.scene, here, there, step)
+                here = there
+                walked.append((part, step, here))
+        except InputError as error:
+            first = first or error
+            continue
+        return walked
+    assert first is not None
+    raise first
+
+
+def _require_motion(scene: Scene, z: Array, end: Array, step: Step) -> None:
+    """Check that a phase does not end where it starts."""
+    metric = metric_weights(scene)
+    if metric @ (end - z) ** 2 < (STILL * scene.scales.length) ** 2:
+        raise InputError("", "", f"{step[1]} holds already at {describe_pose(z)}")
+
+
+def _list_ways(scene: Scene, z: Array, part: Part) -> Iterator[list[Step]]:
+    """Phases that may carry a part from `z`, the plain ones first."""
+    missing = _list_missing(scene, z, part.contacts)
+    if len(missing) == 1 and len(part.contacts) == 4:
+        # A border that `z` is beside, not on, has to be reached first.
+        held = tuple(c for c in part.contacts if c not in missing)
+        onto = (held, Until(contact=missing[0]))
+        for way in _list_plain(scene, part):
+            yield [onto, *way]
+        return
+    yield from _list_plain(scene, part)
+    if len(part.contacts) == 3:
+        yield from _list_guided(scene, part)
+
+
+def _list_plain(scene: Scene, part: Part) -> Iterator[list[Step]]:
+    """One phase each."""
+    for contact in part.gained:
+        yield [(part.contacts, Until(contact=contact))]
+    if not part.gained:
+        yield [(part.contacts, _coordinate(scene, part.coordinate, part.stop))]
+
+
+def _list_guided(scene: Scene, part: Part) -> Iterator[list[Step]]:
+    """Phases that lead to near the end first: with two freedoms another end may be nearer."""
+    share = BEFORE if part.gained else 1.0
+    aim = part.start + share * (part.stop - part.start)
+    guides = [(part.contacts, _coordinate(scene, k, aim)) for k in (0, 1)]
+    ends = [[(part.contacts, Until(contact=contact))] for contact in part.gained] or [[]]
+    for count in (1, 2):
+        for chosen in permutations(guides, count):
+            for end in ends:
+                yield [*chosen, *end]
+
+
+def _coordinate(scene: Scene, row: int, pose: Array) -> Until:
+    """The end of a phase at x or phi of a pose, rounded as it is printed."""
+    if row == 0:
+        digits = math.ceil(-math.log10(DIGITS * scene.scales.length))
+        return Until(coordinate="x", value=round(float(pose[0]), digits))
+    degrees = round(math.degrees(pose[1]), math.ceil(-math.log10(math.degrees(DIGITS))))
+    return Until(coordinate="phi", value=math.radians(degrees))
+
+
+def format_until(until: Until) -> str:
+    """The value of a phase's `until` in a problem file, which reads back as it was."""
+    if until.contact is not None:
+        return f'"{until.contact}"'
+    assert until.value is not None
+    if until.coordinate == "x":
+        return f"{{ x = {until.value + 0.0!r} }}"
+    degrees = round(math.degrees(until.value), math.ceil(-math.log10(math.degrees(DIGITS))))
+    return f"{{ phi_deg = {degrees + 0.0!r} }}"
+
+
+@lru_cache(maxsize=64)
+def _form(scene: Scene, contacts: tuple[Contact, ...]) -> Formation:
+    return Formation(scene, contacts)
