@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import copy
 import tomllib
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-import wholearm
 from conftest import HEPTAGON
 from crossing import hexagon, measure_fingers
 from plane import finger_gap, make_scene, place_corners, point_to_segment
@@ -28,7 +26,6 @@ from wholearm.mapping.formationmap import (
     build_map,
     list_formations,
 )
-from wholearm.mapping.route import format_route
 from wholearm.model import Array, Scene
 from wholearm.problem import Problem, build_problem
 
@@ -322,72 +319,6 @@ def test_mirrored_problem_has_the_mirrored_map() -> None:
             lengths.append(abs(float(mine.mean()) - float(its.mean())))
     assert max(lengths) < 0.1
     np.testing.assert_array_equal(one.cell < 0, two.cell[::-1, ::-1] < 0)
-
-
-def test_slide_is_listed_as_in_the_problem_file(heptagon: Problem) -> None:
-    phi = heptagon.scene.polygon.flush_angle(0)
-    text = format_route(list_formations(heptagon, (0.045, phi), (-0.0637, phi)))
-    assert tomllib.loads(text)["phases"] == TABLE["phases"][:3]
-
-
-def test_route_along_curved_borders_is_the_whole_plan(
-    heptagon: Problem, curves: tuple[Curve, ...], tmp_path: Path
-) -> None:
-    # Poses as read off the map: to a tenth of a millimetre and of a degree.
-    poses = [(0.045, -2.0), (-0.0637, -2.0), (-0.0505, -23.4), (0.0078, -50.0)]
-    route = list_formations(heptagon, *((x, np.radians(phi)) for x, phi in poses))
-    text = format_route(route)
-    listed = tomllib.loads(text)["phases"]
-    assert listed == TABLE["phases"]
-    for stretch, curve in zip(route, curves, strict=True):
-        # Ends are those of the traced curves, but for the last, which the user gives.
-        np.testing.assert_allclose(stretch.start, curve.start[[0, 2]], atol=1e-9)
-    pasted = HEPTAGON.read_text(encoding="utf-8").split("[[phases]]")[0] + text
-    path = tmp_path / "pasted.toml"
-    path.write_text(pasted, encoding="utf-8")
-    assert len(wholearm.load(str(path)).phases) == 5
-
-
-@pytest.mark.parametrize("back", [False, True])
-def test_route_through_cells_changes_one_contact_at_a_time(heptagon: Problem, back: bool) -> None:
-    scene = heptagon.scene
-    ends = [(0.02, 0.3), (-0.08, -0.8)]
-    start, stop = ends[::-1] if back else ends
-    route = list_formations(heptagon, start, stop)
-    assert len(route) == 7
-    np.testing.assert_array_equal(route[0].start, start)
-    np.testing.assert_allclose(route[-1].stop, stop, atol=1e-12)
-    assert route[-1].until.coordinate == "x"
-    for one, two in pairwise(route):
-        np.testing.assert_allclose(one.stop, two.start, atol=1e-12)
-        assert set(two.contacts) - set(one.contacts) == {one.until.contact}
-        z = close(scene, *one.stop[:, None]).z
-        assert np.abs(gaps(scene, {*one.contacts, *two.contacts}, z)).max() < 1e-9
-    for stretch in route:
-        middle = (stretch.start + stretch.stop) / 2
-        label = label_cells(scene, *middle[:, None])[0]
-        table = contact_table(scene)
-        assert stretch.contacts == tuple(table[i] for i in label if i != NOWHERE)
-
-
-def test_route_backwards_along_a_border(heptagon: Problem) -> None:
-    phi = heptagon.scene.polygon.flush_angle(0)
-    route = list_formations(heptagon, (-0.05, phi + 0.003), (0.03, phi))
-    assert [str(stretch.until) for stretch in route] == ["v5-finger2", "v2-finger1", "x = 0.03 m"]
-    assert route[0].start == pytest.approx([-0.05, phi], abs=1e-12)
-
-
-def test_routes_that_cannot_be_followed_are_named(heptagon: Problem) -> None:
-    with pytest.raises(InputError, match="too short"):
-        list_formations(heptagon, (0.0, 0.1), (0.2, 0.2))
-    with pytest.raises(InputError, match="two or more"):
-        list_formations(heptagon, (0.0, 0.1))
-    with pytest.raises(InputError, match="same place"):
-        list_formations(heptagon, (0.0, 0.1), (0.0, 0.1))
-    phi = heptagon.scene.polygon.flush_angle(0)
-    x = -0.06368782401
-    with pytest.raises(InputError, match="crossing"):
-        list_formations(heptagon, (x - 0.01, phi - 0.1), (x + 0.01, phi + 0.1))
 
 
 @pytest.fixture(scope="module")

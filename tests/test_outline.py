@@ -11,13 +11,13 @@ from tipping import roll
 from wholearm.contact import parse_contact
 from wholearm.curve import Curve
 from wholearm.errors import InputError
+from wholearm.explore import close
 from wholearm.formation import Formation
 from wholearm.model import Array
 from wholearm.outline import (
     POINTS,
     RELEASE_AT,
     Outline,
-    close,
     count_freedoms,
     load,
     outline_curve,

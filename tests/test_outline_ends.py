@@ -8,9 +8,10 @@ import pytest
 from plane import make_formation, measure_gaps, measure_slip
 from wholearm.contact import parse_contact
 from wholearm.errors import InputError
+from wholearm.explore import close
 from wholearm.formation import Formation
 from wholearm.options import PlanOptions
-from wholearm.outline import close, load, outline_curve, outline_onwards, outline_phase
+from wholearm.outline import load, outline_curve, outline_onwards, outline_phase
 from wholearm.path import trace_phases
 from wholearm.pathdomain.pathplan import plan_path
 from wholearm.problem import Phase, Problem, Until

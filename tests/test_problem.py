@@ -183,7 +183,6 @@ ALLOWED_UNTIL = "allowed are a contact name"
         (put("phases.2.contacts.1", 5), "phases[3].contacts", "5 is not a contact"),
         (put("phases.2.contacts.1", "v0-palm"), "phases[3].contacts", "v0-palm is given twice"),
         (put("phases.0.contacts.2", "v4-finger1"), "phases[1].contacts", "fingers touch"),
-        (drop("phases.0.contacts.3"), "phases[1].contacts", "v1-palm v2-finger1 v5-finger2"),
         (put("start.x", 0.0), "phases[1].contacts", "v3-finger1 v5-finger2"),
         (put("phases.0.contacts.1", "v1-palm rolling"), "phases[1].contacts", "makes 5"),
         (put("phases.0.contacts.1", "v1-palm rolls"), "phases[1].contacts", "'v1-palm rolls'"),
@@ -325,3 +324,11 @@ def test_a_hand_that_is_crossed_at_the_start_is_refused() -> None:
         table["phases"] = table["phases"][1:2]
 
     assert read_edited(pass_by).start[0] == 0.0
+
+
+def test_the_first_phase_may_let_go_of_what_touches() -> None:
+    def edit(table: dict[str, Any]) -> None:
+        table["phases"][0]["contacts"].remove("v0-palm")
+
+    first = read_edited(edit).phases[0].formation
+    assert first.names == ("v1-palm", "v2-finger1", "v5-finger2")

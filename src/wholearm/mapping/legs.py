@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from .pieces import cut
 
 NEAR = (0.015, float(np.radians(0.5)))
 """Distances within which poses are on a border or crossing: x in radii of gyration, phi in rad."""
-MISSED = 6.0
+MISSED = 4.0
 """Distance from a border, over `NEAR`, within which a leg beside it is said to be a near miss."""
 SAME_PLACE = 1e-3
 """Length of a part over `NEAR` below which its ends are one crossing."""
@@ -184,10 +184,13 @@ def _choose_leg(scene: Scene, start: Array, stop: Array) -> Leg:
             if off < 1:
                 return Leg(track, float(start[0]), float(stop[0]), near[0])
     found = []
-    for track in _list_fingers(scene, start, stop):
+    for track, reach in _list_fingers(scene, start, stop):
         (a, off_a), (b, off_b) = (_locate(track, pose, near) for pose in (start, stop))
-        if max(off_a, off_b) < 1 and abs(a - b) > near[1] and _covers(cut(track), a, b, near[1]):
-            found.append((max(off_a, off_b), track, a, b))
+        if max(off_a, off_b) < 1 and abs(a - b) > near[1]:
+            ends = np.clip([min(a, b) - near[1], max(a, b) + near[1]], *reach)
+            own = replace(track, places=np.linspace(ends[0], ends[1], PLACES))
+            if _covers(cut(own), a, b, near[1]):
+                found.append((max(off_a, off_b), own, a, b))
     if found:
         _, track, a, b = min(found, key=lambda entry: entry[0])
         return Leg(track, a, b, near[1])
@@ -219,8 +222,10 @@ def _list_palm(scene: Scene, start: Array, stop: Array) -> Iterator[tuple[Track,
         yield track_palm(scene, edge, angle, places), off
 
 
-def _list_fingers(scene: Scene, start: Array, stop: Array) -> Iterator[Track]:
-    """Curves on which an edge may lie flush on a finger, from about `start` to about `stop`."""
+def _list_fingers(
+    scene: Scene, start: Array, stop: Array
+) -> Iterator[tuple[Track, tuple[float, float]]]:
+    """Curves on which an edge may lie flush on a finger about a leg, and how far they reach."""
     near = tolerance(scene)[1]
     low, high = sorted((float(start[1]), float(stop[1])))
     x = (float(min(start[0], stop[0])), float(max(start[0], stop[0])))
@@ -232,7 +237,7 @@ def _list_fingers(scene: Scene, start: Array, stop: Array) -> Iterator[Track]:
         places = np.linspace(ends[0], ends[1], PLACES)
         for finger in (0, 1):
             for edge in range(scene.polygon.n_vertices):
-                yield flush_track(scene, finger, edge, vertex, places)
+                yield flush_track(scene, finger, edge, vertex, places), (first, last)
 
 
 def _locate(track: Track, pose: Array, near: Array) -> tuple[float, float]:
@@ -276,7 +281,7 @@ def find_miss(scene: Scene, start: Array, stop: Array) -> Miss | None:
                 ]
                 text = f"{np.degrees(max(ends)):.3g} deg in phi"
                 misses.append(Miss(track, off, text))
-    for track in _list_fingers(scene, start, stop):
+    for track, _ in _list_fingers(scene, start, stop):
         located = [_locate(track, pose, near) for pose in (start, stop)]
         off = max(distance for _, distance in located)
         if off < MISSED and abs(located[0][0] - located[1][0]) > near[1] and cut(track):

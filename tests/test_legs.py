@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from wholearm.errors import InputError
+from wholearm.formation import Formation
+from wholearm.mapping.borders import NOWHERE, flush_track, label_cells
+from wholearm.mapping.closing import close, contact_table
+from wholearm.mapping.legs import describe_miss, find_miss, split_leg, tolerance
+from wholearm.model import Array
+from wholearm.problem import Problem
+
+PHI = np.radians(-35.0)
+
+
+def on_border(problem: Problem, phi: float) -> Array:
+    """Where edge 6 lies flush on finger 2 with vertex 1 on the palm, as in the flip's plan."""
+    track = flush_track(problem.scene, 1, 6, 1, np.array([phi]))
+    return np.array(track.pose(track.places)).ravel()
+
+
+@pytest.mark.parametrize("back", [False, True])
+def test_leg_through_cells_changes_one_contact_at_a_time(heptagon: Problem, back: bool) -> None:
+    scene = heptagon.scene
+    ends = [np.array([0.02, 0.3]), np.array([-0.08, -0.8])]
+    start, stop = ends[::-1] if back else ends
+    parts = split_leg(scene, start, stop)
+    assert len(parts) == 7
+    np.testing.assert_array_equal(parts[0].start, start)
+    np.testing.assert_allclose(parts[-1].stop, stop, atol=1e-12)
+    assert parts[-1].gained == () and parts[-1].coordinate == 0
+    for one, two in pairwise(parts):
+        np.testing.assert_allclose(one.stop, two.start, atol=1e-12)
+        assert set(two.contacts) - set(one.contacts) == set(one.gained)
+        z = close(scene, *one.stop[:, None]).z
+        both = Formation(scene, tuple({*one.contacts, *two.contacts}))
+        assert np.abs(both.evaluate(z, z).C).max() < 1e-9
+    for part in parts:
+        middle = (part.start + part.stop) / 2
+        label = label_cells(scene, *middle[:, None])[0]
+        table = contact_table(scene)
+        assert part.contacts == tuple(table[i] for i in label if i != NOWHERE)
+
+
+def test_leg_follows_a_border_that_both_ends_are_near(heptagon: Problem) -> None:
+    near = tolerance(heptagon.scene)
+    for share in (0.0, 0.9, -0.9):
+        ends = [on_border(heptagon, phi) + share * near for phi in (PHI, PHI + 0.15)]
+        (part,) = split_leg(heptagon.scene, *ends)
+        assert len(part.contacts) == 4 and part.coordinate == 1
+        for place, end in ((part.start, ends[0]), (part.stop, ends[1])):
+            np.testing.assert_allclose(place, on_border(heptagon, place[1]), atol=1e-12)
+            assert (np.abs(place - end) < near).all()
+
+
+def test_straight_leg_beside_a_curved_border_stays_in_its_cell(heptagon: Problem) -> None:
+    """The chord of a border cuts through to the other side, by less than the tolerance."""
+    scene, near = heptagon.scene, tolerance(heptagon.scene)
+    start, stop = (on_border(heptagon, phi) for phi in (PHI, PHI + 0.3))
+    middle = on_border(heptagon, PHI + 0.15)
+    bulge = ((start + stop) / 2 - middle)[0]
+    # Both ends a little off the border towards the chord's other side.
+    way = -np.sign(bulge)
+    aside = np.array([way * (abs(bulge) / 2 + 1.2 * near[0]), 0.0])
+    leg = [start + aside, stop + aside]
+    labels = label_cells(scene, *np.linspace(leg[0], leg[1], 50).T)
+    assert len(np.unique(labels, axis=0)) <= 2
+    parts = split_leg(scene, *leg)
+    assert len({part.contacts for part in parts}) == len(parts)
+
+
+def test_near_miss_names_the_border_and_its_distance(heptagon: Problem) -> None:
+    scene, near = heptagon.scene, tolerance(heptagon.scene)
+    aside = np.array([near[0], 0.0])
+    start, stop = (on_border(heptagon, phi) + 2.0 * aside for phi in (PHI, PHI + 0.2))
+    miss = find_miss(scene, start, stop)
+    assert miss is not None and miss.track.flush == (1, 6)
+    assert 1.0 < miss.off <= 2.0
+    text = describe_miss(scene, miss)
+    assert "e6 flush on finger 2" in text and "mm in x" in text and "0.5 deg" in text
+    assert find_miss(scene, start + 10 * aside, stop + 10 * aside) is None
+    phi = scene.polygon.flush_angle(0) + 3 * near[1]
+    palm = find_miss(scene, np.array([0.045, phi]), np.array([0.0, phi]))
+    assert palm is not None and "e0 flush on the palm, is up to 1.5 deg" in describe_miss(
+        scene, palm
+    )
+
+
+def test_a_crossing_is_named_by_its_contacts(heptagon: Problem) -> None:
+    phi, x = heptagon.scene.polygon.flush_angle(0), -0.06368782401
+    words = r"crossing of borders at x = -63.69 mm.*, of .*v0-palm.*v1-palm.*finger2"
+    with pytest.raises(InputError, match=words):
+        split_leg(heptagon.scene, np.array([x - 0.01, phi - 0.1]), np.array([x + 0.01, phi + 0.1]))
