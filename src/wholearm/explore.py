@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .curve import metric_weights
-from .formation import TOUCHING, Formation
+from .formation import Formation
 from .mapping.closing import close as closed_at
 from .mapping.closing import lower
+from .metric import metric_weights
 from .model import Array
 
 GRID = (120, 60)
@@ -18,8 +18,10 @@ SEEDS = 24
 """Most places from which an end is looked for: those that are nearest to it."""
 STILL = 1e-4
 """Distance from the start, in radii of gyration, below which a phase would have nothing to do."""
-_STEP = 1e-6
-"""Step of the differences that give the gradients of limits [m or rad]."""
+CLOSED = 3e-11
+"""Largest gap of closed contacts, in radii of gyration, and error of a coordinate likewise."""
+_STEP = 1e-5
+"""Step of the differences that give the gradients of limits, in radii of gyration or radians."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,14 +74,17 @@ def explore(formation: Formation, z: Array, slip: Array, ends: list[Ending]) -> 
     if len(parts) != 3 or set(parts) != {None, 0, 1} or formation.rolling:
         return None
     metric = metric_weights(formation.scene)
-    places = _list_places(formation, z)
+    places, near = _list_places(formation, z), formation.scene.touching
     found, least = None, np.inf
     for end in ends:
         off = end.measure(places)
         order = np.argsort(off)[:SEEDS]
         for k in order[np.argsort((places[order] - z) ** 2 @ metric)]:
             goal = close(end.formation, places[k], slip, end.fixed, end.active)
-            if goal is None or end.formation.evaluate_limits(goal[None]).min() <= -TOUCHING:
+            if (
+                goal is None
+                or end.formation.evaluate_limits(goal[None]).min() <= -formation.scene.touching
+            ):
                 continue
             distance = float(metric @ (goal - z) ** 2)
             # One that holds at the start is no end to go to.
@@ -102,8 +107,8 @@ def _list_places(formation: Formation, z: Array) -> Array:
     closed = closed_at(scene, x.ravel(), phi.ravel()).z
     closed = np.vstack([z, closed[np.isfinite(closed).all(axis=1)]])
     gaps = np.abs(formation.evaluate(closed, closed).C).max(axis=1)
-    inside = formation.evaluate_limits(closed).min(axis=1) > -TOUCHING
-    return np.asarray(closed[inside & (gaps < TOUCHING)])
+    inside = formation.evaluate_limits(closed).min(axis=1) > -scene.touching
+    return np.asarray(closed[inside & (gaps < scene.touching)])
 
 
 def close(
@@ -127,7 +132,12 @@ def close(
     active : tuple of int
         Limits of the formation that are met exactly.
     """
-    metric = metric_weights(formation.scene)
+    metric, rho = metric_weights(formation.scene), formation.scene.scales.length
+    sizes = np.full(formation.n_constraints, rho)
+    steps = _STEP * np.diag([rho, rho, 1.0, 1.0, 1.0])
+    if fixed is not None:
+        sizes = np.append(sizes, rho if fixed[0] == 0 else 1.0)
+    sizes = np.append(sizes, np.full(len(active), rho))
     for _ in range(50):
         kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
         slipped = formation.evaluate_slip(z[None])[0] - slip
@@ -137,14 +147,15 @@ def close(
             rows = np.vstack([rows, np.eye(5)[fixed[0]]])
         if active:
             residual = np.append(residual, formation.evaluate_limits(z[None])[0, active])
-            steps = np.vstack([_STEP * np.eye(5), -_STEP * np.eye(5)])
-            ahead, behind = np.split(formation.evaluate_limits(z + steps)[:, active], 2)
-            rows = np.vstack([rows, (ahead - behind).T / (2 * _STEP)])
+            around = formation.evaluate_limits(z + np.vstack([steps, -steps]))[:, active]
+            ahead, behind = np.split(around, 2)
+            rows = np.vstack([rows, (ahead - behind).T / (2 * steps.diagonal())])
+        rows, residual = rows / sizes[:, None], residual / sizes
         lift = (rows / metric).T
         change = lift @ np.linalg.lstsq(rows @ lift, residual, rcond=1e-12)[0]
         # Long steps overshoot where links turn; a tenth of a radian keeps to one branch.
         change *= min(1.0, 0.1 / max(np.abs(change[2:]).max(), 1e-12))
         z = z - change
-        if np.abs(residual).max() < 1e-12:
+        if np.abs(residual).max() < CLOSED:
             return z
     return None

@@ -11,7 +11,7 @@ from .curve import Curve, metric_weights, tangent_basis
 from .dynamics import Directions
 from .errors import InputError
 from .explore import Ending, close, explore
-from .formation import TOUCHING, Formation
+from .formation import Formation
 from .model import Array
 from .path import require_touching, runs_on_curve, trace_phase, trace_phases
 from .problem import Phase, Problem, read_problem
@@ -162,7 +162,7 @@ def _settle(end: Ending, z: Array, slip: Array) -> tuple[Array | None, str]:
     goal = close(formation, z, slip, end.fixed, active)
     while goal is not None:
         limits = formation.evaluate_limits(goal[None])[0]
-        if limits.min() > -TOUCHING:
+        if limits.min() > -formation.scene.touching:
             return goal, ""
         worst = int(limits.argmin())
         reason = f": {formation.limits[worst].text} first"
@@ -185,13 +185,17 @@ def outline_onwards(phase: Phase, before: Outline) -> list[Outline]:
     ending, slip = _end_formation(phase), formation.evaluate_slip(z[None])[0]
     step = z - before.z[-2]
     metric, outlines = metric_weights(formation.scene), []
+    near = formation.scene.touching
     nearest = close(ending, z, slip)
     if nearest is None:
         return []
     far = np.sqrt((metric @ (nearest - z) ** 2) / (metric @ step**2))
     for share in _AHEAD:
         goal = close(ending, z + share * far * step, slip)
-        if goal is not None and ending.evaluate_limits(goal[None]).min() > -TOUCHING:
+        if (
+            goal is not None
+            and ending.evaluate_limits(goal[None]).min() > -formation.scene.touching
+        ):
             outlines.append(_connect(formation, z, goal))
     return outlines
 
@@ -210,7 +214,7 @@ def _look_around(formation: Formation, ending: Formation, z: Array, slip: Array)
     for turn in _TURNS:
         turned = close(formation, z, slip, (2, z[2] + turn))
         goal = None if turned is None else close(ending, turned, slip)
-        if goal is None or ending.evaluate_limits(goal[None]).min() <= -TOUCHING:
+        if goal is None or ending.evaluate_limits(goal[None]).min() <= -formation.scene.touching:
             continue
         distance = float(metric @ (goal - z) ** 2)
         if distance < least:

@@ -135,7 +135,8 @@ def _holds(formation: Formation, until: Until, z: Array) -> bool:
     if until.contact is None:
         return bool(abs(until_distance(formation, until, z[None])[0]) < HELD)
     gaining = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
-    return bool((np.abs(formation.evaluate_limits(z[None])[0, gaining]) < HELD).any())
+    gaps = formation.evaluate_limits(z[None])[0, gaining] / formation.scene.scales.length
+    return bool((np.abs(gaps) < HELD).any())
 
 
 def _is_regular(curve: Curve) -> bool:

@@ -27,8 +27,13 @@ from .closing import Closed, Flags, Numbers, close, first_contact, lower, place_
 SAME_ANGLE, ROUNDING = 1e-7, 1e-11
 """Differences [rad] below which a closed finger that touches one of a border's contacts, and one
 that touches anything, is where the border has it: at the ends of a link angles lose digits."""
-ASIDE = 1e-9
-"""How far beside a pointed tip at a vertex [m] the two contacts that meet there are looked up."""
+ASIDE = 3e-8
+"""How far beside a pointed tip at a vertex the two contacts that meet there are looked up, in radii
+of gyration."""
+LEVEL = 3e-11
+"""Height within which vertices lie on the line of a link, in radii of gyration."""
+LONGEST = 0.06
+"""Longest step in x between neighbouring points of a border, in radii of gyration."""
 NOWHERE = -1
 """Fills the labels of places that are no border."""
 
@@ -75,6 +80,8 @@ class Track:
         the place is no border.
     places : ndarray, shape (n,)
         Parameters to sample at, increasing.
+    step : float, [m]
+        Longest step in x between neighbouring points of what is drawn.
     flush : tuple (int or None, int), or None
         The finger (None for the palm) and the edge that lies flush on it; None where a contact
         only changes its name.
@@ -83,6 +90,7 @@ class Track:
     pose: Callable[[Array], tuple[Array, Array]]
     label: Callable[[Array, Array], Numbers]
     places: Array
+    step: float
     flush: tuple[int | None, int] | None = None
 
 
@@ -142,7 +150,7 @@ def palm_track(scene: Scene, edge: int, phi: float, places: Array) -> Track:
         labels[labels[:, 0] != NOWHERE, 1] = after
         return labels
 
-    return Track(pose, label, places, (None, edge))
+    return Track(pose, label, places, LONGEST * scene.scales.length, (None, edge))
 
 
 def flush_track(scene: Scene, finger: int, edge: int, vertex: int, places: Array) -> Track:
@@ -179,7 +187,7 @@ def flush_track(scene: Scene, finger: int, edge: int, vertex: int, places: Array
         labels[~within | (labels[:, 0] == NOWHERE)] = NOWHERE
         return labels
 
-    return Track(pose, label, places, (finger, edge))
+    return Track(pose, label, places, LONGEST * scene.scales.length, (finger, edge))
 
 
 def _passing_tracks(
@@ -232,7 +240,8 @@ def _circle_track(
             inwards = sign * np.column_stack([-np.sin(angle), np.cos(angle)])
             corners = _corners_at(scene, phi, vertex)
             supported = (
-                ((corners - corners[:, [index]]) * inwards[:, None]).sum(axis=2) > -1e-12
+                ((corners - corners[:, [index]]) * inwards[:, None]).sum(axis=2)
+                > -LEVEL * scene.scales.length
             ).all(axis=1)
             pair = np.broadcast_to([side, arc], (len(x), 2))
         else:
@@ -243,7 +252,8 @@ def _circle_track(
             supported &= sign * (m[:, 1] * axis[:, 0] - m[:, 0] * axis[:, 1]) <= 0
             pair = np.broadcast_to([arc, first + count + edge], (len(x), 2))
         if link.radius == 0:
-            beside = [close(scene, x + d, phi).touched[:, finger] for d in (-ASIDE, ASIDE)]
+            aside = ASIDE * scene.scales.length
+            beside = [close(scene, x + d, phi).touched[:, finger] for d in (-aside, aside)]
             pair = np.column_stack(beside)
             pair = np.sort(pair, axis=1)
             about = (pair == side) | (pair == first + count + index)
@@ -254,7 +264,7 @@ def _circle_track(
         labels[~supported | ~same | (labels[:, 0] == NOWHERE)] = NOWHERE
         return labels
 
-    return Track(pose, label, places)
+    return Track(pose, label, places, LONGEST * scene.scales.length)
 
 
 def _corners_at(scene: Scene, phi: Array, vertex: int) -> Array:

@@ -134,7 +134,7 @@ def _close_finger(link: Finger, finger: int, corners: Array) -> tuple[Array, Num
     offset = (radius + (outward * corners).sum(axis=-1)) / length
     heading = np.arctan2(outward[..., 1], outward[..., 0])
     # At the very end of a pointed link rounding must not let the vertex slip between candidates.
-    slack = 1e-12 if radius == 0 else 0.0
+    slack = 1e-11 * length if radius == 0 else 0.0
     with np.errstate(invalid="ignore", divide="ignore"):
         run = np.sqrt(distance**2 - radius**2)
         side = np.where(

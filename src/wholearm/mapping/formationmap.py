@@ -13,7 +13,6 @@ import numpy as np
 
 from ..contact import Contact
 from ..errors import InputError
-from ..formation import TOUCHING
 from ..model import Array, Scene
 from ..problem import Problem
 from ..sharing import exclusive
@@ -35,8 +34,8 @@ BEYOND = np.radians(6.0)
 """How far the window reaches beyond the flush angles next to the plan [rad]."""
 CROSSED = -5
 """Cell of the places where the closed fingers would overlap."""
-SAME_PLACE = 1e-6
-"""Distance [m or rad] below which ends of borders are one crossing."""
+SAME_PLACE = 3e-5
+"""Distance, in radii of gyration and radians, below which ends of borders are one crossing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,12 +271,13 @@ def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]
     """Where ends of borders meet, with the contacts of all of them, if these are five or more."""
     ends = [(border, k) for border in borders for k in (0, -1)]
     points = np.array([border.points[k] for border, k in ends]).reshape(-1, 2)
+    size = SAME_PLACE * np.array([scene.scales.length, 1.0])
     full = full_formation(scene)
     crossings, free = [], np.ones(len(points), dtype=bool)
     for k in range(len(points)):
         if not free[k]:
             continue
-        same = free & (np.abs(points - points[k]) < SAME_PLACE).all(axis=1)
+        same = free & (np.abs(points - points[k]) < size).all(axis=1)
         free &= ~same
         meeting = [ends[i][0] for i in np.flatnonzero(same)]
         met = {contact for border in meeting for contact in border.contacts}
@@ -291,7 +291,7 @@ def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]
         contacts = tuple(
             contact
             for contact, gap in zip(full.contacts, gaps, strict=True)
-            if contact in met and gap < TOUCHING
+            if contact in met and gap < scene.touching
         )
         if len(contacts) >= 5:
             edges = tuple(dict.fromkeys(b.flush for b in meeting if b.flush is not None))

@@ -201,7 +201,8 @@ def _choose_leg(scene: Scene, start: Array, stop: Array) -> Leg:
 
     share = float(1 / (np.abs(stop - start) / near).max())
     places = np.linspace(-share, 1.0 + share, PLACES)
-    return Leg(Track(pose, lambda x, phi: label_cells(scene, x, phi), places), 0.0, 1.0, share)
+    track = Track(pose, lambda x, phi: label_cells(scene, x, phi), places, np.inf)
+    return Leg(track, 0.0, 1.0, share)
 
 
 def _wide(scene: Scene, start: Array, stop: Array) -> bool:

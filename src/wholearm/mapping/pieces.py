@@ -14,8 +14,6 @@ PARTS, DIVISIONS = 16, 13
 """An interval in which the label changes is cut into so many parts, so often: to rounding."""
 CROWDED = 8
 """Most changes that are told apart between two neighbouring places."""
-LONGEST = 2e-3
-"""Longest step in x [m] between neighbouring points of a piece."""
 
 _Label = Callable[[Array], Numbers]
 
@@ -97,7 +95,7 @@ def _fill(track: Track, low: float, high: float) -> Array:
     inner = track.places[(track.places > low) & (track.places < high)]
     places = np.array([low, *inner, high])
     for _ in range(8):
-        wide = np.flatnonzero(np.abs(np.diff(track.pose(places)[0])) > LONGEST)
+        wide = np.flatnonzero(np.abs(np.diff(track.pose(places)[0])) > track.step)
         if not len(wide):
             break
         places = np.sort(np.append(places, (places[wide] + places[wide + 1]) / 2))

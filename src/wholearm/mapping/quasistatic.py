@@ -19,7 +19,8 @@ from .closing import Flags, Numbers, full_formation
 WAYS = ("+x", "-x", "+phi", "-phi")
 """Directions of travel inside a cell."""
 REGULAR = 1e-9
-"""Least ratio of singular values of A at which the contacts count as independent."""
+"""Least ratio of singular values of A at which contacts count as independent; least determinant of
+their wrenches, in radii of gyration, likewise."""
 _WAYS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 
@@ -79,7 +80,7 @@ def check_cell(scene: Scene, epsilon: float, label: Numbers, z: Array) -> Flags:
     rows[[0, 1], [0, 2]] = 1.0
     matrix = np.concatenate([kinematics.A, np.broadcast_to(rows, (len(z), 2, 5))], axis=1)
     possible = np.zeros((len(z), len(WAYS)), dtype=bool)
-    regular = np.abs(np.linalg.det(matrix)) > 1e-12
+    regular = np.abs(np.linalg.det(matrix)) > REGULAR * scene.scales.length**2
     part = Kinematics(*(array[regular] for array in kinematics))
     for k, way in enumerate(_WAYS):
         right = np.zeros((regular.sum(), 5, 1))
@@ -113,7 +114,7 @@ def _check_balance(
     scene, directions = formation.scene, _directions(kinematics, z_s)
     G = force_rows(formation, kinematics, directions)
     wrench = G[:, :, :3].transpose(0, 2, 1)
-    regular = np.abs(np.linalg.det(wrench)) > 1e-12
+    regular = np.abs(np.linalg.det(wrench)) > REGULAR * scene.scales.length
     wrench[~regular] = np.eye(3)
     right = np.broadcast_to(-scene.applied_force[:3, None], (len(G), 3, 1))
     c_n = np.linalg.solve(wrench, right)[..., 0]

@@ -10,10 +10,11 @@ from itertools import permutations
 import numpy as np
 
 from ..contact import Contact
-from ..curve import describe_pose, metric_weights
+from ..curve import describe_pose
 from ..errors import InputError
 from ..explore import STILL
-from ..formation import TOUCHING, Formation
+from ..formation import Formation
+from ..metric import metric_weights
 from ..model import Array, Scene
 from ..outline import outline_phase
 from ..path import runs_on_curve, trace_phase
@@ -98,7 +99,7 @@ def _skip_sliver(scene: Scene, z: Array, parts: list[Part]) -> list[Part]:
 def _list_missing(scene: Scene, z: Array, contacts: tuple[Contact, ...]) -> list[Contact]:
     """Those of some contacts that do not touch at `z`."""
     gaps = _form(scene, contacts).evaluate(z[None], z[None]).C[0]
-    return [c for c, gap in zip(contacts, gaps, strict=True) if abs(gap) > TOUCHING]
+    return [c for c, gap in zip(contacts, gaps, strict=True) if abs(gap) > scene.touching]
 
 
 def _walk_part(problem: Problem, index: int, z: Array, part: Part) -> list[Walked]:
