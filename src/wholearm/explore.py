@@ -74,23 +74,25 @@ def explore(formation: Formation, z: Array, slip: Array, ends: list[Ending]) -> 
     if len(parts) != 3 or set(parts) != {None, 0, 1} or formation.rolling:
         return None
     metric = metric_weights(formation.scene)
-    places, near = _list_places(formation, z), formation.scene.touching
+    places = _list_places(formation, z)
     found, least = None, np.inf
     for end in ends:
         off = end.measure(places)
         order = np.argsort(off)[:SEEDS]
         for k in order[np.argsort((places[order] - z) ** 2 @ metric)]:
             goal = close(end.formation, places[k], slip, end.fixed, end.active)
-            if (
-                goal is None
-                or end.formation.evaluate_limits(goal[None]).min() <= -formation.scene.touching
-            ):
+            if goal is None or not is_inside(end.formation, goal):
                 continue
             distance = float(metric @ (goal - z) ** 2)
             # One that holds at the start is no end to go to.
             if STILL * formation.scene.scales.length < np.sqrt(distance) < least:
                 found, least = goal, np.sqrt(distance)
     return found
+
+
+def is_inside(formation: Formation, z: Array) -> bool:
+    """Whether a configuration, shape (5,), keeps all limits of a formation."""
+    return bool(formation.evaluate_limits(z[None]).min() > -formation.scene.touching)
 
 
 def _list_places(formation: Formation, z: Array) -> Array:

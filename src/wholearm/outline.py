@@ -10,7 +10,7 @@ from .contact import build_limits
 from .curve import Curve, metric_weights, tangent_basis
 from .dynamics import Directions
 from .errors import InputError
-from .explore import Ending, close, explore
+from .explore import Ending, close, explore, is_inside
 from .formation import Formation
 from .model import Array
 from .path import require_touching, runs_on_curve, trace_phase, trace_phases
@@ -185,17 +185,13 @@ def outline_onwards(phase: Phase, before: Outline) -> list[Outline]:
     ending, slip = _end_formation(phase), formation.evaluate_slip(z[None])[0]
     step = z - before.z[-2]
     metric, outlines = metric_weights(formation.scene), []
-    near = formation.scene.touching
     nearest = close(ending, z, slip)
     if nearest is None:
         return []
     far = np.sqrt((metric @ (nearest - z) ** 2) / (metric @ step**2))
     for share in _AHEAD:
         goal = close(ending, z + share * far * step, slip)
-        if (
-            goal is not None
-            and ending.evaluate_limits(goal[None]).min() > -formation.scene.touching
-        ):
+        if goal is not None and is_inside(ending, goal):
             outlines.append(_connect(formation, z, goal))
     return outlines
 
@@ -214,7 +210,7 @@ def _look_around(formation: Formation, ending: Formation, z: Array, slip: Array)
     for turn in _TURNS:
         turned = close(formation, z, slip, (2, z[2] + turn))
         goal = None if turned is None else close(ending, turned, slip)
-        if goal is None or ending.evaluate_limits(goal[None]).min() <= -formation.scene.touching:
+        if goal is None or not is_inside(ending, goal):
             continue
         distance = float(metric @ (goal - z) ** 2)
         if distance < least:
