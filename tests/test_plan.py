@@ -246,7 +246,7 @@ def test_samples_and_progress(heptagon: Problem) -> None:
         names = {n for n, here in zip(trajectory.contacts, held, strict=True) if here}
         assert names == set(heptagon.phases[phase].formation.names)
         assert np.isnan(trajectory.c_n[rows][:, ~held]).all()
-    assert told[0] == "tracing the phases" and told[-1] == "sampling"
+    assert told[0] == "tracing the phases" and told[-1] == "replaying the plan"
     assert [text for text in told if text.startswith("phase 3 of 5")] == ["phase 3 of 5: time"]
 
 

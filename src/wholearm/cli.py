@@ -66,6 +66,8 @@ def build_parser() -> argparse.ArgumentParser:
     solve.add_argument("--time-intervals", type=int, help="intervals of a phase in the time domain")
     solve.add_argument("--degree", type=int, help="collocation points of an interval there")
     solve.add_argument("--scheme", help="radau (the default) or legendre points")
+    text = "return the plan without replaying it"
+    solve.add_argument("--no-replay", dest="replay", action="store_false", help=text)
     solve.add_argument("--json", action="store_true", help="print the summary as JSON")
 
     verify = _command(commands, "verify", _verify, "replay torques open loop and check the motion")

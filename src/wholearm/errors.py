@@ -44,6 +44,10 @@ class InfeasibleError(WholearmError):
     """No motion satisfies the constraints; the message names constraint, phase and place."""
 
 
+class ReplayError(WholearmError):
+    """A plan was found, but does not hold when it is replayed in the simulator."""
+
+
 class SolverError(WholearmError):
     """The solver stopped without an answer although the problem was not shown infeasible."""
 

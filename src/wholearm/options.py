@@ -56,6 +56,8 @@ class PlanOptions:
         Collocation points per interval in the time domain, from 2 to 6.
     scheme : str
         Which points: ``"radau"`` or ``"legendre"``.
+    replay : bool
+        Whether to replay the plan, to refine what does not hold and to return only what does.
 
     Raises
     ------
@@ -72,6 +74,7 @@ class PlanOptions:
     time_intervals: int | None = None
     degree: int = 3
     scheme: str = "radau"
+    replay: bool = True
 
     def __post_init__(self) -> None:
         given = self.objective
@@ -92,6 +95,8 @@ class PlanOptions:
         if self.transcription not in ("auto", "time"):
             given = self.transcription
             raise InputError("", "transcription", f"{given!r} given; allowed are auto and time")
+        if not isinstance(self.replay, bool):
+            raise InputError("", "replay", f"{self.replay!r} given; allowed are true and false")
         weight = require_number(self.time_weight, "time_weight", positive=True)
         object.__setattr__(self, "time_weight", weight)
         if self.duration is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 
 @dataclass(frozen=True)
@@ -132,6 +132,13 @@ class PhaseReport:
     deviation: Deviation | None
 
 
+class Failure(NamedTuple):
+    """Why torques are not good, and in which phase, by its number."""
+
+    phase: int
+    text: str
+
+
 @dataclass(frozen=True)
 class EnergyBalance:
     """Energies of the whole replay [J]: work = kinetic + potential + losses + residual.
@@ -178,6 +185,8 @@ class Report:
         Distance to the end of the last phase entered, NaN if that is a release.
     failures : tuple of str
         Why the torques are not good, the most important first, empty if they are.
+    failed_phase : int or None
+        Number of the phase that the first of them is about.
     warnings : tuple of str
         What is not asked for but worth knowing.
     phases : tuple of PhaseReport
@@ -196,6 +205,7 @@ class Report:
     reached: bool
     missed_by: float
     failures: tuple[str, ...]
+    failed_phase: int | None
     warnings: tuple[str, ...]
     phases: tuple[PhaseReport, ...]
     energy: EnergyBalance

@@ -15,7 +15,7 @@ from .links import FINGERS_TOUCH
 from .margins import SHORTEST
 from .model import Array, Scene, require_number
 from .problem import End, Problem
-from .report import Deviation, FingerGap, PhaseReport
+from .report import Deviation, Failure, FingerGap, PhaseReport
 from .simulation.events import EventKind, OutcomeKind, Simulation
 
 DEPARTURE = 1e-3
@@ -62,12 +62,20 @@ class Allowance:
             value = require_number(getattr(self, key), key, positive=True)
             object.__setattr__(self, key, value)
 
+    def scale(self, share: float) -> Allowance:
+        """A share of what is allowed from the plan; the speed that passes for rest stays."""
+        return Allowance(share * self.departure, self.rest_speed, share * self.stray)
 
-def describe_overlap(scene: Scene, gap: FingerGap | None) -> list[str]:
+
+def describe_overlap(
+    scene: Scene, phases: Sequence[PhaseReport], gap: FingerGap | None
+) -> list[Failure]:
     """A sentence on links that overlap."""
     if gap is None or gap.least >= -OVERLAP * scene.scales.length:
         return []
-    return [f"{FINGERS_TOUCH} at t = {gap.time:.5g} s: they overlap by {-gap.least:.3g} m"]
+    number = [phase.number for phase in phases if phase.start <= gap.time][-1]
+    text = f"{FINGERS_TOUCH} at t = {gap.time:.5g} s: they overlap by {-gap.least:.3g} m"
+    return [Failure(number, f"{text}, phase {number}")]
 
 
 def judge_end(problem: Problem, simulation: Simulation, allowance: Allowance) -> tuple[bool, str]:
@@ -112,9 +120,9 @@ def describe_speed(scene: Scene, v: Array) -> str:
     return f"{what} turns at {abs(v[2 + fastest]):.3g} rad/s"
 
 
-def describe_stops(problem: Problem, simulation: Simulation, allowance: Allowance) -> list[str]:
+def describe_stops(problem: Problem, simulation: Simulation, allowance: Allowance) -> list[Failure]:
     """Sentences on phases that end at rest but are reached at a speed."""
-    scene, texts = problem.scene, []
+    scene, failures = problem.scene, []
     for event in simulation.find(EventKind.ARRIVAL):
         phase = problem.phases[event.phase]
         v = simulation.z_dot[int(np.flatnonzero(simulation.phase == event.phase)[-1])]
@@ -122,28 +130,30 @@ def describe_stops(problem: Problem, simulation: Simulation, allowance: Allowanc
         if phase.end is End.REST and fast:
             energy = 0.5 * float(scene.mass_diagonal @ v**2)
             unit = "rad/s" if phase.until.coordinate == "phi" else "m/s"
-            texts.append(
+            text = (
                 f"phase {phase.number} does not end at rest: {phase.until} is reached at "
                 f"{event.value:.3g} {unit} at t = {event.time:.5g} s, while "
                 f"{describe_speed(scene, v)}, with {energy:.3g} J left"
             )
-    return texts
+            failures.append(Failure(phase.number, text))
+    return failures
 
 
 def describe_departures(
     problem: Problem, phases: Sequence[PhaseReport], allowance: Allowance
-) -> list[str]:
+) -> list[Failure]:
     """The sentence on the first phase whose replay is too far from the plan, if there is one."""
     length = problem.scene.scales.length
     for phase in phases:
         worst = [d for d in (phase.deviation, phase.end_deviation) if d is not None]
         if any(measure_departure(d, length) > allowance.departure for d in worst):
             far = max(worst, key=lambda d: measure_departure(d, length))
-            return [
+            text = (
                 f"phase {phase.number} departs from the plan, by {far.position:.2g} m and "
                 f"{far.angle:.2g} rad at t = {far.time:.5g} s; {allowance.departure * length:.2g} "
                 f"m and {allowance.departure:.2g} rad are allowed"
-            ]
+            )
+            return [Failure(phase.number, text)]
     return []
 
 
@@ -155,7 +165,7 @@ def measure_departure(deviation: Deviation, length: float) -> float:
 
 def describe_thin(
     problem: Problem, phases: Sequence[PhaseReport], simulation: Simulation, allowance: Allowance
-) -> list[str]:
+) -> list[Failure]:
     """Sentences on the normal forces below epsilon, but for contacts where they were lost.
 
     A contact that is let go without a jump of the torques passes epsilon on its way to zero.
@@ -168,8 +178,11 @@ def describe_thin(
     lost = {(e.phase + 1, e.contact) for e in simulation.find(EventKind.CONTACT_LOST)}
     allowed = ROUNDING * problem.scene.scales.force + allowance.stray * problem.epsilon
     return [
-        f"c_n of {c.contact} falls to {c.least:.5g} N, below epsilon = {problem.epsilon:g} N, "
-        f"at t = {c.time:.5g} s, phase {phase.number}"
+        Failure(
+            phase.number,
+            f"c_n of {c.contact} falls to {c.least:.5g} N, below epsilon = {problem.epsilon:g} N, "
+            f"at t = {c.time:.5g} s, phase {phase.number}",
+        )
         for phase in phases
         for c in phase.contacts
         if c.margin < -allowed

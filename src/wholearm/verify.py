@@ -10,7 +10,7 @@ from .errors import InputError
 from .margins import find_finger_gap, list_contact_margins, list_slip_margins
 from .model import Array
 from .problem import End, Phase, Problem
-from .report import Deviation, EnergyBalance, LeastImpulse, PhaseReport, Report
+from .report import Deviation, EnergyBalance, Failure, LeastImpulse, PhaseReport, Report
 from .sharing import exclusive
 from .simulation.events import Event, EventKind, Simulation
 from .simulation.simulate import simulate
@@ -96,23 +96,24 @@ def inspect(
         for index in range(int(simulation.phase[-1]) + 1)
     )
     reached, outcome = judge_end(problem, simulation, allowance)
-    failures = [] if reached else [outcome]
+    failures = [] if reached else [Failure(len(phases), outcome)]
     failures += describe_stops(problem, simulation, allowance)
     gap = find_finger_gap(problem.scene, simulation, torque.breaks)
-    failures += describe_overlap(problem.scene, gap) if reached else []
+    failures += describe_overlap(problem.scene, phases, gap) if reached else []
     thin = describe_thin(problem, phases, simulation, allowance)
     warnings = _describe_torques(problem, torque)
     if plan is not None:
         failures += thin + describe_departures(problem, phases, allowance)
     else:
-        warnings += thin
+        warnings += [failure.text for failure in thin]
     return Report(
         name=problem.name,
         epsilon=problem.epsilon,
         outcome=outcome,
         reached=reached,
         missed_by=simulation.missed_by,
-        failures=tuple(failures),
+        failures=tuple(failure.text for failure in failures),
+        failed_phase=failures[0].phase if failures else None,
         warnings=tuple(warnings),
         phases=phases,
         energy=_balance(problem, simulation),
