@@ -460,7 +460,7 @@ def test_interrupting_leaves_nothing(
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("wholearm.plan.plan_chain", interrupt)
+    monkeypatch.setattr("wholearm.blocks.plan_chain", interrupt)
     assert main(["solve", str(HEPTAGON)]) == 130
     assert capsys.readouterr().err == "wholearm: interrupted\n"
     assert list(folder.iterdir()) == []
@@ -486,12 +486,14 @@ def test_version() -> None:
     assert result.stdout == f"wholearm {wholearm.__version__}\n"
 
 
-def test_solve_imports_only_what_it_needs(folder: Path) -> None:
+@pytest.mark.parametrize("more", [[], ["--no-replay"]])
+def test_solve_imports_only_what_it_needs(folder: Path, more: list[str]) -> None:
     """What the process costs over importing casadi and numpy is its own work."""
     code = (
         "import sys\nfrom wholearm.cli import main\n"
-        f"assert main(['solve', {str(HEPTAGON)!r}, '-o', 'a.npz']) == 0\n"
-        "unwanted = ('scipy', 'matplotlib', 'wholearm.simulation.simulate', 'wholearm.plots')\n"
+        f"assert main(['solve', {str(HEPTAGON)!r}, '-o', 'a.npz', *{more!r}]) == 0\n"
+        "unwanted = ['scipy', 'matplotlib', 'wholearm.plots']\n"
+        f"unwanted += ['wholearm.simulation.simulate'] if {more!r} else []\n"
         "print([name for name in unwanted if name in sys.modules])"
     )
     result = run("-c", code, cwd=folder)

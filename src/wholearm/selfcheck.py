@@ -22,7 +22,7 @@ from .report import ContactMargin, Deviation, PhaseReport, Report
 from .torque import TorqueProfile
 from .trajectory import Samples, Trajectory, assemble
 from .verdict import Allowance, measure_departure
-from .verify import inspect
+from .verify import choose_times, inspect
 
 REFINEMENTS = 3
 """How often the intervals of a block may be doubled."""
@@ -112,9 +112,12 @@ def replay_plan(
     while True:
         report("replaying the plan")
         check = check_plan(problem, trajectory, strict)
+        if check.failure is not None:
+            # Parabolas through few instants may dip too low; then `verify` looks closely.
+            check = check_plan(problem, trajectory, strict, closely=True)
         if check.failure is None:
             break
-        accepted = check_plan(problem, trajectory, usual)
+        accepted = check_plan(problem, trajectory, usual, closely=True)
         number = check.find_culprit(problem.scene.scales.length, strict.departure)
         index = next(
             k
@@ -133,15 +136,20 @@ def replay_plan(
     return planning, trajectory, _list_figures(planning, check)
 
 
-def check_plan(problem: Problem, trajectory: Trajectory, allowance: Allowance) -> Check:
-    """Replay a plan at few instants, and see what its samples leave of the equations of motion."""
-    times = choose_times(trajectory)
+def check_plan(
+    problem: Problem, trajectory: Trajectory, allowance: Allowance, closely: bool = False
+) -> Check:
+    """Replay a plan, and see what its samples leave of the equations of motion.
+
+    It is looked at in few instants, or `closely`, in those of `verify`.
+    """
+    times = choose_times(trajectory.torque, trajectory) if closely else pick_times(trajectory)
     replayed = inspect(problem, trajectory.torque, trajectory, times, allowance, 1e-9)
     return Check(replayed, find_residual(problem, trajectory))
 
 
-def choose_times(trajectory: Trajectory) -> Array:
-    """Instants to look at: some rows of each phase, and some inside long pieces of the torques."""
+def pick_times(trajectory: Trajectory) -> Array:
+    """Few instants to look at: some rows of each phase, and some in long pieces of the torques."""
     times: list[Array] = []
     for index in range(len(trajectory.motions)):
         rows = np.flatnonzero(trajectory.phase == index)

@@ -75,10 +75,7 @@ def verify(
     if plan is not None and set(plan.contacts) != names:
         odd = ", ".join(sorted(set(plan.contacts) ^ names))
         raise InputError("", "contacts", f"trajectory and problem differ in {odd}")
-    times = _choose_times(torque)
-    if plan is not None:
-        times = np.concatenate([times, plan.t])
-    return inspect(problem, torque, plan, times, allowance, tolerance)
+    return inspect(problem, torque, plan, choose_times(torque, plan), allowance, tolerance)
 
 
 def inspect(
@@ -123,11 +120,12 @@ def inspect(
     )
 
 
-def _choose_times(torque: TorqueProfile) -> Array:
-    """Instants inside every piece of the torques, at least one."""
+def choose_times(torque: TorqueProfile, plan: Trajectory | None) -> Array:
+    """Instants inside every piece of the torques, at least one, and the rows of the plan."""
     count = max(1, SAMPLES // len(torque.coefficients))
     share = np.arange(1, count + 1) / (count + 1)
-    return np.asarray((torque.breaks[:-1, None] + np.diff(torque.breaks)[:, None] * share).ravel())
+    inside = torque.breaks[:-1, None] + np.diff(torque.breaks)[:, None] * share
+    return np.append(inside.ravel(), [] if plan is None else plan.t)
 
 
 def _report_phase(
