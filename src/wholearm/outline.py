@@ -39,6 +39,18 @@ def load(path: str) -> Problem:
         If the file is malformed, a formation does not touch, or an `until` is never reached.
     """
     problem = read_problem(path)
+    require_phases(problem)
+    return problem
+
+
+def require_phases(problem: Problem) -> None:
+    """Check that every phase of a problem can be carried out geometrically.
+
+    Raises
+    ------
+    InputError
+        If a formation does not touch, or an `until` is never reached.
+    """
     curves = trace_phases(problem)
     z = curves[-1].end if curves else problem.start
     for phase in problem.phases[len(curves) :]:
@@ -46,7 +58,6 @@ def load(path: str) -> Problem:
             z = trace_phase(problem, phase, z).end
         else:
             z = outline_phase(problem, phase, z)[-1].z[-1]
-    return problem
 
 
 @dataclass(frozen=True, eq=False)
