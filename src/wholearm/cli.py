@@ -13,7 +13,8 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from .errors import InputError, WholearmError
+from .benchmark.command import add_bench, name_study
+from .errors import InputError, WholearmError, name_source
 
 if TYPE_CHECKING:
     from .torque import TorqueProfile
@@ -29,7 +30,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status."""
     given = sys.argv[1:] if arguments is None else arguments
     try:
-        options = build_parser().parse_args([_protect(text) for text in given])
+        named = name_study([_protect(text) for text in given])
+        options = build_parser().parse_args(named)
         status: int = options.run(options)
         sys.stdout.flush()
         return status
@@ -95,9 +97,9 @@ def build_parser() -> argparse.ArgumentParser:
     text = "print the formations along a route of two or more poses [m, deg] as [[phases]]"
     chart.add_argument("--list", metavar="X,PHI", nargs="+", help=text)
 
-    bench = _command(commands, "bench", _bench, "measure run time against error")
-    bench.add_argument("problem", help="problem file (TOML)")
-    bench.add_argument("-o", "--output", default="results", help="folder for tables and figures")
+    text = "measure run time against error, or run the stress study"
+    bench = commands.add_parser("bench", help=text, description=f"{text[0].upper()}{text[1:]}.")
+    add_bench(bench, _progress)
     return parser
 
 
@@ -233,14 +235,15 @@ def _plot(options: argparse.Namespace) -> int:
     plots.require_format(options.output)
     require_writable(options.output)
     trajectory = load_trajectory(options.trajectory)
-    simulation = None
-    if options.simulate:
-        from .problem import build_problem
-        from .simulation.simulate import simulate
+    with name_source(options.trajectory):
+        simulation = None
+        if options.simulate:
+            from .simulation.simulate import simulate
 
-        problem = build_problem(trajectory.meta["problem"], options.trajectory)
-        simulation = simulate(problem, trajectory.torque, progress=_progress())
-    plots.save(plots.force_margins(trajectory, simulation=simulation), options.output)
+            problem = plots.read_own_problem(trajectory)
+            simulation = simulate(problem, trajectory.torque, progress=_progress())
+        figure = plots.force_margins(trajectory, simulation=simulation)
+    plots.save(figure, options.output)
     _clear_progress()
     print(f"wrote {options.output}")
     return 0
@@ -300,17 +303,6 @@ def _protect(text: str) -> str:
     """Keep argparse from taking a pair of numbers that starts with a minus for an option."""
     pair = text[:1] == "-" and text[1:2] in tuple(".0123456789") and "," in text
     return f" {text}" if pair else text
-
-
-def _bench(options: argparse.Namespace) -> int:
-    from .benchmark.bench import run_bench
-    from .outline import load
-
-    written = run_bench(load(options.problem), options.output, progress=_progress())
-    _clear_progress()
-    for path in written:
-        print(f"wrote {path}")
-    return 0
 
 
 def _progress() -> Callable[[str], None] | None:

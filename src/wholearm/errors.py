@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+LONGEST = 1000
+"""Characters of a message beyond which its middle is left out."""
+
 
 class WholearmError(Exception):
     """Base of every error that this package raises on purpose.
@@ -34,7 +40,26 @@ class InputError(WholearmError):
         self.source = source
         self.key = key
         self.problem = problem
-        super().__init__(": ".join(part for part in (source, key, problem) if part))
+        text = ": ".join(part for part in (source, key, problem) if part)
+        super().__init__(_to_line(text))
+
+
+def _to_line(text: str) -> str:
+    """One line without control characters, its middle left out where it is very long."""
+    if len(text) > LONGEST:
+        text = f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+@contextmanager
+def name_source(source: str) -> Iterator[None]:
+    """Give the source to an `InputError` from inside the block that does not know its own."""
+    try:
+        yield
+    except InputError as error:
+        if error.source or not source:
+            raise
+        raise InputError(source, error.key, error.problem) from None
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
         return type(self), (self.source, self.key, self.problem)

@@ -31,7 +31,7 @@ from .files import write_whole
 from .links import evaluate_finger_gap
 from .model import Array, Finger, Scene, require_number
 from .plotdata import choose_snapshots, cone_shares, find_steps, sample_torques
-from .problem import build_problem
+from .problem import Problem, build_problem
 from .sharing import exclusive
 from .torque import TorqueProfile
 from .trajectory import Trajectory
@@ -74,6 +74,23 @@ class ContactStyle(NamedTuple):
 Styles = Mapping[str, ContactStyle]
 
 
+def read_own_problem(trajectory: Trajectory) -> Problem:
+    """The problem that a trajectory carries along in its `meta`.
+
+    Raises
+    ------
+    InputError
+        If there is none, or it is malformed.
+    """
+    table = trajectory.meta.get("problem")
+    if not isinstance(table, Mapping):
+        raise InputError("", "meta.problem", "the trajectory does not hold its problem's tables")
+    try:
+        return build_problem(table)
+    except InputError as error:
+        raise InputError("", f"meta.problem.{error.key}", error.problem) from None
+
+
 @exclusive
 def force_margins(trajectory: Trajectory, *, simulation: Simulation | None = None) -> Figure:
     """Draw a plan: snapshots, the force margin of every contact, and the torques.
@@ -97,10 +114,7 @@ def force_margins(trajectory: Trajectory, *, simulation: Simulation | None = Non
     InputError
         If `trajectory.meta` lacks the problem.
     """
-    meta = trajectory.meta
-    if not isinstance(meta.get("problem"), Mapping):
-        raise InputError("", "meta.problem", "the trajectory does not hold its problem's tables")
-    problem = build_problem(meta["problem"], "meta.problem")
+    meta, problem = trajectory.meta, read_own_problem(trajectory)
     epsilon = require_number(meta.get("epsilon", problem.epsilon), "meta.epsilon")
     styles = choose_styles(trajectory.contacts)
     with matplotlib.rc_context(_STYLE):

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from .contact import Contact, parse_contact
-from .errors import InputError
+from .errors import InputError, name_source
 from .formation import TOUCHING, Formation, close_finger, describe, find_touching, place_flush
 from .links import evaluate_finger_gap
 from .model import Array, Finger, Friction, Polygon, Scene, require_number
@@ -190,7 +190,7 @@ class Problem:
             table = change_table(self.table, given, name_keys(_TOP, _FINGER))
         except InputError as error:
             raise InputError(self.source, error.key, error.problem) from None
-        return _build(table, self.source)
+        return build_problem(table, self.source)
 
     @property
     def contacts(self) -> tuple[Contact, ...]:
@@ -214,22 +214,25 @@ def read_problem(path: str) -> Problem:
         raise InputError(str(path), "", f"cannot be read: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(str(path), "", f"is not TOML: {error}") from None
-    return _build(table, str(path))
-
-
-def _build(table: Mapping[str, Any], source: str) -> Problem:
-    """Build a problem, with errors that name its source."""
-    try:
-        return build_problem(table, source)
-    except InputError as error:
-        if error.source:
-            raise
-        raise InputError(source, error.key, error.problem) from None
+    except RecursionError:
+        raise InputError(str(path), "", "is nested too deeply") from None
+    return build_problem(table, str(path))
 
 
 @exclusive
 def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
-    """Validate a problem given as the nested tables of a problem file."""
+    """Validate a problem given as the nested tables of a problem file.
+
+    Raises
+    ------
+    InputError
+        If anything in it is malformed; names `source`.
+    """
+    with name_source(source):
+        return _build_problem(table, source)
+
+
+def _build_problem(table: Mapping[str, Any], source: str) -> Problem:
     _check_keys(table, "", _TOP, required=_TOP - _OPTIONAL)
     name = table.get("name", "unnamed")
     if not isinstance(name, str):

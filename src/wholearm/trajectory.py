@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -12,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from .archive import read_arrays
 from .errors import InputError
 from .files import write_whole
 from .model import Array
@@ -284,17 +284,8 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
         If the file cannot be read, or an array is missing or of the wrong shape.
     """
     source = str(path)
-    try:
-        with open(path, "rb") as stream:
-            data = np.load(stream, allow_pickle=False)
-            if not isinstance(data, np.lib.npyio.NpzFile):
-                raise InputError(source, "", "is not a trajectory file: one array, no archive")
-            arrays = {name: np.asarray(data[name]) for name in data.files}
-    except OSError as error:
-        raise InputError(source, "", f"cannot be read: {error.strerror or error}") from None
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(source, "", f"is not a trajectory file: {error}") from None
     extra = {"contacts": (), "torque_breaks": (), "torque_coefficients": (2, -1)}
+    arrays = read_arrays(path, (*_ARRAYS, *extra, "meta"))
     for name in (*_ARRAYS, *extra, "meta"):
         if name not in arrays:
             raise InputError(source, name, "array is missing")
@@ -305,6 +296,8 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
         meta = json.loads(str(arrays["meta"]))
     except json.JSONDecodeError as error:
         raise InputError(source, "meta", f"is not JSON: {error}") from None
+    except RecursionError:
+        raise InputError(source, "meta", "is nested too deeply") from None
     if not isinstance(meta, dict):
         raise InputError(source, "meta", "is not a JSON object")
     named = meta.get("rolling", [])

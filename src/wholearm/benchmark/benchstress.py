@@ -31,7 +31,7 @@ def measure_stress(problem: Problem) -> list[Row]:
         started, failures = time.perf_counter(), []
         for trial in range(TRIALS):
             goal = ("time", "effort", "margin")[trial % 3]
-            changes = _change(problem.table, spread, random)
+            changes = change_numbers(problem.table, spread, random)
             try:
                 other = problem.with_(changes)
                 report = verify(other, solve(other, goal))
@@ -47,7 +47,9 @@ def measure_stress(problem: Problem) -> list[Row]:
     return rows
 
 
-def _change(table: Mapping[str, Any], spread: float, random: np.random.Generator) -> dict[str, Any]:
+def change_numbers(
+    table: Mapping[str, Any], spread: float, random: np.random.Generator
+) -> dict[str, Any]:
     """Numbers of a problem file changed by up to `spread`, by their dotted keys."""
     keys = ["object.mass"]
     for number, finger in table["fingers"].items():

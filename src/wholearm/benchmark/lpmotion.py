@@ -21,10 +21,13 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import coo_array
 
+from ..mapping.closing import Numbers
 from ..model import Array, Scene
 from ..problem import Phase
 from .newton import locate
 from .tracing import slides
+
+Bounds = list[tuple[float | None, float | None]]
 
 FASTEST = 1e3
 """Largest speed that is considered, over the scene's own."""
@@ -129,7 +132,8 @@ def fast_margin(
     row = upper.begin(count, np.zeros(count))
     upper.add(row, nodes, 1 / np.sqrt(top))
     upper.add(row, count + nodes, -np.ones(count))
-    bounds = [(0.0, float(limit)) for limit in top] + [(0.0, None)] * count
+    bounds: Bounds = [(0.0, float(limit)) for limit in top]
+    bounds += [(0.0, None)] * count
     bounds += [(None, None)] * (total - first_c - 1) + [(None, 1.0)]
     for end, rest in zip((0, count - 1), rests, strict=True):
         if rest:
@@ -301,16 +305,16 @@ class _Rows:
 
     def __init__(self, width: int) -> None:
         self.width, self.count = width, 0
-        self._entries: list[tuple[Array, Array, Array]] = []
+        self._entries: list[tuple[Numbers, Numbers, Array]] = []
         self._right: list[Array] = []
 
-    def begin(self, count: int, right: Array) -> Array:
+    def begin(self, count: int, right: Array) -> Numbers:
         """Numbers of `count` new rows with the given right sides."""
         self._right.append(np.broadcast_to(right, (count,)))
         self.count += count
         return np.arange(self.count - count, self.count)
 
-    def add(self, row: Array, column: Array, value: Array) -> None:
+    def add(self, row: Numbers, column: Numbers, value: Array) -> None:
         """Add one entry to each of some rows."""
         self._entries.append((row, column, np.broadcast_to(value, row.shape)))
 
@@ -322,9 +326,7 @@ class _Rows:
         )
 
 
-def _maximise(
-    total: int, upper: _Rows, equal: _Rows, bounds: list[tuple[float | None, float | None]]
-) -> float:
+def _maximise(total: int, upper: _Rows, equal: _Rows, bounds: Bounds) -> float:
     cost = np.zeros(total)
     cost[-1] = -1.0
     A_ub, b_ub = upper.build()

@@ -23,6 +23,9 @@ UNABLE = -1e-7
 FREE = 0.02
 """Reduced inertia over that without friction above which nothing jams."""
 
+HELD = 1e-3
+"""Length of a phase over the radius of gyration below which it may count as nothing to do."""
+
 
 class Verdict(NamedTuple):
     """What a second look says about a refusal.
@@ -49,6 +52,11 @@ def judge(problem: Problem, error: WholearmError, stops: list[tuple[float, float
         own = number in (None, phase.number)
         if phase.formation.n_constraints == 4 and not phase.until.is_release:
             trace = _reach(problem.scene, phase, z)
+            if (
+                len(trace.z) < 3
+                and _length(problem.scene, trace) < HELD * problem.scene.scales.length
+            ):
+                return Verdict("close", f"phase {phase.number} has nothing to do")
             if not trace.reached:
                 return Verdict("confirmed", f"phase {phase.number}: {trace.ending}")
             if own:
@@ -69,6 +77,11 @@ def judge(problem: Problem, error: WholearmError, stops: list[tuple[float, float
     if isinstance(error, InputError) and not open_end.reason:
         return Verdict("refuted", "every phase reaches its until")
     return open_end
+
+
+def _length(scene: Scene, trace: Trace) -> float:
+    steps = np.diff(trace.z, axis=0)
+    return float(np.sqrt(steps**2 @ weights(scene)).sum())
 
 
 def _find_phase(text: str) -> int | None:
@@ -108,9 +121,7 @@ def _stops_before(problem: Problem, phase: Phase) -> bool:
     return phase.index == 0 or problem.phases[phase.index - 1].end is End.REST
 
 
-def _straight(
-    scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]
-) -> Array | None:
+def _straight(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -> Array | None:
     """Configurations on the straight leg of (x, phi) from `z`, shape (n, 5); None if it breaks."""
     points = [z]
     scale = np.sqrt(weights(scene))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import json
 import math
 import tomllib
 from collections.abc import Callable
@@ -17,9 +19,9 @@ from ..problem import Problem, build_problem
 from .newton import locate
 from .scenes import Table, random_route, random_scene
 
-TRIES = 40
+TRIES = 6
 """Routes that are drawn for one scene before another scene is."""
-SCENES = 20
+SCENES = 40
 """Scenes that are drawn for one case before its last list is taken as it is."""
 
 
@@ -65,7 +67,8 @@ def draw_case(seed: int, number: int) -> Case:
             stops = [(float(part.stop[0]), float(part.stop[1])) for part in stretches]
             route = ROUTES[int(rng.integers(len(ROUTES)))]
             phases, stops, name = route(rng, problem, phases, stops)
-            return Case(number, f"{kind}, {name}", {**table, "phases": phases}, stops)
+            plain = json.loads(json.dumps({**table, "phases": phases}, default=float))
+            return Case(number, f"{kind}, {name}", plain, stops)
     raise InputError("", f"scene {number}", "no route was found")
 
 
@@ -165,7 +168,7 @@ def _struck(
         and phase["until"] in following["contacts"]
         and set(following["contacts"]) <= {*phase["contacts"], phase["until"]}
         else phase
-        for phase, following in zip(phases, phases[1:], strict=False)
+        for phase, following in itertools.pairwise(phases)
     ]
     return [*changed, phases[-1]], stops, "impacts"
 
@@ -175,7 +178,7 @@ def _joined(
 ) -> tuple[Phases, Stops, str]:
     """Smooth ends wherever a phase passes into one with three contacts or fewer freedoms."""
     changed = []
-    for phase, following in zip(phases, phases[1:], strict=False):
+    for phase, following in itertools.pairwise(phases):
         gained = {phase["until"]} if isinstance(phase["until"], str) else set()
         fits = set(following["contacts"]) <= {*phase["contacts"], *gained}
         less = len(following["contacts"]) < len(phase["contacts"]) + len(gained)

@@ -1,4 +1,4 @@
-"""One scene of the stress study: planned, replayed and checked, or refused and the refusal judged."""
+"""One scene of the stress study: planned, replayed and checked, or its refusal judged."""
 
 from __future__ import annotations
 
@@ -77,49 +77,34 @@ class Answer(NamedTuple):
     verdict: str = ""
 
 
-def run_scene(task: tuple[int, int]) -> dict[str, Any]:
-    """Run one scene, given as (seed, number), and return what came of it as plain data."""
-    started = time.process_time()
-    case = draw_case(*task)
-    record = {"scene": case.number, "kind": case.kind}
-    answers, findings = run_case(case)
+def run_scene(task: tuple[int, int, str]) -> dict[str, Any]:
+    """Run one scene, given as (seed, number, objective); what came of it as plain data."""
+    seed, number, objective = task
+    case = draw_case(seed, number)
+    answer, seconds = run_case(case, objective)
     return {
-        **record,
-        "answers": answers,
-        "findings": [list(finding) for finding in findings],
-        "seconds": round(time.process_time() - started, 3),
-    }
-
-
-def run_case(case: Case) -> tuple[list[dict[str, Any]], list[Finding]]:
-    """Plan a case for every objective, with and without noise."""
-    findings: list[Finding] = []
-    problem, refusal = _load(case.table)
-    if problem is None or refusal is not None:
-        answer = _refuse_list(case, problem, refusal)
-        return [_describe("list", answer, 0.0)], answer.findings
-    noisy, _ = _load(_perturb(case))
-    answers = []
-    for objective in OBJECTIVES:
-        started = time.process_time()
-        answer = _plan(problem, objective, case)
-        seconds = time.process_time() - started
-        other = _plan_again(noisy, objective)
-        findings += [Finding(f.kind, f"{objective}: {f.text}") for f in answer.findings]
-        findings += _compare(objective, answer, other)
-        answers.append(_describe(objective, answer, seconds))
-    return answers, findings
-
-
-def _describe(objective: str, answer: Answer, seconds: float) -> dict[str, Any]:
-    return {
-        "objective": objective,
+        "scene": [number, objective],
+        "kind": case.kind,
         "outcome": answer.outcome,
         "value": answer.value,
         "text": answer.text,
         "verdict": answer.verdict,
+        "findings": [list(finding) for finding in answer.findings],
         "seconds": round(seconds, 3),
     }
+
+
+def run_case(case: Case, objective: str) -> tuple[Answer, float]:
+    """Plan a case for an objective, with and without noise; the time is that of one plan [s]."""
+    problem, refusal = _load(case.table)
+    if problem is None or refusal is not None:
+        return _refuse_list(case, problem, refusal), 0.0
+    started = time.process_time()
+    answer = _plan(problem, objective, case)
+    seconds = time.process_time() - started
+    noisy, _ = _load(_perturb(case))
+    findings = [*answer.findings, *_compare(answer, _plan_again(noisy, objective))]
+    return answer._replace(findings=findings), seconds
 
 
 def _load(table: dict[str, Any]) -> tuple[Problem | None, Exception | None]:
@@ -229,15 +214,15 @@ def _plan_again(problem: Problem | None, objective: str) -> Answer:
         return Answer("failed", None, repr(error), [])
 
 
-def _compare(objective: str, one: Answer, other: Answer) -> list[Finding]:
+def _compare(one: Answer, other: Answer) -> list[Finding]:
     """What noise changed in an answer."""
     kind = "optimum that differs under noise"
     if one.outcome != other.outcome:
-        text = f"{objective}: {one.outcome}, with noise {other.outcome} {other.text or one.text}"
+        text = f"{one.outcome}, with noise {other.outcome} {other.text or one.text}"
         return [Finding(kind, text)] if "failed" not in (one.outcome, other.outcome) else []
     if one.value is None or other.value is None:
         return []
     difference = abs(one.value - other.value) / max(abs(one.value), 1e-300)
     if difference <= SAME:
         return []
-    return [Finding(kind, f"{objective}: {one.value:.9g} and {other.value:.9g}")]
+    return [Finding(kind, f"{one.value:.9g} and {other.value:.9g}")]

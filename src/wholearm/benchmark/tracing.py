@@ -1,4 +1,4 @@
-"""A second way to follow the curve of a phase with one freedom: small steps and plain overlap tests.
+"""A second way to follow the curve of a phase: small steps and plain overlap tests.
 
 It knows neither C-functions nor limits of formations. The motion ends where a contact leaves the
 feature that it slides on, where two bodies run into each other, or at the phase's `until`.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing as mp
 import os
 import signal
@@ -16,6 +17,11 @@ from typing import Any, NamedTuple
 
 MEMORY = 6 * 2**30
 """Address space that a worker may take [byte]: a claim beyond it fails instead of swapping."""
+
+PATIENCE = 6.0
+"""Wall-clock time that a task may take over its bound of processor time: others may run too."""
+_CPU = getattr(signal, "SIGXCPU", 24)
+"""Signal that ends a process whose processor time is used up."""
 
 
 class Answer(NamedTuple):
@@ -44,9 +50,9 @@ class Answer(NamedTuple):
 class _Worker:
     """A process that runs tasks one after the other."""
 
-    def __init__(self, context: Any, run: Callable[[Any], Any]) -> None:
+    def __init__(self, context: Any, run: Callable[[Any], Any], bound: float) -> None:
         self.pipe, far = context.Pipe()
-        self.process = context.Process(target=_serve, args=(far, run), daemon=True)
+        self.process = context.Process(target=_serve, args=(far, run, bound), daemon=True)
         self.process.start()
         far.close()
         self.task: Any = None
@@ -76,14 +82,14 @@ def run_tasks(
     jobs : int
         Number of workers.
     bound : float, [s]
-        How long a task may take by the wall clock.
+        Processor time that a task may take. By the wall clock it may take `PATIENCE` times that.
     """
     context = mp.get_context("spawn")
     waiting = list(reversed(tasks))
     workers: list[_Worker] = []
     try:
         for _ in range(min(jobs, len(tasks))):
-            workers.append(_Worker(context, run))
+            workers.append(_Worker(context, run, bound))
             workers[-1].give(waiting.pop())
         while any(worker.busy for worker in workers):
             for k, worker in enumerate(workers):
@@ -92,7 +98,7 @@ def run_tasks(
                     continue
                 if answer.ended in ("late", "died"):
                     worker.stop()
-                    workers[k] = worker = _Worker(context, run)
+                    workers[k] = worker = _Worker(context, run, bound)
                 worker.busy = False
                 if waiting:
                     worker.give(waiting.pop())
@@ -108,16 +114,18 @@ def _look(worker: _Worker, bound: float) -> Answer | None:
     seconds = time.monotonic() - worker.started
     try:
         if worker.pipe.poll():
-            return Answer(worker.task, *worker.pipe.recv(), seconds)
+            ended, result, printed = worker.pipe.recv()
+            return Answer(worker.task, ended, result, printed, seconds)
     except (EOFError, OSError):
         worker.process.join()
-        return Answer(worker.task, "died", worker.process.exitcode, "", seconds)
-    if seconds > bound:
+        code = worker.process.exitcode
+        return Answer(worker.task, "late" if code == -_CPU else "died", code, "", seconds)
+    if seconds > PATIENCE * bound:
         return Answer(worker.task, "late", None, "", seconds)
     return None
 
 
-def _serve(pipe: Connection, run: Callable[[Any], Any]) -> None:
+def _serve(pipe: Connection, run: Callable[[Any], Any], bound: float) -> None:
     """Run what comes through the pipe until it closes."""
     # The parent alone answers an interrupt, and takes its workers with it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -131,6 +139,7 @@ def _serve(pipe: Connection, run: Callable[[Any], Any]) -> None:
                 task = pipe.recv()
             except (EOFError, OSError):
                 return
+            _limit_time(bound)
             try:
                 outcome = "done", run(task)
             except Exception:
@@ -145,6 +154,19 @@ def _serve(pipe: Connection, run: Callable[[Any], Any]) -> None:
                 pipe.send((*outcome, text))
             except (BrokenPipeError, OSError):
                 return
+
+
+def _limit_time(bound: float) -> None:
+    """Let the process end when it has used up its time from now on; between tasks it idles."""
+    try:
+        import resource
+    except ImportError:
+        return
+    hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+    soft = math.ceil(time.process_time() + bound)
+    if hard != resource.RLIM_INFINITY:
+        soft = min(soft, hard)
+    resource.setrlimit(resource.RLIMIT_CPU, (soft, hard))
 
 
 def _limit_memory() -> None:

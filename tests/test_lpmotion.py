@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from wholearm.benchmark.lpmotion import fast_margin, inertia_ratio, rest_margin, slow_margin
+from wholearm.benchmark.tracing import follow, spread
+from wholearm.curve import Curve
+from wholearm.dynamics import Directions, reduced_inertia
+from wholearm.model import Array, Friction, Scene
+from wholearm.options import PlanOptions
+from wholearm.pathdomain.pathplan import plan_path
+from wholearm.problem import Phase, Problem
+
+Course = tuple[Array, Array, Array]
+
+
+@pytest.fixture(scope="module")
+def course(heptagon: Problem, curves: tuple[Curve, ...]) -> tuple[Phase, Course]:
+    phase = heptagon.phases[2]
+    start = curves[2].evaluate(np.zeros(1)).z[0]
+    (reached,) = (way for way in follow(heptagon.scene, phase, start) if way.reached)
+    return phase, spread(heptagon.scene, phase, reached, 12)
+
+
+def _weaker(scene: Scene, share: float) -> Scene:
+    fingers = [replace(f, torque_limit=share * f.torque_limit) for f in scene.fingers]
+    return replace(scene, fingers=(fingers[0], fingers[1]))
+
+
+def test_where_a_plan_exists_a_motion_keeps_the_limits(
+    heptagon: Problem, course: tuple[Phase, Course]
+) -> None:
+    phase, (s, z, z_s) = course
+    slow, _ = slow_margin(heptagon.scene, phase, heptagon.epsilon, z, z_s)
+    fast = fast_margin(heptagon.scene, phase, heptagon.epsilon, (s, z, z_s))
+    assert 0.0 < slow <= fast + 1e-9
+
+
+def test_without_strength_no_motion_exists(heptagon: Problem, course: tuple[Phase, Course]) -> None:
+    phase, (s, z, z_s) = course
+    scene = _weaker(heptagon.scene, 0.01)
+    assert slow_margin(scene, phase, heptagon.epsilon, z, z_s)[0] < 0.0
+    assert fast_margin(scene, phase, heptagon.epsilon, (s, z, z_s)) < 0.0
+    assert rest_margin(scene, phase, 1.0, z[0]) < 0.0
+    assert rest_margin(heptagon.scene, phase, heptagon.epsilon, z[0]) > 0.0
+
+
+def test_the_largest_epsilon_of_slow_motion_leaves_no_margin(
+    heptagon: Problem, course: tuple[Phase, Course], curves: tuple[Curve, ...]
+) -> None:
+    """Raised by the margin over what it takes, epsilon is the most that a slow motion can keep."""
+    phase, (_, z, z_s) = course
+    free = replace(heptagon.scene, fingers=_weaker(heptagon.scene, 1e3).fingers)
+    margin, _ = slow_margin(free, phase, heptagon.epsilon, z, z_s)
+    more = heptagon.epsilon + margin * heptagon.scene.scales.force
+    assert slow_margin(free, phase, more, z, z_s)[0] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_planner_and_linear_programme_agree_on_the_weakest_hand(
+    heptagon: Problem, curves: tuple[Curve, ...], course: tuple[Phase, Course]
+) -> None:
+    """The planner still finds a motion where the programme has room, and the margin says so."""
+    phase, (s, z, z_s) = course
+    plan = plan_path(curves[2], heptagon.epsilon, PlanOptions(intervals=20), phase.number)
+    peak = float(np.abs(plan.motion.evaluate(plan.motion.times).tau).max())
+    scene = _weaker(heptagon.scene, 1.001 * peak / 2.0)
+    assert fast_margin(scene, phase, heptagon.epsilon, (s, z, z_s)) >= -1e-9
+
+
+def test_inertia_is_that_of_the_determinant(
+    heptagon: Problem, course: tuple[Phase, Course], curves: tuple[Curve, ...]
+) -> None:
+    phase, (_, z, z_s) = course
+    rough = replace(heptagon.scene, friction=Friction(0.6, 0.9, 0.9))
+    formation = replace(phase.formation, scene=rough)
+    ratios = inertia_ratio(rough, replace(phase, formation=formation), z, z_s)
+    part = curves[2].segments[0]
+    own = reduced_inertia(
+        formation, formation.evaluate(z[:1], z_s[:1]), Directions(part.Xi, part.sigma)
+    )
+    assert ratios[0] == pytest.approx(own[0], rel=1e-9)
