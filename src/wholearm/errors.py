@@ -43,6 +43,9 @@ class InputError(WholearmError):
         text = ": ".join(part for part in (source, key, problem) if part)
         super().__init__(_to_line(text))
 
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
+        return type(self), (self.source, self.key, self.problem)
+
 
 def _to_line(text: str) -> str:
     """One line without control characters, its middle left out where it is very long."""
@@ -60,9 +63,6 @@ def name_source(source: str) -> Iterator[None]:
         if error.source or not source:
             raise
         raise InputError(source, error.key, error.problem) from None
-
-    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
-        return type(self), (self.source, self.key, self.problem)
 
 
 class InfeasibleError(WholearmError):

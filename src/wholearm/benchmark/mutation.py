@@ -21,6 +21,7 @@ BASE: dict[str, Any] = {
     "name": "square",
     "epsilon": 0.05,
     "gravity": 9.81,
+    "fingers_collide": True,
     "object": {
         "vertices": [[-0.035, -0.035], [0.035, -0.035], [0.035, 0.035], [-0.035, 0.035]],
         "mass": 0.2,
@@ -28,7 +29,7 @@ BASE: dict[str, Any] = {
     "fingers": {
         key: {
             "base": [side * 0.08, -0.01],
-            "length": 0.18,
+            "length": 0.11,
             "radius": 0.005,
             "inertia": 0.005,
             "viscous": 0.01,
@@ -77,6 +78,8 @@ METAS = (
 )  # fmt: skip
 """What takes the place of a trajectory's `meta`."""
 
+_DEFLATED = (zipfile.ZIP_DEFLATED,)
+
 
 class Mutant(NamedTuple):
     """A file with something wrong in it.
@@ -114,11 +117,14 @@ def base_files() -> tuple[bytes, bytes, bytes]:
         npz, table = os.path.join(folder, "a.npz"), os.path.join(folder, "a.csv")
         plan.save(npz)
         plan.save_torques(table)
-        with open(npz, "rb") as stream:
-            trajectory = stream.read()
+        with np.load(npz) as data:
+            arrays = {name: data[name] for name in data.files}
         with open(table, "rb") as stream:
             torques = stream.read()
-    return to_toml(BASE).encode(), torques, trajectory
+    # Timings and dates would make every run's files different.
+    meta = json.loads(str(arrays["meta"]))
+    arrays["meta"] = np.array(json.dumps({**meta, "timings": {}}))
+    return to_toml(BASE).encode(), torques, _pack(arrays)
 
 
 def draw_mutant(seed: int, number: int) -> Mutant:
@@ -350,9 +356,10 @@ def _pack(arrays: dict[str, Any], raw: dict[str, bytes] | None = None, add: bool
                 continue
             member = io.BytesIO()
             np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=True)
-            archive.writestr(f"{name}.npy", member.getvalue())
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), member.getvalue(), *_DEFLATED)
         for name, content in (raw or {}).items():
-            archive.writestr(name if name.endswith("/") else f"{name}.npy", content)
+            full = name if name.endswith("/") else f"{name}.npy"
+            archive.writestr(zipfile.ZipInfo(full), content, *_DEFLATED)
     return stream.getvalue()
 
 
