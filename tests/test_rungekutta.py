@@ -49,7 +49,7 @@ def test_error_estimate_bounds_the_error() -> None:
     y, t, h = ca.SX.sym("y", 1), ca.SX.sym("t"), ca.SX.sym("h")
     end, fifth, third = rungekutta.build_step(lambda s, _: -s, y, t, h)
     tolerance = 1e-6
-    error = rungekutta.build_error(fifth, third, y, tolerance)
+    error = rungekutta.build_error(fifth, third, y, 1.0, tolerance)
     step = ca.Function("step", [y, t, h], [end, error])
     for length in (0.2, 0.5, 1.0):
         state, estimate = (float(value) for value in step(1.0, 0.0, length))

@@ -335,7 +335,7 @@ def test_a_planned_stop_and_start_are_kept_though_rounding_disturbs_them(
     exact = push.fit()
     inner = np.where((exact.breaks > 0) & (exact.breaks < 0.5), off, 0.0)
     torque = TorqueProfile(exact.breaks + inner, exact.coefficients * (1 + off))
-    simulation = simulate(push.problem, torque)
+    simulation = simulate(push.problem, torque, tolerance=1e-10)
     palm = [e for e in simulation.events if e.contact == "v0-palm" and e.time < 0.4]
     # Where the acceleration vanishes, too, a speed of 1e-12 decides when it sticks.
     near = 1e-4 if soft else 1e-6

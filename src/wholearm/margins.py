@@ -13,10 +13,11 @@ from .model import Array, Scene
 from .problem import Phase, Problem
 from .report import ContactMargin, FingerGap, SlipMargin
 from .simulation.events import EventKind, Simulation
-from .simulation.jumps import SETTLING
+from .simulation.tolerances import SETTLING
 
 SHORTEST = 2 * SETTLING
-"""Interval below which forces may jump, and rounding spoils a parabola [s]."""
+"""Interval below which forces may jump, and rounding spoils a parabola, relative to the scene's
+time."""
 
 
 def list_contact_margins(
@@ -24,10 +25,10 @@ def list_contact_margins(
 ) -> tuple[ContactMargin, ...]:
     """Least normal forces in a phase, which the simulation has at `rows`."""
     lost = {e.contact: e for e in simulation.find(EventKind.CONTACT_LOST) if e.phase == phase.index}
-    contacts = []
+    shortest, contacts = SHORTEST * problem.scene.scales.time, []
     for name in phase.formation.names:
         column = simulation.contacts.index(name)
-        least, time = find_least(simulation.t[rows], simulation.c_n[rows, column], breaks)
+        least, time = find_least(simulation.t[rows], simulation.c_n[rows, column], breaks, shortest)
         if name in lost and not least <= lost[name].value:
             least, time = lost[name].value, lost[name].time
         contacts.append(ContactMargin(name, least, time, least - problem.epsilon))
@@ -42,12 +43,12 @@ def list_slip_margins(
     columns = [simulation.contacts.index(name) for name in formation.names]
     c_n, c_t = simulation.c_n[rows][:, columns], simulation.c_t[rows][:, columns]
     slipped = {e.contact: e for e in simulation.find(EventKind.SLIP) if e.phase == phase.index}
-    margins = []
+    shortest, margins = SHORTEST * formation.scene.scales.time, []
     for row, values in zip(
         formation.rolling_rows, slip_margins(formation, c_n, c_t).T, strict=True
     ):
         name = formation.names[row]
-        least, time = find_least(simulation.t[rows], values, breaks)
+        least, time = find_least(simulation.t[rows], values, breaks, shortest)
         if name in slipped and not least <= slipped[name].value:
             least, time = slipped[name].value, slipped[name].time
         margins.append(SlipMargin(name, least, time))
@@ -58,10 +59,13 @@ def find_finger_gap(scene: Scene, simulation: Simulation, breaks: Array) -> Fing
     """Least gap between the links in a replay; None if they pass each other."""
     if not scene.fingers_collide:
         return None
-    return FingerGap(*find_least(simulation.t, evaluate_finger_gap(scene, simulation.z), breaks))
+    gaps, shortest = evaluate_finger_gap(scene, simulation.z), SHORTEST * scene.scales.time
+    return FingerGap(*find_least(simulation.t, gaps, breaks, shortest))
 
 
-def find_least(t: Array, values: Array, breaks: Array) -> tuple[float, float]:
+def find_least(
+    t: Array, values: Array, breaks: Array, shortest: float = 0.0
+) -> tuple[float, float]:
     """Least value of a sampled function and where, refined by parabolas inside smooth stretches.
 
     Parameters
@@ -72,6 +76,8 @@ def find_least(t: Array, values: Array, breaks: Array) -> tuple[float, float]:
         NaN where unknown.
     breaks : ndarray, [s]
         Where the function may have a kink: no parabola has one inside.
+    shortest : float, [s]
+        Interval below which the function may jump.
 
     Returns
     -------
@@ -83,7 +89,7 @@ def find_least(t: Array, values: Array, breaks: Array) -> tuple[float, float]:
     first = int(np.nanargmin(values))
     least, time = float(values[first]), float(t[first])
     left, right = np.diff(t)[:-1], np.diff(t)[1:]
-    smooth = (left > SHORTEST) & (right > SHORTEST) & ~_is_among(t[1:-1], breaks)
+    smooth = (left > shortest) & (right > shortest) & ~_is_among(t[1:-1], breaks)
     smooth &= ~np.isnan(values[:-2] + values[1:-1] + values[2:])
     left, right = left[smooth], right[smooth]
     middle = values[1:-1][smooth]

@@ -176,6 +176,7 @@ def describe_thin(
         for n in e.contact.split(", ")
     }
     lost = {(e.phase + 1, e.contact) for e in simulation.find(EventKind.CONTACT_LOST)}
+    shortest = SHORTEST * problem.scene.scales.time
     allowed = ROUNDING * problem.scene.scales.force + allowance.stray * problem.epsilon
     return [
         Failure(
@@ -187,5 +188,5 @@ def describe_thin(
         for c in phase.contacts
         if c.margin < -allowed
         and (phase.number, c.contact) not in lost
-        and abs(c.time - let_go.get((phase.number, c.contact), math.inf)) > SHORTEST
+        and abs(c.time - let_go.get((phase.number, c.contact), math.inf)) > shortest
     ]

@@ -32,16 +32,12 @@ from ..errors import JammingError
 from ..formation import Formation
 from ..model import Array, Scene
 from .events import EventKind
-from .modes import Mode, Response, Rows, Unit, find_grips, list_units, respond
+from .modes import Mode, Response, Rows, Unit, find_fixed, find_grips, list_units, respond
 from .replay import Replay
+from .tolerances import STANDING, is_slower
 
-STANDING = 1e-9
-"""Speed that counts as none, relative to the scene's: the integration's error may give it either
-sign."""
 CLEAR = 1e-8
 """Least margin of a clear decision, relative to the scene's forces, torques or accelerations."""
-AHEAD = 2e-5
-"""How much later a decision is judged, relative to the scene's time."""
 TRIES = 50
 """How often in a row decisions may be made without any time passing."""
 
@@ -53,8 +49,8 @@ class Choice(NamedTuple):
     ----------
     signs : ndarray, shape (n_c + 2,)
         Directions of contacts and joints, zero for what is held or rolls.
-    moves : ndarray of bool, shape (n_c + 2,)
-        Whether each starts to move.
+    fixed : ndarray of bool, shape (n_c + 2,)
+        Whether each is held, or cannot move for what else is held.
     margin : float
         Least of the relative accelerations along the directions and reserves of friction.
     pressing : float
@@ -62,7 +58,7 @@ class Choice(NamedTuple):
     """
 
     signs: Array
-    moves: NDArray[np.bool_]
+    fixed: NDArray[np.bool_]
     margin: float
     pressing: float
 
@@ -98,7 +94,7 @@ def choose_mode(
     ]
     if not still:
         return False
-    if is_standing(scene, run.y[5:10]):
+    if is_slower(scene, run.y[5:10], STANDING):
         return True
     run.count_decision(TRIES)
     orders = [_list_options(run, unit, float(signs[unit.rows[0]]), turned) for unit in still]
@@ -107,7 +103,7 @@ def choose_mode(
     for unit in still:
         row = unit.rows[0]
         before = 0.0 if row in run.stuck else float(signs[row])
-        after = float(choice.signs[row]) if choice.moves[row] else 0.0
+        after = float(choice.signs[row]) if not choice.fixed[row] else 0.0
         changes = before != after and not (enters and after) and unit.grips
         for row in unit.rows if changes else ():
             note_change(run, row, before, after, run.t if time is None else time)
@@ -119,13 +115,6 @@ def measure_rates(scene: Scene, count: int) -> Array:
     """The scene's speed for `count` contacts, then that of joints, shape (count + 2,)."""
     scales = scene.scales
     return np.repeat([scales.speed, 1 / scales.time], [count, 2])
-
-
-def is_standing(scene: Scene, v: Array) -> bool:
-    """Whether the velocity z', shape (5,), is none but for rounding."""
-    scales = scene.scales
-    units = np.array([scales.speed, scales.speed, 1, 1, 1]) / np.array([1, 1, *[scales.time] * 3])
-    return bool((np.abs(v) < STANDING * units).all())
 
 
 def note_change(run: Replay, row: int, before: float, after: float, time: float) -> None:
@@ -152,11 +141,11 @@ def _list_options(
         first = -present if set(unit.rows) & set(turned) else present
         return (first, 0.0, -first) if unit.grips else (first, -first)
     s = run.stepper
-    cones = s.outputs[s.to.events][s.rows.cone].reshape(2, -1)
-    low, high = cones[:, s.mode.holders.index(unit.rows)]
+    holder = s.mode.holders.index(unit.rows)
+    low, high = s.outputs[s.to.events][s.rows.cone].reshape(2, -1)[:, holder]
     way = 1.0 if high < low else -1.0
     # Friction is at the edge of its cone and opposes the slip to come.
-    edge = min(low, high) < s.slack[s.rows.cone.start]
+    edge = min(low, high) < s.slack[s.rows.cone.start + holder]
     return (way, -way, 0.0) if edge else (0.0, way, -way)
 
 
@@ -204,7 +193,7 @@ class _Judge:
     def __init__(self, run: Replay, still: Sequence[Unit]) -> None:
         self.formation, self.still = run.phase.formation, still
         self.scene = run.problem.scene
-        self.h = AHEAD * self.scene.scales.time
+        self.h = run.tolerances.settling
         self.z, self.v = run.y[:5].copy(), run.y[5:10].copy()
         self.load, self.later = (np.array([1.0, *run.torque(t)]) for t in (run.t, run.t + self.h))
         self.rows = evaluate_rows(self.formation, self.z, self.v)
@@ -238,7 +227,7 @@ class _Judge:
         scales, count = self.scene.scales, self.formation.n_contacts
         gained = (now.rates @ self.load + then.rates @ self.later) / 2
         gained = signs * gained / (measure_rates(self.scene, count) / scales.time)
-        moves = np.abs(gained) > CLEAR
+        fixed = find_fixed(mode, self.rows.A, self.rows.A_t)
         holds = then.holds @ self.later
         cones = holds[count:].reshape(2, -1).min(axis=0)
         margins = [np.inf]
@@ -247,9 +236,9 @@ class _Judge:
             if signs[row] == 0:
                 force = scales.force if row < count else scales.torque
                 margins.append(cones[mode.holders.index(unit.rows)] / force)
-            elif moves[row]:
+            elif abs(gained[row]) > CLEAR:
                 margins.append(gained[row])
-        return Choice(signs, moves, float(min(margins)), float(holds[:count].min() / scales.force))
+        return Choice(signs, fixed, float(min(margins)), float(holds[:count].min() / scales.force))
 
 
 def evaluate_rows(formation: Formation, z: Array, v: Array) -> Rows:
@@ -278,6 +267,7 @@ def _take(run: Replay, signs: Array, still: Sequence[Unit]) -> None:
     root = np.sqrt(formation.scene.mass_diagonal)
     before = run.stored
     rows = np.vstack([kinematics.P[0], gradients[wrong]]) / root
+    rows /= np.linalg.norm(rows, axis=1)[:, None]
     run.y[5:10] -= np.linalg.lstsq(rows, rows @ (root * v))[0] / root
     run.impact += before - run.stored
     grips = find_grips(formation, signs)

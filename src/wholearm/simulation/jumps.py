@@ -12,17 +12,8 @@ from .choosing import choose_mode, note_change
 from .events import EventKind, Outcome
 from .locate import find_first
 from .replay import Replay
-from .stepper import SLACK_FORCE, Stepper
-
-REACHED = 1e-6
-"""Distance to the end of a phase that counts as there, when at rest [m or rad]."""
-SLOW = 1e-4
-"""Speed that counts as rest at the end of a phase [m/s or rad/s]."""
-SETTLING = 1e-6
-"""How long before a torque break a planned arrival may come by rounding [s]."""
-REST_WINDOW = 1e-4
-"""How long before a torque break a formation at rest is held, whatever the torques [s]: too short
-for its contacts to part by more than what counts as touching."""
+from .stepper import Stepper
+from .tolerances import REACHED, SLOW, is_slower
 
 
 @dataclass(frozen=True)
@@ -87,9 +78,9 @@ def look_again(
     s = run.stepper
     if not s.outputs[s.to.ratio] > 0:
         run.fail_to_step(float(s.outputs[s.to.ratio]))
-    forces = s.outputs[s.to.c_n]
-    if forces.min() < -SLACK_FORCE:
-        return let_go(run, np.flatnonzero(forces < -SLACK_FORCE).tolist())
+    pulling = np.flatnonzero(s.outputs[s.to.c_n] < -run.tolerances.force)
+    if len(pulling):
+        return let_go(run, pulling.tolist())
     return slip(run) if find_slipping(s) else None
 
 
@@ -167,7 +158,8 @@ def _measure_reserves(s: Stepper) -> list[float]:
 def find_slipping(s: Stepper) -> list[int]:
     """Which contacts that the phase lets roll are out of their cones."""
     reserves = _measure_reserves(s) if s.mode.holders else []
-    return [k for k, least in enumerate(reserves) if least < -SLACK_FORCE and s.mode.declares(k)]
+    slack = -s.slack[s.rows.cone.start]
+    return [k for k, least in enumerate(reserves) if least < slack and s.mode.declares(k)]
 
 
 def turn(run: Replay, events: Sequence[int]) -> Ending | None:
@@ -180,8 +172,8 @@ def turn(run: Replay, events: Sequence[int]) -> Ending | None:
     s.inputs[s.at.t] = now = run.t
     rows = [k - s.rows.slide.start for k in events if k in _turning(s)]
     if s.formation.n_constraints < 4 and _is_settled(run):
-        return Arrival(-float(s.outputs[s.to.until_rate]), REST_WINDOW)
-    stepped = steps_within(run, SETTLING)
+        return Arrival(-float(s.outputs[s.to.until_rate]), run.tolerances.rest_window)
+    stepped = steps_within(run, run.tolerances.settling)
     if stepped:
         coast_to_step(run, hide=True)
         run.drop()
@@ -219,6 +211,11 @@ def coast_to_step(run: Replay, hide: bool) -> None:
         run.stepper.inputs[run.stepper.at.t] = run.t
 
 
+def is_there(run: Replay) -> bool:
+    """Whether the distance to the end of the phase counts as none, at rest."""
+    return abs(run.value(run.stepper.rows.until)) < REACHED * run.until_unit
+
+
 def _is_settled(run: Replay) -> bool:
     """Whether everything has all but stopped at the end of the phase, just before a torque break.
 
@@ -226,9 +223,9 @@ def _is_settled(run: Replay) -> bool:
     """
     return (
         run.phase.end is End.REST
-        and abs(run.value(run.stepper.rows.until)) < REACHED
-        and bool(np.abs(run.y[5:10]).max() < SLOW)
-        and run.breaks[run.piece + 1] - run.t <= REST_WINDOW
+        and is_there(run)
+        and is_slower(run.problem.scene, run.y[5:10], SLOW)
+        and run.breaks[run.piece + 1] - run.t <= run.tolerances.rest_window
     )
 
 
@@ -240,7 +237,7 @@ def _bridge(run: Replay) -> bool:
     forces are not recorded. Returns whether all motion has ended.
     """
     s = run.stepper
-    if steps_within(run, SETTLING):
+    if steps_within(run, run.tolerances.settling):
         run.drop()
         coast_to_step(run, hide=True)
         run.drop()
@@ -248,7 +245,7 @@ def _bridge(run: Replay) -> bool:
         rows: list[int] = []
     else:
         start = s.outputs.copy()
-        stretch = min(SETTLING, run.breaks[run.piece + 1] - run.t)
+        stretch = min(run.tolerances.settling, run.breaks[run.piece + 1] - run.t)
         run.step_to(stretch)
         events = find_first(run, start, stretch, _turning(s))
         if not events:

@@ -16,7 +16,7 @@ class Inputs(NamedTuple):
     y : slice
         State, shape (STATE,).
     t, h, tolerance : int
-        Time and step [s]; largest error of z and z' over the step [m, rad, m/s, rad/s].
+        Time and step [s]; largest error of z and z' over the step, in units of the scene.
     Xi, sigma : slice
         Directions of sliding and of the joints, zero for what is held.
     kept : slice
@@ -65,7 +65,7 @@ class Outputs(NamedTuple):
     worst : int
         Least of the event values plus their slacks: below zero something has happened.
     dip : int
-        Least c_n and margin to slipping at the stages within the step [N].
+        Least c_n and reserve of friction at the stages within the step, in units of the scene.
     until_rate : int
         Time derivative of the distance to the phase's end.
     events : slice

@@ -44,7 +44,8 @@ def find_first(run: Replay, start: Array, h: float, among: range | None = None) 
             run.step_to(step)
             return float(s.outputs[place]) + offset
 
-        h = _find_root(value, h, float(before[k]), float(after[k]))
+        near = 1e-2 * run.tolerances.shortest_step
+        h = _find_root(value, h, float(before[k]), float(after[k]), near)
         done.append(k)
         if h != s.inputs[s.at.h]:
             run.step_to(h)
@@ -58,9 +59,9 @@ def find_first(run: Replay, start: Array, h: float, among: range | None = None) 
 
 
 def _find_root(
-    function: Callable[[float], float], high: float, f_low: float, f_high: float
+    function: Callable[[float], float], high: float, f_low: float, f_high: float, near: float
 ) -> float:
-    """Root in [0, high] of a function that falls from f_low >= 0 to f_high < 0, to rounding.
+    """Root in [0, high] of a function that falls from f_low >= 0 to f_high < 0, to `near`.
 
     The Illinois variant of regula falsi, which converges fast on the smooth functions here.
     """
@@ -78,7 +79,7 @@ def _find_root(
             low, f_low = high, f_high
         else:
             f_low /= 2
-        close = abs(middle - high) <= 1e-16
+        close = abs(middle - high) <= near
         high, f_high = middle, f_middle
         if close:
             break

@@ -15,11 +15,12 @@ A contact that lies flush with one which its phase lets roll has no friction of 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from ..contact import Expression
 from ..dynamics import build_force_rows
@@ -28,6 +29,10 @@ from ..model import Array
 
 INDEPENDENT = 1e-9
 """Least singular value of constraints, each of length one, for forces to be determined."""
+
+
+FIXED = 1e-7
+"""Share of a contact's or joint's freedom that constraints leave, below which they leave none."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,7 @@ class Unit(NamedTuple):
     grips: bool
 
 
+@lru_cache(maxsize=64)
 def list_units(formation: Formation) -> tuple[Unit, ...]:
     """Everything that may slide or turn, contacts first; no contacts flush with a rolling one."""
     friction = np.concatenate([formation.friction, formation.scene.dry[3:]])
@@ -143,6 +149,13 @@ class Mode:
         normal, tangential = unit[:count], unit[count:]
         H = np.vstack([normal, edge - tangential, edge + tangential])
         return H, np.concatenate([np.zeros(count), most, most])
+
+    @cached_property
+    def hold_units(self) -> Array:
+        """The scene's units of H c + h, shape (n_c + 2 K,) [N, N m]."""
+        scales, count = self.formation.scene.scales, self.formation.n_contacts
+        held = [scales.force if rows[0] < count else scales.torque for rows in self.holders]
+        return np.array([scales.force] * count + held + held)
 
     def build_constraints(self, z: Expression, v: Expression) -> tuple[Expression, ...]:
         """Expressions as of `Formation.build_constraints`, with the angles of held joints."""
@@ -233,7 +246,7 @@ def respond(mode: Mode, signs: Array, rows: Rows, v: Array) -> Response | None:
     P = np.vstack([rows.A, rows.A_t[rolling], np.eye(5)[joints]])
     bend = np.concatenate([rows.A_dot_v, rows.A_t_dot_v[rolling], np.zeros(len(joints))])
     inverse_mass = 1 / scene.mass_diagonal
-    if not _are_independent(P * np.sqrt(inverse_mass)):
+    if mode.grips and not _are_independent(P * np.sqrt(inverse_mass)):
         return None
     slip = mode.rolled.sliding_friction * signs[:count]
     G = np.vstack([rows.A - slip[:, None] * rows.A_t, P[count:]])
@@ -255,6 +268,24 @@ def respond(mode: Mode, signs: Array, rows: Rows, v: Array) -> Response | None:
     holds = H @ c
     holds[:, 0] += h
     return Response(acceleration, rates, holds, ratio)
+
+
+def find_fixed(mode: Mode, A: Array, A_t: Array) -> NDArray[np.bool_]:
+    """Which contacts, then joints, the constraints of a mode let not slide or turn, (n_c + 2,).
+
+    Parameters
+    ----------
+    A, A_t : ndarray, shape (n_c, 5)
+    """
+    joints = np.eye(5)[3:]
+    root = np.sqrt(mode.formation.scene.mass_diagonal)
+    held = [A, A_t[list(mode.rolled.rolling_rows)], joints[list(mode.grips.joints)]]
+    free = np.vstack([A_t, joints]) / root
+    length = np.linalg.norm(free, axis=1)
+    P = np.vstack(held) / root
+    basis = np.linalg.svd(P / np.linalg.norm(P, axis=1)[:, None], full_matrices=False)[2]
+    rest = free - (free @ basis.T) @ basis
+    return np.asarray(np.linalg.norm(rest, axis=1) < FIXED * length)
 
 
 def _are_independent(rows: Array) -> bool:

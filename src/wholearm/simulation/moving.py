@@ -10,15 +10,12 @@ from ..model import Array
 from ..problem import End
 from .events import EventKind, Outcome, OutcomeKind
 from .jumps import (
-    REACHED,
-    REST_WINDOW,
-    SETTLING,
-    SLOW,
     Arrival,
     Ending,
     Rested,
     coast_to_step,
     find_slipping,
+    is_there,
     let_go,
     let_slip,
     look_again,
@@ -26,25 +23,20 @@ from .jumps import (
     turn,
 )
 from .locate import find_first
-from .replay import FIRST_STEP, Replay
+from .replay import Replay
 from .rungekutta import ORDER
-from .stepper import SLACK_FORCE
-
-LONGEST_WINDOW = 1e-3
-"""How long before a torque break an arrival at a speed may come and still belong to it [s]."""
-SHORTEST_STEP = 1e-14
-"""Step below which the integration gives up, relative to the time [s]."""
+from .tolerances import REACHED, SHORTEST_STEP, SLOW, measure_units
 
 
 def move(run: Replay) -> Ending:
     """Integrate until the motion rests, arrives, releases its contacts or fails."""
     start = run.stepper.outputs.copy()
-    run.h = min(run.h, FIRST_STEP)
+    run.h = min(run.h, run.tolerances.first_step)
     while True:
         outputs, to = run.stepper.outputs, run.stepper.to
         target = min(run.breaks[run.piece + 1], run.wanted[run.next_wanted])
         h, whole = _try_step(run, target)
-        if outputs[to.worst] < 0 and not (whole and _is_there(run, target)):
+        if outputs[to.worst] < 0 and not (whole and _is_at_end(run, target)):
             ending = _stop_at_event(run, start, h)
             if ending is not None:
                 return ending
@@ -73,7 +65,8 @@ def _try_step(run: Replay, target: float) -> tuple[float, bool]:
         inputs[at.t], inputs[at.h] = run.t, h
         s.step()
         error = outputs[to.error]
-        sudden = outputs[to.dip] < -1e-6 and outputs[to.worst] >= 0 and h > 1e-7
+        brief = h <= run.tolerances.settling / 10
+        sudden = outputs[to.dip] < -1e-6 and outputs[to.worst] >= 0 and not brief
         if error <= 1 and not sudden:
             grown = h * (5.0 if error < 1e-6 else min(5.0, 0.9 * error ** (-1 / ORDER)))
             run.h = grown if h == run.h else max(run.h, grown)
@@ -82,11 +75,11 @@ def _try_step(run: Replay, target: float) -> tuple[float, bool]:
         run.rejected += 1
         factor = 0.9 * error ** (-1 / ORDER) if error > 1 else 0.2
         run.h = h * (0.5 if error <= 1 else max(0.2, factor))
-        if run.h < SHORTEST_STEP * max(1.0, abs(run.t)):
+        if run.h < max(run.tolerances.shortest_step, SHORTEST_STEP * abs(run.t)):
             run.fail_to_step(float(outputs[to.ratio]))
 
 
-def _is_there(run: Replay, t: float) -> bool:
+def _is_at_end(run: Replay, t: float) -> bool:
     """Whether the step just tried ends at the end of the phase, and at a torque break.
 
     By rounding a planned motion ends a little beyond the end of its phase, or has just turned back.
@@ -94,28 +87,30 @@ def _is_there(run: Replay, t: float) -> bool:
     and an impact comes at any, with the step of the torques that goes with it, or as they end.
     """
     s = run.stepper
-    if t != run.breaks[run.piece + 1] or abs(run.value(s.rows.until)) >= REACHED:
+    if t != run.breaks[run.piece + 1] or not is_there(run):
         return False
-    speed = abs(float(s.outputs[s.to.until_rate]))
+    speed = abs(_measure_rate(run))
     if run.phase.end is End.SMOOTH:
         speed = speed if run.phase.until.contact else 0.0
     elif run.phase.end is End.IMPACT:
         coming = run.piece + 1
         speed = 0.0 if coming >= len(run.steps_at) or run.steps_at[coming] else speed
     elif s.formation.n_constraints < 4:
-        speed = float(np.abs(s.outputs[s.to.y][5:10]).max())
+        units = measure_units(run.problem.scene)[5:]
+        speed = float(np.abs(s.outputs[s.to.y][5:10] / units).max())
     pressing = s.outputs[s.to.events][s.rows.force]
-    return speed < SLOW and bool(pressing.min() >= -SLACK_FORCE) and not find_slipping(s)
+    return speed < SLOW and bool(pressing.min() >= -run.tolerances.force) and not find_slipping(s)
 
 
 def _pass_break(run: Replay) -> Ending | None:
     """Go on to the next piece of the torques."""
     s = run.stepper
-    if _is_there(run, run.t):
+    if _is_at_end(run, run.t):
         rate, strikes = -float(s.outputs[s.to.until_rate]), _strikes(run)
         # Before a step that is still to come, the torques are those of the phase that ends.
         stepped = run.next_piece()
-        return Arrival(rate, SETTLING if stepped else REST_WINDOW, strikes)
+        window = run.tolerances.settling if stepped else run.tolerances.rest_window
+        return Arrival(rate, window, strikes)
     if run.t >= run.breaks[-1]:
         return run.run_out()
     if not run.next_piece():
@@ -133,7 +128,7 @@ def _stop_at_event(run: Replay, start: Array, h: float) -> Ending | None:
     if rows.until in kinds:
         return _pass_on(run) if run.phase.end is End.SMOOTH or _strikes(run) else _reach(run)
     if rows.speed in kinds:
-        if abs(run.value(rows.until)) >= REACHED:
+        if not is_there(run):
             run.note(EventKind.REST, f"the object comes to rest {run.when()}")
         return Rested()
     pulling = [k for k in kinds if k < rows.force.stop]
@@ -155,10 +150,16 @@ def _reach(run: Replay) -> Arrival:
     rate = -float(s.outputs[s.to.until_rate])
     # A planned motion that comes this early by its error would have stopped v / a later.
     stopping = 2 * _time_to_stop(run)
-    window = min(stopping, LONGEST_WINDOW) if stopping < math.inf else 0.0
-    if abs(rate) < SLOW:
-        window = max(window, SETTLING)
+    window = min(stopping, run.tolerances.longest_window) if stopping < math.inf else 0.0
+    if abs(_measure_rate(run)) < SLOW:
+        window = max(window, run.tolerances.settling)
     return Arrival(rate, window)
+
+
+def _measure_rate(run: Replay) -> float:
+    """Time derivative of the distance to the end of the phase, in units of the scene."""
+    s = run.stepper
+    return float(s.outputs[s.to.until_rate]) / run.until_unit * run.problem.scene.scales.time
 
 
 def _time_to_stop(run: Replay) -> float:
@@ -175,8 +176,8 @@ def _strikes(run: Replay) -> bool:
 
     Where impulses do not allow an impact a planned motion stops instead.
     """
-    rate = -float(run.stepper.outputs[run.stepper.to.until_rate])
-    stops = rate < SLOW or rate * _time_to_stop(run) / 2 < REACHED
+    rate, time = -_measure_rate(run), _time_to_stop(run) / run.problem.scene.scales.time
+    stops = rate < SLOW or rate * time / 2 < REACHED
     return run.phase.end is End.IMPACT and not stops
 
 
@@ -188,13 +189,14 @@ def _pass_on(run: Replay) -> Arrival:
     """
     s = run.stepper
     s.inputs[s.at.t] = run.t
-    rate, window = -float(s.outputs[s.to.until_rate]), SETTLING
+    rate, settling = -float(s.outputs[s.to.until_rate]), run.tolerances.settling
+    window = settling
     strikes = run.phase.end is End.IMPACT
     if run.phase.until.contact is not None and not strikes:
-        run.step_to(SETTLING)
-        slowing = (float(s.outputs[s.to.until_rate]) + rate) / SETTLING
+        run.step_to(settling)
+        slowing = (float(s.outputs[s.to.until_rate]) + rate) / settling
         if slowing > 0:
-            window = min(max(2 * rate / slowing, SETTLING), LONGEST_WINDOW)
+            window = min(max(2 * rate / slowing, settling), run.tolerances.longest_window)
     if steps_within(run, window):
         coast_to_step(run, hide=False)
     return Arrival(rate, window, strikes)

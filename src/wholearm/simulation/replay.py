@@ -15,11 +15,7 @@ from .events import Event, EventKind, Outcome, OutcomeKind, Section
 from .layout import STATE
 from .modes import FREE, Grips
 from .stepper import Stepper, build_stepper
-
-FIRST_STEP = 1e-3
-"""Length of the first step tried from rest [s]."""
-STEP_OF_TORQUE = 1e-9
-"""Jump of the torques at a break that counts as one [N m]."""
+from .tolerances import find_tolerances
 
 
 class Replay:
@@ -43,6 +39,10 @@ class Replay:
         The contacts whose release ends the phase.
     side : float
         Sign of (coordinate - value) before the end of the phase, if that is a coordinate's value.
+    tolerances : Tolerances
+        Those of the scene.
+    until_unit : float, [m or rad]
+        Unit of the distance to the end of the phase.
     moving : bool
         Whether the motion goes on into the phase that is entered.
     stuck : set of int
@@ -62,9 +62,11 @@ class Replay:
         wanted: Array,
     ) -> None:
         self.problem, self.tolerance = problem, tolerance
+        self.tolerances = find_tolerances(problem.scene)
+        self.until_unit = 1.0
         self.breaks = [float(b) for b in torque.breaks]
         self.coefficients = torque.coefficients
-        self.steps_at = _find_steps(torque)
+        self.steps_at = _find_steps(torque, self.tolerances.torque_step)
         self.step_times = [b for b, s in zip(self.breaks, self.steps_at, strict=False) if s]
         inside = wanted[(wanted >= self.breaks[0]) & (wanted <= self.breaks[-1])]
         self.wanted = [*inside.tolist(), math.inf]
@@ -72,7 +74,7 @@ class Replay:
         self.t, self.piece = self.breaks[0], 0
         self.y = np.zeros(STATE)
         self.y[:5] = problem.start
-        self.h = FIRST_STEP
+        self.h = self.tolerances.first_step
         self.hold = -math.inf
         self.impact = 0.0
         self.moving = False
@@ -173,7 +175,7 @@ class Replay:
 
     def lose(self, contact: str, c_n: float) -> Outcome:
         """End because `contact` would have to pull."""
-        how = "to zero" if c_n > -1e-6 else f"to {c_n:.3g} N"
+        how = "to zero" if c_n > -1e3 * self.tolerances.force else f"to {c_n:.3g} N"
         text = f"c_n of {contact} falls {how} {self.when()}"
         self.note(EventKind.CONTACT_LOST, text, contact, c_n)
         return Outcome(OutcomeKind.CONTACT_LOST, text)
@@ -182,7 +184,7 @@ class Replay:
         """End because a rolling contact slips: the `row`-th of the formation, with forces in N."""
         formation = self.phase.formation
         name, bound = formation.names[row], formation.friction[row] * c_n
-        how = "exceeds" if abs(c_t) - bound > 1e-6 else "reaches"
+        how = "exceeds" if abs(c_t) - bound > 1e3 * self.tolerances.force else "reaches"
         text = f"{name} slips: |c_t| = {abs(c_t):.5g} N {how} mu c_n = {bound:.5g} N {self.when()}"
         self.note(EventKind.SLIP, text, name, bound - abs(c_t))
         return Outcome(OutcomeKind.SLIPS, text)
@@ -257,8 +259,8 @@ class Replay:
         return float(0.5 * v**2 @ scene.mass_diagonal + height)
 
 
-def _find_steps(torque: TorqueProfile) -> Array:
-    """Whether the torques step at the start of each piece, shape (k,)."""
+def _find_steps(torque: TorqueProfile, least: float) -> Array:
+    """Whether the torques step by more than `least` at the start of each piece, shape (k,)."""
     alternate = (-1.0) ** np.arange(torque.coefficients.shape[2])
     jump = (torque.coefficients[1:] @ alternate) - torque.coefficients[:-1].sum(axis=2)
-    return np.append(True, np.abs(jump).max(axis=1) > STEP_OF_TORQUE)
+    return np.append(True, np.abs(jump).max(axis=1) > least)

@@ -119,12 +119,16 @@ def build_step(
 
 
 def build_error(
-    fifth: Expression, third: Expression, y: Expression, tolerance: Expression
+    fifth: Expression,
+    third: Expression,
+    y: Expression,
+    units: Expression,
+    tolerance: Expression,
 ) -> Expression:
-    """Size of a step's error over the tolerance, absolute below 1 and relative above.
+    """Size of a step's error over the tolerance, which counts in `units`, or in y above them.
 
     The combination of the two estimates is that of DOP853 and behaves like h^8.
     """
-    scale = tolerance * (1 + ca.fabs(y))
+    scale = tolerance * (units + ca.fabs(y))
     high, low = ca.sumsqr(fifth / scale), ca.sumsqr(third / scale)
     return high / ca.sqrt(y.shape[0] * ca.fmax(high + 0.01 * low, 1e-300))

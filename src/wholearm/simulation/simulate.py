@@ -27,7 +27,7 @@ from ..problem import End, Phase, Problem
 from ..sharing import exclusive
 from ..torque import TorqueProfile
 from .events import EventKind, Outcome, OutcomeKind, Simulation, collect
-from .jumps import REACHED, REST_WINDOW, Arrival, Ending, Released, Rested
+from .jumps import Arrival, Ending, Released, Rested, is_there
 from .moving import move
 from .replay import Replay
 from .starting import Departure
@@ -51,7 +51,8 @@ def simulate(
     problem : Problem
     torque : TorqueProfile
     tolerance : float
-        Largest error of each step, in z and z' [m, rad, m/s, rad/s].
+        Largest error of each step, in z and z', over those or over the scene's length, 1 rad, speed
+        and angular speed (`Scene.scales`) where these are more.
     times : array_like, shape (n,), optional, [s]
         Instants at which the state is wanted; steps end there. Those outside the torques' time
         are left out.
@@ -105,7 +106,7 @@ def _play(run: Replay, phase: Phase, following: Phase | None) -> Outcome | None:
             run.note(EventKind.START, f"the object starts to move {run.when()}")
             set_off(run, ending)
             ending = move(run)
-            brief = brief + 1 if run.t - started < 1e-12 else 0
+            brief = brief + 1 if run.t - started < 100 * run.tolerances.shortest_step else 0
             if brief > 20:
                 raise SimulationError(f"starting and stopping do not end {run.where()}")
         if isinstance(ending, Outcome):
@@ -151,8 +152,8 @@ def _rest(run: Replay) -> Departure | Arrival | Released | Outcome:
     y[5:10] = 0.0
     run.impact += before - run.stored
     run.record(still=True)
-    if abs(run.value(run.stepper.rows.until)) < REACHED:
-        return Arrival(0.0, REST_WINDOW)
+    if is_there(run):
+        return Arrival(0.0, run.tolerances.rest_window)
     rest = find_rest(run.phase.formation, y[:5])
     sticks = False
     while True:
@@ -177,7 +178,7 @@ def _rest(run: Replay) -> Departure | Arrival | Released | Outcome:
 
 def _settles(run: Replay, change: Collapse) -> bool:
     """Whether the torques step before a contact could part."""
-    return run.coming_step - run.time(change.x) <= REST_WINDOW
+    return run.coming_step - run.time(change.x) <= run.tolerances.rest_window
 
 
 def _advance(run: Replay, stop: float) -> None:

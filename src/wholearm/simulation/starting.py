@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +19,10 @@ from ..dynamics import Directions
 from ..formation import Formation, Kinematics
 from ..model import Array
 from .modes import Mode, Response, Rows, find_grips, list_units, respond
-from .stepper import SLACK_FORCE
+from .tolerances import ROUNDING_FORCE, find_tolerances, measure_units
 
-STILL = 1e-9
-"""Acceleration, in the metric M5 or of a contact or joint, that counts as rounding."""
-CLOSING = 1e-6
-"""Acceleration of a gap that counts as rounding [m/s^2]: its gradient is a difference quotient."""
-_STEP = 1e-5
-"""Step of the difference quotient [m, rad]."""
+_STEP = 3e-5
+"""Step of the difference quotient, in units of the scene."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +73,16 @@ class Way(Protocol):
         """Start this way at `x` of a piece, where the torques are `tau`."""
 
 
+class Slack(NamedTuple):
+    """What counts as rounding in the rows of a pattern of the same names."""
+
+    drive: float
+    slips: Array
+    grips: Array
+    holds: Array
+    openings: Array
+
+
 @dataclass(frozen=True, eq=False)
 class Pattern:
     """A choice of directions; quantities at rest are rows @ (1, tau_1, tau_2).
@@ -98,6 +104,7 @@ class Pattern:
     openings : ndarray, shape (k, 3), [m/s^2]
         Accelerations of the gaps of what touches but is not in the formation.
     ratio : float
+    slack : Slack
     """
 
     directions: Directions
@@ -108,17 +115,19 @@ class Pattern:
     grips: Array
     openings: Array
     ratio: float
+    slack: Slack
 
     @property
     def margins(self) -> list[tuple[Array, float]]:
         """Rows r and offsets d with r @ (1, tau_1, tau_2) + d >= 0 while it moves this way."""
         kinds = (
-            (self.slips, STILL),
-            (self.openings, CLOSING),
-            (self.holds, SLACK_FORCE),
-            (self.grips, SLACK_FORCE),
+            (self.slips, self.slack.slips),
+            (self.openings, self.slack.openings),
+            (self.holds, self.slack.holds),
+            (self.grips, self.slack.grips),
         )
-        return [(row, slack) for rows, slack in kinds for row in rows]
+        pairs = (pair for kind in kinds for pair in zip(*kind, strict=True))
+        return [(row, float(offset)) for row, offset in pairs]
 
     def drive(self, tau: Array) -> float:
         """How strongly it accelerates, in the metric M5."""
@@ -127,18 +136,18 @@ class Pattern:
 
     def slides(self, tau: Array) -> bool:
         """Whether contacts and joints accelerate in their directions and nothing closes."""
-        load = [1.0, *tau]
+        load, slack = [1.0, *tau], self.slack
         return (
             self.ratio > 0
-            and self.drive(tau) > STILL
-            and bool((self.slips @ load >= -STILL).all())
-            and bool((self.grips @ load >= -SLACK_FORCE).all())
-            and bool((self.openings @ load >= -CLOSING).all())
+            and self.drive(tau) > slack.drive
+            and bool((self.slips @ load >= -slack.slips).all())
+            and bool((self.grips @ load >= -slack.grips).all())
+            and bool((self.openings @ load >= -slack.openings).all())
         )
 
     def moves(self, tau: Array) -> bool:
         """Whether it slides this way and every contact presses."""
-        return bool((self.holds @ [1.0, *tau] >= -SLACK_FORCE).all()) and self.slides(tau)
+        return bool((self.holds @ [1.0, *tau] >= -self.slack.holds).all()) and self.slides(tau)
 
     def depart(self, x: float, tau: Array) -> Departure:
         """Start this way at `x` of a piece, where the torques are `tau`."""
@@ -163,9 +172,10 @@ def find_patterns(
     kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
     gradient = np.zeros((0, 5))
     if near.any():
-        steps = _STEP * np.concatenate([np.eye(5), -np.eye(5)])
+        ahead = _STEP * measure_units(formation.scene)[:5]
+        steps = np.concatenate([np.diag(ahead), -np.diag(ahead)])
         values = formation.evaluate_limits(z + steps)[:, near]
-        gradient = (values[:5] - values[5:]).T / (2 * _STEP)
+        gradient = (values[:5] - values[5:]).T / (2 * ahead)
     units = list_units(formation)
     choices = [(1.0, -1.0, 0.0) if held and unit.grips else (1.0, -1.0) for unit in units]
     patterns = []
@@ -197,7 +207,16 @@ def _build_pattern(
     if response is None:
         return None
     declared = np.array([mode.declares(k) for k in range(len(mode.holders))] * 2, dtype=bool)
-    cones = response.holds[count:]
+    cones, cone_units = response.holds[count:], mode.hold_units[count:]
+    tolerances = find_tolerances(formation.scene)
+    units = np.concatenate([mode.hold_units[:count], cone_units[declared]])
+    slack = Slack(
+        drive=tolerances.drive,
+        slips=np.repeat([tolerances.still, tolerances.still_joint], [count, 2]),
+        grips=ROUNDING_FORCE * cone_units[~declared],
+        holds=ROUNDING_FORCE * units,
+        openings=np.full(len(gradient), tolerances.closing),
+    )
     return Pattern(
         directions=Directions(signs[:count], signs[count:]),
         mass=formation.scene.mass_diagonal,
@@ -207,4 +226,5 @@ def _build_pattern(
         grips=cones[~declared],
         openings=gradient @ response.acceleration,
         ratio=response.ratio,
+        slack=slack,
     )

@@ -11,12 +11,12 @@ from ..formation import Formation
 from ..model import Array, Scene
 
 BALANCED = 1e-6
-"""Pull that counts as none: the accuracy of the linear programme [N]."""
+"""Pull that counts as none, relative to the scene's force: the accuracy of the linear programme."""
 
 
 def balances(scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array) -> bool:
     """Whether contact forces inside the friction cones balance gravity and torques at rest."""
-    return not find_pulls(scene, contacts, z, tau).max() > BALANCED
+    return not find_pulls(scene, contacts, z, tau).max() > BALANCED * scene.scales.force
 
 
 def find_pulls(scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array) -> Array:
@@ -39,11 +39,15 @@ def find_pulls(scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array
     """
     from scipy.optimize import linprog
 
-    touching = _formation(scene, contacts)
+    touching, scales = _formation(scene, contacts), scene.scales
+    # Forces count in the scene's force, torques in its torque.
+    units = np.array([1.0, 1.0, *[scales.length] * 3])
     kinematics = touching.evaluate(z[None], np.zeros((1, 5)))
     n_c = touching.n_contacts
-    normal, joints = kinematics.A[0].T, np.eye(5)[:, 3:]
-    balance = np.hstack([normal, kinematics.A_t[0].T, -joints, -normal])
+    normal, tangential = ((rows / units).T for rows in (kinematics.A[0], kinematics.A_t[0]))
+    joints = np.eye(5)[:, 3:]
+    balance = np.hstack([normal, tangential, -joints, -normal])
+    load = (scene.applied_force + joints @ tau) / (scales.force * units)
     cone, unit, none = -np.diag(touching.friction), np.eye(n_c), np.zeros((n_c, 2 + n_c))
     within = np.vstack([np.hstack([cone, sign * unit, none]) for sign in (1.0, -1.0)])
     free, pressing = [(None, None)] * n_c, [(0.0, None)] * n_c
@@ -52,11 +56,11 @@ def find_pulls(scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array
         A_ub=within,
         b_ub=np.zeros(2 * n_c),
         A_eq=balance,
-        b_eq=-(scene.applied_force + joints @ tau),
-        bounds=[*pressing, *free, *((-d, d) for d in scene.dry[3:]), *pressing],
+        b_eq=-load,
+        bounds=[*pressing, *free, *((-d, d) for d in scene.dry[3:] / scales.torque), *pressing],
         method="highs",
     )
-    return np.asarray(answer.x[-n_c:]) if answer.status == 0 else np.full(n_c, np.inf)
+    return scales.force * answer.x[-n_c:] if answer.status == 0 else np.full(n_c, np.inf)
 
 
 @lru_cache(maxsize=64)

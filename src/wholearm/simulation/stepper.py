@@ -20,16 +20,7 @@ from ..problem import Until
 from .layout import STATE, EventRows, Inputs, Outputs, lay_out
 from .modes import FREE, Grips, Mode
 from .rungekutta import build_error, build_step
-
-SLACK_FORCE = 1e-9
-"""How far below zero c_n counts as rounding [N]."""
-SLACK_LIMIT = 1e-9
-"""How far below zero a limit counts as rounding [m]: the contact just given up starts at zero."""
-SHORT = 1e-6
-"""How far below zero a limit may start [m]: a phase may end at rest this much short of the place
-where the next one's formation begins."""
-SLACK_SPEED = 1e-13
-"""How far below zero a speed counts as rounding [m/s, rad/s]."""
+from .tolerances import ROUNDING_FORCE, find_tolerances, measure_units
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +83,7 @@ def build_stepper(
         What friction holds meanwhile.
     """
     mode, functions, at, to, rows = _compile(formation, until, side, degree, grips)
-    slack = _slack(rows)
+    slack = _slack(mode, rows)
     inputs, results = np.zeros(at.size), np.zeros(to.size)
     buffers = [function.buffer() for function in functions]
     for buffer, _ in buffers:
@@ -102,11 +93,13 @@ def build_stepper(
     return Stepper(mode, inputs, results, at, to, rows, slack, step, look, buffers)
 
 
-def _slack(rows: EventRows) -> Array:
-    slack = np.full(rows.size, SLACK_SPEED)
-    slack[rows.force] = slack[rows.cone] = SLACK_FORCE
-    slack[rows.limit] = SHORT
-    slack[rows.until] = 0.0
+def _slack(mode: Mode, rows: EventRows) -> Array:
+    scene = mode.formation.scene
+    tolerances, slack = find_tolerances(scene), np.zeros(rows.size)
+    slack[: rows.cone.stop] = ROUNDING_FORCE * mode.hold_units
+    slack[rows.slide], slack[rows.joint] = tolerances.speed, tolerances.turning
+    slack[rows.limit] = tolerances.short
+    slack[rows.speed] = tolerances.speed * scene.scales.mass**0.5
     return slack
 
 
@@ -123,18 +116,19 @@ def _compile(
 
     def rate(state: Expression, t: Expression) -> Expression:
         rates, c, *_ = model.dynamics(state, t, packed)
-        forces.append(model.hold(c))
+        forces.append(model.hold(c) / mode.hold_units)
         return rates
 
     end, fifth, third = build_step(rate, y, packed[at.t], packed[at.h])
-    error = build_error(fifth[:10], third[:10], y[:10], packed[at.tolerance])
+    units = ca.DM(measure_units(formation.scene))
+    error = build_error(fifth[:10], third[:10], y[:10], units, packed[at.tolerance])
     dip = ca.mmin(ca.vertcat(*forces))
     end = _project(mode, end, packed[at.kept])
     limits = len(open_limits(formation, until))
     rows = EventRows(*lay_out(n_c, 2 * held, n_c, 2, limits, None, None))
     time = packed[at.t] + packed[at.h]
     at_end = ca.SX.sym("state", STATE), ca.SX.sym("time"), ca.SX.sym("error"), ca.SX.sym("dip")
-    outputs, to = model.outputs(*at_end, _slack(rows))
+    outputs, to = model.outputs(*at_end, _slack(mode, rows))
     report = ca.Function("report", [*at_end, packed], [outputs])
     results = report(end, time, error, dip, packed), report(y, packed[at.t], 0, 0, packed)
     functions = [

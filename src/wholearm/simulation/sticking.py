@@ -21,15 +21,17 @@ from ..cones import find_weakest
 from ..contact import Contact
 from ..dynamics import Directions
 from ..errors import SimulationError
-from ..formation import TOUCHING, Formation, Kinematics
+from ..formation import Formation, Kinematics
 from ..model import Array
 from .modes import Mode
-from .starting import STILL, Departure, Way, find_patterns, respond_at_rest
+from .starting import Departure, Way, find_patterns, respond_at_rest
 from .statics import balances, find_pulls
-from .stepper import SLACK_FORCE, SLACK_LIMIT
+from .tolerances import Tolerances, find_tolerances, measure_units
 
 _AHEAD = 1e-5
-"""How far ahead along the free direction signs and gaps are looked for [m, rad]."""
+"""How far ahead along the free direction signs and gaps are looked for, in units of the scene."""
+_CLOSED = 3e-15
+"""Gap that counts as rounding, relative to the scene's length."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +52,7 @@ class RestDirection:
         Reduced inertia over that without friction; jammed at zero and below.
     closes : bool
         Whether it would push features that touch already into one another.
+    tolerances : Tolerances
     """
 
     heading: Array
@@ -58,11 +61,14 @@ class RestDirection:
     holds: Array
     ratio: float
     closes: bool
+    tolerances: Tolerances
 
     @property
     def margins(self) -> list[tuple[Array, float]]:
         """Rows r and offsets d with r @ (1, tau_1, tau_2) + d >= 0 while it moves this way."""
-        return [(self.acceleration, -STILL), *((row, SLACK_FORCE) for row in self.holds)]
+        rounding = self.tolerances
+        holds = [(row, rounding.force) for row in self.holds]
+        return [(self.acceleration, -rounding.drive), *holds]
 
     def drive(self, tau: Array) -> float:
         """How strongly it accelerates this way, in the metric M5."""
@@ -70,11 +76,11 @@ class RestDirection:
 
     def slides(self, tau: Array) -> bool:
         """Whether it accelerates this way, if every contact can press or pull."""
-        return self.drive(tau) > STILL and not self.closes
+        return self.drive(tau) > self.tolerances.drive and not self.closes
 
     def moves(self, tau: Array) -> bool:
         """Whether the formation starts to move this way under torques `tau`, shape (2,)."""
-        keeps = float((self.holds @ [1.0, *tau]).min()) >= -SLACK_FORCE
+        keeps = float((self.holds @ [1.0, *tau]).min()) >= -self.tolerances.force
         return self.ratio > 0 and keeps and self.slides(tau)
 
     def depart(self, x: float, tau: Array) -> Departure:
@@ -230,24 +236,28 @@ def find_rest(formation: Formation, z: Array) -> Rest:
             "determined; it cannot start from rest"
         )
     if rank < 4:
-        near = np.abs(formation.evaluate_limits(z[None])[0]) < TOUCHING
+        near = np.abs(formation.evaluate_limits(z[None])[0]) < formation.scene.touching
         patterns = find_patterns(formation, z, near, held=False)
         return Rest(formation, z, patterns, formation.contacts + _gained(formation, near), near)
     heading = right[4] / root
-    step = _AHEAD / np.abs(heading).max()
+    scene = formation.scene
+    units = measure_units(scene)[:5]
+    step = _AHEAD / np.abs(heading / units).max()
     limits = formation.evaluate_limits(z + step * np.array([[0.0], [1.0], [-1.0]]) * heading)
-    near = np.abs(limits[0]) < TOUCHING
+    near = np.abs(limits[0]) < scene.touching
     # The curvature of the path cancels in the difference of both ways.
     rise = (limits[1, near] - limits[2, near]) / 2
-    closes = [bool((sign * rise < -SLACK_LIMIT).any()) for sign in (1.0, -1.0)]
+    closes = [bool((sign * rise < -find_tolerances(scene).limit).any()) for sign in (1.0, -1.0)]
     rates = np.concatenate([kinematics.A_t[0] @ heading, heading[3:]])
     rates[list(formation.rolling_rows)] = 0.0
-    still = np.abs(rates) < 1e-9
+    # How fast each slides or turns over how fast anything moves.
+    scale = _AHEAD / step * np.repeat([scene.scales.length, 1.0], [formation.n_contacts, 2])
+    still = np.abs(rates) < 1e-9 * scale
     signs = np.sign([rates, -rates])
     if still.any():
         # What is stationary here has the direction that it takes up just after.
         ahead = [_rates(formation, z, step, sign * heading) for sign in (1, -1)]
-        signs = np.where(still, np.where(np.abs(ahead) > 1e-12, np.sign(ahead), 0.0), signs)
+        signs = np.where(still, np.where(np.abs(ahead) > 1e-12 * scale, np.sign(ahead), 0.0), signs)
     ways = tuple(
         _build_way(formation, side * heading, Directions(s[:-2], s[-2:]), kinematics, close)
         for side, s, close in zip((1.0, -1.0), signs, closes, strict=True)
@@ -270,8 +280,9 @@ def _build_way(
 ) -> RestDirection:
     answer = respond_at_rest(Mode(formation), np.concatenate(directions), kinematics)
     assert answer is not None
+    tolerances = find_tolerances(formation.scene)
     drive = heading * formation.scene.mass_diagonal @ answer.acceleration
-    return RestDirection(heading, directions, drive, answer.holds, answer.ratio, closes)
+    return RestDirection(heading, directions, drive, answer.holds, answer.ratio, closes, tolerances)
 
 
 def _rates(formation: Formation, z: Array, step: float, heading: Array) -> Array:
@@ -305,6 +316,7 @@ def close_contacts(
         If a gap is larger, or the contacts cannot be closed from `z`.
     """
     inverse_mass = 1 / formation.scene.mass_diagonal
+    closed = _CLOSED * formation.scene.scales.length
     for _ in range(8):
         kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
         gaps, rows = kinematics.C[0], kinematics.A[0]
@@ -314,7 +326,7 @@ def close_contacts(
                 f"{formation.names[worst]}, with a gap of {gaps[worst]:.3g} m, does not touch"
             )
         slid = np.zeros(0) if slip is None else formation.evaluate_slip(z[None])[0] - slip
-        if np.abs(gaps[worst]) < 1e-16 and (np.abs(slid) < 1e-16).all():
+        if np.abs(gaps[worst]) < closed and (np.abs(slid) < closed).all():
             break
         rows = rows if slip is None else kinematics.P[0]
         lift = inverse_mass[:, None] * rows.T
@@ -322,7 +334,7 @@ def close_contacts(
             z = z - lift @ np.linalg.solve(rows @ lift, np.concatenate([gaps, slid]))
         except np.linalg.LinAlgError:
             raise SimulationError(f"{' '.join(formation.names)} depend on one another") from None
-    if not np.abs(gaps[worst]) < TOUCHING * 1e-3:
+    if not np.abs(gaps[worst]) < formation.scene.touching * 1e-3:
         raise SimulationError(
             f"{formation.names[worst]}, with a gap of {gaps[worst]:.3g} m, cannot be closed"
         )

@@ -12,14 +12,15 @@ from ..formation import Formation
 from ..impact import Obstacle, strike, transfer
 from ..model import Array
 from ..problem import End, Phase
-from .choosing import STANDING, is_standing, measure_rates
+from .choosing import measure_rates
 from .events import EventKind, Outcome, OutcomeKind
-from .jumps import REACHED, Ending, look_again
-from .modes import find_grips, list_units
+from .jumps import Ending, look_again
+from .modes import Mode, find_fixed, find_grips, list_units
 from .replay import Replay
 from .starting import Departure
 from .stepper import open_limits
 from .sticking import close_contacts
+from .tolerances import REACHED, STANDING, is_slower, measure_until
 
 _OUTCOMES = {
     Obstacle.PULL: OutcomeKind.CONTACT_LOST,
@@ -36,7 +37,7 @@ def enter(run: Replay, phase: Phase, following: Phase | None) -> None:
     run.y[:5] = _close(run, phase.formation)
     if run.moving:
         run.y[5:10] = project_velocity(phase.formation, run.y[:5], run.y[5:10])
-        run.moving = not is_standing(run.problem.scene, run.y[5:10])
+        run.moving = not is_slower(run.problem.scene, run.y[5:10], STANDING)
     if not run.moving:
         run.y[5:10] = 0.0
     run.impact += before - run.stored
@@ -44,6 +45,7 @@ def enter(run: Replay, phase: Phase, following: Phase | None) -> None:
     if until.value is not None:
         run.side = math.copysign(1.0, run.y[0 if until.coordinate == "x" else 2] - until.value)
     run.stuck = set()
+    run.until_unit = measure_until(run.problem.scene, until)
     run.take()
     run.limits = [limit.text for limit in open_limits(phase.formation, until)]
     run.releasable = find_releasable(phase, following)
@@ -52,7 +54,7 @@ def enter(run: Replay, phase: Phase, following: Phase | None) -> None:
 def _close(run: Replay, formation: Formation) -> Array:
     """The present configuration with every contact of a formation closed."""
     try:
-        return close_contacts(formation, run.y[:5], 10 * REACHED)
+        return close_contacts(formation, run.y[:5], 10 * REACHED * run.problem.scene.scales.length)
     except SimulationError as error:
         raise SimulationError(f"{error} {run.where()}") from None
 
@@ -94,18 +96,12 @@ def project_velocity(formation: Formation, z: Array, v: Array) -> Array:
 
 def set_off(run: Replay, departure: Departure) -> None:
     """Give the stepper the directions of a motion that starts from rest."""
-    formation, heading = run.phase.formation, departure.heading
+    formation = run.phase.formation
     grips = find_grips(formation, np.concatenate(departure.directions))
-    rates = np.concatenate(
-        [formation.evaluate(run.y[None, :5], run.y[None, :5]).A_t[0] @ heading, heading[3:]]
-    )
-    slow = STANDING * measure_rates(run.problem.scene, formation.n_contacts)
-    run.stuck = {
-        row
-        for unit in list_units(formation)
-        for row in unit.rows
-        if unit.grips and abs(rates[row]) < slow[row]
-    }
+    if formation.n_constraints < 4:
+        rows = formation.evaluate(run.y[None, :5], run.y[None, 5:10])
+        fixed = find_fixed(Mode(formation, grips), rows.A[0], rows.A_t[0])
+        run.stuck = {row for u in list_units(formation) for row in u.rows if u.grips and fixed[row]}
     if grips != run.stepper.mode.grips:
         run.take(grips)
     s = run.stepper

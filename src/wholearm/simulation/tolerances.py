@@ -1,0 +1,128 @@
+"""The simulator's tolerances, each relative to a scale of the scene (`Scene.scales`).
+
+Lengths are counted in the scene's length, angles in rad, forces and torques in its force and
+torque, and so on: the same motion told in other units is simulated with the same tolerances.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from ..model import Array, Scene
+from ..problem import Until
+
+ROUNDING_FORCE = 1e-9
+"""How far below zero a force, a torque or what friction has left counts as rounding."""
+ROUNDING_SPEED = 2e-13
+"""How far below zero a speed counts as rounding."""
+ROUNDING_LIMIT = 3e-8
+"""How far below zero a limit counts as rounding: the contact just given up starts at zero."""
+SHORT = 3e-5
+"""How far below zero a limit may start: a phase may end at rest this much short of the place where
+the next one's formation begins."""
+REACHED = 3e-5
+"""Distance to the end of a phase that counts as there, when at rest."""
+SLOW = 2e-4
+"""Speed that counts as rest at the end of a phase."""
+STANDING = 1e-9
+"""Speed that counts as none where friction decides: the integration's error may give it either
+sign."""
+SETTLING = 2e-5
+"""How long before a torque break a planned arrival or reversal may come by rounding."""
+REST_WINDOW = 2e-3
+"""How long before a torque break a formation at rest is held, whatever the torques: too short for
+its contacts to part by more than what counts as touching."""
+LONGEST_WINDOW = 2e-2
+"""How long before a torque break an arrival at a speed may come and still belong to it."""
+FIRST_STEP = 2e-2
+"""Length of the first step tried from rest."""
+SHORTEST_STEP = 1e-13
+"""Step below which the integration gives up, relative to the scene's time and the time gone by."""
+STEP_OF_TORQUE = 2e-8
+"""Jump of the torques at a break that counts as one."""
+STILL = 1e-10
+"""Acceleration that counts as rounding."""
+CLOSING = 1e-7
+"""Acceleration of a gap that counts as rounding: its gradient is a difference quotient."""
+
+
+class Tolerances(NamedTuple):
+    """Tolerances of a scene in SI units; see the constants of the same names.
+
+    Attributes
+    ----------
+    force, torque : float, [N], [N m]
+        Rounding.
+    speed, turning : float, [m/s], [rad/s]
+        Rounding.
+    limit, short : float, [m]
+    settling, rest_window, longest_window, first_step, shortest_step : float, [s]
+    torque_step : float, [N m]
+    drive : float, [kg^(1/2) m/s^2]
+        `STILL`, in the metric M5.
+    still, still_joint, closing : float, [m/s^2], [rad/s^2], [m/s^2]
+    """
+
+    force: float
+    torque: float
+    speed: float
+    turning: float
+    limit: float
+    short: float
+    settling: float
+    rest_window: float
+    longest_window: float
+    first_step: float
+    shortest_step: float
+    torque_step: float
+    drive: float
+    still: float
+    still_joint: float
+    closing: float
+
+
+@lru_cache(maxsize=64)
+def find_tolerances(scene: Scene) -> Tolerances:
+    """The tolerances of a scene."""
+    scales = scene.scales
+    return Tolerances(
+        force=ROUNDING_FORCE * scales.force,
+        torque=ROUNDING_FORCE * scales.torque,
+        speed=ROUNDING_SPEED * scales.speed,
+        turning=ROUNDING_SPEED / scales.time,
+        limit=ROUNDING_LIMIT * scales.length,
+        short=SHORT * scales.length,
+        settling=SETTLING * scales.time,
+        rest_window=REST_WINDOW * scales.time,
+        longest_window=LONGEST_WINDOW * scales.time,
+        first_step=FIRST_STEP * scales.time,
+        shortest_step=SHORTEST_STEP * scales.time,
+        torque_step=STEP_OF_TORQUE * scales.torque,
+        drive=STILL * scales.mass**0.5 * scales.acceleration,
+        still=STILL * scales.acceleration,
+        still_joint=STILL / scales.time**2,
+        closing=CLOSING * scales.acceleration,
+    )
+
+
+@lru_cache(maxsize=64)
+def measure_units(scene: Scene) -> Array:
+    """The scene's units of z, then of z', shape (10,): lengths and rad, and both over time."""
+    scales = scene.scales
+    place = np.array([scales.length, scales.length, 1.0, 1.0, 1.0])
+    units = np.concatenate([place, place / scales.time])
+    units.setflags(write=False)
+    return units
+
+
+def measure_until(scene: Scene, until: Until) -> float:
+    """Unit of the distance to the end of a phase [m or rad]."""
+    return 1.0 if until.coordinate == "phi" else scene.scales.length
+
+
+def is_slower(scene: Scene, v: Array, bound: float) -> bool:
+    """Whether no component of z', shape (5,), exceeds `bound` times the scene's unit of it."""
+    return bool((np.abs(v) < bound * measure_units(scene)[5:]).all())
