@@ -1,0 +1,123 @@
+"""A box on the palm that a finger pushes, so that it sticks and slips, and torques for it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from plane import accelerate, make_formation, make_scene, stack_rows
+from wholearm.formation import close_finger, place_flush
+from wholearm.model import Array, Friction, Scene
+from wholearm.problem import Phase, Problem, Until
+from wholearm.torque import TorqueProfile
+
+FAR = Until(coordinate="x", value=-0.3)
+"""An end that is never reached."""
+
+
+def linear(
+    times: Sequence[float] | Array, first: Sequence[float] | Array, second: Sequence[float]
+) -> TorqueProfile:
+    """Torques linear between instants [s, N m]; a time given twice is a step."""
+    t, tau = np.array(times), np.array([first, second]).T
+    pieces = np.flatnonzero(np.diff(t) > 0)
+    middle, half = (tau[1:] + tau[:-1])[pieces] / 2, (tau[1:] - tau[:-1])[pieces] / 2
+    breaks = np.append(t[pieces], t[-1])
+    return TorqueProfile(breaks, np.stack([middle, half], axis=2))
+
+
+def evaluate(torque: TorqueProfile, t: float) -> Array:
+    """Torques at one instant, shape (2,)."""
+    k = min(int(np.searchsorted(torque.breaks, t, side="right")) - 1, len(torque.coefficients) - 1)
+    start, stop = torque.breaks[k : k + 2]
+    x = (2 * t - start - stop) / (stop - start)
+    return np.asarray(torque.coefficients[k] @ x ** np.arange(torque.coefficients.shape[2]))
+
+
+def pushed(mu: float = 0.3, contacts: str = "v0-palm v1-palm v2-finger1") -> Problem:
+    """A box on the palm that finger 1 leans on, and finger 2 far off; both slide freely.
+
+    Finger 1 has dry friction, which finger 2 has not: that swings as its torque wants.
+    """
+    scene = make_scene(base=0.1)
+    left = dataclasses.replace(scene.fingers[1], base=[-0.5, -0.01], viscous=0.0, dry=0.0)
+    scene = Scene(scene.polygon, (scene.fingers[0], left), Friction(mu, 0.1, 0.1))
+    q = place_flush(scene, 0, 0.0)
+    z = np.array([*q, close_finger(scene, q, 0), np.pi / 2])
+    phase = Phase(0, make_formation(scene, contacts), FAR)
+    return Problem("pushed box", scene, 0.0, z, (phase,))
+
+
+def rocking(scale: float = 1.0) -> TorqueProfile:
+    """Finger 1 pushes the box until it slides, eases off until it sticks, and does so again."""
+    share = np.array([0.0, 1.4, 1.3, 0.35, 0.35, 1.5, 0.4])
+    return linear(np.arange(7) / 10, 0.14 * scale * share, [1e-3] * 7)
+
+
+class Push:
+    """The box of `pushed` moved by plan: twice to the left by `run` [m], and still between.
+
+    The torques of finger 1 follow by inverse dynamics, from the plain dynamics of the tests.
+    """
+
+    def __init__(self, soft: bool, run: float = 0.004) -> None:
+        self.problem, self.soft, self.run = pushed(), soft, run
+        self.times = (0.0, 0.2, 0.3, 0.5)
+
+    def law(self, t: float, stage: int) -> tuple[float, float, float]:
+        """x, x' and x'' at a time of a stage."""
+        start, rate = self.times[stage], 2 * np.pi / (self.times[stage + 1] - self.times[stage])
+        x = self.problem.start[0] - (self.run if stage else 0.0)
+        if stage == 1:
+            return x, 0.0, 0.0
+        u, run = rate * (t - start), self.run
+        if self.soft:
+            share = run / (2 * np.pi)
+            return (
+                x - share * (u - np.sin(u)),
+                -share * rate * (1 - np.cos(u)),
+                -share * rate**2 * np.sin(u),
+            )
+        u, rate = u / 2, rate / 2
+        return (
+            x - run / 2 * (1 - np.cos(u)),
+            -run / 2 * rate * np.sin(u),
+            -run / 2 * rate**2 * np.cos(u),
+        )
+
+    def torque(self, t: float, stage: int) -> float:
+        """Torque of finger 1 [N m]; within the cone while the box is still."""
+        if stage == 1:
+            return 0.07
+        problem = self.problem
+        x, x_dot, x_ddot = self.law(t, stage)
+        q = place_flush(problem.scene, 0, x)
+        z = np.array([*q, close_finger(problem.scene, q, 0), problem.start[4]])
+        formation = problem.phases[0].formation
+        normal, tangent = stack_rows(formation, z)
+        turn = -normal[2, 0] * x_dot / normal[2, 3]
+        v = np.array([x_dot, 0.0, 0.0, turn, 0.0])
+        ahead = np.array([-1.0, 0.0, 0.0, normal[2, 0] / normal[2, 3], 0.0])
+        Xi, sigma = np.sign(tangent @ ahead), np.array([np.sign(ahead[3]), 1.0])
+        first, second = (
+            accelerate(formation, z, v, np.array([tau, 1e-3]), Xi, sigma)[0][0]
+            for tau in (0.0, 1.0)
+        )
+        return float((x_ddot - first) / (second - first))
+
+    def fit(self, pieces: int = 6, degree: int = 7) -> TorqueProfile:
+        """The torques as polynomials, which may step between the stages."""
+        breaks, coefficients = [0.0], []
+        nodes = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
+        for stage in range(3):
+            edges = np.linspace(self.times[stage], self.times[stage + 1], pieces + 1)
+            for low, high in pairwise(edges):
+                t = (low + high + nodes * (high - low)) / 2
+                values = [self.torque(float(one), stage) for one in t]
+                own = np.polynomial.polynomial.polyfit(nodes, values, degree)
+                coefficients.append([own, [1e-3] + [0.0] * degree])
+                breaks.append(high)
+        return TorqueProfile(np.array(breaks), np.array(coefficients))
