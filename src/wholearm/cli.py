@@ -75,7 +75,12 @@ def build_parser() -> argparse.ArgumentParser:
     verify = _command(commands, "verify", _verify, "replay torques open loop and check the motion")
     verify.add_argument("problem", help="problem file (TOML)")
     verify.add_argument("torques", help="trajectory file (.npz) or torques (.csv: t,tau1,tau2)")
-    verify.add_argument("--tolerance", type=float, default=1e-9, help="of the simulator (1e-9)")
+    verify.add_argument(
+        "--tolerance",
+        type=float,
+        default=1e-9,
+        help="of the simulator's steps, relative to the scene's scales (1e-9)",
+    )
     text = (
         "how far the replay may be from the plan, over the object's radius of gyration, and in rad"
     )
