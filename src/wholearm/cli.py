@@ -1,7 +1,7 @@
 """The command line: ``wholearm solve|verify|plot|map|bench``.
 
 Exit status 0 means done and all contacts held, 1 infeasible or a contact lost or a goal missed,
-2 bad input. Each command imports what it needs and nothing else.
+2 bad input, 130 interrupted, 143 terminated. Each command imports what it needs and nothing else.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from .benchmark.command import add_bench, name_study
 from .errors import InputError, WholearmError, name_source
+from .interrupts import guard
 
 if TYPE_CHECKING:
     from .torque import TorqueProfile
@@ -29,6 +30,10 @@ class _Parser(argparse.ArgumentParser):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status."""
     given = sys.argv[1:] if arguments is None else arguments
+    return guard(lambda: _run(given), _clear_progress)
+
+
+def _run(given: Sequence[str]) -> int:
     try:
         named = name_study([_protect(text) for text in given])
         options = build_parser().parse_args(named)
@@ -43,10 +48,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The reader has gone; keep the interpreter from complaining again when it exits.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except KeyboardInterrupt:
-        _clear_progress()
-        print("wholearm: interrupted", file=sys.stderr)
-        return 130
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -130,7 +131,7 @@ class _Version(argparse.Action):
 def _solve(options: argparse.Namespace) -> int:
     from dataclasses import fields
 
-    from .files import require_writable
+    from .files import require_writable, together
     from .options import PlanOptions
     from .outline import load
     from .plan import solve_with
@@ -146,9 +147,10 @@ def _solve(options: argparse.Namespace) -> int:
         if path is not None:
             require_writable(path)
     trajectory = solve_with(load(options.problem), plan_options, _progress())
-    trajectory.save(output)
-    if options.torques is not None:
-        trajectory.save_torques(options.torques)
+    with together():
+        trajectory.save(output)
+        if options.torques is not None:
+            trajectory.save_torques(options.torques)
     _clear_progress()
     if options.json:
         print(json.dumps(dict(trajectory.meta), indent=2))

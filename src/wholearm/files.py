@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import BinaryIO
 
 from .errors import InputError
+from .interrupts import held, on_end
 
 
 def require_writable(path: str | os.PathLike[str]) -> None:
@@ -54,17 +58,63 @@ def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object
         raise InputError(target, "", f"cannot be written: {error.strerror}") from None
 
 
+@contextmanager
+def together() -> Iterator[None]:
+    """Have all files that are written in this context appear at its end, or none."""
+    staged: list[tuple[str, str]] = []
+    token = _staged.set(staged)
+    try:
+        yield
+        with held():
+            for part, target in staged:
+                try:
+                    os.replace(part, target)
+                except OSError as error:
+                    raise InputError(target, "", f"cannot be written: {error.strerror}") from None
+    finally:
+        _staged.reset(token)
+        for part, _ in staged:
+            _remove(part)
+
+
 def _is_special(target: str) -> bool:
     return os.path.exists(target) and not os.path.isfile(target) and not os.path.isdir(target)
 
 
 def _replace(target: str, write: Callable[[BinaryIO], object]) -> None:
     folder, name = os.path.split(target)
-    part = os.path.join(folder, f".{name}.{os.getpid()}.part")
+    part = os.path.join(folder, f".{name}.{os.getpid()}.{threading.get_ident()}.part")
+    staged = _staged.get()
     try:
+        _parts.add(part)
         with open(part, "xb") as stream:
             write(stream)
-        os.replace(part, target)
+        if staged is None:
+            with held():
+                os.replace(part, target)
+        else:
+            staged.append((part, target))
+    except BaseException:
+        _remove(part)
+        raise
     finally:
-        if os.path.exists(part):
-            os.unlink(part)
+        if staged is None:
+            _parts.discard(part)
+
+
+def _remove(part: str) -> None:
+    if os.path.exists(part):
+        os.unlink(part)
+    _parts.discard(part)
+
+
+def _remove_all() -> None:
+    for part in tuple(_parts):
+        _remove(part)
+
+
+_parts: set[str] = set()
+"""Temporary files that exist now."""
+_staged: ContextVar[list[tuple[str, str]] | None] = ContextVar("staged", default=None)
+"""Temporary files and where they are to appear, inside `together`."""
+on_end(_remove_all)

@@ -7,7 +7,10 @@ from typing import Any
 import casadi as ca
 
 from .contact import Expression
+from .interrupts import check
 
+STOPPED = "User_Requested_Stop"
+"""Status of a solver that an interrupt stopped: nothing else asks it to."""
 _OPTIONS = {
     "print_level": 0,
     "sb": "yes",
@@ -30,8 +33,8 @@ def build_solver(
     push: float,
     derivatives: dict[str, Expression] | None = None,
     **options: Any,
-) -> Expression:
-    """Return a CasADi function that solves an NLP with Ipopt.
+) -> Solver:
+    """Return what solves an NLP with Ipopt.
 
     Parameters
     ----------
@@ -58,4 +61,30 @@ def build_solver(
         "error_on_fail": False,
         **(derivatives or {}),
     }
-    return ca.nlpsol(name, "ipopt", nlp, casadi_options)
+    return Solver(ca.nlpsol(name, "ipopt", nlp, casadi_options))
+
+
+class Solver:
+    """An NLP solver that an interrupt ends: CasADi would stop it and go on as if it had failed."""
+
+    def __init__(self, function: Expression) -> None:
+        self._function = function
+
+    def __call__(self, **arguments: Any) -> dict[str, Expression]:
+        """Solve; inputs and outputs are those of a CasADi NLP solver.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            If a signal stopped the solver.
+        """
+        result: dict[str, Expression] = self._function(**arguments)
+        check()
+        if self._function.stats()["return_status"] == STOPPED:
+            raise KeyboardInterrupt
+        return result
+
+    def stats(self) -> dict[str, Any]:
+        """Statistics of the last call."""
+        statistics: dict[str, Any] = self._function.stats()
+        return statistics

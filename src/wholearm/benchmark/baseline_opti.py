@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from ..curve import Curve
+from ..ipopt import STOPPED
 from ..torque import TorqueProfile
 
 
@@ -103,6 +104,8 @@ def plan_with_opti(curve: Curve, epsilon: float, intervals: int) -> BaselineResu
         pass
     solved = time.perf_counter()
     stats, value = opti.stats(), opti.debug.value
+    if stats["return_status"] == STOPPED:
+        raise KeyboardInterrupt
     times, start = [], 0.0
     for duration, tau in zip(durations, torques, strict=True):
         stop = start + float(value(duration))

@@ -17,7 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from .. import __version__
-from ..files import write_whole
+from ..files import together, write_whole
 from ..plots import save
 
 _LOOKS = {
@@ -44,9 +44,10 @@ class Row(NamedTuple):
 def write_results(name: str, rows: Sequence[Row], stem: str) -> list[str]:
     """Write all measurements as Markdown, CSV and PNG; return the files' paths."""
     paths = [f"{stem}.{ending}" for ending in ("md", "csv", "png")]
-    write_whole(paths[0], lambda stream: stream.write(format_markdown(name, rows).encode()))
-    write_whole(paths[1], lambda stream: stream.write(format_csv(rows).encode()))
-    save(draw_run_times(rows), paths[2])
+    with together():
+        write_whole(paths[0], lambda stream: stream.write(format_markdown(name, rows).encode()))
+        write_whole(paths[1], lambda stream: stream.write(format_csv(rows).encode()))
+        save(draw_run_times(rows), paths[2])
     return paths
 
 

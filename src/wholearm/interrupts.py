@@ -1,0 +1,167 @@
+"""SIGINT and SIGTERM end a command within a second, whoever swallows the exception.
+
+A signal raises KeyboardInterrupt, so that files and child processes are cleaned up on the way out.
+Code in between may swallow that (CasADi stops its solver and goes on), so the signal is remembered:
+no file appears after it (`check`), and the command's status is that of the signal. A thread watches
+over it: a command that has not ended when `PATIENCE` is over, because it swallowed the exception or
+is inside a long call, is ended there.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import TextIO
+
+PATIENCE = 0.45
+"""How long a command may take to clean up [s]."""
+_WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
+
+_guarded = False
+_received: int | None = None
+_holding = False
+_ending = threading.RLock()
+"""Held while something is done that may not be left half done, ending the process included."""
+_cleanups: list[Callable[[], object]] = []
+
+
+def guard(run: Callable[[], int], tidy: Callable[[], object] = int) -> int:
+    """Run a command with signals that end it, and return its exit status: 128 + the signal's.
+
+    Parameters
+    ----------
+    run : callable
+        The command. One inside another leaves signals to the outer one.
+    tidy : callable
+        Called before the line that says why the command ends.
+    """
+    global _guarded, _received
+    if _guarded or threading.current_thread() is not threading.main_thread():
+        try:
+            return run()
+        except KeyboardInterrupt:
+            tidy()
+            raise
+    errors, _guarded, _received = sys.stderr, True, None
+    status = 0
+    try:
+        with _handlers(), _watcher():
+            status = run()
+    except KeyboardInterrupt:
+        _received = _received or signal.SIGINT
+    except BaseException:
+        # Some extension modules turn the interrupt of an import into an error of their own.
+        if _received is None:
+            raise
+    finally:
+        sys.stderr, _guarded = errors, False
+    if _received is None:
+        return status
+    tidy()
+    _say(_received)
+    return 128 + _received
+
+
+def check() -> None:
+    """Raise KeyboardInterrupt if a signal has come, though somebody swallowed it."""
+    if _guarded and _received is not None and not _holding:
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def held() -> Iterator[None]:
+    """Have signals wait while something is done that may not be left half done."""
+    global _holding
+    check()
+    with _ending:
+        outer, _holding = _holding, True
+        try:
+            yield
+        finally:
+            _holding = outer
+    check()
+
+
+def on_end(cleanup: Callable[[], object]) -> None:
+    """Register what has to be cleaned up when a command is ended by force."""
+    _cleanups.append(cleanup)
+
+
+@contextmanager
+def _handlers() -> Iterator[None]:
+    # A shell lets background jobs ignore SIGINT, which is not for us to change.
+    ours = [n for n in _WORDS if signal.getsignal(n) not in (signal.SIG_IGN, None)]
+    previous = {number: signal.signal(number, _interrupt) for number in ours}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _interrupt(number: int, _: FrameType | None) -> None:
+    """Handle a signal: the first one raises KeyboardInterrupt."""
+    global _received
+    first, _received = _received is None, _received or number
+    # Whoever swallows the exception writes about it; one line is to be there, ours.
+    sys.stderr = io.StringIO()
+    if first and not _holding:
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def _watcher() -> Iterator[None]:
+    """Watch for signals in a thread, which sees them even while the main thread is in a call."""
+    if os.name != "posix":
+        yield
+        return
+    errors, over = sys.stderr, threading.Event()
+    source, sink = os.pipe()
+    os.set_blocking(sink, False)
+    previous = signal.set_wakeup_fd(sink, warn_on_full_buffer=False)
+
+    def watch() -> None:
+        while not over.is_set():
+            number = os.read(source, 1)[0]
+            if number in _WORDS and not over.wait(PATIENCE):
+                with _ending:
+                    if not over.is_set():
+                        _end(number, errors)
+
+    thread = threading.Thread(target=watch, name="wholearm signals", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        with _ending:
+            over.set()
+        signal.set_wakeup_fd(previous)
+        os.write(sink, b"\0")
+        thread.join()
+        os.close(source)
+        os.close(sink)
+
+
+def _end(number: int, errors: TextIO) -> None:
+    """End the process now."""
+    for cleanup in _cleanups:
+        cleanup()
+    processes = sys.modules.get("multiprocessing")
+    for child in processes.active_children() if processes else ():
+        child.terminate()
+    sys.stderr = errors
+    _say(number)
+    os._exit(128 + number)
+
+
+def _say(number: int) -> None:
+    try:
+        print(f"wholearm: {_WORDS[signal.Signals(number)]}", file=sys.stderr, flush=True)
+    except OSError:
+        pass  # nobody reads it
