@@ -7,12 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import InputError, JammingError, WholearmError
+from ..errors import InputError, WholearmError
 from ..model import Array, Scene
 from ..problem import End, Phase, Problem
 from .lpmotion import fast_margin, inertia_ratio, rest_margin, slow_margin
 from .newton import locate
-from .tracing import Trace, close, follow, spread, weights
+from .overlap import clearances
+from .tracing import OVERLAP, Trace, close, follow, spread, weights
 
 PLACES = 60
 """Places along a curve at which limits are looked at."""
@@ -139,8 +140,11 @@ def _straight(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -
                 break
         for name in phase.formation.names:
             touch = locate(scene, name, guess[None])
-            if min(touch.low[0], touch.high[0]) < -1e-6 * scene.scales.length:
+            if min(touch.low[0], touch.high[0]) < -OVERLAP * scene.scales.length:
                 return None
+        apart = clearances(scene, guess[None])
+        if min(gap[0] for gap in apart.values()) < -OVERLAP * scene.scales.length:
+            return None
         points.append(guess)
     return np.array(points)
 
@@ -164,6 +168,3 @@ def _judge_cell(problem: Problem, phase: Phase, z: Array, path: Array | None) ->
     if rest < UNABLE:
         return Verdict("confirmed", f"{at}: no motion from rest at the start, {rest:.3g}")
     return Verdict("open", f"{at}: not a straight leg")
-
-
-__all__ = ["JammingError", "Verdict", "judge"]
