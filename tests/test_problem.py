@@ -276,11 +276,13 @@ def test_bad_file_names_the_file(tmp_path: Path, old: str, new: str, key: str, t
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("content", [b"\xff\xfe", b"\x00", b"[[[["])
+@pytest.mark.parametrize(
+    "content", [b"\xff\xfe", b"\x00", b"[[[[", b"a = " + b"9" * 5000, b"a = " + b"[" * 20_000]
+)
 def test_not_toml(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "bad.toml"
     path.write_bytes(content)
-    with pytest.raises(InputError, match="is not TOML"):
+    with pytest.raises(InputError, match=r"is not TOML|is nested too deeply"):
         read_problem(str(path))
 
 

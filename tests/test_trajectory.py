@@ -287,3 +287,14 @@ def test_bad_names_of_rolling_contacts(trajectory: Trajectory, tmp_path: Path, g
 
 def test_nothing_rolls_unless_it_is_said(trajectory: Trajectory) -> None:
     assert trajectory.rolling.shape == trajectory.c_t.shape and not trajectory.rolling.any()
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "9" * 5000, "", "{"])
+def test_meta_that_is_not_json_is_named(tmp_path: Path, trajectory: Trajectory, text: str) -> None:
+    path = tmp_path / "plan.npz"
+    trajectory.save(path)
+    with np.load(path) as data:
+        arrays = {name: data[name] for name in data.files}
+    np.savez(path, **arrays | {"meta": np.array(text)})
+    with pytest.raises(InputError, match=r"plan\.npz: meta: is n"):
+        load_trajectory(path)

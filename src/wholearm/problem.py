@@ -212,7 +212,7 @@ def read_problem(path: str) -> Problem:
             table = tomllib.load(stream)
     except OSError as error:
         raise InputError(str(path), "", f"cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise InputError(str(path), "", f"is not TOML: {error}") from None
     except RecursionError:
         raise InputError(str(path), "", "is nested too deeply") from None

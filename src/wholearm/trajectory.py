@@ -294,7 +294,7 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     _check_order(source, arrays)
     try:
         meta = json.loads(str(arrays["meta"]))
-    except json.JSONDecodeError as error:
+    except ValueError as error:
         raise InputError(source, "meta", f"is not JSON: {error}") from None
     except RecursionError:
         raise InputError(source, "meta", "is nested too deeply") from None

@@ -19,7 +19,7 @@ from .stressproblems import compare_values, list_trials, run_trial
 from .stressreport import format_summary, stamp_machine
 from .workers import Answer, run_tasks
 
-SCENE_BOUND, FILE_BOUND, TRIAL_BOUND = 40.0, 20.0, 60.0
+SCENE_BOUND, FILE_BOUND, TRIAL_BOUND = 30.0, 20.0, 60.0
 """Processor time that a scene and an objective (two plans), a file and a trial may take [s]."""
 _ENDINGS = {"raised": "traceback", "late": "hang", "died": "crash"}
 
