@@ -129,14 +129,14 @@ def _trace_phase(problem: Problem, phase: Phase, z: Array) -> Curve:
 def _holds(formation: Formation, until: Until, z: Array) -> bool:
     """Whether `until` holds at `z`.
 
-    Of a contact counts where it can be gained: a tip on the line of an edge that it is beyond, as
-    where the edge lies flush on the link, does not touch the edge.
+    Of a contact counts where it can be gained: what is on a line only because an edge lies flush
+    there, beyond the end of the edge or of the link, does not touch.
     """
     if until.contact is None:
         return bool(abs(until_distance(formation, until, z[None])[0]) < HELD)
     gaining = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
     gaps = formation.evaluate_limits(z[None])[0, gaining] / formation.scene.scales.length
-    return bool((np.abs(gaps) < HELD).any())
+    return bool(len(gaps) and (np.abs(gaps) < HELD).all())
 
 
 def _is_regular(curve: Curve) -> bool:
@@ -175,6 +175,10 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
     rho = formation.scene.polygon.gyration_radius
     names = [limit.text for limit in formation.limits] + [str(until)]
     wanted = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
+    # What is closed from the start, such as the end of a flush edge that the link does not reach
+    # yet, is not what is waited for.
+    closed = np.abs(formation.evaluate_limits(z[None])[0]) / rho < HELD
+    wanted = [k for k in wanted if not closed[k]] or wanted
     wanted = [len(names) - 1] if until.contact is None else wanted
 
     def margins(points: Array) -> Array:

@@ -14,6 +14,7 @@ import numpy as np
 from ..errors import InputError
 from ..formation import close_finger, find_touching, place_flush
 from ..mapping.borders import NOWHERE, Piece, Window, flush_track, label_cells, palm_track
+from ..mapping.legs import tolerance
 from ..mapping.pieces import cut
 from ..model import Array, Finger, Friction, Polygon, Scene
 from ..problem import Problem, build_problem
@@ -127,8 +128,9 @@ def random_route(rng: np.random.Generator, problem: Problem) -> list[tuple[float
         if there is None:
             continue
         size = problem.scene.scales.length
-        jitter = rng.uniform(-1.0, 1.0, 2) * fuzz * np.array([size, 1.0])
-        poses.append(there + jitter)
+        there = there + rng.uniform(-1.0, 1.0, 2) * fuzz * np.array([size, 1.0])
+        if (np.abs(there - poses[-1]) > tolerance(problem.scene)).any():
+            poses.append(there)
     if len(poses) == 1:
         poses.append(here + np.array([0.3 * problem.scene.scales.length, 0.0]))
     return [(float(x), float(phi)) for x, phi in poses]

@@ -23,7 +23,7 @@ NEAR = (0.015, float(np.radians(0.5)))
 MISSED = 4.0
 """Distance from a border, over `NEAR`, within which a leg beside it is said to be a near miss."""
 SAME_PLACE = 1e-3
-"""Length of a part over `NEAR` below which its ends are one crossing."""
+"""Length of a part over `NEAR` below which it is left out: its ends are one crossing."""
 BESIDE = 1e-6
 """Gap between parts, over `NEAR`, above which what lies between cannot be reached."""
 SHORTEST = 0.3
@@ -50,6 +50,8 @@ class Part(NamedTuple):
         What may end it: contacts that touch from its end on; empty where it ends in between.
     coordinate : {0, 1}
         x or phi, whichever tells its end best.
+    inside : ndarray, shape (2,), [m, rad]
+        Where it ends if nothing is gained: at `stop`, or a little before what cannot be passed.
     """
 
     contacts: tuple[Contact, ...]
@@ -57,6 +59,7 @@ class Part(NamedTuple):
     stop: Array
     gained: tuple[Contact, ...]
     coordinate: int
+    inside: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +130,7 @@ def split_leg(scene: Scene, start: Array, stop: Array) -> list[Part]:
     ]
     _require_reached(scene, leg, kept, [low + near, high - near])
     spans = [(p.label, float(p.places[0]), float(p.places[-1])) for p in kept]
+    spans = [span for span in spans if span[2] - span[1] > SAME_PLACE * leg.near] or spans
     if way < 0:
         spans = [(label, last, first) for label, first, last in spans[::-1]]
     # The track goes on a little beyond the leg; a change of contacts that near ends the leg.
@@ -150,10 +154,8 @@ def _build_parts(
     for index, (label, first, last) in enumerate(spans):
         mine = name_contacts(table, label)
         begin, end = leg.at(first), leg.at(last)
-        if (np.abs(end - begin) < SAME_PLACE * near).all():
-            touching = _find_touching(scene, end)
-            raise _crossing(end, touching or mine)
         gained: tuple[Contact, ...] = ()
+        inside = end
         if index + 1 < len(spans):
             following = name_contacts(table, spans[index + 1][0])
             gained = tuple(c for c in following if c not in mine)
@@ -161,13 +163,11 @@ def _build_parts(
                 raise _crossing(end, tuple(dict.fromkeys((*mine, *following))))
         elif at_change:
             gained = tuple(c for c in _find_touching(scene, end) if c not in mine)
-            if not gained:
-                inside = INSIDE * leg.near * (1.0 if first < last else -1.0)
-                end = leg.at(last - inside if abs(last - first) > abs(inside) else first)
+            inside = leg.at(last + np.clip(first - last, -INSIDE * leg.near, INSIDE * leg.near))
         coordinate = int((np.abs(end - begin) / near).argmax())
         if leg.track.flush is not None:
             coordinate = 0 if leg.track.flush[0] is None else 1
-        parts.append(Part(mine, begin, end, gained, coordinate))
+        parts.append(Part(mine, begin, end, gained, coordinate, inside))
     return parts
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from ..contact import Contact
 from ..curve import describe_pose
 from ..errors import InputError
-from ..explore import STILL
+from ..explore import STILL, is_inside
 from ..formation import Formation
 from ..metric import metric_weights
 from ..model import Array, Scene
@@ -92,6 +92,8 @@ def _skip_sliver(scene: Scene, z: Array, parts: list[Part]) -> list[Part]:
         short = (np.abs(first.stop - first.start) < tolerance(scene)).all()
         if not short or _list_missing(scene, z, following.contacts):
             break
+        if not is_inside(_form(scene, following.contacts), z):
+            break
         parts = parts[1:]
     return parts
 
@@ -148,8 +150,8 @@ def _list_plain(scene: Scene, part: Part) -> Iterator[list[Step]]:
     """One phase each."""
     for contact in part.gained:
         yield [(part.contacts, Until(contact=contact))]
-    if not part.gained:
-        yield [(part.contacts, _coordinate(scene, part.coordinate, part.stop))]
+    if not part.gained or (part.inside != part.stop).any():
+        yield [(part.contacts, _coordinate(scene, part.coordinate, part.inside))]
 
 
 def _list_guided(scene: Scene, part: Part) -> Iterator[list[Step]]:
