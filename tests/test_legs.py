@@ -56,20 +56,31 @@ def test_leg_follows_a_border_that_both_ends_are_near(heptagon: Problem) -> None
             assert (np.abs(place - end) < near).all()
 
 
-def test_straight_leg_beside_a_curved_border_stays_in_its_cell(heptagon: Problem) -> None:
-    """The chord of a border cuts through to the other side, by less than the tolerance."""
-    scene, near = heptagon.scene, tolerance(heptagon.scene)
-    start, stop = (on_border(heptagon, phi) for phi in (PHI, PHI + 0.3))
-    middle = on_border(heptagon, PHI + 0.15)
-    bulge = ((start + stop) / 2 - middle)[0]
-    # Both ends a little off the border towards the chord's other side.
-    way = -np.sign(bulge)
-    aside = np.array([way * (abs(bulge) / 2 + 1.2 * near[0]), 0.0])
-    leg = [start + aside, stop + aside]
-    labels = label_cells(scene, *np.linspace(leg[0], leg[1], 50).T)
-    assert len(np.unique(labels, axis=0)) <= 2
+def beside_border(problem: Problem, bulge: float) -> tuple[Array, Array]:
+    """A leg whose ends are three times the tolerance off a border that bulges by so many times."""
+    near = tolerance(problem.scene)[0]
+    for span in np.linspace(0.1, 0.6, 400):
+        start, stop = on_border(problem, PHI), on_border(problem, PHI + span)
+        away = ((start + stop) / 2 - on_border(problem, PHI + span / 2))[0]
+        if abs(away) > bulge * near:
+            break
+    aside = np.array([-np.sign(away) * 3.0 * near, 0.0])
+    return start + aside, stop + aside
+
+
+@pytest.mark.parametrize("bulge, crosses", [(4.0, False), (9.0, True)])
+def test_straight_leg_beside_a_curved_border(
+    heptagon: Problem, bulge: float, crosses: bool
+) -> None:
+    """Where it is less than the tolerance beyond the border, it stays in its cell."""
+    scene, leg = heptagon.scene, beside_border(heptagon, bulge)
+    on_finger_2 = label_cells(scene, *np.linspace(*leg, 300).T)[:, 4]
+    assert (np.diff(on_finger_2) != 0).sum() == 2
     parts = split_leg(scene, *leg)
-    assert len({part.contacts for part in parts}) == len(parts)
+    touched = [next(c for c in part.contacts if c.finger == 1) for part in parts]
+    changes = sum(one != two for one, two in pairwise(touched))
+    assert changes == (2 if crosses else 0)
+    assert touched[0] == touched[-1] == contact_table(scene)[on_finger_2[0]]
 
 
 def test_near_miss_names_the_border_and_its_distance(heptagon: Problem) -> None:
@@ -91,6 +102,6 @@ def test_near_miss_names_the_border_and_its_distance(heptagon: Problem) -> None:
 
 def test_a_crossing_is_named_by_its_contacts(heptagon: Problem) -> None:
     phi, x = heptagon.scene.polygon.flush_angle(0), -0.06368782401
-    words = r"crossing of borders at x = -63.69 mm.*, of .*v0-palm.*v1-palm.*finger2"
+    words = r"crossing of borders at x = -63.69 mm.*, of v1-palm, v3-finger1, v0-finger2, v0-palm"
     with pytest.raises(InputError, match=words):
         split_leg(heptagon.scene, np.array([x - 0.01, phi - 0.1]), np.array([x + 0.01, phi + 0.1]))

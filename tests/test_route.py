@@ -15,6 +15,7 @@ from wholearm.benchmark.scenes import random_route, random_scene
 from wholearm.curve import Curve
 from wholearm.errors import InputError
 from wholearm.mapping.route import Route, format_route, list_formations
+from wholearm.outline import outline_phase
 from wholearm.problem import Problem, build_problem
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
@@ -121,6 +122,107 @@ def test_lists_do_not_depend_on_units(heptagon: Problem) -> None:
     assert [s.contacts for s in one] == [s.contacts for s in two]
     for a, b in zip(one, two, strict=True):
         np.testing.assert_allclose(a.stop * [size, 1.0], b.stop, rtol=1e-4, atol=1e-4)
+
+
+HARD = {
+    "a pointed tip runs off an edge that lies flush": (
+        [
+            [-0.0861, -0.0032],
+            [-0.0337, -0.0679],
+            [0.0661, -0.0493],
+            [0.0721, 0.0395],
+            [-0.0278, 0.0712],
+        ],
+        [([0.0687, 0.0075], 0.2347, 0.0), ([-0.195, 0.0028], 0.2047, 0.0)],
+        (0, -0.0009),
+        [(-0.0009, 51.034), (0.0133, 51.034), (-0.109, 91.915)],
+        "v3-finger2",
+    ),
+    "a pointed tip passes from edge to edge": (
+        [
+            [0.0666, 0.0695],
+            [0.0511, 0.0713],
+            [-0.0296, 0.0332],
+            [-0.0733, -0.0178],
+            [-0.0678, -0.0691],
+            [-0.0189, -0.0631],
+            [0.0071, -0.0494],
+            [0.0694, 0.011],
+        ],
+        [([0.2446, -0.0229], 0.3186, 0.0), ([-0.2226, 0.026], 0.2919, 0.0)],
+        (6, 0.0873),
+        [(0.0873, -44.138), (0.1379, -28.38), (0.1384, -27.663), (0.0715, -27.663)],
+        "v2-finger2",
+    ),
+    "a vertex passes from the side of a link to its rounded tip": (
+        [
+            [-0.0492, -0.092],
+            [-0.0364, -0.0739],
+            [0.0087, 0.0079],
+            [0.0328, 0.055],
+            [0.0492, 0.0923],
+            [0.0333, 0.0687],
+            [-0.001, 0.0068],
+            [-0.0404, -0.0706],
+        ],
+        [([0.1886, -0.0131], 0.1886, 0.0012), ([-0.1469, -0.0287], 0.1492, 0.0053)],
+        (1, -0.0139),
+        [(-0.0139, -61.107), (0.0364, -62.899), (-0.1043, -62.936)],
+        "v5-tip1",
+    ),
+    "the end of a cell is far away": (
+        [
+            [0.0771, 0.0821],
+            [0.0302, 0.0392],
+            [-0.0333, -0.0287],
+            [-0.0767, -0.0826],
+            [-0.0332, -0.0422],
+            [0.0334, 0.0288],
+        ],
+        [([0.117, -0.0326], 0.3934, 0.0128), ([-0.0972, -0.0252], 0.3999, 0.0093)],
+        (4, -0.1417),
+        [(-0.1417, -46.856), (-0.1387, -47.581), (0.3798, -42.853)],
+        "v5-finger1",
+    ),
+}
+"""Vertices [m], fingers (base, length, radius) [m], start (edge, x), poses [m, deg], an end."""
+
+
+def build_table(
+    vertices: list[list[float]],
+    hands: list[tuple[list[float], float, float]],
+    start: tuple[int, float],
+) -> dict[str, Any]:
+    """A problem file's tables whose phase names what touches at the start."""
+    table = copy.deepcopy(TABLE) | {"start": {"flush": start[0], "x": start[1]}}
+    table["object"]["vertices"] = vertices
+    for finger, (base, length, radius) in zip(table["fingers"].values(), hands, strict=True):
+        finger |= {"base": base, "length": length, "radius": radius}
+    lowest = [f"v{start[0]}-palm", f"v{(start[0] + 1) % len(vertices)}-palm"]
+    table["phases"] = [{"contacts": lowest, "until": {"x": start[1]}}]
+    return table
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_hard_lists_load(name: str, tmp_path: Path) -> None:
+    vertices, hands, start, poses, end = HARD[name]
+    table = build_table(vertices, hands, start)
+    route = list_degrees(build_problem(table), *poses)
+    assert end in [str(stretch.until) for stretch in route]
+    problem = load_pasted(table, route, tmp_path)
+    assert len(problem.phases) == len(route)
+
+
+def test_list_goes_on_where_loading_ends_a_phase(heptagon: Problem, tmp_path: Path) -> None:
+    """Each phase of a list, loaded, ends where the next one's contacts touch."""
+    route = list_degrees(heptagon, (0.045, FLAT), (0.03, -20.0), (-0.02, -30.0), (-0.0505, -23.4))
+    problem = load_pasted(TABLE, route, tmp_path)
+    z = problem.start
+    for phase in problem.phases:
+        gaps = phase.formation.evaluate(z[None], z[None]).C[0]
+        assert np.abs(gaps).max() < 1e-9
+        assert phase.formation.evaluate_limits(z[None]).min() > -1e-9
+        z = outline_phase(problem, phase, z)[-1].z[-1]
 
 
 @pytest.mark.parametrize("seed", range(6))

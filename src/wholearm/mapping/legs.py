@@ -38,6 +38,10 @@ PROBES = 9
 """Places of an excursion into a neighbouring cell at which its depth is measured."""
 
 
+Span = tuple[Numbers, float, float]
+"""A label and the parameters between which a leg has it."""
+
+
 class Part(NamedTuple):
     """A part of a leg with one contact formation.
 
@@ -146,9 +150,7 @@ def split_leg(scene: Scene, start: Array, stop: Array) -> list[Part]:
     return _build_parts(scene, leg, spans, at_change)
 
 
-def _build_parts(
-    scene: Scene, leg: Leg, spans: list[tuple[Numbers, float, float]], at_change: bool
-) -> list[Part]:
+def _build_parts(scene: Scene, leg: Leg, spans: list[Span], at_change: bool) -> list[Part]:
     table, near = contact_table(scene), tolerance(scene)
     parts = []
     for index, (label, first, last) in enumerate(spans):
@@ -309,28 +311,35 @@ def describe_miss(scene: Scene, miss: Miss) -> str:
     )
 
 
-def _drop_excursions(
-    scene: Scene, leg: Leg, spans: list[tuple[Numbers, float, float]]
-) -> list[tuple[Numbers, float, float]]:
-    """Take a leg to stay in a cell where it leaves the cell by less than `NEAR` and comes back."""
-    k = 1
-    while k < len(spans) - 1:
-        before, (_, first, last), after = spans[k - 1], spans[k], spans[k + 1]
-        if (before[0] == after[0]).all() and _is_shallow(scene, leg, before[0], first, last):
-            spans = [*spans[: k - 1], (before[0], before[1], after[2]), *spans[k + 2 :]]
-            k = max(k - 1, 1)
-        else:
-            k += 1
-    return spans
+def _drop_excursions(scene: Scene, leg: Leg, spans: list[Span]) -> list[Span]:
+    """Keep a contact that a straight leg loses, by less than `NEAR`, and gains again."""
+    labels = np.array([label for label, _, _ in spans])
+    for column in (0, 2, 4):
+        own = labels[:, column]
+        for k in range(1, len(spans)):
+            again = np.flatnonzero(own[k:] == own[k - 1])
+            if not len(again) or again[0] == 0:
+                continue
+            first, last = spans[k][1], spans[k + int(again[0]) - 1][2]
+            if _is_shallow(scene, leg, column, int(own[k - 1]), first, last):
+                own[k : k + int(again[0])] = own[k - 1]
+    kept: list[Span] = []
+    for label, (_, first, last) in zip(labels, spans, strict=True):
+        if kept and (kept[-1][0] == label).all():
+            _, first, _ = kept.pop()
+        kept.append((label, first, last))
+    return kept
 
 
-def _is_shallow(scene: Scene, leg: Leg, label: Numbers, first: float, last: float) -> bool:
-    """Whether each place of a straight leg is within `NEAR` of the cell with a label."""
+def _is_shallow(
+    scene: Scene, leg: Leg, column: int, contact: int, first: float, last: float
+) -> bool:
+    """Whether each place of a straight leg is within `NEAR` of where a contact touches."""
     x, phi = leg.track.pose(np.linspace(first, last, PROBES))
     box = np.array([[a, b] for a in (-1, 0, 1) for b in (-1, 0, 1)]) * tolerance(scene)
     around = (np.column_stack([x, phi])[:, None] + box).reshape(-1, 2)
     labels = label_cells(scene, *around.T).reshape(PROBES, len(box), -1)
-    return bool((labels == label).all(axis=2).any(axis=1).all())
+    return bool((labels[..., column] == contact).any(axis=1).all())
 
 
 def _require_reached(scene: Scene, leg: Leg, kept: list[Piece], ends: list[float]) -> None:
