@@ -9,7 +9,8 @@ from wholearm.errors import InputError
 from wholearm.formation import Formation
 from wholearm.mapping.borders import NOWHERE, flush_track, label_cells
 from wholearm.mapping.closing import close, contact_table
-from wholearm.mapping.legs import describe_miss, find_miss, split_leg, tolerance
+from wholearm.mapping.legs import split_leg
+from wholearm.mapping.nearby import tolerance
 from wholearm.model import Array
 from wholearm.problem import Problem
 
@@ -81,23 +82,6 @@ def test_straight_leg_beside_a_curved_border(
     changes = sum(one != two for one, two in pairwise(touched))
     assert changes == (2 if crosses else 0)
     assert touched[0] == touched[-1] == contact_table(scene)[on_finger_2[0]]
-
-
-def test_near_miss_names_the_border_and_its_distance(heptagon: Problem) -> None:
-    scene, near = heptagon.scene, tolerance(heptagon.scene)
-    aside = np.array([near[0], 0.0])
-    start, stop = (on_border(heptagon, phi) + 2.0 * aside for phi in (PHI, PHI + 0.2))
-    miss = find_miss(scene, start, stop)
-    assert miss is not None and miss.track.flush == (1, 6)
-    assert 1.0 < miss.off <= 2.0
-    text = describe_miss(scene, miss)
-    assert "e6 flush on finger 2" in text and "mm in x" in text and "0.5 deg" in text
-    assert find_miss(scene, start + 10 * aside, stop + 10 * aside) is None
-    phi = scene.polygon.flush_angle(0) + 3 * near[1]
-    palm = find_miss(scene, np.array([0.045, phi]), np.array([0.0, phi]))
-    assert palm is not None and "e0 flush on the palm, is up to 1.5 deg" in describe_miss(
-        scene, palm
-    )
 
 
 def test_a_crossing_is_named_by_its_contacts(heptagon: Problem) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import InputError
 from ..formation import close_finger, find_touching, place_flush
 from ..mapping.borders import NOWHERE, Piece, Window, flush_track, label_cells, palm_track
-from ..mapping.legs import tolerance
+from ..mapping.nearby import tolerance
 from ..mapping.pieces import cut
 from ..model import Array, Finger, Friction, Polygon, Scene
 from ..problem import Problem, build_problem

@@ -18,7 +18,8 @@ from ..path import trace_phases
 from ..problem import Problem, Until
 from ..sharing import exclusive
 from .borders import Window
-from .legs import describe_miss, describe_place, find_miss, tolerance
+from .legs import describe_place
+from .nearby import describe_miss, find_miss, tolerance
 from .walk import Walked, format_until, walk_leg
 
 
@@ -84,7 +85,7 @@ class Route(Sequence[Stretch]):
 def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
     """List the contact formations along a route of straight legs.
 
-    A leg with both ends near one border (`legs.NEAR`) follows the border, and ends that near a
+    A leg with both ends near one border (`nearby.NEAR`) follows the border, and ends that near a
     change of contacts are moved to it. Each phase is carried out as when the list is loaded: on
     a border along its curve, in a cell to the nearest end.
 

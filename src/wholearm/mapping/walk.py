@@ -19,7 +19,8 @@ from ..model import Array, Scene
 from ..outline import outline_phase
 from ..path import runs_on_curve, trace_phase
 from ..problem import Phase, Problem, Until
-from .legs import Part, split_leg, tolerance
+from .legs import Part, split_leg
+from .nearby import tolerance
 
 DIGITS = 1e-5
 """Coordinates that end a phase are rounded to this, in radii of gyration and radians."""
@@ -74,7 +75,7 @@ def walk_leg(problem: Problem, index: int, z: Array, start: Array, stop: Array) 
     while parts:
         parts = _skip_sliver(problem.scene, z, parts)
         try:
-            walked += _walk_part(problem, index + len(walked), z, parts[0])
+            walked += _walk_part(problem, index + len(walked), z, parts[:2])
         except InputError as error:
             moved = (np.abs(z[[0, 2]] - parts[0].start) > 1e-3 * tolerance(problem.scene)).any()
             if not moved or replans == REPLANS:
@@ -90,9 +91,7 @@ def _skip_sliver(scene: Scene, z: Array, parts: list[Part]) -> list[Part]:
     while len(parts) > 1:
         first, following = parts[:2]
         short = (np.abs(first.stop - first.start) < tolerance(scene)).all()
-        if not short or _list_missing(scene, z, following.contacts):
-            break
-        if not is_inside(_form(scene, following.contacts), z):
+        if not short or not _can_start(scene, z, following.contacts):
             break
         parts = parts[1:]
     return parts
@@ -104,10 +103,11 @@ def _list_missing(scene: Scene, z: Array, contacts: tuple[Contact, ...]) -> list
     return [c for c, gap in zip(contacts, gaps, strict=True) if abs(gap) > scene.touching]
 
 
-def _walk_part(problem: Problem, index: int, z: Array, part: Part) -> list[Walked]:
-    """The first of the ways through a part that can be carried out."""
+def _walk_part(problem: Problem, index: int, z: Array, parts: list[Part]) -> list[Walked]:
+    """The first way through a part that can be carried out, and goes on if there is such a way."""
     first: InputError | None = None
-    for steps in _list_ways(problem.scene, z, part):
+    spare: list[Walked] = []
+    for steps in _list_ways(problem.scene, z, parts[0]):
         here = z
         walked: list[Walked] = []
         try:
@@ -115,13 +115,22 @@ def _walk_part(problem: Problem, index: int, z: Array, part: Part) -> list[Walke
                 there = advance(problem, index + len(walked), here, step)
                 _require_motion(problem.scene, here, there, step)
                 here = there
-                walked.append((part, step, here))
+                walked.append((parts[0], step, here))
         except InputError as error:
             first = first or error
             continue
-        return walked
+        if len(parts) == 1 or _can_start(problem.scene, here, parts[1].contacts):
+            return walked
+        spare = spare or walked
+    if spare:
+        return spare
     assert first is not None
     raise first
+
+
+def _can_start(scene: Scene, z: Array, contacts: tuple[Contact, ...]) -> bool:
+    """Whether a formation holds at `z`."""
+    return not _list_missing(scene, z, contacts) and is_inside(_form(scene, contacts), z)
 
 
 def _require_motion(scene: Scene, z: Array, end: Array, step: Step) -> None:
