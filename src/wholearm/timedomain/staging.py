@@ -8,17 +8,18 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..dynamics import Directions
+from ..dynamics import Directions, force_rows
 from ..formation import TOUCHING, Formation
 from ..model import Array
 from ..outline import Outline, outline_onwards, outline_phase
 from ..problem import End, Phase, Problem
 from .collocation import Scheme
+from .modes import LEAST_INTERVALS, link
 from .stage import Stage, StagePoints
 from .timekernels import new_rows
 
-LEAST_INTERVALS = 3
-"""Fewest intervals of a stage."""
+PRESS = 0.5
+"""Normal forces that a first guess is near, over the weight of the object."""
 _NEAR = 0.02
 """Distance over the radius of gyration at which a limit is watched from the start."""
 
@@ -106,33 +107,63 @@ def _guess(
     formation = outline.formation
     knots = np.linspace(0.0, 1.0, len(outline.z))
     slopes = np.gradient(outline.z, knots, axis=0)
+    bends = np.gradient(slopes, knots, axis=0)
     breaks = np.linspace(0.0, 1.0, count + 1)
 
-    def follow(share: Array) -> tuple[Array, Array]:
+    def follow(share: Array) -> tuple[Array, Array, Array]:
         angle = np.pi * (clock[0] + share * (clock[1] - clock[0]))
         span = max(ends[1] - ends[0], 1e-12)
         place = ((1 - np.cos(angle)) / 2 - ends[0]) / span
-        rate = np.pi * np.sin(angle) / (2 * span * total)
-        z, slope = (
+        rate = (np.pi * np.sin(angle) / (2 * span * total))[..., None]
+        gain = (np.pi**2 * np.cos(angle) / (2 * span * total**2))[..., None]
+        z, slope, bend = (
             np.stack([np.interp(place, knots, column) for column in table.T], axis=-1)
-            for table in (outline.z, slopes)
+            for table in (outline.z, slopes, bends)
         )
-        return z, slope * rate[..., None]
+        return z, slope * rate, slope * gain + bend * rate**2
 
-    z, v = follow(breaks[:-1, None] + scheme.points / count)
-    forces = np.zeros((count, scheme.degree, formation.n_constraints))
-    forces[..., : formation.n_contacts] = 1.0
+    z, v, a = follow(breaks[:-1, None] + scheme.points / count)
+    forces, tau = _balance(outline, z, v, a)
     return StagePoints(
         total * (clock[1] - clock[0]),
         np.full(count, 1 / count),
-        np.stack(follow(breaks), axis=1),
+        np.stack(follow(breaks)[:2], axis=1),
         z,
         v,
-        np.zeros_like(z),
+        a,
         forces,
-        np.zeros((count, 2, 2)),
+        tau,
         np.zeros(0),
     )
+
+
+def _balance(outline: Outline, z: Array, v: Array, a: Array) -> tuple[Array, Array]:
+    """Forces of a motion, shape (K, d, n_c + R), and torques, shape (K, 2, 2), within limits.
+
+    The object's equations of motion leave forces of which the ones nearest to a light press are
+    taken; the joints' then give the torques.
+    """
+    formation, scene = outline.formation, outline.formation.scene
+    flat = [table.reshape(-1, 5) for table in (z, v, a)]
+    Xi, sigma = outline.directions
+    G = force_rows(formation, formation.evaluate(*flat[:2]), outline.directions)
+    applied = scene.applied_force - scene.dry * np.append(np.zeros(3), sigma)
+    needed = scene.mass_diagonal * flat[2] + scene.viscous * flat[1] - applied
+    light = np.zeros(formation.n_constraints)
+    light[: formation.n_contacts] = PRESS * scene.scales.force
+    forces = []
+    for rows, wanted in zip(G[:, :, :3], needed[:, :3], strict=True):
+        missing = wanted - light @ rows
+        forces.append(light + np.linalg.lstsq(rows.T, missing, rcond=1e-6)[0])
+    c = np.array(forces)
+    c[:, : formation.n_contacts] = np.clip(
+        c[:, : formation.n_contacts], 0.1 * light[0], 20 * scene.scales.force
+    )
+    tau = needed[:, 3:] - np.einsum("nij,ni->nj", G[:, :, 3:], c)
+    tau = np.clip(tau, -0.9 * scene.torque_limit, 0.9 * scene.torque_limit)
+    count, degree = z.shape[:2]
+    tau = tau.reshape(count, degree, 2)
+    return c.reshape(count, degree, -1), np.stack([tau[:, 0], tau[:, -1]], axis=1)
 
 
 def _go_straight(phase: Phase, nearest: list[Outline], before: Outline) -> list[Outline]:

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from ..batch import Batch
+from ..contact import Contact
 from ..curve import metric_weights
 from ..dynamics import Directions, build_forward, split_forces
 from ..formation import Formation
@@ -196,10 +197,16 @@ class TimeMotion:
 
 def make_motions(stages: Sequence[Stage], scheme: Scheme) -> list[StageMotion]:
     """The stages' guesses as functions of time."""
-    motions = []
-    slip, phase = np.zeros(0), -1
+    motions: list[StageMotion] = []
+    kept: dict[Contact, float] = {}
+    phase = -1
     for stage in stages:
-        if stage.phase != phase:
-            slip, phase = stage.formation.evaluate_slip(stage.guess.nodes[0, :1])[0], stage.phase
-        motions.append(StageMotion(stage.formation, stage.directions, scheme, stage.guess, slip))
+        formation = stage.formation
+        slip = formation.evaluate_slip(stage.guess.nodes[0, :1])[0]
+        rolling = [formation.contacts[row] for row in formation.rolling_rows]
+        # What has rolled in this phase before keeps where it is.
+        before = kept if stage.phase == phase else {}
+        kept = {c: before.get(c, s) for c, s in zip(rolling, slip.tolist(), strict=True)}
+        slip, phase = np.array([kept[c] for c in rolling]), stage.phase
+        motions.append(StageMotion(formation, stage.directions, scheme, stage.guess, slip))
     return motions

@@ -56,10 +56,10 @@ OPENING = 0.1
 """Least acceleration with which the gap of a released contact opens [m/s^2]."""
 CLEAR = 2e-5
 """Gap of a released contact after a third of the first stage without it at least [m]."""
-SLIDING = 0.05
+SLIDING = 0.001
 """Least sliding over the radius of gyration, and least speed of a joint [rad/s]: what hardly moves
 would be held by friction."""
-SHORTEST, LONGEST = 1e-4, 20.0
+SHORTEST, LONGEST = 6e-4, 20.0
 """Least and largest duration of a stage [s]."""
 _HURRY = 1e-2
 """Weight of time against shortfalls [N/s]: keeps a motion that is short of something brisk."""
@@ -287,7 +287,11 @@ def least_rates(stage: Stage, scheme: Scheme) -> Array:
 
 def _find_still(stage: Stage, last: bool) -> set[int]:
     """Rows of (contacts, joints) that stand still at the end of a stage."""
-    return set(range(stage.formation.n_contacts + 2)) if last else set(stage.turns)
+    if last:
+        return set(range(stage.formation.n_contacts + 2))
+    coming = stage.gained.rolling if stage.gained else ()
+    rolls = [k for k, c in enumerate(stage.formation.contacts) if c in coming]
+    return {*stage.turns, *rolls}
 
 
 def _watch(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:

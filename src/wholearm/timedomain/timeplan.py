@@ -21,14 +21,13 @@ from ..options import Objective, PlanOptions
 from ..phaseplan import PhasePlan
 from ..problem import Phase, Problem
 from .collocation import make_scheme
-from .revising import halve, turn_friction
+from .modesearch import improve
+from .revising import halve
 from .stage import Stage
 from .staging import outline_stages
 from .timemotion import TimeMotion, make_motions
 from .timesearch import Search, Solution
 
-REVISIONS = 2
-"""Most times that directions of friction are revised."""
 FIRST = 16
 """Intervals of a phase for least time that are few enough to start with; otherwise half of it."""
 CONVINCING = 2
@@ -127,12 +126,8 @@ def _choose_intervals(phases: Sequence[Phase]) -> int:
 def _solve(search: Search, stages: list[Stage], halvings: int) -> Solution:
     """Solve, revise friction, halve all intervals, and make limits hold in between."""
     solution = search.solve(stages)
-    for _ in range(REVISIONS if solution.success else 0):
-        turned = turn_friction(solution.stages, search.scheme)
-        other = search.solve(turned) if turned is not None else None
-        if other is None or not other.success or not other.cost < solution.cost:
-            break
-        solution = other
+    if solution.success:
+        solution = improve(search, solution)
     for _ in range(halvings):
         if solution.success:
             every = [np.ones(stage.intervals, dtype=bool) for stage in solution.stages]

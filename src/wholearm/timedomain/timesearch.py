@@ -107,10 +107,18 @@ class Search:
         """Multipliers of a first guess."""
         return _SOFT if self.goal in _ITERATIONS else FIRST_SIZE
 
-    def solve(self, stages: list[Stage], before: Solution | None = None) -> Solution:
-        """Solve from the stages' guesses, until no limit is broken at the points."""
+    def solve(
+        self, stages: list[Stage], before: Solution | None = None, most: int = 150
+    ) -> Solution:
+        """Solve from the stages' guesses, until no limit is broken at the points.
+
+        Parameters
+        ----------
+        most : int
+            Most iterations.
+        """
         while True:
-            nlp = self.build(stages)
+            nlp = self.build(stages, most)
             multipliers = None
             if before is not None and before.watched == [stage.watched for stage in stages]:
                 multipliers = carry_multipliers(
@@ -124,9 +132,9 @@ class Search:
                 return solution
             stages = watching
 
-    def build(self, stages: Sequence[Stage]) -> TimeNLP:
+    def build(self, stages: Sequence[Stage], most: int = 150) -> TimeNLP:
         """Build the NLP."""
-        weight, limit = self.options.time_weight, _ITERATIONS.get(self.goal, 150)
+        weight, limit = self.options.time_weight, _ITERATIONS.get(self.goal, most)
         nlp = build_time_nlp(stages, self.scheme, self.goal, weight, limit, self.give)
         self.effort.build_time += nlp.build_time
         return nlp

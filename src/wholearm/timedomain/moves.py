@@ -1,0 +1,199 @@
+"""Changes of a sequence of modes that a solution asks for.
+
+Where the least rate of a sense holds a contact back over a stretch, rolling there allows what the
+stretch does and more; where a rolling contact leans on one side of its cone over a stretch, so does
+sliding that way. A stage that has shrunk to nothing is in the way of others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..formation import Formation
+from ..model import Array
+from .collocation import Scheme
+from .modes import Mode, drop, in_mode, link, merge, mode_of, split
+from .stage import Stage
+from .timenlp import SHORTEST, least_rates
+
+_STALLED = 1e-6
+"""Rate over the largest one at which a direction of friction counts as held back."""
+_LEANS = 1e-4
+"""Margin to the friction cone over mu c_n at which a rolling contact counts as leaning on it."""
+_GONE = 1.01
+"""Duration over the shortest one at which a stage counts as shrunk to nothing."""
+
+
+class Run(NamedTuple):
+    """A stretch of a stage over which something is at its limit.
+
+    Attributes
+    ----------
+    row : int
+        Of (contacts, joints).
+    begin, stop : int
+        Its intervals.
+    sign : float
+        Direction, of a rolling contact that leans on its cone, in which it would slide; 0 for one
+        that its least rate holds back.
+    share : float, [s]
+        How long it lasts.
+    """
+
+    row: int
+    begin: int
+    stop: int
+    sign: float
+    share: float
+
+
+def list_moves(
+    stages: Sequence[Stage], scheme: Scheme, own: Sequence[Formation], epsilon: float
+) -> Iterator[list[Stage]]:
+    """Sequences of stages that a solution asks for, the most promising ones first.
+
+    Parameters
+    ----------
+    stages : sequence of Stage
+        With the solution as guesses.
+    own : sequence of Formation
+        The formation that each stage's phase asks for: what rolls there has to.
+    epsilon : float, [N]
+    """
+    for index, stage in enumerate(stages):
+        if stage.guess.duration < _GONE * SHORTEST:
+            left = drop(stages, index)
+            if left is not None:
+                yield link(merge(left))
+    runs = [
+        (run, index)
+        for index, stage in enumerate(stages)
+        for run in [
+            *_find_held(stage, scheme),
+            *_find_leaning(stage, scheme, own[index], epsilon),
+        ]
+    ]
+    wide = [(run._replace(begin=0, stop=stages[k].intervals), k) for run, k in runs if _is_most(run, stages[k])]
+    runs.sort(key=lambda found: -found[0].share)
+    wide.sort(key=lambda found: -found[0].share)
+    for run, index in [*wide, *runs]:
+        stage = stages[index]
+        for sign in (0.0, -mode_of(stage).signs[run.row]) if run.sign == 0 else (run.sign,):
+            pieces = _change(stages, index, run, sign, scheme)
+            if pieces is not None:
+                yield link(merge([*stages[:index], *pieces, *stages[index + 1 :]]))
+    yield from _unpin(stages, scheme)
+
+
+def _is_most(run: Run, stage: Stage) -> bool:
+    """Whether a run is more than half of its stage."""
+    return 2 * run.share > stage.guess.duration
+
+
+def _change(
+    stages: Sequence[Stage], index: int, run: Run, sign: float, scheme: Scheme
+) -> list[Stage] | None:
+    """Pieces of a stage with another direction in a run, or None if that cannot be."""
+    stage, formation = stages[index], stages[index].formation
+    rows = formation.turn_with(run.row)
+    if sign == 0:
+        full = formation.n_constraints >= 4
+        if run.row >= formation.n_contacts or len(rows) > 1 or full:
+            return None
+        if formation.friction[run.row] == 0:
+            return None
+    mode = mode_of(stage).changed(rows, sign)
+    # Where the neighbour is in that mode already, the place between them has been chosen.
+    at_start, at_end = run.begin == 0, run.stop == stage.intervals
+    if not (at_start and at_end):
+        near = [stages[index - 1]] if at_start and index else []
+        near += [stages[index + 1]] if at_end and index + 1 < len(stages) else []
+        if any(other.phase == stage.phase and mode_of(other) == mode for other in near):
+            return None
+    return split(stage, scheme, run.begin, run.stop, mode)
+
+
+def _unpin(stages: Sequence[Stage], scheme: Scheme) -> Iterator[list[Stage]]:
+    """Where something turns right between two phases: let it turn before that, or after it."""
+    for index, (stage, coming) in enumerate(zip(stages[:-1], stages[1:], strict=True)):
+        if stage.phase == coming.phase or stage.strikes or not stage.turns:
+            continue
+        names = stage.formation.names
+        turned = {names[k] if k < len(names) else k - len(names) for k in stage.turns}
+        for after in (True, False):
+            part = coming if after else stage
+            own = part.formation.names
+            rows = [
+                k
+                for k in range(len(own) + 2)
+                if (own[k] if k < len(own) else k - len(own)) in turned
+            ]
+            signs = mode_of(part).signs
+            mode = Mode(tuple(-s if k in rows else s for k, s in enumerate(signs)))
+            few = max(1, part.intervals // 4)
+            begin, stop = (0, few) if after else (part.intervals - few, part.intervals)
+            pieces = split(part, scheme, begin, stop, mode)
+            at = index + after
+            yield link(merge([*stages[:at], *pieces, *stages[at + 1 :]]))
+
+
+def _find_held(stage: Stage, scheme: Scheme) -> list[Run]:
+    """Stretches over which a least rate holds something back."""
+    formation, part = stage.formation, stage.guess
+    z, v = part.z.reshape(-1, 5), part.v.reshape(-1, 5)
+    slip = np.einsum("nij,nj->ni", formation.evaluate(z, v).A_t, v)
+    rates = np.hstack([slip / formation.scene.polygon.gyration_radius, v[:, 3:]])
+    senses = rates * np.concatenate(stage.directions)
+    fast = np.abs(v[:, 2:]).max()
+    least = 1.01 * least_rates(stage, scheme).reshape(-1, 1)
+    held = senses < least + _STALLED * fast
+    held &= (np.abs(senses).max(axis=1) > 1e-3 * fast)[:, None]
+    held[:, list(formation.rolling_rows)] = False
+    return _find_runs(held, stage, scheme, np.zeros(held.shape[1]))
+
+
+def _find_leaning(stage: Stage, scheme: Scheme, own: Formation, epsilon: float) -> list[Run]:
+    """Stretches over which a contact that need not roll leans on one side of its cone."""
+    formation, n_c = stage.formation, stage.formation.n_contacts
+    runs = []
+    for k, row in enumerate(formation.rolling_rows):
+        if formation.contacts[row] in own.rolling:
+            continue
+        c_n = stage.guess.forces[..., row].ravel()
+        c_t = stage.guess.forces[..., n_c + k].ravel()
+        mu = formation.friction[row]
+        near = mu * (c_n - epsilon) - np.abs(c_t) < _LEANS * mu * c_n
+        for sign in (1.0, -1.0):
+            leaning = np.zeros((len(c_n), n_c + 2), dtype=bool)
+            # Friction pushes against sliding.
+            leaning[:, row] = near & (sign * c_t < 0)
+            runs += _find_runs(leaning, stage, scheme, np.full(n_c + 2, sign))
+    return runs
+
+
+def _find_runs(
+    flags: NDArray[np.bool_], stage: Stage, scheme: Scheme, signs: Array
+) -> list[Run]:
+    """Longest run of True in each column, of shape (K d, n), if it is an interval long."""
+    found = []
+    for row, column in enumerate(flags.T):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], column.astype(int), [0]])))
+        runs = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+        if not runs:
+            continue
+        first, last = max(runs, key=lambda run: run[1] - run[0])
+        if last - first < scheme.degree:
+            continue
+        begin, stop = first // scheme.degree, -(-last // scheme.degree)
+        breaks = stage.guess.breaks
+        share = float(breaks[stop] - breaks[begin]) * stage.guess.duration
+        found.append(Run(row, begin, stop, float(signs[row]), share))
+    return found
+
+
+__all__ = ["Run", "list_moves", "in_mode", "replace"]
