@@ -1,8 +1,4 @@
-"""The equations of the time-domain NLP: at a point, at a stage's end, from stage to stage.
-
-Unknowns are w = T z' and u = T^2 z'', so that collocation is linear; lengths count in radii of
-gyration, forces in N.
-"""
+"""The equations of the time-domain NLP: at a point, over an interval, from stage to stage."""
 
 from __future__ import annotations
 
@@ -15,101 +11,112 @@ from ..dynamics import build_force_rows
 from ..formation import Formation
 from ..problem import Until
 from .blocknlp import Kernel, build_kernel
+from .collocation import Scheme, make_scheme
 
 NOTHING = ca.SX(0, 1)
-LEVER = 0.1
-"""Length that torques are divided by, to weigh them against forces [m]."""
 
 
 @lru_cache(maxsize=32)
 def point_kernel(formation: Formation) -> Kernel:
     """Equations and inequalities at a collocation point.
 
-    x is (z, w, u, forces, tau at the start and the end of the interval, T), and z at the start of
+    x is (z, z', z'', forces, tau at the start and the end of the interval), and z at the start of
     the interval if a contact rolls. p is (Xi, sigma, the point's place in the interval, the least
-    rate [rad/s], a unit of time [s]). y is the contacts' constraints, in position, velocity and
-    acceleration, the five equations of motion, and what must not be negative: the senses of
-    friction of the sliding contacts.
+    rate). y is the contacts' constraints, in position, velocity and acceleration, the five
+    equations of motion, and what must not be negative: the senses of friction of the sliding
+    contacts.
     """
     scene, n_c, n_p = formation.scene, formation.n_contacts, formation.n_constraints
-    rho = scene.polygon.gyration_radius
-    z, w, u = (ca.SX.sym(name, 5) for name in ("z", "w", "u"))
-    forces, tau, T = ca.SX.sym("forces", n_p), ca.SX.sym("tau", 4), ca.SX.sym("T")
+    z, v, a = (ca.SX.sym(name, 5) for name in ("z", "v", "a"))
+    forces, tau = ca.SX.sym("forces", n_p), ca.SX.sym("tau", 4)
     first = ca.SX.sym("first", 5 if formation.rolling else 0)
     Xi, sigma, place = ca.SX.sym("Xi", n_c), ca.SX.sym("sigma", 2), ca.SX.sym("place")
-    least, unit = ca.SX.sym("least"), ca.SX.sym("unit")
-    gaps, P, P_dot_w, A_t = formation.build_constraints(z, w)
+    least = ca.SX.sym("least")
+    gaps, P, P_dot_v, A_t = formation.build_constraints(z, v)
     if formation.rolling:
-        gaps[n_c:] -= formation.roll_function(first, w)[0]
+        gaps[n_c:] -= formation.roll_function(first, v)[0]
     applied = (
         ca.DM(scene.applied_force)
         + ca.vertcat(0, 0, 0, tau[:2] * (1 - place) + tau[2:] * place)
         - ca.DM(scene.dry) * ca.vertcat(0, 0, 0, sigma)
         + build_force_rows(formation, P, A_t, Xi).T @ forces
     )
-    moving = ca.DM(scene.mass_diagonal) * u + ca.DM(scene.viscous) * w * T - applied * T**2
-    balance = moving / unit**2 / ca.DM([1.0, 1.0, rho, LEVER, LEVER])
+    balance = ca.DM(scene.mass_diagonal) * a + ca.DM(scene.viscous) * v - applied
     sliding = [k for k in range(n_c) if k not in formation.rolling_rows]
     # With `:`, no rows of a single one are no rows, and not a row without columns.
-    senses = (Xi * (A_t @ w) / rho - least * T)[sliding, :]
-    y = ca.vertcat(gaps / rho, P @ w / rho, (P @ u + P_dot_w) / rho, balance, senses)
+    senses = (Xi * (A_t @ v) - least)[sliding, :]
+    y = ca.vertcat(gaps, P @ v, P @ a + P_dot_v, balance, senses)
     return build_kernel(
-        ca.vertcat(z, w, u, forces, tau, T, first), ca.vertcat(Xi, sigma, place, least, unit), y
+        ca.vertcat(z, v, a, forces, tau, first), ca.vertcat(Xi, sigma, place, least), y
     )
 
 
 @lru_cache(maxsize=32)
 def end_kernel(formation: Formation) -> Kernel:
-    """Contacts at the end of an interval without a point there: x is (z, w), and z at its start."""
-    rho = formation.scene.polygon.gyration_radius
-    z, w = ca.SX.sym("z", 5), ca.SX.sym("w", 5)
+    """Contacts at the end of an interval without a point there: x is (z, z'), and z at its start."""
+    z, v = ca.SX.sym("z", 5), ca.SX.sym("v", 5)
     first = ca.SX.sym("first", 5 if formation.rolling else 0)
-    gaps, P, _, _ = formation.build_constraints(z, w)
+    gaps, P, _, _ = formation.build_constraints(z, v)
     if formation.rolling:
-        gaps[formation.n_contacts :] -= formation.roll_function(first, w)[0]
-    return build_kernel(ca.vertcat(z, w, first), NOTHING, ca.vertcat(gaps, P @ w) / rho)
+        gaps[formation.n_contacts :] -= formation.roll_function(first, v)[0]
+    return build_kernel(ca.vertcat(z, v, first), NOTHING, ca.vertcat(gaps, P @ v))
+
+
+@lru_cache(maxsize=32)
+def collocation_kernel(name: str, degree: int, freedoms: int) -> Kernel:
+    """Collocation along the tangent space: N^T (s_j - s_0 - h sum_l a_jl r_l).
+
+    x is (s at the start, at the points and, if no point is there, at the end; the rates r at the
+    points; h), p the columns of N, and y a row for each freedom at each point and end.
+    """
+    scheme: Scheme = make_scheme(name, degree)
+    rungs = degree + (not scheme.ends)
+    table = scheme.integrals.tolist() + ([] if scheme.ends else [scheme.weights.tolist()])
+    start, h = ca.SX.sym("start", 5), ca.SX.sym("h")
+    here, rates = ca.SX.sym("here", 5, rungs), ca.SX.sym("rates", 5, degree)
+    N = ca.SX.sym("N", 5, freedoms)
+    steps = here - ca.repmat(start, 1, rungs) - h * (rates @ ca.DM(table).T)
+    x = ca.vertcat(start, ca.vec(here), ca.vec(rates), h)
+    return build_kernel(x, ca.vec(N), ca.vec(N.T @ steps))
 
 
 @lru_cache(maxsize=64)
 def watch_kernel(formation: Formation, watched: tuple[int, ...]) -> Kernel:
     """Limits of a formation, of x = z."""
-    rho = formation.scene.polygon.gyration_radius
-    values = ca.vertcat(*(formation.limits[k].value for k in watched)) / rho
+    values = ca.vertcat(*(formation.limits[k].value for k in watched))
     return build_kernel(build_features(formation.scene).z, NOTHING, values)
 
 
 @lru_cache(maxsize=64)
 def opening_kernel(formation: Formation, contact: Contact) -> Kernel:
-    """Second derivative of a contact's gap [m/s^2], of x = (z, w, u, T)."""
-    z, w, u, T = (ca.SX.sym(*symbol) for symbol in (("z", 5), ("w", 5), ("u", 5), ("T",)))
-    _, A, _, A_dot_w = Formation(formation.scene, (contact,)).function(z, w)
-    return build_kernel(ca.vertcat(z, w, u, T), NOTHING, (A @ u + A_dot_w) / T**2)
+    """Second derivative of a contact's gap, of x = (z, z', z'')."""
+    z, v, a = (ca.SX.sym(name, 5) for name in ("z", "v", "a"))
+    _, A, _, A_dot_v = Formation(formation.scene, (contact,)).function(z, v)
+    return build_kernel(ca.vertcat(z, v, a), NOTHING, A @ a + A_dot_v)
 
 
 def goal_kernel(
     formation: Formation, until: Until | None, turns: tuple[int, ...], gained: Formation | None
 ) -> Kernel | None:
-    """What is zero at the end of a stage, of x = (z, w); None if nothing is.
+    """What is zero at the end of a stage, of x = (z, z'); None if nothing is.
 
     The end of the phase is reached, rates turn, and what is gained is approached without speed.
     """
     scene = formation.scene
-    rho = scene.polygon.gyration_radius
-    z, w = build_features(scene).z, ca.SX.sym("w", 5)
+    z, v = build_features(scene).z, ca.SX.sym("v", 5)
     parts: list[Expression] = []
     if until is not None and until.contact is not None:
-        parts.append(build_gap(until.contact, scene) / rho)
+        parts.append(build_gap(until.contact, scene))
     elif until is not None and until.value is not None:
-        x = until.coordinate == "x"
-        parts.append((z[0] - until.value) / rho if x else z[2] - until.value)
+        parts.append((z[0] if until.coordinate == "x" else z[2]) - until.value)
     if turns:
-        rates = ca.vertcat(formation.function(z, w)[2] @ w / rho, w[3:])
+        rates = ca.vertcat(formation.function(z, v)[2] @ v, v[3:])
         # A flush edge has one rate, and equations said twice spoil the solver's steps.
         parts += [rates[k] for k in {formation.turn_with(k): k for k in turns}.values()]
     if gained is not None:
-        P = gained.build_constraints(z, w)[1]
-        parts += [P[i, :] @ w / rho for i in new_rows(formation, gained)]
-    return build_kernel(ca.vertcat(z, w), NOTHING, ca.vertcat(*parts)) if parts else None
+        P = gained.build_constraints(z, v)[1]
+        parts += [P[i, :] @ v for i in new_rows(formation, gained)]
+    return build_kernel(ca.vertcat(z, v), NOTHING, ca.vertcat(*parts)) if parts else None
 
 
 def new_rows(formation: Formation, following: Formation) -> list[int]:
@@ -121,19 +128,12 @@ def new_rows(formation: Formation, following: Formation) -> list[int]:
 
 
 @lru_cache(maxsize=1)
-def join_kernel() -> Kernel:
-    """The jump of w, in two units of time, of x = (after, before, T before, T after)."""
-    after, before, T = ca.SX.sym("after", 5), ca.SX.sym("before", 5), ca.SX.sym("T", 2)
-    return build_kernel(ca.vertcat(after, before, T), NOTHING, after - before * T[1] / T[0])
-
-
-@lru_cache(maxsize=1)
 def effort_kernel() -> Kernel:
-    """Integral of tau^T tau over an interval, of x = (tau, T) and p = its share of T."""
-    tau, T, share = ca.SX.sym("tau", 4), ca.SX.sym("T"), ca.SX.sym("share")
+    """Integral of tau^T tau over an interval, of x = (tau, h)."""
+    tau, h = ca.SX.sym("tau", 4), ca.SX.sym("h")
     first, last = tau[:2], tau[2:]
     squares = ca.sumsqr(first) + ca.dot(first, last) + ca.sumsqr(last)
-    return build_kernel(ca.vertcat(tau, T), share, share * T * squares / 3)
+    return build_kernel(ca.vertcat(tau, h), NOTHING, h * squares / 3)
 
 
 def find_leaving(formation: Formation, following: Formation) -> list[int]:
@@ -145,28 +145,25 @@ def find_leaving(formation: Formation, following: Formation) -> list[int]:
 def impact_kernel(formation: Formation, following: Formation) -> Kernel:
     """A plastic impact M5 (v+ - v-) = G+^T p, P+ v+ = 0 onto the next formation.
 
-    x is (w after, w before, T before, T after, z, p), p the sliding directions after it. y is zero
+    x is (z' after, z' before, z, impulses), p the sliding directions after it. y is zero
     in its first 5 + n_c + R rows; then come what must not be negative: the rates of the gaps that
     open, and the friction cones of rolling contacts.
     """
     scene, n_c = following.scene, following.n_contacts
-    rho = scene.polygon.gyration_radius
-    after, before, T = ca.SX.sym("after", 5), ca.SX.sym("before", 5), ca.SX.sym("T", 2)
+    after, before = ca.SX.sym("after", 5), ca.SX.sym("before", 5)
     z, impulses = ca.SX.sym("z", 5), ca.SX.sym("impulses", following.n_constraints)
     Xi = ca.SX.sym("Xi", n_c)
     _, P, _, A_t = following.build_constraints(z, after)
     push = build_force_rows(following, P, A_t, Xi).T @ impulses
-    jump = ca.DM(scene.mass_diagonal) * (after - before * T[1] / T[0]) - T[1] * push
-    mass = scene.polygon.mass
-    jump = jump / (mass * rho) / ca.DM([1.0, 1.0, rho, LEVER, LEVER])
+    jump = ca.DM(scene.mass_diagonal) * (after - before) - push
     A = formation.function(z, after)[1]
     rolling = list(following.rolling_rows)
     grip = ca.DM(following.friction)[rolling, :] * impulses[rolling, :]
     y = ca.vertcat(
         jump,
-        P @ after / rho,
-        A[find_leaving(formation, following), :] @ after / rho,
+        P @ after,
+        A[find_leaving(formation, following), :] @ after,
         grip - impulses[n_c:, :],
         grip + impulses[n_c:, :],
     )
-    return build_kernel(ca.vertcat(after, before, T, z, impulses), Xi, y)
+    return build_kernel(ca.vertcat(after, before, z, impulses), Xi, y)
