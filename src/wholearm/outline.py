@@ -103,8 +103,10 @@ def outline_curve(curve: Curve, share: float = 1.0) -> list[Outline]:
     return outlines
 
 
-def outline_phase(problem: Problem, phase: Phase, z: Array) -> list[Outline]:
-    """Outline a phase from `z`, shape (5,), to its end.
+def outline_phase(
+    problem: Problem, phase: Phase, z: Array, release_at: float = RELEASE_AT
+) -> list[Outline]:
+    """Outline a phase from `z`, shape (5,), to its end; a release is at a share of the curve.
 
     Raises
     ------
@@ -119,7 +121,7 @@ def outline_phase(problem: Problem, phase: Phase, z: Array) -> list[Outline]:
         raise InputError(problem.source, key, "the contacts leave no freedom to move")
     if freedoms == 1:
         curve = trace_phase(problem, phase, z)
-        return outline_curve(curve, RELEASE_AT if phase.until.is_release else 1.0)
+        return outline_curve(curve, release_at if phase.until.is_release else 1.0)
     goal = _find_goal(problem, phase, z)
     return [_connect(formation, z, goal)]
 

@@ -110,5 +110,5 @@ def raise_bounds(
         low[own.limits.presses] = floor[:, None]
         cushion = hold_least(formation, epsilon)[formation.n_contacts :]
         low[own.limits.cones] = cushion + np.tile(raised.cone, 2)[:, None]
-        low[own.watches] += raised.gap[:, None] / formation.scene.polygon.gyration_radius
+        low[own.watches] += raised.gap[:, None]
     return low, high

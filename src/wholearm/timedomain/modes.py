@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -139,6 +138,29 @@ def merge(stages: Sequence[Stage]) -> list[Stage]:
     return merged
 
 
+def release_earlier(stages: Sequence[Stage], index: int) -> list[Stage] | None:
+    """Stages of which one belongs to the next phase, or None if that cannot be.
+
+    It has to be the last but not the only one of a phase that ends by a release.
+    """
+    stage = stages[index]
+    coming = stages[index + 1] if index + 1 < len(stages) else None
+    before = stages[index - 1] if index else None
+    if coming is None or before is None or before.phase != stage.phase:
+        return None
+    if coming.phase == stage.phase or not coming.opens or stage.until is not None:
+        return None
+    names = stage.formation.names
+    if not set(coming.formation.names) < set(names) or coming.formation.rolling:
+        return None
+    rows = [names.index(name) for name in coming.formation.names]
+    Xi, sigma = stage.directions
+    guess = stage.guess._replace(forces=stage.guess.forces[..., rows])
+    directions = Directions(Xi[rows], sigma)
+    moved = replace(coming, directions=directions, guess=guess, until=None, strikes=False)
+    return [*stages[:index], moved, replace(coming, opens=False), *stages[index + 2 :]]
+
+
 def drop(stages: Sequence[Stage], index: int) -> list[Stage] | None:
     """Stages without one of them, or None if it is all that its phase has."""
     stage = stages[index]
@@ -175,9 +197,3 @@ def _cut(part: StagePoints, scheme: Scheme, begin: int, stop: int) -> StagePoint
     while len(shares) - 1 < LEAST_INTERVALS:
         shares = np.sort(np.append(shares, (shares[1:] + shares[:-1]) / 2))
     return resample(part, scheme, shares, float(breaks[0]), float(breaks[-1]))
-
-
-__all__ = [
-    "LEAST_INTERVALS", "Mode", "drop", "find_turns", "in_mode", "link", "merge", "mode_of",
-    "pairwise", "sign_sequence", "split",
-]  # fmt: skip

@@ -8,7 +8,6 @@ sliding that way. A stage that has shrunk to nothing is in the way of others.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,16 +16,16 @@ from numpy.typing import NDArray
 from ..formation import Formation
 from ..model import Array
 from .collocation import Scheme
-from .modes import Mode, drop, in_mode, link, merge, mode_of, split
+from .modes import drop, link, merge, mode_of, release_earlier, split
 from .stage import Stage
-from .timenlp import SHORTEST, least_rates
+from .timenlp import least_rates
 
 _STALLED = 1e-6
 """Rate over the largest one at which a direction of friction counts as held back."""
 _LEANS = 1e-4
 """Margin to the friction cone over mu c_n at which a rolling contact counts as leaning on it."""
-_GONE = 1.01
-"""Duration over the shortest one at which a stage counts as shrunk to nothing."""
+_GONE = 1e-4
+"""Share of the whole duration below which a stage counts as shrunk to nothing."""
 
 
 class Run(NamedTuple):
@@ -53,7 +52,11 @@ class Run(NamedTuple):
 
 
 def list_moves(
-    stages: Sequence[Stage], scheme: Scheme, own: Sequence[Formation], epsilon: float
+    stages: Sequence[Stage],
+    scheme: Scheme,
+    own: Sequence[Formation],
+    epsilon: float,
+    leaning: bool = False,
 ) -> Iterator[list[Stage]]:
     """Sequences of stages that a solution asks for, the most promising ones first.
 
@@ -63,10 +66,21 @@ def list_moves(
         With the solution as guesses.
     own : sequence of Formation
         The formation that each stage's phase asks for: what rolls there has to.
-    epsilon : float, [N]
+    epsilon : float
+    leaning : bool
+        Whether only contacts count that lean on their cones.
     """
+    if leaning:
+        runs = [
+            (run, k)
+            for k, stage in enumerate(stages)
+            for run in _find_leaning(stage, scheme, own[k], epsilon)
+        ]
+        yield from _apply(stages, scheme, runs)
+        return
+    total = sum(stage.guess.duration for stage in stages)
     for index, stage in enumerate(stages):
-        if stage.guess.duration < _GONE * SHORTEST:
+        if stage.guess.duration < _GONE * total:
             left = drop(stages, index)
             if left is not None:
                 yield link(merge(left))
@@ -78,16 +92,28 @@ def list_moves(
             *_find_leaning(stage, scheme, own[index], epsilon),
         ]
     ]
+    yield from _apply(stages, scheme, runs)
+    for index in range(len(stages)):
+        left = release_earlier(stages, index)
+        if left is not None:
+            yield link(merge(left))
+
+
+def _apply(
+    stages: Sequence[Stage], scheme: Scheme, runs: list[tuple[Run, int]]
+) -> Iterator[list[Stage]]:
+    """Stages in which what is at its limit over a run moves in another way; whole ones first."""
     wide = [(run._replace(begin=0, stop=stages[k].intervals), k) for run, k in runs if _is_most(run, stages[k])]
     runs.sort(key=lambda found: -found[0].share)
     wide.sort(key=lambda found: -found[0].share)
     for run, index in [*wide, *runs]:
         stage = stages[index]
-        for sign in (0.0, -mode_of(stage).signs[run.row]) if run.sign == 0 else (run.sign,):
-            pieces = _change(stages, index, run, sign, scheme)
-            if pieces is not None:
-                yield link(merge([*stages[:index], *pieces, *stages[index + 1 :]]))
-    yield from _unpin(stages, scheme)
+        signs = [run.sign] if run.sign else [0.0, -mode_of(stage).signs[run.row]]
+        pieces = [_change(stages, index, run, sign, scheme) for sign in signs]
+        # What can roll turns by rolling first.
+        found = next((piece for piece in pieces if piece is not None), None)
+        if found is not None:
+            yield link(merge([*stages[:index], *found, *stages[index + 1 :]]))
 
 
 def _is_most(run: Run, stage: Stage) -> bool:
@@ -118,36 +144,12 @@ def _change(
     return split(stage, scheme, run.begin, run.stop, mode)
 
 
-def _unpin(stages: Sequence[Stage], scheme: Scheme) -> Iterator[list[Stage]]:
-    """Where something turns right between two phases: let it turn before that, or after it."""
-    for index, (stage, coming) in enumerate(zip(stages[:-1], stages[1:], strict=True)):
-        if stage.phase == coming.phase or stage.strikes or not stage.turns:
-            continue
-        names = stage.formation.names
-        turned = {names[k] if k < len(names) else k - len(names) for k in stage.turns}
-        for after in (True, False):
-            part = coming if after else stage
-            own = part.formation.names
-            rows = [
-                k
-                for k in range(len(own) + 2)
-                if (own[k] if k < len(own) else k - len(own)) in turned
-            ]
-            signs = mode_of(part).signs
-            mode = Mode(tuple(-s if k in rows else s for k, s in enumerate(signs)))
-            few = max(1, part.intervals // 4)
-            begin, stop = (0, few) if after else (part.intervals - few, part.intervals)
-            pieces = split(part, scheme, begin, stop, mode)
-            at = index + after
-            yield link(merge([*stages[:at], *pieces, *stages[at + 1 :]]))
-
-
 def _find_held(stage: Stage, scheme: Scheme) -> list[Run]:
     """Stretches over which a least rate holds something back."""
     formation, part = stage.formation, stage.guess
     z, v = part.z.reshape(-1, 5), part.v.reshape(-1, 5)
     slip = np.einsum("nij,nj->ni", formation.evaluate(z, v).A_t, v)
-    rates = np.hstack([slip / formation.scene.polygon.gyration_radius, v[:, 3:]])
+    rates = np.hstack([slip, v[:, 3:]])
     senses = rates * np.concatenate(stage.directions)
     fast = np.abs(v[:, 2:]).max()
     least = 1.01 * least_rates(stage, scheme).reshape(-1, 1)
@@ -194,6 +196,3 @@ def _find_runs(
         share = float(breaks[stop] - breaks[begin]) * stage.guess.duration
         found.append(Run(row, begin, stop, float(signs[row]), share))
     return found
-
-
-__all__ = ["Run", "list_moves", "in_mode", "replace"]

@@ -81,6 +81,8 @@ class Stage:
         Limits of the contacts that were let go where the phase began.
     opens : bool
         Whether they are let go at the start of this stage.
+    adapts : float
+        What it costs to change the duration of an interval; nothing if they keep their shares.
     """
 
     phase: int
@@ -94,6 +96,7 @@ class Stage:
     watched: tuple[int, ...] = ()
     released: tuple[int, ...] = ()
     opens: bool = False
+    adapts: float = 0.0
 
     @property
     def intervals(self) -> int:

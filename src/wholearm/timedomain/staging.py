@@ -11,17 +11,19 @@ import numpy as np
 from ..dynamics import Directions, force_rows
 from ..formation import TOUCHING, Formation
 from ..model import Array
-from ..outline import Outline, outline_onwards, outline_phase
+from ..outline import RELEASE_AT, Outline, outline_onwards, outline_phase
 from ..problem import End, Phase, Problem
 from .collocation import Scheme
 from .modes import LEAST_INTERVALS, link
+from .ownunits import in_own_units, scale_state
 from .stage import Stage, StagePoints
-from .timekernels import new_rows
 
 PRESS = 0.5
 """Normal forces that a first guess is near, over the weight of the object."""
 _NEAR = 0.02
 """Distance over the radius of gyration at which a limit is watched from the start."""
+_TOUCHES = 1e-5
+"""Gap over the radius of gyration below which a contact touches that a phase lets go."""
 
 
 def outline_stages(
@@ -32,24 +34,39 @@ def outline_stages(
     intervals: int,
     pace: float,
     onwards: bool = False,
+    release_at: float = RELEASE_AT,
 ) -> list[Stage]:
-    """Stages of phases that are planned as one, with a first guess.
+    """Stages of phases that are planned as one, with a first guess, in the scene's own units.
 
     The guessed duration is `pace` times that of a fall over the length of the outlines. With
     `onwards`, phases that go on in motion may end farther away where that takes fewer reversals.
+    A phase that ends by a release is guessed to do so at the share `release_at` of its curve.
     """
     parts: list[tuple[Phase, Outline, bool]] = []
     for phase in phases:
-        outlines = outline_phase(problem, phase, z)
+        outlines = outline_phase(problem, phase, z, release_at)
         if parts and parts[-1][0].end is End.SMOOTH:
             outlines = [*_turn_first(outlines[0], parts[-1][1]), *outlines[1:]]
             if onwards:
                 outlines = _go_straight(phase, outlines, parts[-1][1])
         parts += [(phase, outline, outline is outlines[-1]) for outline in outlines]
         z = outlines[-1].z[-1]
+    own, scales = in_own_units(problem), problem.scene.scales
+    phases = [own.phases[phase.index] for phase in phases]
+    parts = [
+        (
+            own.phases[phase.index],
+            replace(
+                outline,
+                formation=own.phases[phase.index].formation,
+                z=scale_state(outline.z, scales),
+            ),
+            last,
+        )
+        for phase, outline, last in parts
+    ]
     lengths = np.array([outline.length for _, outline, _ in parts])
-    gravity = problem.scene.gravity or 9.81
-    total = pace * float(np.sqrt(lengths.sum() / gravity))
+    total = pace * float(np.sqrt(lengths.sum()))
     ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
     # The guess runs as (1 - cos) over all stages, so each has its own share of the time.
     clock = np.arccos(1 - 2 * np.clip(ends, 0.0, 1.0)) / np.pi
@@ -58,7 +75,7 @@ def outline_stages(
     released: tuple[int, ...] = ()
     for k, (phase, outline, last) in enumerate(parts):
         count = max(LEAST_INTERVALS, round(lengths[k] / longest[phase.index] * intervals))
-        following = problem.phases[phase.index + 1] if phase is not phases[-1] and last else None
+        following = own.phases[phase.index + 1] if phase is not phases[-1] and last else None
         strikes = following is not None and phase.end is End.IMPACT
         guess = _guess(
             outline, scheme, count, (clock[k], clock[k + 1]), (ends[k], ends[k + 1]), total
@@ -67,7 +84,7 @@ def outline_stages(
             guess = guess._replace(impulses=np.zeros(following.formation.n_constraints))
         opens = k > 0 and parts[k - 1][0] is not phase
         if opens:
-            touching = np.abs(phase.formation.evaluate_limits(outline.z[:1])[0]) < TOUCHING
+            touching = np.abs(phase.formation.evaluate_limits(outline.z[:1])[0]) < _TOUCHES
             released = tuple(np.flatnonzero(touching).tolist())
         stages.append(
             Stage(
@@ -76,15 +93,13 @@ def outline_stages(
                 outline.directions,
                 guess,
                 until=phase.until if last and not phase.until.is_release else None,
-                turns=outline.turns,
-                gained=_find_gained(phase, following) if not strikes else None,
                 strikes=strikes,
                 watched=tuple(sorted({*_choose_watched(phase, outline), *released})),
                 released=released,
                 opens=opens,
             )
         )
-    return stages
+    return link(stages)
 
 
 def _guess(
@@ -150,14 +165,14 @@ def _balance(outline: Outline, z: Array, v: Array, a: Array) -> tuple[Array, Arr
     applied = scene.applied_force - scene.dry * np.append(np.zeros(3), sigma)
     needed = scene.mass_diagonal * flat[2] + scene.viscous * flat[1] - applied
     light = np.zeros(formation.n_constraints)
-    light[: formation.n_contacts] = PRESS * scene.scales.force
+    light[: formation.n_contacts] = PRESS
     forces = []
     for rows, wanted in zip(G[:, :, :3], needed[:, :3], strict=True):
         missing = wanted - light @ rows
         forces.append(light + np.linalg.lstsq(rows.T, missing, rcond=1e-6)[0])
     c = np.array(forces)
     c[:, : formation.n_contacts] = np.clip(
-        c[:, : formation.n_contacts], 0.1 * light[0], 20 * scene.scales.force
+        c[:, : formation.n_contacts], 0.1 * PRESS, 20.0
     )
     tau = needed[:, 3:] - np.einsum("nij,ni->nj", G[:, :, 3:], c)
     tau = np.clip(tau, -0.9 * scene.torque_limit, 0.9 * scene.torque_limit)
@@ -201,17 +216,10 @@ def _turn_first(outline: Outline, before: Outline) -> list[Outline]:
     return pieces
 
 
-def _find_gained(phase: Phase, following: Phase | None) -> Formation | None:
-    """The next phase's formation, if it has a constraint that this phase's has not."""
-    if following is None or not new_rows(phase.formation, following.formation):
-        return None
-    return following.formation
-
-
 def _choose_watched(phase: Phase, outline: Outline) -> tuple[int, ...]:
     """Limits that are near zero along the outline, and the phase's own end."""
     values = outline.formation.evaluate_limits(outline.z)
-    near = values.min(axis=0) < _NEAR * outline.formation.scene.polygon.gyration_radius
+    near = values.min(axis=0) < _NEAR
     gained = [limit.gained == phase.until.contact for limit in outline.formation.limits]
     mine = np.array(gained) & (phase.until.contact is not None)
     return tuple(np.flatnonzero(near | mine).tolist())

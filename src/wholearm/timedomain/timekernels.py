@@ -136,6 +136,13 @@ def effort_kernel() -> Kernel:
     return build_kernel(ca.vertcat(tau, h), NOTHING, h * squares / 3)
 
 
+@lru_cache(maxsize=1)
+def stretch_kernel() -> Kernel:
+    """What it costs to change the duration of an interval, of x = h, p = (weight, h before)."""
+    h, p = ca.SX.sym("h"), ca.SX.sym("p", 2)
+    return build_kernel(h, p, p[0] * (h / p[1] - 1) ** 2)
+
+
 def find_leaving(formation: Formation, following: Formation) -> list[int]:
     """Contacts of a formation that the next one does not have."""
     return [i for i, c in enumerate(formation.contacts) if c not in following.contacts]

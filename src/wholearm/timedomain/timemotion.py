@@ -71,9 +71,19 @@ class StageMotion(Keeper):
     def _forward(self) -> Batch:
         return Batch(build_forward(self.formation))
 
-    @cached_property
+    @property
     def _pieces(self) -> Array:
-        """Powers of x in [-1, 1] that give z over each interval, shape (K, 5, n).
+        """Powers of x in [-1, 1] that give z over each interval, shape (K, 5, n)."""
+        return self._integrated[0]
+
+    @property
+    def defects(self) -> Array:
+        """By how much collocation misses z and z' at the end of each interval, shape (K, 2, 5)."""
+        return self._integrated[1]
+
+    @cached_property
+    def _integrated(self) -> tuple[Array, Array]:
+        """The pieces and the defects.
 
         The accelerations at an interval's points are integrated twice from its start, and those
         that follow there by forward dynamics again, until they are one motion. What is left at
@@ -101,7 +111,7 @@ class StageMotion(Keeper):
         miss = (z[1:] - place.sum(axis=2))[..., None], (v[1:] - velocity.sum(axis=2))[..., None]
         place[..., :4] += miss[0] * [0.5, 0.75, 0.0, -0.25]
         place[..., :4] += half * miss[1] * [-0.25, -0.25, 0.25, 0.25]
-        return place
+        return place, np.concatenate(miss, axis=2).transpose(0, 2, 1)
 
     def _interpolate(self, t: Array) -> tuple[Array, Array]:
         """Z and its derivative by the polynomial of each interval."""

@@ -1,24 +1,25 @@
 """The planning NLP in the time domain, for formations with any number of freedoms.
 
-A stage is a stretch on one formation with fixed directions of friction, of free duration T, in K
-intervals with d collocation points each. Torques are linear in each interval and may step between.
-Unknowns are z, w = T z' and T at the nodes between intervals, and z, w, u = T^2 z'' and the contact
-forces c at every point, where
+A stage is a stretch on one formation with fixed directions of friction, in K intervals of unknown
+durations h with d collocation points each. Torques are linear in each interval and may step
+between. Unknowns are z and z' at the nodes between intervals, h of each interval, and z, z', z''
+and the contact forces c at every point, where
 
-    C(z) = 0,  P w = 0,  P u + P'(w) w = 0,
-    M5 u + T B w = T^2 (g - D sigma + S tau + G^T c),
-    c_n >= epsilon,  |tau| <= limit,  Xi A_t w >= 0,  sigma theta' >= 0,
+    C(z) = 0,  P z' = 0,  P z'' + P' z' = 0,
+    M5 z'' + B z' = g - D sigma + S tau + G^T c,
+    c_n >= epsilon,  |tau| <= limit,  Xi A_t z' >= 0,  sigma theta' >= 0,
     |c_t| <= mu (c_n - epsilon) (rolling).
 
 So contacts hold at every point, without drift, and friction never pushes the wrong way. Along the
 contacts' tangent space alone, with an orthonormal basis N of the null space of P at a guess of
-each interval, the differential equations are collocated, with h the interval's share of T:
+each interval, the differential equations are collocated:
 
-    N^T (z_j - z_0 - h sum_l a_jl w_l) = 0,  N^T (w_j - w_0 - h sum_l a_jl u_l) = 0.
+    N^T (z_j - z_0 - h sum_l a_jl z'_l) = 0,  N^T (z'_j - z'_0 - h sum_l a_jl z''_l) = 0.
 
-These rows are linear. Unknowns and rows are in the order of time, and each node's z, w and T are a
-function of the interval before it. What stands still at an instant has no sense of friction there:
-an inequality that equations keep at zero would leave the solver no interior.
+Nothing but these rows knows of durations, so that a stage may shrink to nothing. The intervals of a
+stage keep their shares of it, or within bounds choose them. Unknowns and rows are in the order of
+time. What stands still at an instant has no sense of friction there: an inequality that equations
+keep at zero would leave the solver no interior. All quantities are in units that fit the scene.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,36 +37,40 @@ from ..curve import tangent_basis
 from ..ipopt import build_solver
 from ..model import Array
 from ..options import Objective
-from .blocknlp import Indices, assemble_nlp
+from .blocknlp import Assembled, Indices, assemble_nlp
 from .collocation import Scheme
 from .stage import Stage
 from .timekernels import (
+    collocation_kernel,
     effort_kernel,
     end_kernel,
     goal_kernel,
     impact_kernel,
-    join_kernel,
     opening_kernel,
     point_kernel,
+    stretch_kernel,
     watch_kernel,
 )
-from .timelayout import BEFORE, MARGIN, StageLayout, T, W, Z, lay_out
+from .timelayout import MARGIN, V, Z, StageLayout, lay_out
 from .timelimits import Give, LimitRows, add_limits
 from .timerows import Rows
 
-OPENING = 0.1
-"""Least acceleration with which the gap of a released contact opens [m/s^2]."""
-CLEAR = 2e-5
-"""Gap of a released contact after a third of the first stage without it at least [m]."""
-SLIDING = 0.001
-"""Least sliding over the radius of gyration, and least speed of a joint [rad/s]: what hardly moves
-would be held by friction."""
-SHORTEST, LONGEST = 6e-4, 20.0
-"""Least and largest duration of a stage [s]."""
-_HURRY = 1e-2
-"""Weight of time against shortfalls [N/s]: keeps a motion that is short of something brisk."""
-PUSH = 1e-6
-"""How far the first guess is kept from its bounds."""
+OPENING = 0.01
+"""Least acceleration with which the gap of a released contact opens, over gravity."""
+CLEAR = 5e-4
+"""Gap of a released contact after a third of the first stage without it at least, over the radius
+of gyration."""
+SLIDING = 3e-3
+"""Least sliding, over the radius of gyration, and least speed of a joint, in the scene's unit of
+time: what does not move at all would have no sense."""
+SHORTEST = 1e-7
+"""Least duration of an interval, in the scene's unit: a stage may shrink to nothing."""
+EVEN = 0.2
+"""Least duration of an interval that chooses its share over that of its neighbour."""
+_HURRY = 3e-4
+"""Weight of time against shortfalls: keeps a motion that is short of something brisk."""
+NEAR, FAR = 1e-6, 1e-2
+"""How far from its bounds a start is kept: a solution, and a first guess."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +80,7 @@ class StageRows:
     Attributes
     ----------
     states : ndarray of int, shape (K, m)
-        How z, w and T go on.
+        How z and z' go on.
     points : ndarray of int, shape (K, d, m)
         What holds at the points.
     limits : LimitRows
@@ -99,7 +105,9 @@ class TimeNLP:
 
     Attributes
     ----------
-    solver : casadi.Function
+    assembled : Assembled
+    max_iter : int
+        Most iterations of the solver.
     layouts : list of StageLayout
     rows : Rows
     rows_of : list of StageRows
@@ -110,13 +118,28 @@ class TimeNLP:
     build_time : float, [s]
     """
 
-    solver: Expression
+    assembled: Assembled
+    max_iter: int
     layouts: list[StageLayout]
     rows: Rows
     rows_of: list[StageRows]
     lasts: int
     soft: NDArray[np.bool_]
     build_time: float
+
+    @cached_property
+    def solver(self) -> Expression:
+        """Ipopt, to start from a solution."""
+        return self._build(NEAR)
+
+    @cached_property
+    def first_solver(self) -> Expression:
+        """Ipopt, to start from a guess."""
+        return self._build(FAR)
+
+    def _build(self, push: float) -> Expression:
+        built = self.assembled
+        return build_solver("time_nlp", built.nlp, push, built.derivatives, max_iter=self.max_iter)
 
 
 def build_time_nlp(
@@ -146,7 +169,8 @@ def build_time_nlp(
         give = Give(-1.0)
     layouts = lay_out(stages, scheme, give is not None, objective is Objective.ELASTIC)
     rows, cost = Rows(), np.zeros(layouts[-1].stop)
-    _start(rows, layouts[0].nodes[0], stages[0].guess.nodes[0])
+    own = rows.linear(10, low=stages[0].guess.nodes[0].ravel(), high=stages[0].guess.nodes[0].ravel())
+    rows.put(own, layouts[0].nodes[0, :10], 1.0)
     weights = {Objective.TIME: 1.0, Objective.EFFORT: time_weight, Objective.ELASTIC: _HURRY}
     rows_of = []
     for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True)):
@@ -154,32 +178,27 @@ def build_time_nlp(
         if k + 1 < len(stages):
             _join(rows, stage, stages[k + 1], layout, layouts[k + 1].nodes[0])
         if objective is Objective.EFFORT:
-            columns = np.hstack([layout.tau, layout.nodes[:-1, T, None]])
-            rows.charge(effort_kernel(), columns, stage.guess.fractions[:, None])
-        cost[layout.nodes[-1, T]] = weights.get(objective, 0.0)
+            columns = np.hstack([layout.tau, layout.h[:, None]])
+            rows.charge(effort_kernel(), columns, np.zeros((len(columns), 0)))
+        if stage.adapts:
+            lengths = stage.guess.duration * stage.guess.fractions
+            parameters = np.column_stack([np.full(len(lengths), stage.adapts), lengths])
+            rows.charge(stretch_kernel(), layout.h[:, None], parameters)
+        cost[layout.h] = weights.get(objective, 0.0)
         cost[layout.short] = 1 / stage.intervals
     lasts, last, end = -1, stages[-1], layouts[-1].nodes[-1]
     if give is not None:
         cost[end[MARGIN]] = -1.0 if objective is Objective.MARGIN else 1.0
         total = rows.linear(1, high=np.inf)
-        rows.put(total, end[[T, BEFORE]], 1.0)
+        rows.put(total, np.concatenate([layout.h for layout in layouts]), 1.0)
         lasts = int(total[0])
     N = tangent_basis(last.formation, last.guess.nodes[-1, 0])
     rest = rows.linear(N.shape[1])
-    rows.put(rest[:, None], end[W], N.T)
+    rows.put(rest[:, None], end[V], N.T)
     built = assemble_nlp(len(cost), rows.triplets, rows.linear_rows, rows.blocks, cost)
-    solver = build_solver("time_nlp", built.nlp, PUSH, built.derivatives, max_iter=max_iter)
     soft = np.array(give.tau if give else (0.0, 0.0)) + (objective is Objective.ELASTIC) > 0
     seconds = time.perf_counter() - started
-    return TimeNLP(solver, layouts, rows, rows_of, lasts, soft, seconds)
-
-
-def _start(rows: Rows, node: Indices, state: Array) -> None:
-    """Rest at the first node, and nothing passed yet."""
-    own = rows.linear(10, low=state.ravel(), high=state.ravel())
-    rows.put(own, node[:T], 1.0)
-    if len(node) > MARGIN:
-        rows.put(rows.linear(1), node[BEFORE], 1.0)
+    return TimeNLP(built, max_iter, layouts, rows, rows_of, lasts, soft, seconds)
 
 
 def _add_stage(
@@ -195,9 +214,10 @@ def _add_stage(
     node, coming = layout.nodes[:-1], layout.nodes[1:]
     chain = rows.linear(*node.shape)
     rows.put(chain, coming, 1.0)
-    rows.put(chain[:, :T], layout.ends, -1.0)
-    rows.put(chain[:, T:], node[:, T:], -1.0)
+    rows.put(chain[:, :MARGIN], layout.ends, -1.0)
+    rows.put(chain[:, MARGIN:], node[:, MARGIN:], -1.0)
     states = np.hstack([chain, _collocate(rows, stage, layout, scheme)])
+    _share(rows, stage, layout)
     points = _balance(rows, stage, layout, scheme, last)
     if not scheme.ends:
         first = node[:, Z] if formation.rolling else node[:, :0]
@@ -208,40 +228,47 @@ def _add_stage(
     watches = _watch(rows, stage, layout, scheme)
     gained = [formation.limits[k].gained for k in stage.released]
     for contact in [c for c in gained if c is not None and stage.opens]:
-        count = scheme.degree
-        columns = [layout.z[0], layout.w[0], layout.u[0], np.full((count, 1), node[0, T])]
-        own = rows.nonlinear(count, 1, low=OPENING, high=np.inf)
+        columns = [layout.z[0], layout.v[0], layout.a[0]]
+        own = rows.nonlinear(scheme.degree, 1, low=OPENING, high=np.inf)
         rows.repeat(opening_kernel(formation, contact), np.hstack(columns), own)
-    speed = formation.scene.speed_limit
-    for k in np.flatnonzero(np.isfinite(speed)):
-        for sign in (1.0, -1.0):
-            own = rows.linear(*layout.w.shape[:2], high=np.inf)
-            rows.put(own, layout.w[..., 3 + k], sign)
-            rows.put(own, node[:, T, None], speed[k])
     goal = goal_kernel(formation, stage.until, stage.turns, stage.gained)
     if goal is not None:
-        rows.repeat(goal, layout.nodes[-1:, :T], rows.nonlinear(1, goal.outputs))
+        rows.repeat(goal, layout.nodes[-1:, :MARGIN], rows.nonlinear(1, goal.outputs))
     limits = add_limits(rows, stage, layout, scheme, give)
     return StageRows(states, points, limits, watches)
 
 
 def _collocate(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
-    """Collocate z and w along the tangent space, shape (K, m)."""
-    collected = []
-    integrals = scheme.integrals
-    for k, h in enumerate(stage.guess.fractions):
-        N = tangent_basis(stage.formation, stage.guess.z[k, scheme.degree // 2]).T
-        for state, rate, part in ((layout.z, layout.w, Z), (layout.w, layout.u, W)):
-            here, table = state[k], integrals
-            if not scheme.ends:
-                here = np.vstack([here, layout.ends[k, part]])
-                table = np.vstack([integrals, scheme.weights])
-            own = rows.linear(len(here), len(N))
-            rows.put(own[:, :, None], here[:, None], N)
-            rows.put(own[:, :, None], layout.nodes[k, part], -N)
-            rows.put(own[:, None, :, None], rate[k][:, None], -h * table[:, :, None, None] * N)
-            collected.append(own.ravel())
-    return np.array(collected).reshape(stage.intervals, -1)
+    """Collocate z and z' along the tangent space, shape (K, m)."""
+    middles = stage.guess.z[:, scheme.degree // 2]
+    bases = [tangent_basis(stage.formation, z) for z in middles]
+    kernel = collocation_kernel(scheme.name, scheme.degree, bases[0].shape[1])
+    parameters = np.array([N.ravel(order="F") for N in bases])
+    K, collected = stage.intervals, []
+    for state, rate, part in ((layout.z, layout.v, Z), (layout.v, layout.a, V)):
+        columns = [layout.nodes[:-1, part], state.reshape(K, -1)]
+        columns += [] if scheme.ends else [layout.ends[:, part]]
+        columns += [rate.reshape(K, -1), layout.h[:, None]]
+        own = rows.nonlinear(K, kernel.outputs)
+        rows.repeat(kernel, np.hstack(columns), own, parameters)
+        collected.append(own)
+    return np.hstack(collected)
+
+
+def _share(rows: Rows, stage: Stage, layout: StageLayout) -> None:
+    """Intervals keep their shares of the stage, or are not too uneven."""
+    before, after = layout.h[:-1], layout.h[1:]
+    if not stage.adapts:
+        own = rows.linear(len(before))
+        # In shares of an even interval, rows are of the size of others.
+        shares = stage.intervals * stage.guess.fractions
+        rows.put(own, before, shares[1:])
+        rows.put(own, after, -shares[:-1])
+        return
+    for shorter, longer in ((before, after), (after, before)):
+        own = rows.linear(len(before), high=np.inf)
+        rows.put(own, shorter, 1.0)
+        rows.put(own, longer, -EVEN)
 
 
 def _balance(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool) -> Indices:
@@ -253,16 +280,15 @@ def _balance(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last
     def spread(table: Indices) -> Indices:
         return np.broadcast_to(table[:, None], (*shape, table.shape[1]))
 
-    columns = [layout.z, layout.w, layout.u, layout.forces, spread(layout.tau)]
-    columns += [spread(node[:, T, None]), spread(node[:, Z] if formation.rolling else node[:, :0])]
+    columns = [layout.z, layout.v, layout.a, layout.forces, spread(layout.tau)]
+    columns += [spread(node[:, Z] if formation.rolling else node[:, :0])]
     signs = np.concatenate(stage.directions)
-    parameters = np.empty((*shape, n_c + 5))
+    parameters = np.empty((*shape, n_c + 4))
     parameters[..., : n_c + 2] = signs
     parameters[..., n_c + 2] = scheme.points
     parameters[..., n_c + 3] = least_rates(stage, scheme)
-    parameters[..., n_c + 4] = stage.guess.duration
     sliding = [k for k in range(n_c) if k not in formation.rolling_rows]
-    still = _find_still(stage, last) if scheme.ends else set()
+    still = find_still(stage, last) if scheme.ends else set()
     senses = kernel.outputs - len(sliding)
     high = np.where(np.arange(kernel.outputs) < senses, 0.0, np.inf)
     low = np.zeros((*shape, kernel.outputs))
@@ -275,7 +301,7 @@ def _balance(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last
 
 
 def least_rates(stage: Stage, scheme: Scheme) -> Array:
-    """Least rate of each point, shape (K, d) [rad/s].
+    """Least rate of each point, shape (K, d).
 
     It is nothing where motion starts, stops or turns, and in a stage with one freedom: there all
     moves together, and friction cannot hold one contact alone.
@@ -285,7 +311,7 @@ def least_rates(stage: Stage, scheme: Scheme) -> Array:
     return np.asarray(SLIDING * free * np.minimum(1.0, 8 * np.minimum(at, 1 - at)))
 
 
-def _find_still(stage: Stage, last: bool) -> set[int]:
+def find_still(stage: Stage, last: bool) -> set[int]:
     """Rows of (contacts, joints) that stand still at the end of a stage."""
     if last:
         return set(range(stage.formation.n_contacts + 2))
@@ -301,7 +327,7 @@ def _watch(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Ind
         return np.zeros((K, d, 0), dtype=np.int64)
     released = np.isin(stage.watched, stage.released)
     later = (not stage.opens) | (stage.guess.places(scheme.points)[..., None] > 1 / 3)
-    low = CLEAR / formation.scene.polygon.gyration_radius * (later & released)
+    low = CLEAR * (later & released)
     goal = None if stage.until is None else stage.until.contact
     reached = [goal is not None and formation.limits[k].gained == goal for k in stage.watched]
     if scheme.ends:
@@ -314,24 +340,17 @@ def _watch(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Ind
 
 def _join(rows: Rows, stage: Stage, coming: Stage, layout: StageLayout, first: Indices) -> None:
     """Position and velocity go on from one stage to the next; an impact changes the velocity."""
-    last, following = layout.nodes[-1], layout.following
-    place = rows.linear(6)
-    rows.put(place, np.append(first[Z], first[T]), 1.0)
-    rows.put(place, np.append(last[Z], following[0]), -1.0)
-    columns = [first[W], last[W], [last[T], following[0]]]
+    last = layout.nodes[-1]
+    same = np.setdiff1d(np.arange(len(first)), np.arange(5, 10)) if stage.strikes else slice(None)
+    own = rows.linear(len(first[same]))
+    rows.put(own, first[same], 1.0)
+    rows.put(own, last[same], -1.0)
     if stage.strikes:
         kernel = impact_kernel(stage.formation, coming.formation)
         equal = np.arange(kernel.outputs) < 5 + coming.formation.n_constraints
         own = rows.nonlinear(1, kernel.outputs, high=np.where(equal, 0.0, np.inf))
-        columns += [last[Z], following[1:]]
+        columns = [first[V], last[V], last[Z], layout.impulses]
         rows.repeat(kernel, np.concatenate(columns)[None], own, coming.directions.Xi[None])
-    else:
-        rows.repeat(join_kernel(), np.concatenate(columns)[None], rows.nonlinear(1, 5))
-    if len(first) > MARGIN:
-        more = rows.linear(2)
-        rows.put(more, first[MARGIN:], 1.0)
-        rows.put(more, last[MARGIN:], -1.0)
-        rows.put(more[1], last[T], -1.0)
 
 
 def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tuple[Array, Array]:
@@ -344,15 +363,16 @@ def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tup
         low[layout.tau] = np.where(soft, -np.inf, -limit)
         high[layout.tau] = np.where(soft, np.inf, limit)
         low[layout.short] = 0.0
-        low[layout.nodes[:, T]], high[layout.nodes[:, T]] = SHORTEST, LONGEST
-        still = _find_still(stage, stage is stages[-1]) if scheme.ends else set()
-        rate = least_rates(stage, scheme) * stage.guess.duration
+        low[layout.h] = SHORTEST
+        still = find_still(stage, stage is stages[-1]) if scheme.ends else set()
+        rate, fastest = least_rates(stage, scheme), stage.formation.scene.speed_limit
         for joint, sigma in enumerate(stage.directions.sigma):
-            own = layout.w[..., 3 + joint]
+            own = layout.v[..., 3 + joint]
             ends = np.zeros_like(own, dtype=bool)
             ends[-1, -1] = stage.formation.n_contacts + joint in still
-            low[own] = np.where((sigma < 0) | ends, -np.inf, rate)
-            high[own] = np.where((sigma > 0) | ends, np.inf, -rate)
+            slow = np.where(ends, -fastest[joint], rate)
+            low[own] = np.where(sigma > 0, slow, -fastest[joint])
+            high[own] = np.where(sigma > 0, fastest[joint], -slow)
         if coming is not None and stage.strikes:
-            low[layout.following[1 : 1 + coming.formation.n_contacts]] = 0.0
+            low[layout.impulses[: coming.formation.n_contacts]] = 0.0
     return low, high

@@ -21,15 +21,16 @@ from ..options import Objective, PlanOptions
 from ..phaseplan import PhasePlan
 from ..problem import Phase, Problem
 from .collocation import make_scheme
-from .modesearch import improve
+from .modesearch import adapt, improve
 from .revising import halve
+from .ownunits import in_own_units, scale_options, to_si, unit_of
 from .stage import Stage
 from .staging import outline_stages
 from .timemotion import TimeMotion, make_motions
 from .timesearch import Search, Solution
 
-FIRST = 16
-"""Intervals of a phase for least time that are few enough to start with; otherwise half of it."""
+FIRST = 10
+"""Most intervals of a phase to start with."""
 CONVINCING = 2
 """Motions that miss limits least, from different guesses, after which there seems to be no plan."""
 _PACES = (2.0, 4.0, 1.0)
@@ -70,11 +71,16 @@ def plan_phases(
         If there is no plan.
     """
     scheme = make_scheme(options.scheme, options.degree)
-    search = Search(problem, options, scheme, duration, options.goal)
+    scales = problem.scene.scales
+    search = Search(
+        in_own_units(problem),
+        scale_options(options, scales),
+        scheme,
+        None if duration is None else duration / scales.time,
+        options.goal,
+    )
     wanted = options.time_intervals or _choose_intervals(phases)
-    at_once = options.goal is Objective.TIME and wanted <= FIRST
-    most = FIRST if at_once else FIRST // 2
-    halvings = max(0, math.ceil(math.log2(wanted / most)))
+    halvings = max(0, math.ceil(math.log2(wanted / FIRST)))
 
     def outline(times: int, pace: float, onwards: bool = False) -> list[Stage]:
         count = math.ceil(wanted / 2**times)
@@ -83,7 +89,7 @@ def plan_phases(
     first = outline(halvings, _PACES[0])
     solution = _solve(search, first, halvings)
     if solution.success:
-        return _summarise(search, phases, solution)
+        return _summarise(problem, search, phases, solution)
     from .timeexplain import ease, explain, list_shortfalls
 
     status, short = solution.status, list[list[Stage]]()
@@ -96,7 +102,7 @@ def plan_phases(
         elif eased is not None:
             solution = _solve(search, eased, times)
         if solution.success:
-            return _summarise(search, phases, solution)
+            return _summarise(problem, search, phases, solution)
         if len(short) == CONVINCING:
             break
 
@@ -120,14 +126,15 @@ def _list_guesses(
 
 def _choose_intervals(phases: Sequence[Phase]) -> int:
     """Intervals of each phase: a phase with one freedom has fewer unknowns in each."""
-    return 32 if len(phases) == 1 and phases[0].formation.n_constraints == 4 else 16
+    return 32 if len(phases) == 1 and phases[0].formation.n_constraints == 4 else 10
 
 
 def _solve(search: Search, stages: list[Stage], halvings: int) -> Solution:
-    """Solve, revise friction, halve all intervals, and make limits hold in between."""
+    """Solve, find modes and intervals, halve these, and make limits hold in between."""
     solution = search.solve(stages)
-    if solution.success:
-        solution = improve(search, solution)
+    if not solution.success:
+        return solution
+    solution = adapt(search, improve(search, solution))
     for _ in range(halvings):
         if solution.success:
             every = [np.ones(stage.intervals, dtype=bool) for stage in solution.stages]
@@ -136,19 +143,22 @@ def _solve(search: Search, stages: list[Stage], halvings: int) -> Solution:
 
 
 def _summarise(
-    search: Search, phases: Sequence[Phase], solution: Solution
+    problem: Problem, search: Search, phases: Sequence[Phase], solution: Solution
 ) -> list[PhasePlan[TimeMotion]]:
     """The plan of each phase; what solving has cost counts for the first."""
-    plans, effort, options = [], search.effort, search.options
-    motions = make_motions(solution.stages, search.scheme)
+    plans, effort = [], search.effort
+    unit, margin = unit_of(search.goal, problem.scene.scales), solution.margin
+    weight = search.options.time_weight * problem.scene.scales.torque**2
+    solved = [to_si(stage, problem) for stage in solution.stages]
+    motions = make_motions(solved, search.scheme)
     for phase in phases:
-        stages = zip(motions, solution.stages, strict=True)
+        stages = zip(motions, solved, strict=True)
         motion = TimeMotion([own for own, stage in stages if stage.phase == phase.index])
         torque = motion.torque
         value = {
             Objective.TIME: motion.duration,
-            Objective.EFFORT: options.time_weight * motion.duration + torque.integrate_squares(),
-            Objective.MARGIN: search.problem.epsilon + solution.margin,
+            Objective.EFFORT: weight * motion.duration + torque.integrate_squares(),
+            Objective.MARGIN: problem.epsilon + unit * margin,
         }[search.goal]
         plans.append(PhasePlan(motion, torque, value, 0, 0, 0.0, 0.0))
     plans[0] = plans[0]._replace(

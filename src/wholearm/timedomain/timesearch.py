@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ..options import Objective, PlanOptions
 from ..problem import Problem
 from .between import Limits, find_misses, raise_bounds
@@ -20,12 +23,14 @@ from .warmstart import FIRST_SIZE, Multipliers, carry_multipliers, first_multipl
 
 ROUNDS = 24
 """Most times that limits are tightened."""
-REFINEMENTS = 1
+REFINEMENTS = 4
 """Most times that intervals are halved because of misses."""
+DEFECT = 3e-7
+"""What collocation may miss z and z' by at the end of an interval, in the scene's own units."""
+DEAR = 1e-5
+"""What limits that are raised in an interval may cost, over the cost, without halving it."""
 _ITERATIONS = {Objective.ELASTIC: 300, Objective.RELAX: 300}
 """Most iterations of one solve, if not 150."""
-_SOFT = 1e-2
-"""First multipliers where limits are soft."""
 _DEARER = 0.2
 """How much dearer, relatively, a plan may get by tightening before it counts as lost."""
 
@@ -38,6 +43,7 @@ class Effort:
     solves: int = 0
     build_time: float = 0.0
     solve_time: float = 0.0
+    sequences: int = 1
 
 
 class Solution(NamedTuple):
@@ -102,11 +108,6 @@ class Search:
         """The same search with another objective."""
         return replace(self, goal=goal, give=give, duration=None)
 
-    @property
-    def size(self) -> float:
-        """Multipliers of a first guess."""
-        return _SOFT if self.goal in _ITERATIONS else FIRST_SIZE
-
     def solve(
         self, stages: list[Stage], before: Solution | None = None, most: int = 150
     ) -> Solution:
@@ -152,21 +153,22 @@ class Search:
         low_g, high_g = raise_bounds(nlp, stages, limits, self.problem.epsilon, low)
         if self.duration is not None and nlp.lasts >= 0:
             high_g[nlp.lasts] = self.duration
-        result = nlp.solver(
+        solver = nlp.first_solver if multipliers is None else nlp.solver
+        result = solver(
             x0=pack([stage.guess for stage in stages], nlp.layouts, margin),
             lbx=low,
             ubx=high,
             lbg=low_g,
             ubg=high_g,
-            **(multipliers or first_multipliers((low, high), (low_g, high_g), self.size)),
+            **(multipliers or first_multipliers((low, high), (low_g, high_g), FIRST_SIZE)),
         )
-        stats = nlp.solver.stats()
+        stats = solver.stats()
         self.effort.iterations += stats["iter_count"]
         self.effort.solves += 1
         self.effort.solve_time += stats["t_wall_total"]
         x, cost = result["x"].full()[:, 0], float(result["f"])
         return Solution(
-            adopt(stages, unpack(stages, x, nlp.layouts)),
+            adopt(stages, unpack(x, nlp.layouts)),
             cost,
             -cost if self.goal is Objective.MARGIN else 0.0,
             f"Ipopt stopped with {stats['return_status']}",
@@ -174,6 +176,22 @@ class Search:
             nlp,
             {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")},
         )
+
+    def find_dear(
+        self, solution: Solution, misses: Sequence[Limits]
+    ) -> list[NDArray[np.bool_]]:
+        """Intervals in which raising limits by their misses would cost much, each of shape (K,)."""
+        on_x, on_g = (np.abs(solution.multipliers[key]) for key in ("lam_x0", "lam_g0"))
+        marked = []
+        for k, (stage, miss) in enumerate(zip(solution.stages, misses, strict=True)):
+            layout, rows = solution.nlp.layouts[k], solution.nlp.rows_of[k].limits
+            n_c, R = stage.formation.n_contacts, stage.formation.n_rolling
+            price = on_x[layout.forces[:, :, :n_c]].sum(axis=1) + on_g[rows.presses].sum(axis=1)
+            both = on_g[rows.cones].sum(axis=1)
+            grip = both[:, :R] + both[:, R:]
+            cost = (price * miss.c_n).sum(axis=1) + (grip * miss.cone).sum(axis=1)
+            marked.append(np.asarray(cost > DEAR * abs(solution.cost)))
+        return marked
 
     def hold(self, solution: Solution) -> Solution:
         """Go on from a solution until limits hold between points too."""
@@ -186,9 +204,10 @@ class Search:
                 for stage, motion in zip(solution.stages, motions, strict=True)
             ]
             worst = max(miss.worst for miss in misses)
-            if worst <= 1:
-                return solution
-            marked = [miss.coarse for miss in misses]
+            marked = [
+                dear | (np.abs(motion.defects).max(axis=(1, 2)) > DEFECT)
+                for dear, motion in zip(self.find_dear(solution, misses), motions, strict=True)
+            ]
             if refined < REFINEMENTS and any(mine.any() for mine in marked):
                 refined += 1
                 finer = self.solve(halve(solution.stages, self.scheme, marked), solution)
@@ -196,6 +215,8 @@ class Search:
                     solution = finer
                     limits = [Limits.none(stage) for stage in solution.stages]
                     continue
+            if worst <= 1:
+                return solution
             limits = [raised.raised(miss) for raised, miss in zip(limits, misses, strict=True)]
             tighter = self.run(
                 solution.nlp, solution.stages, limits, solution.multipliers, solution.margin

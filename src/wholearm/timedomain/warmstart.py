@@ -10,7 +10,7 @@ from ..model import Array
 from .stage import Stage
 from .timenlp import TimeNLP
 
-FIRST_SIZE = 1e-3
+FIRST_SIZE = 1e-2
 """Multipliers of a first guess."""
 
 Multipliers = dict[str, Array]
@@ -51,7 +51,7 @@ def carry_multipliers(
         middles = finer.breaks[:-1] + finer.fractions / 2
         parent = np.searchsorted(part.breaks, middles, side="right") - 1
         share = finer.fractions / part.fractions[parent]
-        for name in ("tau", "w", "forces"):
+        for name in ("tau", "v", "forces"):
             mine, theirs = getattr(new.layouts[k], name), getattr(old.layouts[k], name)
             values = on_x[theirs[parent]]
             lam_x[mine] = values * share.reshape(-1, *[1] * (values.ndim - 1))
