@@ -11,8 +11,10 @@ from timed import landing
 from wholearm.outline import outline_phase
 from wholearm.path import trace_phases
 from wholearm.timedomain.collocation import make_scheme
+from wholearm.timedomain.ownunits import in_own_units
 from wholearm.timedomain.stage import Stage
-from wholearm.timedomain.staging import LEAST_INTERVALS, outline_stages
+from wholearm.timedomain.modes import LEAST_INTERVALS
+from wholearm.timedomain.staging import outline_stages
 
 SCHEME = make_scheme("radau", 3)
 
@@ -34,7 +36,8 @@ def test_stages_are_those_of_the_outlines(stages: list[Stage]) -> None:
             z = outline.z[-1]
     # What slides the other way after the release has to turn on its way, in one stage more.
     assert [stage.phase for stage in stages] == [*phases, phases[-1]]
-    assert all(stage.formation is problem.phases[stage.phase].formation for stage in stages)
+    own = in_own_units(problem)
+    assert all(stage.formation is own.phases[stage.phase].formation for stage in stages)
     assert [stage.until is None for stage in stages] == [True, True, True, False]
 
 
@@ -55,11 +58,13 @@ def test_guesses_follow_the_outlines_in_one_sweep(stages: list[Stage]) -> None:
     for stage, part in zip(stages, parts, strict=True):
         assert stage.intervals >= LEAST_INTERVALS
         np.testing.assert_allclose(part.fractions, 1 / stage.intervals)
-        # Points on straight lines between 25 closed configurations.
+        # Points on straight lines between 25 closed configurations, in radii of gyration.
         gaps = [measure_gaps(stage.formation, z) for z in part.z.reshape(-1, 5)]
-        assert np.abs(gaps).max() < 1e-4
+        assert np.abs(gaps).max() < 3e-3
         np.testing.assert_allclose(part.nodes[1:, 0], part.z[:, -1], atol=1e-12)
-        assert (part.forces == 1.0).all() and not part.tau.any() and not part.a.any()
+        assert part.forces[..., : stage.formation.n_contacts].min() > 0
+        limits = stage.formation.scene.torque_limit
+        assert (np.abs(part.tau) < limits).all()
         # Velocities are the slope of what is guessed.
         t = part.duration * part.places(SCHEME.points)
         step = np.diff(part.z[:, :2], axis=1)[:, 0] / np.diff(t[:, :2], axis=1)
@@ -81,7 +86,7 @@ def test_the_duration_is_that_of_a_fall_times_the_pace(pace: float) -> None:
         for outline in outline_phase(problem, phase, z):
             length += outline.length
             z = outline.z[-1]
-    whole = sum(stage.guess.duration for stage in stages)
+    whole = sum(stage.guess.duration for stage in stages) * problem.scene.scales.time
     # The outline that is split leaves out nothing but the rounding of its length.
     assert whole == pytest.approx(pace * np.sqrt(length / 9.81), rel=1e-3)
 

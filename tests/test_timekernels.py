@@ -15,17 +15,18 @@ from wholearm.formation import Formation
 from wholearm.model import Array, Scene
 from wholearm.problem import Until
 from wholearm.timedomain.blocknlp import Kernel
+from wholearm.timedomain.collocation import make_scheme
 from wholearm.timedomain.timekernels import (
-    LEVER,
+    collocation_kernel,
     effort_kernel,
     end_kernel,
     find_leaving,
     goal_kernel,
     impact_kernel,
-    join_kernel,
     new_rows,
     opening_kernel,
     point_kernel,
+    stretch_kernel,
     watch_kernel,
 )
 from wholearm.trajectory import Samples
@@ -88,40 +89,37 @@ def constraints(formation: Formation, z: Array, w: Array, u: Array) -> tuple[Arr
 def test_points_have_newton_and_euler_and_closed_contacts(formation: Formation) -> None:
     rng = np.random.default_rng(formation.n_constraints)
     scene, n_c, n_p = formation.scene, formation.n_contacts, formation.n_constraints
-    rho = scene.polygon.gyration_radius
     for _ in range(3):
-        z, w, u = draw(rng)
+        z, v, a = draw(rng)
         forces, tau = rng.normal(size=n_p), rng.normal(size=4)
-        T, place, unit = rng.uniform(0.1, 0.3, 3)
+        place = rng.uniform(0.1, 0.3)
         Xi, sigma = rng.choice([-1.0, 1.0], n_c), rng.choice([-1.0, 1.0], 2)
         first, least = (z + 0.02 * rng.normal(size=5) if formation.rolling else z[:0]), 0.3
-        x = [z, w, u, forces, tau, np.array([T]), first]
-        y = call(point_kernel(formation), x, Xi, sigma, np.array([place, least, unit]))
+        x = [z, v, a, forces, tau, first]
+        y = call(point_kernel(formation), x, Xi, sigma, np.array([place, least]))
         gaps, rates, bends, balance, senses = np.split(y, np.cumsum([n_p, n_p, n_p, 5]))
-        np.testing.assert_allclose(rho * gaps[:n_c], measure_gaps(formation, z), atol=1e-15)
-        expected = constraints(formation, z, w, u)
+        np.testing.assert_allclose(gaps[:n_c], measure_gaps(formation, z), atol=1e-15)
+        expected = constraints(formation, z, v, a)
         for got, one, size in zip((rates, bends), expected, (1e-7, 1e-5), strict=True):
-            np.testing.assert_allclose(rho * got, one, atol=size)
+            np.testing.assert_allclose(got, one, atol=size)
         now = tau[:2] * (1 - place) + tau[2:] * place
         c_n, c_t = split_forces(formation, forces, Xi)
-        row = Samples(z, w / T, u / T**2, now, c_n, c_t)
+        row = Samples(z, v, a, now, c_n, c_t)
         missing, size_of = unbalance(formation, row, sigma)
-        scale = unit**2 * np.array([1.0, 1.0, rho, LEVER, LEVER])
-        # The kernel's rows are masses times accelerations less forces, in other units.
-        bound = 1e-12 * size_of.max() * T**2 / scale.min()
-        np.testing.assert_allclose(balance, -missing * T**2 / scale, atol=bound)
-        slip = measure_slip(formation, z, w / T)
+        # The kernel's rows are masses times accelerations less forces.
+        np.testing.assert_allclose(balance, -missing, atol=1e-12 * size_of.max())
+        slip = measure_slip(formation, z, v)
         sliding = [k for k in range(n_c) if k not in formation.rolling_rows]
-        np.testing.assert_allclose(senses / T, (Xi * slip / rho - least)[sliding], atol=1e-12)
+        np.testing.assert_allclose(senses, (Xi * slip - least)[sliding], atol=1e-12)
 
 
 @every
 def test_rolling_contacts_keep_what_has_rolled_by(formation: Formation) -> None:
     rng = np.random.default_rng(3)
-    scene, n_c = formation.scene, formation.n_contacts
+    n_c = formation.n_contacts
     z, w, _ = draw(rng)
     first = draw(rng)[0] if formation.rolling else z[:0]
-    y = call(end_kernel(formation), [z, w, first]) * scene.polygon.gyration_radius
+    y = call(end_kernel(formation), [z, w, first])
     assert y.shape == (2 * formation.n_constraints,)
     np.testing.assert_allclose(y[:n_c], measure_gaps(formation, z), atol=1e-15)
     rates, _ = constraints(formation, z, w, 0 * w)
@@ -143,7 +141,6 @@ def test_ends_are_where_gaps_coordinates_and_rates_vanish(
 ) -> None:
     rng = np.random.default_rng(11)
     scene = landing().scene
-    rho = scene.polygon.gyration_radius
     formation = make_formation(scene, "v0-palm v1-palm v3-finger1")
     gained = roll(make_formation(scene, "v0-palm v1-palm v5-finger2"), "v0-palm")
     z, w, _ = draw(rng)
@@ -151,17 +148,17 @@ def test_ends_are_where_gaps_coordinates_and_rates_vanish(
     end = None
     if isinstance(until, str):
         end = Until(parse_contact(until, scene))
-        expected.append(measure_gaps(make_formation(scene, until), z)[0] / rho)
+        expected.append(measure_gaps(make_formation(scene, until), z)[0])
     elif until is not None:
         end = Until(None, *until)
-        expected.append((z[0] - 0.01) / rho if until[0] == "x" else z[2] + 0.3)
-    rates = [*measure_slip(formation, z, w) / rho, *w[3:]]
+        expected.append(z[0] - 0.01 if until[0] == "x" else z[2] + 0.3)
+    rates = [*measure_slip(formation, z, w), *w[3:]]
     expected += [rates[row] for row in turns]
     # A finger's contact comes up, and a contact with the palm stops sliding.
     assert new_rows(formation, gained) == [2, 3]
     one = make_formation(scene, "v5-finger2")
     opening = constraints(one, z, w, 0 * w)[0][0]
-    expected += [opening / rho, measure_slip(formation, z, w)[0] / rho]
+    expected += [opening, measure_slip(formation, z, w)[0]]
     kernel = goal_kernel(formation, end, turns, gained)
     assert kernel is not None
     np.testing.assert_allclose(call(kernel, [z, w]), expected, atol=1e-6)
@@ -181,36 +178,60 @@ def test_gaps_open_with_their_second_derivative() -> None:
         kernel = opening_kernel(formation, contact)
         one = Formation(formation.scene, (contact,))
         second = constraints(one, z, w, u)[1][0]
-        got = call(kernel, [z, w, u, np.array([0.2])])
-        np.testing.assert_allclose(got, second / 0.2**2, atol=1e-4)
+        np.testing.assert_allclose(call(kernel, [z, w, u]), second, atol=1e-5)
 
 
-def test_limits_are_watched_in_radii_of_gyration() -> None:
+def test_limits_are_watched() -> None:
     rng = np.random.default_rng(6)
     formation = make_formation(landing().scene, "v1-palm v4-finger1 v6-finger2")
     texts = [limit.gained.name if limit.gained else "" for limit in formation.limits]
     watched = tuple(texts.index(name) for name in ("v2-palm", "v0-palm", "v3-finger1"))
     gaps = make_formation(formation.scene, "v2-palm v0-palm v3-finger1")
     z, _, _ = draw(rng)
-    got = call(watch_kernel(formation, watched), [z]) * formation.scene.polygon.gyration_radius
+    got = call(watch_kernel(formation, watched), [z])
     np.testing.assert_allclose(got, measure_gaps(gaps, z), atol=1e-15)
 
 
-def test_velocities_go_on_over_another_unit_of_time() -> None:
+@pytest.mark.parametrize("name, degree", [("radau", 3), ("legendre", 2)])
+@pytest.mark.parametrize("freedoms", [1, 2])
+def test_collocation_holds_for_what_polynomials_integrate(
+    name: str, degree: int, freedoms: int
+) -> None:
     rng = np.random.default_rng(7)
-    v, jump = rng.normal(size=(2, 5))
-    before, after = 0.3, 0.07
-    got = call(join_kernel(), [after * (v + jump), before * v, np.array([before, after])])
-    np.testing.assert_allclose(got, after * jump, atol=1e-15)
+    scheme, h = make_scheme(name, degree), 0.3
+    # Rates that are polynomials of degree d - 1 are integrated exactly to every point and the end.
+    powers = rng.normal(size=(5, degree))
+    N, start = rng.normal(size=(5, freedoms)), rng.normal(size=5)
+
+    def state(x: float) -> Array:
+        parts = [h * powers[:, k] * x ** (k + 1) / (k + 1) for k in range(degree)]
+        return np.asarray(start + np.sum(parts, axis=0))
+
+    places = [*scheme.points, *([] if scheme.ends else [1.0])]
+    rates = [powers @ x ** np.arange(degree) for x in scheme.points]
+    x = [start, *map(state, places), *rates, np.array([h])]
+    kernel = collocation_kernel(name, degree, freedoms)
+    np.testing.assert_allclose(call(kernel, x, N.ravel(order="F")), 0.0, atol=1e-13)
+    # What is missed is missed along the columns of N, point after point.
+    shift = rng.normal(size=5)
+    x[1] = x[1] + shift
+    missed = call(kernel, x, N.ravel(order="F")).reshape(-1, freedoms)
+    np.testing.assert_allclose(missed[0], N.T @ shift, atol=1e-13)
+    np.testing.assert_allclose(missed[1:], 0.0, atol=1e-13)
+
+
+def test_intervals_cost_what_they_change_by() -> None:
+    got = call(stretch_kernel(), [np.array([0.3])], np.array([5.0, 0.2]))
+    np.testing.assert_allclose(got, 5.0 * 0.5**2, rtol=1e-14)
 
 
 def test_effort_is_the_integral_of_squares() -> None:
     rng = np.random.default_rng(8)
-    tau, T, share = rng.normal(size=(2, 2)), 0.4, 0.05
+    tau, h = rng.normal(size=(2, 2)), 0.02
     places, weights = np.polynomial.legendre.leggauss(2)
     values = tau[0] + (places[:, None] + 1) / 2 * (tau[1] - tau[0])
-    expected = T * share * weights / 2 @ (values**2).sum(axis=1)
-    got = call(effort_kernel(), [tau.ravel(), np.array([T])], np.array([share]))
+    expected = h * weights / 2 @ (values**2).sum(axis=1)
+    got = call(effort_kernel(), [tau.ravel(), np.array([h])])
     np.testing.assert_allclose(got, expected, rtol=1e-14)
 
 
@@ -223,24 +244,22 @@ def test_impacts_balance_the_momentum_of_every_body(rolls: tuple[str, ...]) -> N
     # An impact is over at once: what has no impulse is left out of the balance.
     bare = [replace(link, viscous=0.0, dry=0.0) for link in scene.fingers]
     still = Scene(scene.polygon, (bare[0], bare[1]), scene.friction, 0.0)
-    rho, n_p, n_c = scene.polygon.gyration_radius, after.n_constraints, after.n_contacts
+    n_p, n_c = after.n_constraints, after.n_contacts
     assert find_leaving(before, after) == [1]
     for _ in range(3):
         z, v_after, v_before = draw(rng)
-        T = rng.uniform(0.1, 0.3, 2)
         impulses, Xi = rng.normal(size=n_p), rng.choice([-1.0, 1.0], n_c)
-        x = [T[1] * v_after, T[0] * v_before, T, z, impulses]
+        x = [v_after, v_before, z, impulses]
         y = call(impact_kernel(before, after), x, Xi)
         jump, held, leaving, cones = np.split(y, np.cumsum([5, n_p, 1]))
         p_n, p_t = split_forces(after, impulses, Xi)
         row = Samples(z, v_before, v_after - v_before, np.zeros(2), p_n, p_t)
         missing, _ = unbalance(replace(after, scene=still), row, np.ones(2))
-        scale = scene.polygon.mass * rho * np.array([1.0, 1.0, rho, LEVER, LEVER]) / T[1]
-        np.testing.assert_allclose(jump * scale, -missing, atol=1e-13 * np.abs(missing).max())
+        np.testing.assert_allclose(jump, -missing, atol=1e-13 * np.abs(missing).max())
         rates, _ = constraints(after, z, v_after, 0 * z)
-        np.testing.assert_allclose(held * rho / T[1], rates, atol=1e-6)
+        np.testing.assert_allclose(held, rates, atol=1e-6)
         opening, _ = constraints(Formation(scene, before.contacts[1:2]), z, v_after, 0 * z)
-        np.testing.assert_allclose(leaving * rho / T[1], opening, atol=1e-6)
+        np.testing.assert_allclose(leaving, opening, atol=1e-6)
         rows = list(after.rolling_rows)
         grip = after.friction[rows] * p_n[rows]
         np.testing.assert_allclose(cones, [*(grip - p_t[rows]), *(grip + p_t[rows])], atol=1e-14)

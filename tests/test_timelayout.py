@@ -14,11 +14,10 @@ from wholearm.model import Array
 from wholearm.timedomain.collocation import make_scheme
 from wholearm.timedomain.stage import Stage, StagePoints
 from wholearm.timedomain.timelayout import (
-    BEFORE,
     MARGIN,
+    STATE,
     StageLayout,
-    T,
-    W,
+    V,
     Z,
     lay_out,
     pack,
@@ -71,8 +70,8 @@ def owners(layouts: Sequence[StageLayout]) -> Array:
     """How often each unknown occurs in the layouts, but for `ends` that are points'."""
     counts = np.zeros(layouts[-1].stop)
     for layout in layouts:
-        tables = [*(getattr(layout, n) for n in ("nodes", "tau", "z", "w", "u", "forces"))]
-        for table in (*tables, layout.short, layout.following):
+        tables = [*(getattr(layout, n) for n in ("nodes", "h", "tau", "z", "v", "a", "forces"))]
+        for table in (*tables, layout.short, layout.impulses):
             np.add.at(counts, table.ravel().astype(int), 1)
         if layout.ends[0, 0] != layout.z[0, -1, 0]:
             np.add.at(counts, layout.ends.ravel(), 1)
@@ -89,8 +88,8 @@ def test_every_unknown_has_one_place(
     scheme = make_scheme(name, degree)
     layouts = lay_out(make_stages(name, degree, strikes), scheme, with_margin, elastic)
     np.testing.assert_array_equal(owners(layouts), 1.0)
-    assert layouts[0].nodes.shape == (4, 13 if with_margin else 11)
-    assert [len(layout.following) for layout in layouts] == [4 if strikes else 1, 1, 0]
+    assert layouts[0].nodes.shape == (4, 11 if with_margin else 10)
+    assert [len(layout.impulses) for layout in layouts] == [3 if strikes else 0, 0, 0]
     assert [layout.short.shape[1] for layout in layouts] == ([6, 5, 3] if elastic else [0] * 3)
 
 
@@ -98,7 +97,7 @@ def test_every_unknown_has_one_place(
 def test_unknowns_are_in_the_order_of_time(name: str, degree: int) -> None:
     for layout in lay_out(make_stages(name, degree, True), make_scheme(name, degree)):
         for k in range(len(layout.tau)):
-            assert layout.nodes[k].max() < layout.tau[k].min() < layout.z[k].min()
+            assert layout.nodes[k].max() < layout.h[k] < layout.tau[k].min() < layout.z[k].min()
             for before, after in pairwise(range(degree)):
                 assert layout.forces[k, before].max() < layout.z[k, after].min()
             assert layout.forces[k].max() < layout.nodes[k + 1].min()
@@ -116,19 +115,15 @@ def test_points_are_packed_and_unpacked(
     given = [stage.guess for stage in stages]
     x = pack(given, layouts, 0.7)
     assert x.shape == (layouts[-1].stop,)
-    for one, other in zip(given, unpack(stages, x, layouts), strict=True):
+    for one, other in zip(given, unpack(x, layouts), strict=True):
         for mine, yours in zip(tables(one), tables(other), strict=True):
-            # Velocities are multiplied and divided by the duration.
+            # Shares are multiplied by the duration and divided by their sum.
             np.testing.assert_allclose(yours, mine, rtol=1e-14)
-    passed = 0.0
     for part, layout in zip(given, layouts, strict=True):
-        duration = part.duration
-        np.testing.assert_array_equal(x[layout.nodes[:, T]], duration)
+        np.testing.assert_array_equal(x[layout.h], part.duration * part.fractions)
         np.testing.assert_array_equal(x[layout.nodes[:, Z]], part.nodes[:, 0])
-        np.testing.assert_array_equal(x[layout.nodes[:, W]], duration * part.nodes[:, 1])
-        np.testing.assert_array_equal(x[layout.u], duration**2 * part.a)
-        np.testing.assert_array_equal(x[layout.ends], x[layout.nodes[1:, :T]])
+        np.testing.assert_array_equal(x[layout.nodes[:, V]], part.nodes[:, 1])
+        np.testing.assert_array_equal(x[layout.a], part.a)
+        np.testing.assert_array_equal(x[layout.ends], x[layout.nodes[1:, :STATE]])
         if with_margin:
             np.testing.assert_array_equal(x[layout.nodes[:, MARGIN]], 0.7)
-            np.testing.assert_allclose(x[layout.nodes[:, BEFORE]], passed, rtol=1e-14)
-        passed += duration

@@ -15,6 +15,7 @@ from ..plan import solve
 from ..problem import Phase, Problem
 from ..simulation.simulate import simulate
 from ..timedomain.collocation import make_scheme
+from ..timedomain.ownunits import to_si
 from ..timedomain.staging import outline_stages
 from ..timedomain.timemotion import TimeMotion, make_motions
 from ..timedomain.timeplan import plan_phases
@@ -70,9 +71,9 @@ def _isolate(problem: Problem, index: int, z: Array) -> Problem:
 
 def _find_end_error(problem: Problem, name: str, degree: int, intervals: int) -> float:
     scheme = make_scheme(name, degree)
-    search = Search(problem, PlanOptions(), scheme, None, Objective.EFFORT)
+    search = Search.of(problem, PlanOptions(Objective.EFFORT, scheme=name, degree=degree))
     stages = outline_stages(problem, problem.phases, problem.start, scheme, intervals, _PACE)
-    found = search.solve(stages).stages
+    found = [to_si(stage, problem) for stage in search.solve(stages).stages]
     torque = TimeMotion(make_motions(found, scheme)).torque
     simulation = simulate(problem, torque, tolerance=1e-13, times=torque.breaks[-1:])
     if simulation.t[-1] < torque.breaks[-1] - 1e-3 * torque.duration:

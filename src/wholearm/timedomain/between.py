@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..cones import hold_least, slip_margins
 from ..minima import find_least
@@ -15,12 +14,10 @@ from .stage import Stage
 from .timemotion import StageMotion
 from .timenlp import CLEAR, TimeNLP
 
-MISS = 5e-7
-"""Largest miss of a force limit between points [N]."""
-GRAZE = 1e-8
-"""Deepest overlap between points [m]."""
-COARSE = 1e-2
-"""Miss of a force limit above which an interval is halved [N]."""
+MISS = 2.5e-7
+"""Largest miss of a force limit between points, over the weight of the object."""
+GRAZE = 3e-7
+"""Deepest overlap between points, over the radius of gyration."""
 LOOKS = 25
 """Places per interval at which limits are looked at."""
 _OVER = 1.5
@@ -32,9 +29,9 @@ class Limits(NamedTuple):
 
     Attributes
     ----------
-    c_n : ndarray, shape (K, n_c), [N]
-    cone : ndarray, shape (K, R), [N]
-    gap : ndarray, shape (K, n_watched), [m]
+    c_n : ndarray, shape (K, n_c)
+    cone : ndarray, shape (K, R)
+    gap : ndarray, shape (K, n_watched)
     """
 
     c_n: Array
@@ -58,18 +55,13 @@ class Limits(NamedTuple):
         allowed = (MISS, MISS, GRAZE)
         return max(float(t.max(initial=0.0)) / a for t, a in zip(self, allowed, strict=True))
 
-    @property
-    def coarse(self) -> NDArray[np.bool_]:
-        """Which intervals are to be halved, shape (K,)."""
-        return np.asarray((np.hstack([self.c_n, self.cone]) > COARSE).any(axis=1))
-
 
 def find_misses(stage: Stage, motion: StageMotion, epsilon: float, margin: float = 0.0) -> Limits:
     """By how much limits are missed in each interval, at worst.
 
     Parameters
     ----------
-    epsilon, margin : float, [N]
+    epsilon, margin : float
         Least c_n, and what c_n but no friction cone has to exceed it by.
     """
     formation, inner = stage.formation, np.linspace(1e-9, 1 - 1e-9, LOOKS)
@@ -96,7 +88,7 @@ def raise_bounds(
 
     Parameters
     ----------
-    epsilon : float, [N]
+    epsilon : float
         Least c_n.
     """
     low, high = nlp.rows.bounds

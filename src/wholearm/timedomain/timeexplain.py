@@ -12,12 +12,13 @@ from ..errors import InfeasibleError, InputError, SolverError
 from ..model import Array
 from ..options import Objective
 from ..problem import Phase, Problem
+from .ownunits import to_si
 from .stage import Stage
 from .timelimits import Give
 from .timesearch import Search
 
 SHORT = 1e-4
-"""Least shortfall that counts [N or N m]."""
+"""Least shortfall that counts, over the weight of the object, or that times the radius of gyration."""
 
 Replan = Callable[[Problem], object]
 """Plans the same phases of another problem; raises if there is no plan."""
@@ -31,6 +32,7 @@ def ease(search: Search, stages: Sequence[Stage]) -> list[Stage] | None:
 
 def explain(
     search: Search,
+    problem: Problem,
     phases: Sequence[Phase],
     short: Sequence[list[Stage]],
     status: str,
@@ -41,6 +43,8 @@ def explain(
     Parameters
     ----------
     search : Search
+    problem : Problem
+        In SI units.
     phases : sequence of Phase
     short : sequence of list of Stage
         What `ease` found from different guesses, where that is short of something.
@@ -53,7 +57,7 @@ def explain(
     what = f"phase{'s' if len(phases) > 1 else ''} {numbers}"
     if not short:
         return SolverError(f"no plan for {what}: {status}; try other time_intervals")
-    problem = search.problem
+    scales = problem.scene.scales
 
     def sum_up(stages: list[Stage]) -> float:
         return sum(shortfall.amount for shortfall in list_shortfalls(problem, stages))
@@ -70,11 +74,13 @@ def explain(
     ]
     limits.append(Limit("epsilon", problem.epsilon, "N", -1))
     gives = [Give(0.0, (1.0, 0.0)), Give(0.0, (0.0, 1.0)), Give(1.0)]
+    units = [scales.torque, scales.torque, scales.force]
 
     def find_least(index: int) -> float | None:
         solution = search.aiming(Objective.RELAX, gives[index]).solve(eased)
         limit = limits[index]
-        return limit.value + limit.sign * solution.cost if solution.success else None
+        cost = units[index] * solution.cost
+        return limit.value + limit.sign * cost if solution.success else None
 
     def can_plan(index: int, value: float) -> bool:
         try:
@@ -88,7 +94,15 @@ def explain(
 
 
 def list_shortfalls(problem: Problem, stages: Sequence[Stage]) -> list[Shortfall]:
-    """What the motion of stages is short of, each limit where it is worst."""
+    """What the motion of stages is short of, each limit where it is worst.
+
+    Parameters
+    ----------
+    problem : Problem
+        In SI units, as the answers are; the stages are in the scene's own.
+    stages : sequence of Stage
+    """
+    stages = [to_si(stage, problem) for stage in stages]
     worst: dict[str, Shortfall] = {}
     passed = 0.0
     for stage in stages:
@@ -126,8 +140,10 @@ def _list_of_stage(problem: Problem, stage: Stage, passed: float) -> list[Shortf
     found = []
     for column, name in enumerate(names):
         row = int(short[:count, column].argmax())
-        if short[row, column] > SHORT:
-            unit = "N m" if column >= len(names) - 2 else "N"
+        joint = column >= len(names) - 2
+        scales = problem.scene.scales
+        if short[row, column] > SHORT * (scales.torque if joint else scales.force):
+            unit = "N m" if joint else "N"
             where = f"t = {middles[row]:.4f} s, phase {stage.phase + 1}"
             amount = float(short[row, column])
             found.append(Shortfall(name, amount, unit, where, amount / spans[column]))

@@ -27,7 +27,7 @@ from .timeplan import plan_phases
 
 Plans = list[PhasePlan[TimeMotion]]
 AT_REST = 1e-4
-"""Speed below which an impact counts as a stop [m/s]."""
+"""Speed below which an impact counts as a stop, in the scene's own units."""
 
 
 def plan_struck(
@@ -117,7 +117,7 @@ def assess_struck(
     """
     ends = [k + 1 for k, phase in enumerate(block) if phase.end is End.IMPACT]
     speeds = {k: measure_speed(problem.scene, _last_state(plans[k - 1])[1]) for k in ends}
-    stops = [k for k in ends if speeds[k] < AT_REST]
+    stops = [k for k in ends if speeds[k] < AT_REST * problem.scene.scales.speed]
     found = []
     for k in ends:
         phase, following = block[k - 1], block[k]

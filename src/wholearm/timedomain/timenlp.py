@@ -245,6 +245,8 @@ def _collocate(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) ->
     kernel = collocation_kernel(scheme.name, scheme.degree, bases[0].shape[1])
     parameters = np.array([N.ravel(order="F") for N in bases])
     K, collected = stage.intervals, []
+    if not kernel.outputs:
+        return np.zeros((K, 0), dtype=np.int64)
     for state, rate, part in ((layout.z, layout.v, Z), (layout.v, layout.a, V)):
         columns = [layout.nodes[:-1, part], state.reshape(K, -1)]
         columns += [] if scheme.ends else [layout.ends[:, part]]

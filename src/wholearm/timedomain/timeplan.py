@@ -20,10 +20,9 @@ from ..model import Array
 from ..options import Objective, PlanOptions
 from ..phaseplan import PhasePlan
 from ..problem import Phase, Problem
-from .collocation import make_scheme
 from .modesearch import adapt, improve
 from .revising import halve
-from .ownunits import in_own_units, scale_options, to_si, unit_of
+from .ownunits import to_si, unit_of
 from .stage import Stage
 from .staging import outline_stages
 from .timemotion import TimeMotion, make_motions
@@ -70,21 +69,13 @@ def plan_phases(
     InfeasibleError, SolverError
         If there is no plan.
     """
-    scheme = make_scheme(options.scheme, options.degree)
-    scales = problem.scene.scales
-    search = Search(
-        in_own_units(problem),
-        scale_options(options, scales),
-        scheme,
-        None if duration is None else duration / scales.time,
-        options.goal,
-    )
+    search = Search.of(problem, options, duration)
     wanted = options.time_intervals or _choose_intervals(phases)
     halvings = max(0, math.ceil(math.log2(wanted / FIRST)))
 
     def outline(times: int, pace: float, onwards: bool = False) -> list[Stage]:
         count = math.ceil(wanted / 2**times)
-        return outline_stages(problem, phases, z, scheme, count, pace, onwards)
+        return outline_stages(problem, phases, z, search.scheme, count, pace, onwards)
 
     first = outline(halvings, _PACES[0])
     solution = _solve(search, first, halvings)
@@ -110,7 +101,7 @@ def plan_phases(
         own = [other.phases[phase.index] for phase in phases]
         return plan_phases(other, own, z, options, explained=False, patient=False)
 
-    raise explain(search, phases, short, status, replan if explained else None)
+    raise explain(search, problem, phases, short, status, replan if explained else None)
 
 
 def _list_guesses(

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from ..options import Objective, PlanOptions
 from ..problem import Problem
 from .between import Limits, find_misses, raise_bounds
-from .collocation import Scheme
+from .collocation import Scheme, make_scheme
+from .ownunits import in_own_units, scale_options
 from .revising import adopt, halve, watch_broken
 from .stage import Stage
 from .timelayout import pack, unpack
@@ -37,7 +38,7 @@ _DEARER = 0.2
 
 @dataclass
 class Effort:
-    """What solving has cost so far."""
+    """What solving has cost so far; `sequences` counts the sequences of modes that were tried."""
 
     iterations: int = 0
     solves: int = 0
@@ -54,7 +55,7 @@ class Solution(NamedTuple):
     stages : list of Stage
     cost : float
         Objective.
-    margin : float, [N]
+    margin : float
         Least c_n over epsilon, if that is an unknown.
     status : str
         How it ended, in words.
@@ -83,12 +84,14 @@ class Solution(NamedTuple):
 class Search:
     """A search for a plan: what stays the same from solve to solve, and what it has cost.
 
+    It works in the scene's own units.
+
     Attributes
     ----------
     problem : Problem
     options : PlanOptions
     scheme : Scheme
-    duration : float or None, [s]
+    duration : float or None
         Longest duration, for the objective `margin`.
     goal : Objective
     give : Give or None
@@ -103,6 +106,18 @@ class Search:
     goal: Objective
     give: Give | None = None
     effort: Effort = field(default_factory=Effort)
+
+    @staticmethod
+    def of(problem: Problem, options: PlanOptions, duration: float | None = None) -> Search:
+        """A search for a problem, options and a longest duration in SI units."""
+        scales = problem.scene.scales
+        return Search(
+            in_own_units(problem),
+            scale_options(options, scales),
+            make_scheme(options.scheme, options.degree),
+            None if duration is None else duration / scales.time,
+            options.goal,
+        )
 
     def aiming(self, goal: Objective, give: Give | None = None) -> Search:
         """The same search with another objective."""
