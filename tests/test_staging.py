@@ -11,9 +11,9 @@ from timed import landing
 from wholearm.outline import outline_phase
 from wholearm.path import trace_phases
 from wholearm.timedomain.collocation import make_scheme
+from wholearm.timedomain.modes import LEAST_INTERVALS
 from wholearm.timedomain.ownunits import in_own_units
 from wholearm.timedomain.stage import Stage
-from wholearm.timedomain.modes import LEAST_INTERVALS
 from wholearm.timedomain.staging import outline_stages
 
 SCHEME = make_scheme("radau", 3)

@@ -11,7 +11,7 @@ from thrown import shove
 from tipping import box
 from wholearm.curve import Curve
 from wholearm.errors import InfeasibleError, SolverError
-from wholearm.options import Objective, PlanOptions
+from wholearm.options import PlanOptions
 from wholearm.path import trace_phases
 from wholearm.pathdomain.pathplan import plan_path
 from wholearm.phaseplan import PhasePlan
@@ -41,13 +41,17 @@ def why_not(plan: Callable[[], object]) -> str:
 
 
 def search(problem: Problem) -> Search:
-    return Search(problem, COARSE, SCHEME, None, Objective.TIME)
+    return Search.of(problem, COARSE)
 
 
 def outline(problem: Problem, index: int = 0) -> Stage:
-    """The first stage of a phase as it is guessed, with c_n = 1 N, no c_t and no torques."""
+    """The first stage of a phase as it is guessed, but with c_n = 1 N, no c_t and no torques."""
     start = trace_phases(problem)[index - 1].end if index else problem.start
-    return outline_stages(problem, problem.phases[index : index + 1], start, SCHEME, 4, 2.0)[0]
+    stage = outline_stages(problem, problem.phases[index : index + 1], start, SCHEME, 4, 2.0)[0]
+    forces = np.zeros_like(stage.guess.forces)
+    forces[..., : stage.formation.n_contacts] = 1 / problem.scene.scales.force
+    tau = np.zeros_like(stage.guess.tau)
+    return replace(stage, guess=stage.guess._replace(forces=forces, tau=tau))
 
 
 def test_a_force_that_weight_limits_has_its_closed_form() -> None:
@@ -112,18 +116,20 @@ def test_shortfalls_are_measured_where_they_are_worst() -> None:
     problem = change_limit(shove()[0], 2, 0.9)
     stage = outline(problem)
     forces, tau = stage.guess.forces.copy(), stage.guess.tau.copy()
-    forces[1, 0, 0], forces[3, 2, 0] = 0.4, 0.85
-    forces[2, 1, 2] = 0.9 - 5e-5
-    tau[0, 1, 1], tau[2, 0, 1] = 2.25, -2.75
-    stage = replace(stage, guess=stage.guess._replace(forces=forces, tau=tau, duration=0.8))
+    scales = problem.scene.scales
+    forces[1, 0, 0], forces[3, 2, 0] = 0.4 / scales.force, 0.85 / scales.force
+    forces[2, 1, 2] = 0.9 / scales.force - 5e-5
+    tau[0, 1, 1], tau[2, 0, 1] = 2.25 / scales.torque, -2.75 / scales.torque
+    guess = stage.guess._replace(forces=forces, tau=tau, duration=0.8 / scales.time)
+    stage = replace(stage, guess=guess)
     first, second = list_shortfalls(problem, [stage])
     name = stage.formation.names[0]
-    # In the second and third of four even intervals; what is below a tenth of a mN does not count.
+    # In the second and third of four even intervals; what is below 1e-4 of the weight is left out.
     assert str(first) == f"c_n of {name} >= epsilon = 0.9 N is 0.5 N short at t = 0.3000 s, phase 1"
     limit = "torque limit of finger 2 = 2 N m"
     assert str(second) == f"{limit} is 0.75 N m short at t = 0.5000 s, phase 1"
     # Another stage counts on from there, and only the worse place is kept.
-    later = replace(stage, phase=1, guess=stage.guess._replace(forces=forces - 0.1))
+    later = replace(stage, phase=1, guess=guess._replace(forces=forces - 0.1 / scales.force))
     worse, same = list_shortfalls(problem, [stage, later])[:2]
     assert worse.amount == pytest.approx(0.6) and worse.where == "t = 1.1000 s, phase 2"
     assert same == second
@@ -137,7 +143,7 @@ def test_cones_of_rolling_contacts_can_be_short(side: float) -> None:
     formation = stage.formation
     (row,) = formation.rolling_rows
     forces = stage.guess.forces.copy()
-    forces[2, 1, formation.n_contacts] = 0.7 * side
+    forces[2, 1, formation.n_contacts] = 0.7 * side / problem.scene.scales.force
     stage = replace(stage, guess=stage.guess._replace(forces=forces))
     (found,) = list_shortfalls(problem, [stage])
     mu = formation.friction[row]
@@ -165,7 +171,7 @@ def test_a_changed_limit_is_the_only_change(index: int) -> None:
 
 def test_failures_that_no_limit_explains_are_the_solvers() -> None:
     problem, _ = shove()
-    failed = explain(search(problem), problem.phases, [], "Restoration_Failed", None)
+    failed = explain(search(problem), problem, problem.phases, [], "Restoration_Failed", None)
     assert isinstance(failed, SolverError)
     assert str(failed).startswith("no plan for phases 1 and 2: Restoration_Failed; try other ")
 
@@ -175,7 +181,7 @@ def test_the_motion_that_is_short_of_least_is_described() -> None:
     near, far = outline(problem), outline(problem)
     far = replace(far, guess=far.guess._replace(forces=0.5 * far.guess.forces))
     for short in ([far], [near]), ([near], [far]):
-        error = explain(search(problem), problem.phases[:1], short, "", None)
+        error = explain(search(problem), problem, problem.phases[:1], short, "", None)
         assert isinstance(error, InfeasibleError) and error.exit_status == 1
         assert str(error).startswith("phase 1 is infeasible: c_n of ")
         assert str(error).count(" is 0.2 N short at t = ") == 3 == str(error).count(" short ")

@@ -88,7 +88,7 @@ def constraints(formation: Formation, z: Array, w: Array, u: Array) -> tuple[Arr
 @every
 def test_points_have_newton_and_euler_and_closed_contacts(formation: Formation) -> None:
     rng = np.random.default_rng(formation.n_constraints)
-    scene, n_c, n_p = formation.scene, formation.n_contacts, formation.n_constraints
+    n_c, n_p = formation.n_contacts, formation.n_constraints
     for _ in range(3):
         z, v, a = draw(rng)
         forces, tau = rng.normal(size=n_p), rng.normal(size=4)

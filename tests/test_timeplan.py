@@ -104,9 +104,9 @@ def test_schemes_and_degrees_agree(
 ) -> None:
     options = PlanOptions(scheme=name, degree=degree, time_intervals=16)
     plans = plan_phases(heptagon, (heptagon.phases[3],), curves[2].end, options)
-    # Torques that are linear over a 16th of the phase cost 0.136 to 0.157 % with every scheme.
+    # Intervals end where torques switch; what is left is that these are linear in between.
     above = total(plans) / trajectory.meta["phase_durations"][3] - 1
-    assert above == pytest.approx(1.45e-3, abs=2.5e-4)
+    assert -1e-5 < above < 1e-3
     stage = plans[0].motion.stages[0]
     z, _ = integrate(stage, *stage.points.nodes[0])
     error = np.abs(z - stage.points.nodes[-1, 0]).max()
@@ -117,9 +117,9 @@ def test_schemes_and_degrees_agree(
 @pytest.mark.parametrize("name, degree", SCHEMES)
 def test_landings_of_other_schemes_take_as_long(name: str, degree: int) -> None:
     plans = plan_landing(scheme=name, degree=degree, time_intervals=8)
-    # Measured 118.5 to 120.4 ms: on 8 intervals, halved or not, limits between points are raised
-    # by different amounts.
-    assert total(plans) == pytest.approx(0.1192, rel=0.015)
+    # Whatever the points are, intervals end where torques switch.
+    reference = total(list(plan_landing(time_intervals=16)))
+    assert total(plans) == pytest.approx(reference, rel=1e-3)
 
 
 @pytest.mark.parametrize("phase", range(3))
@@ -210,7 +210,8 @@ def test_one_and_two_contacts_are_planned_for_every_objective(
     least = [float(np.nanmin(trajectory.c_n)) for trajectory in (fastest, plan)]
     assert min(least) > problem.epsilon - SLACK
     if objective == "margin":
-        assert least[1] > least[0]
+        # Phases without a choice may limit both.
+        assert least[1] > least[0] - SLACK
 
 
 @pytest.mark.parametrize("objective", ["time", "effort", "margin"])

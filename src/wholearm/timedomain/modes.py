@@ -56,8 +56,10 @@ def sign_sequence(stages: Sequence[Stage]) -> tuple[tuple[int, Mode], ...]:
 
 @lru_cache(maxsize=64)
 def _roll(formation: Formation, rows: tuple[int, ...]) -> Formation:
-    """A formation with other rolling contacts; one object for each, since kernels are kept by it."""
-    return Formation(formation.scene, formation.contacts, tuple(formation.contacts[k] for k in rows))
+    """A formation with other rolling contacts; always the same object."""
+    return Formation(
+        formation.scene, formation.contacts, tuple(formation.contacts[k] for k in rows)
+    )
 
 
 def in_mode(stage: Stage, mode: Mode) -> Stage:
@@ -96,18 +98,14 @@ def find_turns(stage: Stage, coming: Stage) -> tuple[int, ...]:
     formation = stage.formation
     after = dict(zip(coming.formation.names, mode_of(coming).signs, strict=False))
     own = mode_of(stage).signs
-    turns = [
-        k for k, name in enumerate(formation.names) if own[k] * after.get(name, 0.0) < 0
-    ]
+    turns = [k for k, name in enumerate(formation.names) if own[k] * after.get(name, 0.0) < 0]
     n_c = formation.n_contacts
     joints = coming.directions.sigma
     turns += [n_c + k for k in range(2) if stage.directions.sigma[k] * joints[k] < 0]
     return tuple(turns)
 
 
-def split(
-    stage: Stage, scheme: Scheme, begin: int, stop: int, mode: Mode
-) -> list[Stage]:
+def split(stage: Stage, scheme: Scheme, begin: int, stop: int, mode: Mode) -> list[Stage]:
     """Pieces of a stage, of which the intervals `begin` to `stop` are in another mode.
 
     They have to be linked again.
@@ -186,8 +184,10 @@ def _join(first: StagePoints, second: StagePoints) -> StagePoints:
     shares = (first.duration / total, second.duration / total)
     fractions = np.concatenate([first.fractions * shares[0], second.fractions * shares[1]])
     nodes = np.concatenate([first.nodes[:-1], second.nodes])
-    tables = [np.concatenate(pair) for pair in zip(first[3:8], second[3:8], strict=True)]
-    return StagePoints(total, fractions, nodes, *tables, second.impulses)
+    z, v, a, forces, tau = (
+        np.concatenate(pair) for pair in zip(first[3:8], second[3:8], strict=True)
+    )
+    return StagePoints(total, fractions, nodes, z, v, a, forces, tau, second.impulses)
 
 
 def _cut(part: StagePoints, scheme: Scheme, begin: int, stop: int) -> StagePoints:

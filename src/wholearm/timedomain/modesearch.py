@@ -16,8 +16,8 @@ PATIENCE = 60
 STRETCH = 1e-3
 """What it costs all intervals to change their durations by as much as they are, over the cost: of
 many equal choices the nearest is made."""
-WORTH = 1e-5
-"""Least gain of a move over the cost; a stage that has shrunk to nothing may cost as much to drop."""
+WORTH = 1e-4
+"""Least gain of a move over the cost; dropping what has shrunk to nothing may cost as much."""
 
 
 def improve(search: Search, solution: Solution) -> Solution:
@@ -45,7 +45,7 @@ def improve(search: Search, solution: Solution) -> Solution:
 
 
 def adapt(search: Search, solution: Solution) -> Solution:
-    """Let the intervals choose their shares of the duration, so that torques switch between them."""
+    """Let the intervals choose their shares of the duration: torques then switch between them."""
     count = sum(stage.intervals for stage in solution.stages)
     price = STRETCH * abs(solution.cost) / count
     loose = [replace(stage, adapts=price) for stage in solution.stages]

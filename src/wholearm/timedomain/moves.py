@@ -84,6 +84,10 @@ def list_moves(
             left = drop(stages, index)
             if left is not None:
                 yield link(merge(left))
+    for index in range(len(stages)):
+        left = release_earlier(stages, index)
+        if left is not None:
+            yield link(merge(left))
     runs = [
         (run, index)
         for index, stage in enumerate(stages)
@@ -93,17 +97,17 @@ def list_moves(
         ]
     ]
     yield from _apply(stages, scheme, runs)
-    for index in range(len(stages)):
-        left = release_earlier(stages, index)
-        if left is not None:
-            yield link(merge(left))
 
 
 def _apply(
     stages: Sequence[Stage], scheme: Scheme, runs: list[tuple[Run, int]]
 ) -> Iterator[list[Stage]]:
     """Stages in which what is at its limit over a run moves in another way; whole ones first."""
-    wide = [(run._replace(begin=0, stop=stages[k].intervals), k) for run, k in runs if _is_most(run, stages[k])]
+    wide = [
+        (run._replace(begin=0, stop=stages[k].intervals), k)
+        for run, k in runs
+        if _is_most(run, stages[k])
+    ]
     runs.sort(key=lambda found: -found[0].share)
     wide.sort(key=lambda found: -found[0].share)
     for run, index in [*wide, *runs]:
@@ -178,9 +182,7 @@ def _find_leaning(stage: Stage, scheme: Scheme, own: Formation, epsilon: float) 
     return runs
 
 
-def _find_runs(
-    flags: NDArray[np.bool_], stage: Stage, scheme: Scheme, signs: Array
-) -> list[Run]:
+def _find_runs(flags: NDArray[np.bool_], stage: Stage, scheme: Scheme, signs: Array) -> list[Run]:
     """Longest run of True in each column, of shape (K d, n), if it is an interval long."""
     found = []
     for row, column in enumerate(flags.T):

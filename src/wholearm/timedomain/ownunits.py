@@ -31,6 +31,7 @@ def in_own_units(problem: Problem) -> Problem:
         epsilon=problem.epsilon / scales.force,
         start=scale_state(problem.start, scales),
         phases=phases,
+        table={},
     )
 
 

@@ -9,7 +9,6 @@ from itertools import pairwise
 import numpy as np
 
 from ..dynamics import Directions, force_rows
-from ..formation import TOUCHING, Formation
 from ..model import Array
 from ..outline import RELEASE_AT, Outline, outline_onwards, outline_phase
 from ..problem import End, Phase, Problem
@@ -119,7 +118,6 @@ def _guess(
     total : float, [s]
         Duration of all stages.
     """
-    formation = outline.formation
     knots = np.linspace(0.0, 1.0, len(outline.z))
     slopes = np.gradient(outline.z, knots, axis=0)
     bends = np.gradient(slopes, knots, axis=0)
@@ -160,7 +158,7 @@ def _balance(outline: Outline, z: Array, v: Array, a: Array) -> tuple[Array, Arr
     """
     formation, scene = outline.formation, outline.formation.scene
     flat = [table.reshape(-1, 5) for table in (z, v, a)]
-    Xi, sigma = outline.directions
+    sigma = outline.directions.sigma
     G = force_rows(formation, formation.evaluate(*flat[:2]), outline.directions)
     applied = scene.applied_force - scene.dry * np.append(np.zeros(3), sigma)
     needed = scene.mass_diagonal * flat[2] + scene.viscous * flat[1] - applied
@@ -171,9 +169,7 @@ def _balance(outline: Outline, z: Array, v: Array, a: Array) -> tuple[Array, Arr
         missing = wanted - light @ rows
         forces.append(light + np.linalg.lstsq(rows.T, missing, rcond=1e-6)[0])
     c = np.array(forces)
-    c[:, : formation.n_contacts] = np.clip(
-        c[:, : formation.n_contacts], 0.1 * PRESS, 20.0
-    )
+    c[:, : formation.n_contacts] = np.clip(c[:, : formation.n_contacts], 0.1 * PRESS, 20.0)
     tau = needed[:, 3:] - np.einsum("nij,ni->nj", G[:, :, 3:], c)
     tau = np.clip(tau, -0.9 * scene.torque_limit, 0.9 * scene.torque_limit)
     count, degree = z.shape[:2]

@@ -18,7 +18,8 @@ from .timelimits import Give
 from .timesearch import Search
 
 SHORT = 1e-4
-"""Least shortfall that counts, over the weight of the object, or that times the radius of gyration."""
+"""Least shortfall that counts, of forces over the weight, of torques over that times the radius
+of gyration of the object."""
 
 Replan = Callable[[Problem], object]
 """Plans the same phases of another problem; raises if there is no plan."""

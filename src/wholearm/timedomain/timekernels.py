@@ -53,7 +53,7 @@ def point_kernel(formation: Formation) -> Kernel:
 
 @lru_cache(maxsize=32)
 def end_kernel(formation: Formation) -> Kernel:
-    """Contacts at the end of an interval without a point there: x is (z, z'), and z at its start."""
+    """Contacts at the end of an interval without a point there, of x = (z, z', z at its start)."""
     z, v = ca.SX.sym("z", 5), ca.SX.sym("v", 5)
     first = ca.SX.sym("first", 5 if formation.rolling else 0)
     gaps, P, _, _ = formation.build_constraints(z, v)

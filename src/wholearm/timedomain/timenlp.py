@@ -51,7 +51,7 @@ from .timekernels import (
     stretch_kernel,
     watch_kernel,
 )
-from .timelayout import MARGIN, V, Z, StageLayout, lay_out
+from .timelayout import MARGIN, StageLayout, V, Z, lay_out
 from .timelimits import Give, LimitRows, add_limits
 from .timerows import Rows
 
@@ -169,7 +169,9 @@ def build_time_nlp(
         give = Give(-1.0)
     layouts = lay_out(stages, scheme, give is not None, objective is Objective.ELASTIC)
     rows, cost = Rows(), np.zeros(layouts[-1].stop)
-    own = rows.linear(10, low=stages[0].guess.nodes[0].ravel(), high=stages[0].guess.nodes[0].ravel())
+    own = rows.linear(
+        10, low=stages[0].guess.nodes[0].ravel(), high=stages[0].guess.nodes[0].ravel()
+    )
     rows.put(own, layouts[0].nodes[0, :10], 1.0)
     weights = {Objective.TIME: 1.0, Objective.EFFORT: time_weight, Objective.ELASTIC: _HURRY}
     rows_of = []

@@ -21,8 +21,8 @@ from ..options import Objective, PlanOptions
 from ..phaseplan import PhasePlan
 from ..problem import Phase, Problem
 from .modesearch import adapt, improve
-from .revising import halve
 from .ownunits import to_si, unit_of
+from .revising import halve
 from .stage import Stage
 from .staging import outline_stages
 from .timemotion import TimeMotion, make_motions

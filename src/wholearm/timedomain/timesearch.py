@@ -192,9 +192,7 @@ class Search:
             {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")},
         )
 
-    def find_dear(
-        self, solution: Solution, misses: Sequence[Limits]
-    ) -> list[NDArray[np.bool_]]:
+    def find_dear(self, solution: Solution, misses: Sequence[Limits]) -> list[NDArray[np.bool_]]:
         """Intervals in which raising limits by their misses would cost much, each of shape (K,)."""
         on_x, on_g = (np.abs(solution.multipliers[key]) for key in ("lam_x0", "lam_g0"))
         marked = []
