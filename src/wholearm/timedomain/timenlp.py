@@ -60,7 +60,7 @@ OPENING = 0.01
 CLEAR = 5e-4
 """Gap of a released contact after a third of the first stage without it at least, over the radius
 of gyration."""
-SLIDING = 3e-3
+SLIDING = 3e-4
 """Least sliding, over the radius of gyration, and least speed of a joint, in the scene's unit of
 time: what does not move at all would have no sense."""
 SHORTEST = 1e-7

@@ -24,9 +24,9 @@ from .warmstart import FIRST_SIZE, Multipliers, carry_multipliers, first_multipl
 
 ROUNDS = 24
 """Most times that limits are tightened."""
-REFINEMENTS = 4
+REFINEMENTS = 8
 """Most times that intervals are halved because of misses."""
-DEFECT = 3e-7
+DEFECT = 2e-8
 """What collocation may miss z and z' by at the end of an interval, in the scene's own units."""
 DEAR = 1e-5
 """What limits that are raised in an interval may cost, over the cost, without halving it."""
