@@ -14,8 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..contact import Contact
 from ..dynamics import Directions, split_forces
 from ..formation import Formation
+from ..model import Scene
 from .collocation import Scheme
 from .mesh import resample
 from .stage import Stage, StagePoints
@@ -55,11 +57,9 @@ def sign_sequence(stages: Sequence[Stage]) -> tuple[tuple[int, Mode], ...]:
 
 
 @lru_cache(maxsize=64)
-def _roll(formation: Formation, rows: tuple[int, ...]) -> Formation:
-    """A formation with other rolling contacts; always the same object."""
-    return Formation(
-        formation.scene, formation.contacts, tuple(formation.contacts[k] for k in rows)
-    )
+def _roll(scene: Scene, contacts: tuple[Contact, ...], rows: tuple[int, ...]) -> Formation:
+    """A formation by its rolling contacts; always the same object, since kernels are kept by it."""
+    return Formation(scene, contacts, tuple(contacts[k] for k in rows))
 
 
 def in_mode(stage: Stage, mode: Mode) -> Stage:
@@ -75,7 +75,7 @@ def in_mode(stage: Stage, mode: Mode) -> Stage:
     if rows != formation.rolling_rows:
         c_n, c_t = split_forces(formation, part.forces, stage.directions.Xi)
         part = part._replace(forces=np.concatenate([c_n, c_t[..., list(rows)]], axis=-1))
-        formation = _roll(formation, rows)
+        formation = _roll(formation.scene, formation.contacts, rows)
     return replace(stage, formation=formation, directions=directions, guess=part)
 
 
