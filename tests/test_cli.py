@@ -510,6 +510,40 @@ def test_bad_input_is_told_before_anything_heavy_is_imported() -> None:
     assert run("-c", code).stdout == "2 []\n"
 
 
+def run_in_shell(command: str, redirection: str) -> tuple[int, str, bytes]:
+    """Exit status, stderr and what is in `out.npz`, or nothing, of a command with a redirection."""
+    run = subprocess.run(
+        ["bash", "-c", f'"{sys.executable}" -m wholearm {command} {redirection}'],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    written = Path("out.npz").read_bytes()[:2] if Path("out.npz").exists() else b""
+    return run.returncode, run.stderr, written
+
+
+@pytest.mark.skipif(os.name != "posix", reason="redirections of a POSIX shell")
+@pytest.mark.parametrize(
+    ("redirection", "status", "message"),
+    [
+        (">&-", 0, ""),
+        ("2>&-", 0, ""),
+        (
+            "> /dev/full",
+            1,
+            "cannot be written: No space left on device\n",
+        ),
+    ],
+)
+def test_output_that_cannot_be_written_is_no_traceback(
+    folder: Path, redirection: str, status: int, message: str
+) -> None:
+    plan = f"solve '{HEPTAGON}' -o out.npz --intervals 10"
+    got, errors, written = run_in_shell(plan, redirection)
+    assert (got, errors) == (status, message and f"wholearm: standard output: {message}")
+    assert written == b"PK"
+
+
 def test_a_closed_pipe_is_no_traceback(folder: Path) -> None:
     command = [sys.executable, "-m", "wholearm", "solve", str(HEPTAGON), "-o", "a.npz"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)

@@ -1,9 +1,11 @@
 """Run the command line: ``wholearm`` and ``python -m wholearm``."""
 
+import atexit
+import os
 import signal
 import sys
 
-from .interrupts import guard
+from .interrupts import ENDED, guard
 
 
 def _run() -> int:
@@ -14,10 +16,18 @@ def _run() -> int:
 
 def run() -> None:
     """Run a command, from its imports on, and exit with its status."""
+    if sys.stdout is None:
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")
     status = guard(_run)
     # What the command had to do is done; exiting takes a moment, and would be a traceback.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
+    if status in ENDED:
+        # To delete large expressions one by one can take seconds.
+        atexit._run_exitfuncs()
+        os._exit(status)
     sys.exit(status)
 
 

@@ -7,6 +7,7 @@ Exit status 0 means done and all contacts held, 1 infeasible or a contact lost o
 from __future__ import annotations
 
 import argparse
+import errno
 import json
 import os
 import sys
@@ -42,12 +43,30 @@ def _run(given: Sequence[str]) -> int:
         return status
     except WholearmError as error:
         _clear_progress()
-        print(f"wholearm: {error}", file=sys.stderr)
+        _complain(str(error))
         return error.exit_status
     except BrokenPipeError:
-        # The reader has gone; keep the interpreter from complaining again when it exits.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _silence_output()
         return 1
+    except OSError as error:
+        # Files are written elsewhere, with errors of their own; this is the output.
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
+            raise
+        _silence_output()
+        _complain(f"standard output: cannot be written: {error.strerror}")
+        return 1
+
+
+def _complain(text: str) -> None:
+    try:
+        print(f"wholearm: {text}", file=sys.stderr, flush=True)
+    except OSError:
+        pass  # nobody reads it
+
+
+def _silence_output() -> None:
+    """Keep the interpreter from complaining again, when it exits, about what cannot be written."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def build_parser() -> argparse.ArgumentParser:
