@@ -18,6 +18,7 @@ import wholearm
 from conftest import HEPTAGON
 from tipping import BOX, scale, tipped
 from wholearm.cli import build_parser, main
+from wholearm.torquetable import format_rows, place_rows
 from wholearm.trajectory import Trajectory, load_trajectory
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
@@ -89,16 +90,82 @@ def test_solve_writes_the_plan(folder: Path, capsys: pytest.CaptureFixture[str])
     out, err = capsys.readouterr()
     assert err == ""
     lines = out.splitlines()
-    assert len(lines) == 7 and lines[0].split()[:2] == ["phase", "duration"]
+    assert len(lines) == 9 and lines[0].split()[:2] == ["phase", "duration"]
     plan = load_trajectory("a.npz")
     shown = [float(line.split()[1]) for line in lines[1:6]]
     np.testing.assert_allclose(shown, plan.meta["phase_durations"], atol=5e-7)
     assert min(float(line.split()[2]) for line in lines[1:6]) == pytest.approx(0.05, abs=1e-5)
     assert max(float(line.split()[3]) for line in lines[1:6]) <= 2.0
-    assert lines[6] == (f"time = {plan.duration:.6f} s, {plan.duration:.6f} s in all; wrote a.npz")
+    assert lines[6].startswith("replayed: least c_n 0.0500")
+    assert lines[7].startswith("wrote a.csv: ") and " rows; its replay holds: phi = " in lines[7]
+    assert lines[8] == (f"time = {plan.duration:.6f} s, {plan.duration:.6f} s in all; wrote a.npz")
+    assert main(["verify", str(HEPTAGON), "a.csv"]) == 0
     assert len(plan.t) == 5 * 21
     assert Path("a.csv").read_text().startswith("t,tau1,tau2\n0.0,")
     assert sorted(path.name for path in folder.iterdir()) == ["a.csv", "a.npz"]
+
+
+@pytest.mark.parametrize("more", [["linear"], ["hold"], []])
+def test_solve_writes_samples_and_what_becomes_of_them(
+    folder: Path, capsys: pytest.CaptureFixture[str], more: list[str]
+) -> None:
+    given = ["--interpolation", *more] if more else []
+    command = ["solve", str(HEPTAGON), "-o", "a.npz", "--torques", "a.csv", "--sample-rate", "200"]
+    assert main([*command, *given, "--json"]) == 0
+    plan, table = load_trajectory("a.npz"), wholearm.read_torque_csv("a.csv")
+    figures = json.loads(capsys.readouterr().out)["torques"]
+    kind = more[0] if more else "linear"
+    assert (figures["file"], figures["sample_rate"]) == ("a.csv", 200.0)
+    assert figures["interpolation"] == kind
+    t = np.asarray(0.005 * np.arange(int(200 * plan.duration)), dtype=np.float64)
+    middle = table.at(np.asarray(t + 0.0025))
+    samples = plan.torque.at(t + 1e-12)
+    later = plan.torque.at(t + 0.005 + 1e-12)
+    expected = samples if kind == "hold" else (samples + later) / 2
+    np.testing.assert_allclose(middle, expected, atol=1e-9)
+    phases = figures["replay"]["phases"]
+    assert [row["phase"] for row in phases] == [1, 2, 3, 4, 5]
+    planned = [row["planned_arrival"] for row in phases]
+    np.testing.assert_allclose(planned, plan.phase_starts[1:])
+    # What is lost is told, here and by verify, but is no error of solve.
+    assert main(["verify", str(HEPTAGON), "a.csv"]) == (0 if figures["replay"]["ok"] else 1)
+    first = capsys.readouterr().out.splitlines()[0]
+    assert figures["replay"]["reason"].split(" at t = ")[0] in first
+    assert main([*command, *given]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert f"{kind} at 200 Hz; its replay " in lines[7]
+    assert lines[8].split("  ") == [
+        "phase", "arrival [s]", "planned [s]", "least c_n [N]", "planned [N]", "contact"
+    ]  # fmt: skip
+    assert [line.split()[0] for line in lines[9:14]] == ["1", "2", "3", "4", "5"]
+
+
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        (["--sample-rate", "100"], "--sample-rate: needs --torques FILE"),
+        (["--torques", "a.csv", "--interpolation", "hold"], "--interpolation: is for tables"),
+        (["--torques", "a.csv", "--sample-rate", "-5"], "sample_rate: -5.0 is not a positive"),
+        (
+            ["--torques", "a.csv", "--sample-rate", "9", "--interpolation", "cubic"],
+            "interpolation: 'cubic' given; allowed are linear and hold",
+        ),
+        (["--torques", "a.csv", "--sample-rate", "0.01"], "sample_rate: 0.01 Hz given; allowed"),
+    ],
+)
+def test_bad_sampling(
+    folder: Path, capsys: pytest.CaptureFixture[str], given: list[str], message: str
+) -> None:
+    assert message in fails(capsys, 2, "solve", str(HEPTAGON), "--intervals", "20", *given)
+    assert not list(folder.iterdir())
+
+
+def test_solve_without_a_replay(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["solve", str(HEPTAGON), "-o", "a.npz", "--intervals", "20", "--no-replay"]
+    assert main([*command, "--torques", "a.csv"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[6] == "the plan was not replayed" and lines[7].endswith(" rows")
+    assert load_trajectory("a.npz").meta["replay"] is None
 
 
 def test_solve_names_its_output_after_the_problem(folder: Path) -> None:
@@ -386,8 +453,7 @@ def test_verify_names_a_missed_goal(folder: Path, capsys: pytest.CaptureFixture[
 def test_verify_names_a_slip(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     starts = tipped().phase_starts
     torque = scale(0, 0.95, starts[1], starts[2])
-    rows = "\n".join(",".join(map(repr, row)) for row in torque.rows(40).tolist())
-    Path("weak.csv").write_text(f"t,tau1,tau2\n{rows}\n")
+    Path("weak.csv").write_text(format_rows(place_rows(torque)))
     assert main(["verify", str(BOX), "weak.csv"]) == 1
     out, err = capsys.readouterr()
     assert err == "" and "FAILED: " in out and "v1-palm slips: |c_t| = " in out

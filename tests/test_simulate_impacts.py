@@ -181,10 +181,20 @@ def test_next_to_no_speed_is_a_stop() -> None:
     assert simulation.z_dot[last].any() and not simulation.z_dot[first].any()
 
 
+def chords(torque: TorqueProfile, count: int) -> TorqueProfile:
+    """Straight lines between points on the torques, `count` in each piece."""
+    x = np.linspace(-1.0, 1.0, count + 1)
+    powers = x[:, None] ** np.arange(torque.coefficients.shape[2])
+    tau = np.einsum("kjd,nd->knj", torque.coefficients, powers)
+    lines = np.stack([tau[:, 1:] + tau[:, :-1], tau[:, 1:] - tau[:, :-1]], axis=3) / 2
+    start, h = torque.breaks[:-1, None], np.diff(torque.breaks)[:, None]
+    inner = (start + h * (x[:-1] + 1) / 2).ravel()
+    return TorqueProfile(np.append(inner, torque.breaks[-1]), lines.reshape(-1, 2, 2))
+
+
 def test_a_planned_stop_is_that_of_a_phase_that_ends_at_rest(problem: Problem) -> None:
     """Linear torques between rows bring it there a little early, and not quite at rest."""
-    rows = solve(problem, "margin").torque.rows(8)
-    torque = TorqueProfile.join_rows(rows[:, 0], rows[:, 1:])
+    torque = chords(solve(problem, "margin").torque, 8)
     first, second, *others = problem.phases
     stops = [dataclasses.replace(phase, end=End.REST) for phase in others]
     resting = dataclasses.replace(problem, phases=(first, second, *stops))

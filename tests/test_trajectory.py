@@ -273,7 +273,9 @@ def test_rolling_contacts_are_known_and_their_friction_is_interpolated(tmp_path:
     t = np.linspace(0.01, plan.motions[1].duration - 0.01, 50)
     exact, interpolated = (one.motions[1].evaluate(t).c_t[:, 0] for one in (plan, loaded))
     assert np.ptp(exact) > 0.3
-    np.testing.assert_allclose(interpolated, exact, atol=2e-3)
+    # Straight lines, which a kink between two samples is some way off.
+    assert np.quantile(np.abs(interpolated - exact), 0.9) < 2e-3
+    np.testing.assert_allclose(interpolated, exact, atol=0.02)
 
 
 @pytest.mark.parametrize("given", [3, "v1-palm", ["v1-palm"], {"1": []}])

@@ -11,14 +11,16 @@ import errno
 import json
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NoReturn
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, NoReturn
 
 from .benchmark.command import add_bench, name_study
 from .errors import InputError, WholearmError, name_source
 from .interrupts import guard
 
 if TYPE_CHECKING:
+    from .problem import Problem
+    from .tablecheck import Table
     from .torque import TorqueProfile
     from .trajectory import Trajectory
 
@@ -79,6 +81,10 @@ def build_parser() -> argparse.ArgumentParser:
     solve.add_argument("problem", help="problem file (TOML)")
     solve.add_argument("-o", "--output", help="trajectory file to write (default: NAME.npz)")
     solve.add_argument("--torques", metavar="FILE", help="also write the torques as CSV")
+    text = "write samples of the torques at this rate [Hz] instead, and what becomes of the motion"
+    solve.add_argument("--sample-rate", metavar="HZ", type=float, help=text)
+    text = "of samples: linear (the default), or hold for sample-and-hold"
+    solve.add_argument("--interpolation", help=text)
     solve.add_argument("--objective", default="time", help="time, effort or margin (default: time)")
     solve.add_argument("--intervals", type=int, help="intervals of each phase's grid")
     solve.add_argument("--duration", type=float, help="longest duration [s], for margin")
@@ -150,10 +156,12 @@ class _Version(argparse.Action):
 def _solve(options: argparse.Namespace) -> int:
     from dataclasses import fields
 
-    from .files import require_writable, together
+    from .files import require_writable, together, write_text
     from .options import PlanOptions
     from .outline import load
     from .plan import solve_with
+    from .summary import summarise
+    from .torquetable import format_rows
 
     output = options.output or _stem(options.problem) + ".npz"
     given = {
@@ -165,63 +173,49 @@ def _solve(options: argparse.Namespace) -> int:
     for path in (output, options.torques):
         if path is not None:
             require_writable(path)
-    trajectory = solve_with(load(options.problem), plan_options, _progress())
+    _check_sampling(options)
+    problem = load(options.problem)
+    trajectory = solve_with(problem, plan_options, _progress())
+    table = None if options.torques is None else _make_table(options, problem, trajectory)
     with together():
         trajectory.save(output)
-        if options.torques is not None:
-            trajectory.save_torques(options.torques)
+        if table is not None:
+            write_text(options.torques, format_rows(table.rows))
     _clear_progress()
+    figures = None if table is None else {"file": options.torques, **table.figures}
     if options.json:
-        print(json.dumps(dict(trajectory.meta), indent=2))
+        extra = {} if figures is None else {"torques": figures}
+        print(json.dumps({**trajectory.meta, **extra}, indent=2))
     else:
-        print(_summarise(trajectory, output))
+        print(summarise(trajectory, output, figures))
     return 0
+
+
+def _check_sampling(options: argparse.Namespace) -> None:
+    """Check what is asked of a table before anything is planned for it."""
+    from .torquetable import require_sampling
+
+    if options.sample_rate is None:
+        if options.interpolation is not None:
+            raise InputError("", "--interpolation", "is for tables with a --sample-rate")
+        return
+    if options.torques is None:
+        raise InputError("", "--sample-rate", "needs --torques FILE, the table to write")
+    require_sampling(options.sample_rate, options.interpolation or "linear")
+
+
+def _make_table(options: argparse.Namespace, problem: Problem, trajectory: Trajectory) -> Table:
+    """The torque table that is asked for, replayed."""
+    from .tablecheck import make_table, sample_table
+
+    if options.sample_rate is None:
+        return make_table(problem, trajectory, options.replay)
+    interpolation = options.interpolation or "linear"
+    return sample_table(problem, trajectory, options.sample_rate, interpolation, options.replay)
 
 
 def _stem(path: str) -> str:
     return os.path.splitext(os.path.basename(path))[0]
-
-
-def _summarise(trajectory: Trajectory, output: str) -> str:
-    meta = trajectory.meta
-    lines = [
-        f"{'phase':>5}  {'duration [s]':>12}  {'least c_n [N]':>13}  {'largest |tau| [N m]':>19}"
-    ]
-    for index, duration in enumerate(meta["phase_durations"]):
-        rows = trajectory.phase == index
-        c_n = trajectory.c_n[rows]
-        least = c_n[c_n == c_n].min()
-        torque = abs(trajectory.tau[rows]).max()
-        lines.append(f"{index + 1:>5}  {duration:>12.6f}  {least:>13.6f}  {torque:>19.6f}")
-    lines += _list_transitions(meta)
-    value = f"{meta['objective']} = {meta['value']:.6f} {meta['value_unit']}"
-    return "\n".join([*lines, f"{value}, {trajectory.duration:.6f} s in all; wrote {output}"])
-
-
-def _list_transitions(meta: Mapping[str, Any]) -> list[str]:
-    """Table of the impacts that a problem asks for; empty if it has none."""
-    transitions = meta["transitions"]
-    if not transitions:
-        return []
-    saves = f"saves [{meta['value_unit']}]"
-    width = len(saves)
-    lines = [
-        "",
-        f"{'after phase':>11}  {'velocity ratio':>14}  {'least impulse [N s per m/s]':>27}  "
-        f"{'speed [m/s]':>11}  {saves}",
-    ]
-    for row in transitions:
-        impulse = f"{_show(row['least_impulse'])} {row['least_impulse_contact']}"
-        lines.append(
-            f"{row['phase']:>11}  {_show(row['velocity_ratio']):>14}  {impulse:>27}  "
-            f"{_show(row['speed']):>11}  {_show(row['saves']):>{width}}"
-            + ("" if row["possible"] else f"  stops: {row['reason']}")
-        )
-    return [*lines, ""]
-
-
-def _show(value: float | None) -> str:
-    return "-" if value is None else f"{value:.6f}"
 
 
 def _verify(options: argparse.Namespace) -> int:

@@ -77,6 +77,11 @@ def together() -> Iterator[None]:
             _remove(part)
 
 
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write a text file as a whole; see `write_whole`."""
+    write_whole(path, lambda stream: stream.write(text.encode()))
+
+
 def _is_special(target: str) -> bool:
     return os.path.exists(target) and not os.path.isfile(target) and not os.path.isdir(target)
 

@@ -56,22 +56,6 @@ class TorqueProfile:
         squares = np.einsum("kjd,de,kje->k", self.coefficients, moments, self.coefficients)
         return float(squares @ np.diff(self.breaks) / 2)
 
-    def rows(self, per_piece: int) -> Array:
-        """Rows (t, tau_1, tau_2), `per_piece` + 1 on each piece, two at a break where it steps.
-
-        Joined by straight lines they give the torques back up to the curvature between rows.
-        """
-        x = np.linspace(-1.0, 1.0, per_piece + 1)
-        tau = np.einsum(
-            "kjd,nd->knj", self.coefficients, x[:, None] ** np.arange(self.coefficients.shape[2])
-        )
-        middle, half = (self.breaks[1:] + self.breaks[:-1]) / 2, np.diff(self.breaks) / 2
-        t = middle[:, None] + half[:, None] * x
-        t[:, 0], t[:, -1] = self.breaks[:-1], self.breaks[1:]
-        table = np.concatenate([t[..., None], tau], axis=2).reshape(-1, 3)
-        same = (np.abs(np.diff(table, axis=0)) <= [0.0, 1e-6, 1e-6]).all(axis=1)
-        return np.asarray(table[np.append(True, ~same)])
-
     @staticmethod
     def fit(breaks: Array, function: Callable[[Array], Array], degree: int) -> TorqueProfile:
         """Interpolate `function`, t -> (n, 2) [N m], at Chebyshev nodes of each piece.

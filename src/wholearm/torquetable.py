@@ -20,8 +20,8 @@ ERROR = 1e-5
 STEP = 1e-6
 """Jump at a break from which on the rows keep it as a step, relative to the largest torque."""
 INTERPOLATIONS = ("linear", "hold")
-_PLACES = 17
-"""Places in each piece of torques at which its curvature is looked at."""
+_PLACES = np.linspace(-1.0, 1.0, 17)
+"""Places in each piece of torques at which it is looked at."""
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(6)
 
 
@@ -36,7 +36,8 @@ def place_rows(torque: TorqueProfile, error: float = ERROR) -> Array:
     error : float
         What the lines may miss, relative to the largest torque.
     """
-    largest = float(np.abs(torque.coefficients).sum(axis=2).max())
+    peak = np.abs(_sample(torque.coefficients)).max(axis=(0, 1))
+    largest = float(peak.max())
     if largest == 0.0:
         ends = torque.breaks[[0, -1]]
         return np.column_stack([ends, np.zeros((2, 2))])
@@ -48,7 +49,11 @@ def place_rows(torque: TorqueProfile, error: float = ERROR) -> Array:
     ends = np.concatenate([breaks[:1], steps, breaks[-1:]])
     at = np.searchsorted(knots, ends)
     stretches = [knots[i : j + 1] for i, j in pairwise(at)]
-    return np.concatenate([np.column_stack([own, _fit_lines(torque, own)]) for own in stretches])
+    rows = np.concatenate([np.column_stack([own, _fit_lines(torque, own)]) for own in stretches])
+    # Lines through a bend miss it on both sides; no limit is to be missed for that.
+    peak = np.maximum(peak, np.abs(torque.at(knots)).max(axis=0))
+    rows[:, 1:] = np.clip(rows[:, 1:], -peak, peak)
+    return rows
 
 
 def sample_rows(torque: TorqueProfile, rate: float, interpolation: str) -> Array:
@@ -64,10 +69,7 @@ def sample_rows(torque: TorqueProfile, rate: float, interpolation: str) -> Array
         If the rate is not a positive number or gives fewer than two samples, or the interpolation
         is another one.
     """
-    rate = require_number(rate, "sample_rate", positive=True)
-    if interpolation not in INTERPOLATIONS:
-        allowed = " and ".join(INTERPOLATIONS)
-        raise InputError("", "interpolation", f"{interpolation!r} given; allowed are {allowed}")
+    rate = require_sampling(rate, interpolation)
     start, count = torque.breaks[0], torque.duration * rate
     if not 1 <= count <= 1e7:
         needed = f"{1 / torque.duration:.4g} to {1e7 / torque.duration:.4g} Hz"
@@ -79,6 +81,20 @@ def sample_rows(torque: TorqueProfile, rate: float, interpolation: str) -> Array
         return np.column_stack([t, tau])
     held = np.repeat(tau[:-1], 2, axis=0)
     return np.column_stack([np.repeat(t, 2)[1:-1], held])
+
+
+def require_sampling(rate: object, interpolation: str) -> float:
+    """The rate [Hz] as a number, if it and the interpolation are allowed.
+
+    Raises
+    ------
+    InputError
+        If they are not.
+    """
+    if interpolation not in INTERPOLATIONS:
+        allowed = " and ".join(INTERPOLATIONS)
+        raise InputError("", "interpolation", f"{interpolation!r} given; allowed are {allowed}")
+    return require_number(rate, "sample_rate", positive=True)
 
 
 def format_rows(rows: Array) -> str:
@@ -94,13 +110,11 @@ def read_rows(rows: Array) -> TorqueProfile:
 
 def _divide(torque: TorqueProfile, error: float) -> Array:
     """Breaks of the torques, and places between them where a line would miss more than `error`."""
-    breaks, h = torque.breaks, np.diff(torque.breaks)
-    x = np.linspace(-1.0, 1.0, _PLACES)
-    bends = np.polynomial.polynomial.polyder(torque.coefficients, 2, axis=2)
-    curvature = np.abs(np.einsum("kjd,nd->knj", bends, x[:, None] ** np.arange(bends.shape[2])))
+    breaks, h, x = torque.breaks, np.diff(torque.breaks), _PLACES
+    bends = _sample(np.asarray(np.polynomial.polynomial.polyder(torque.coefficients, 2, axis=2)))
     # A line over a part of length p misses p^2 / 8 times the second derivative.
-    density = np.sqrt(curvature.max(axis=2) / (8 * error))
-    inner = (density[:, 1:] + density[:, :-1]) / 2 * (x[1] - x[0])
+    density = np.sqrt(np.abs(bends).max(axis=2) / (8 * error))
+    inner = (density[:, 1:] + density[:, :-1]) / 2 * np.diff(x)
     total = np.concatenate([np.zeros((len(h), 1)), np.cumsum(inner, axis=1)], axis=1)
     counts = np.maximum(1, np.ceil(total[:, -1])).astype(int)
     parts = []
@@ -108,6 +122,12 @@ def _divide(torque: TorqueProfile, error: float) -> Array:
         inside = np.interp(np.linspace(0.0, total[k, -1], count + 1)[1:-1], total[k], x)
         parts += [breaks[[k]], breaks[k] + h[k] * (inside + 1) / 2]
     return np.append(np.concatenate(parts), breaks[-1])
+
+
+def _sample(coefficients: Array) -> Array:
+    """Values of polynomials, shape (k, 2, d + 1), at some places in each: shape (k, n, 2)."""
+    powers = _PLACES[:, None] ** np.arange(coefficients.shape[2])
+    return np.asarray(np.einsum("kjd,nd->knj", coefficients, powers))
 
 
 def _fit_lines(torque: TorqueProfile, knots: Array) -> Array:

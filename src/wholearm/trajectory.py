@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from .archive import read_arrays
 from .errors import InputError
-from .files import write_whole
+from .files import write_text, write_whole
 from .model import Array
-from .torque import COLUMNS, TorqueProfile
+from .torque import TorqueProfile
+from .torquetable import format_rows, place_rows
 
 
 class Samples(NamedTuple):
@@ -165,19 +166,15 @@ class Trajectory:
     def save_torques(self, path: str | os.PathLike[str]) -> None:
         """Write the torques as CSV, ``t,tau1,tau2``, a repeated time being a step.
 
+        Rows are as dense as the torques are bent; `wholearm.tablecheck` also replays them.
+
         Raises
         ------
         InputError
             If the file cannot be written.
         """
-        rows = self.torque.rows(ROWS)
-        lines = [",".join(COLUMNS), *(",".join(map(repr, row)) for row in rows.tolist())]
-        text = "\n".join(lines) + "\n"
-        write_whole(path, lambda stream: stream.write(text.encode()))
+        write_text(path, format_rows(place_rows(self.torque)))
 
-
-ROWS = 20
-"""Rows of a torque CSV per piece: their straight lines then replay to about a micrometre."""
 
 _ARRAYS = {
     "t": (), "q": (3,), "theta": (2,), "q_dot": (3,), "theta_dot": (2,), "q_ddot": (3,),
