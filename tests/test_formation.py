@@ -392,3 +392,15 @@ def test_describe() -> None:
     contacts = [parse_contact(name, WIDE) for name in ("v1-palm", "e0-tip1")]
     assert describe(contacts) == "e0-tip1 v1-palm"
     assert describe([]) == "nothing"
+
+
+def test_a_joint_right_above_the_object_is_refused() -> None:
+    """A link closes from pointing down, which overlaps an object below its joint."""
+    flat = [[-0.12, 0.0], [0.12, 0.0], [0.12, 0.02], [-0.12, 0.02]]
+    scene = make_scene(flat, base=0.08, depth=0.05)
+    for x in (0.0, 0.05):
+        with pytest.raises(InputError, match="right above it") as caught:
+            close_finger(scene, np.array([x, 0.01, 0.0]), 0)
+        assert caught.value.key == "fingers.1.base"
+    beside = close_finger(scene, np.array([-0.06, 0.01, 0.0]), 0)
+    assert abs(finger_gap(scene, np.array([-0.06, 0.01, 0.0]), 0, beside)[0]) < 1e-12

@@ -34,8 +34,8 @@ _CROSSED = ("#f6e3ee", "#CC79A7", "\\\\\\\\")
 _UNREACHED = {
     "finger 1 too short": -1,
     "finger 2 too short": -2,
-    "joint 1 in the object": -3,
-    "joint 2 in the object": -4,
+    "joint 1 in or above the object": -3,
+    "joint 2 in or above the object": -4,
     "fingers overlap": CROSSED,
 }
 _FORTH, _BACK, _FREE = "#0072B2", "#D55E00", "#7a838f"

@@ -119,6 +119,10 @@ def _walk_part(problem: Problem, index: int, z: Array, parts: list[Part]) -> lis
         except InputError as error:
             first = first or error
             continue
+        if len(parts[0].contacts) == 4 and not _is_at(problem.scene, here, parts[0]):
+            text = f"{steps[-1][1]} is first reached at {describe_pose(here)}"
+            first = first or InputError("", "", text)
+            continue
         if len(parts) == 1 or _can_start(problem.scene, here, parts[1].contacts):
             return walked
         spare = spare or walked
@@ -126,6 +130,12 @@ def _walk_part(problem: Problem, index: int, z: Array, parts: list[Part]) -> lis
         return spare
     assert first is not None
     raise first
+
+
+def _is_at(scene: Scene, z: Array, part: Part) -> bool:
+    """Whether a part of a border ends at `z`: its contact may be gained both ways along it."""
+    away = np.minimum(np.abs(z[[0, 2]] - part.stop), np.abs(z[[0, 2]] - part.inside))
+    return bool((away < tolerance(scene)).all())
 
 
 def _can_start(scene: Scene, z: Array, contacts: tuple[Contact, ...]) -> bool:
@@ -151,8 +161,8 @@ def _list_ways(scene: Scene, z: Array, part: Part) -> Iterator[list[Step]]:
             yield [onto, *way]
         return
     yield from _list_plain(scene, part)
-    if len(part.contacts) == 3:
-        yield from _list_guided(scene, part)
+    rows = (part.coordinate,) if len(part.contacts) == 4 else (0, 1)
+    yield from _list_guided(scene, part, rows)
 
 
 def _list_plain(scene: Scene, part: Part) -> Iterator[list[Step]]:
@@ -163,13 +173,13 @@ def _list_plain(scene: Scene, part: Part) -> Iterator[list[Step]]:
         yield [(part.contacts, _coordinate(scene, part.coordinate, part.inside))]
 
 
-def _list_guided(scene: Scene, part: Part) -> Iterator[list[Step]]:
-    """Phases that lead to near the end first: with two freedoms another end may be nearer."""
+def _list_guided(scene: Scene, part: Part, rows: tuple[int, ...]) -> Iterator[list[Step]]:
+    """Phases that lead to near the end first, by x and phi: another end may be nearer."""
     share = BEFORE if part.gained else 1.0
     aim = part.start + share * (part.stop - part.start)
-    guides = [(part.contacts, _coordinate(scene, k, aim)) for k in (0, 1)]
+    guides = [(part.contacts, _coordinate(scene, row, aim)) for row in rows]
     ends = [[(part.contacts, Until(contact=contact))] for contact in part.gained] or [[]]
-    for count in (1, 2):
+    for count in range(1, len(rows) + 1):
         for chosen in permutations(guides, count):
             for end in ends:
                 yield [*chosen, *end]
