@@ -210,7 +210,7 @@ def _rolled(
     first = phases[0]
     palm = [name for name in first["contacts"] if name.endswith("-palm")]
     links = [next((n for n in first["contacts"] if n.endswith(f"{k}")), "") for k in (1, 2)]
-    if len(palm) != 2 or "" in links:
+    if len(palm) != 2 or "" in links or problem.scene.friction.palm == 0:
         return phases, stops, "from the map"
     middle = (problem.start[0] + stops[0][0]) / 2
     right = rng.uniform() < 0.5
