@@ -6,22 +6,29 @@ import itertools
 import json
 import math
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ..errors import InputError
-from ..mapping.route import format_route, list_formations
+from ..formation import Formation
+from ..mapping.closing import close
+from ..mapping.route import Stretch, format_route, list_formations
 from ..model import Array
-from ..problem import Problem, build_problem
+from ..problem import Phase, Problem, build_problem
+from .lpmotion import slow_margin
 from .newton import locate
 from .scenes import Table, random_route, random_scene
 
-TRIES = 6
+TRIES = 4
 """Routes that are drawn for one scene before another scene is."""
-SCENES = 40
+LOOKS = 4
+"""Places of a stretch at which it is looked whether a slow motion is possible."""
+WILLING = 0.7
+"""Share of the cases whose route a slow motion can probably follow."""
+SCENES = 6
 """Scenes that are drawn for one case before its last list is taken as it is."""
 
 
@@ -52,6 +59,7 @@ def draw_case(seed: int, number: int) -> Case:
     rng = np.random.default_rng([seed, number])
     kinds = list(TWISTS)
     kind = kinds[int(rng.integers(len(kinds)))]
+    willing, last = rng.uniform() < WILLING, None
     for _ in range(SCENES):
         try:
             table = _refit(TWISTS[kind](rng, random_scene(rng)))
@@ -65,11 +73,35 @@ def draw_case(seed: int, number: int) -> Case:
                 continue
             phases = tomllib.loads(format_route(stretches))["phases"]
             stops = [(float(part.stop[0]), float(part.stop[1])) for part in stretches]
+            moves = can_move(problem, stretches)
             route = ROUTES[int(rng.integers(len(ROUTES)))]
             phases, stops, name = route(rng, problem, phases, stops)
             plain = json.loads(json.dumps({**table, "phases": phases}, default=float))
-            return Case(number, f"{kind}, {name}", plain, stops)
-    raise InputError("", f"scene {number}", "no route was found")
+            last = Case(number, f"{kind}, {name}", plain, stops)
+            if moves or not willing:
+                return last
+    if last is None:
+        raise InputError("", f"scene {number}", "no route was found")
+    return last
+
+
+def can_move(problem: Problem, stretches: Sequence[Stretch]) -> bool:
+    """Whether a slow motion keeps all limits at a few places of every stretch of a route."""
+    scene = problem.scene
+    for stretch in stretches:
+        share = np.linspace(0.0, 1.0, LOOKS + 2)[1:-1, None] + np.array([0.0, 1e-4])
+        poses = stretch.start + share.ravel()[:, None] * (stretch.stop - stretch.start)
+        z = close(scene, *poses.T).z
+        if np.isnan(z).any():
+            return False
+        formation = Formation(scene, stretch.contacts)
+        phase = Phase(0, formation, stretch.until)
+        for place, following in zip(z[::2], z[1::2], strict=True):
+            way = np.array([following - place] * 2)
+            pair = np.array([place, following])
+            if slow_margin(scene, phase, problem.epsilon, pair, way)[0] < 0:
+                return False
+    return True
 
 
 def _refit(table: Table) -> Table:
