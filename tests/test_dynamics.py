@@ -23,6 +23,8 @@ from wholearm.dynamics import (
 from wholearm.errors import JammingError
 from wholearm.formation import Formation, close_finger
 from wholearm.model import Array, Friction, Scene
+from wholearm.path import trace_phases
+from wholearm.problem import build_problem
 
 FRICTIONLESS = Friction(0.0, 0.0, 0.0)
 
@@ -249,13 +251,12 @@ def test_without_friction_the_motion_follows_virtual_work(curves: tuple[Curve, .
 
 
 def test_squeeze_moves_no_body(curves: tuple[Curve, ...]) -> None:
-    """The squeeze is a unit vector of c_n that presses and leaves the object alone."""
+    """The squeeze is a unit vector of c_n that leaves the object alone."""
     for curve, s, directions in states(curves, 2):
         point = curve.evaluate(np.array([s]))
         z, z_s, z_ss = point[:3]
         forces = inverse(curve.formation, z, z_s, z_ss, directions)
         assert np.linalg.norm(forces.Cl[0]) == pytest.approx(1.0, abs=1e-12)
-        assert forces.Cl[0].sum() > 0
         a, b = np.array([0.5]), np.array([0.04])
         v, z_ddot = z_s[0] * 0.2, z_s[0] * 0.5 + z_ss[0] * 0.04
         for squeeze in (np.zeros(1), np.full(1, 3.0)):
@@ -442,3 +443,36 @@ def test_compiled_forward_returns_the_matrix_that_jams(curves: tuple[Curve, ...]
     G = A - (formation.friction * Xi)[:, None] * A_t
     expected = A @ np.diag(1 / formation.scene.mass_diagonal) @ G.T
     np.testing.assert_allclose(K, expected, rtol=1e-12)
+
+
+def test_the_squeeze_keeps_its_sense_along_a_curve() -> None:
+    """Here the null vector passes from pressing more to pressing less on the way."""
+    finger = {"length": 20.0, "inertia": 50.0, "torque_limit": 2e5}
+    problem = build_problem(
+        {
+            "epsilon": 50.0,
+            "object": {
+                "vertices": [[-0.3, -4.5], [4.2, -1.7], [2.9, 3.5], [-2.4, 3.9], [-4.4, -1.1]],
+                "mass": 490.0,
+            },
+            "fingers": {
+                "1": {"base": [5.14, -0.92], "radius": 0.66, **finger},
+                "2": {"base": [-3.36, -0.53], "radius": 0.35, **finger},
+            },
+            "friction": {"palm": 0.087, "finger1": 0.126, "finger2": 0.02},
+            "start": {"flush": 1, "x": -3.02},
+            "phases": [
+                {
+                    "contacts": ["v1-palm", "v2-palm", "v3-finger1", "v1-finger2"],
+                    "until": {"x": -7.6},
+                }
+            ],
+        }
+    )
+    (curve,) = trace_phases(problem)
+    (part,) = curve.segments
+    place = curve.evaluate(np.linspace(0.0, curve.length, 300))
+    null = inverse(curve.formation, *place[:3], Directions(part.Xi, part.sigma)).Cl
+    pressing = null.sum(axis=1)
+    assert pressing.min() < 0.0 < pressing.max()
+    assert np.abs(np.diff(null, axis=0)).max() < 0.05

@@ -182,7 +182,7 @@ def inverse(
     """Forces that carry a formation along a curve, at n places.
 
     The object's rows M q'' = g + [W_n - W_t U Xi, W_t(rolling)] c leave the four numbers c one that
-    is free: the squeeze lambda, the component of c along the unit null vector that presses.
+    is free: the squeeze lambda, the component of c along a unit null vector.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def inverse(
     kinematics = kinematics or formation.evaluate(z, z_s)
     G = force_rows(formation, kinematics, directions)
     wrench = G[:, :, :3].transpose(0, 2, 1)
-    null = _null_vector(wrench, formation.n_contacts)
+    null = _null_vector(wrench)
     mass = scene.mass_diagonal
     # Bordering by the null vector makes each solution the shortest one.
     right = np.zeros((len(z), 4, 3))
@@ -314,13 +314,15 @@ def energy(formation: Formation, z: Array, v: Array) -> Array:
     return np.asarray(kinetic + scene.polygon.mass * scene.gravity * z[:, 1])
 
 
-def _null_vector(wrench: Array, n_c: int) -> Array:
-    """Unit null vector of each (3, 4) matrix, by its minors, with the sign that presses more."""
+def _null_vector(wrench: Array) -> Array:
+    """Unit null vector of each (3, 4) matrix, by its minors.
+
+    Minors change continuously along a curve. A sign chosen place by place would not: where it
+    changes, a squeeze interpolated between two places would step.
+    """
     minors = [np.linalg.det(np.delete(wrench, k, axis=2)) for k in range(4)]
     null = np.stack([minors[0], -minors[1], minors[2], -minors[3]], axis=1)
-    pulls = null[:, :n_c].sum(axis=1) < 0
-    size = np.linalg.norm(null, axis=1) * np.where(pulls, -1.0, 1.0)
-    return np.asarray(null / size[:, None])
+    return np.asarray(null / np.linalg.norm(null, axis=1)[:, None])
 
 
 def force_rows(formation: Formation, kinematics: Kinematics, directions: Directions) -> Array:
