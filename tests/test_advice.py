@@ -8,6 +8,7 @@ from wholearm.advice import (
     Change,
     Limit,
     Shortfall,
+    bracket,
     describe_changes,
     find_changes,
     rank_shortfalls,
@@ -93,3 +94,18 @@ def test_shortfalls_are_ranked() -> None:
         "c_n of v3-finger1 >= epsilon = 0.05 N is 0.812 N short at t = 0.0000 s; "
         "torque limit of finger 1 = 2 N m is 0.4 N m short at t = 0.1000 s, phase 2"
     )
+
+
+@pytest.mark.parametrize("sign, farthest, edge", [(-1, 0.0, 0.2), (1, 2.0, 0.7)])
+def test_bracket_comes_near_to_the_edge(sign: int, farthest: float, edge: float) -> None:
+    limit = Limit("friction of palm", 0.5, "", sign)
+    value = bracket(limit, farthest, lambda value: sign * (value - edge) >= 0)
+    assert value is not None and sign * (value - edge) >= 0
+    assert abs(value - edge) <= abs(farthest - 0.5) / 30
+    assert bracket(limit, farthest, lambda _: False) is None
+    assert bracket(limit, 0.5, lambda _: True) is None
+
+
+def test_a_change_without_a_unit() -> None:
+    change = Change(Limit("friction of palm", 0.5, "", -1), 0.2)
+    assert str(change) == "friction of palm = 0.2 instead of 0.5"

@@ -30,7 +30,7 @@ from wholearm.pathdomain.pathplan import guess
 
 EPSILON = 0.05
 INTERVALS = 24
-UNITS = Units(0.04, 0.03, 7.0, np.array([1.7, 0.6]), 1.3)
+UNITS = Units(0.04, 0.03, 7.0, np.array([1.7, 0.6]), 1.3, 9.0)
 LIMIT = 2.0
 
 
@@ -57,7 +57,7 @@ def profile(data: PhaseData) -> Profile:
 
 def evaluate(nlp: PathNLP, data: PhaseData, x: Array, time_weight: float = 1.0) -> tuple[Any, ...]:
     """Objective and constraints of the NLP that the solver holds."""
-    oracle = nlp.solver.oracle()
+    oracle = nlp.solver.function.oracle()
     f, g = oracle(x, parameters(nlp, data, UNITS, time_weight))
     return float(f), g.full()[:, 0]
 
@@ -66,7 +66,7 @@ def evaluate(nlp: PathNLP, data: PhaseData, x: Array, time_weight: float = 1.0) 
 def test_pack_and_unpack(data: PhaseData, profile: Profile, objective: Objective) -> None:
     nlp = build_path_nlp(4, INTERVALS, objective)
     x = pack(nlp, profile, UNITS, 0.7)
-    assert x.shape == (nlp.solver.size1_in("x0"),)
+    assert x.shape == (nlp.solver.function.size1_in("x0"),)
     found, margin = unpack(nlp, data.grid, x, UNITS)
     for one, other in zip(found, profile, strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-13 * np.abs(other).max())
@@ -98,7 +98,7 @@ def test_constraints_are_the_limits(
     tight = rng.uniform(0, 0.1, (len(data.grid.s), 8))
     tightening = Tightening(tight, np.ones(len(data.grid.s)), 0.5)
     bounds = make_bounds(nlp, data, UNITS, tightening)
-    assert len(bounds["lbx"]) == len(bounds["ubx"]) == nlp.solver.size1_in("x0")
+    assert len(bounds["lbx"]) == len(bounds["ubx"]) == nlp.solver.function.size1_in("x0")
     assert len(bounds["lbg"]) == len(bounds["ubg"]) == len(g)
 
     first = nlp.first
@@ -169,7 +169,10 @@ def test_tightening_reaches_what_is_slack(data: PhaseData) -> None:
 def test_multipliers_move_between_grids(data: PhaseData, objective: Objective) -> None:
     nlp = build_path_nlp(4, INTERVALS, objective)
     rng = np.random.default_rng(5)
-    sizes = {"lam_x0": nlp.solver.size1_in("x0"), "lam_g0": nlp.solver.size1_out("g")}
+    sizes = {
+        "lam_x0": nlp.solver.function.size1_in("x0"),
+        "lam_g0": nlp.solver.function.size1_out("g"),
+    }
     multipliers = {key: rng.uniform(0.1, 1.0, size) for key, size in sizes.items()}
     same = move_multipliers(nlp, multipliers, data.grid, data.grid)
     for key in sizes:
@@ -196,7 +199,7 @@ def test_one_build_serves_every_phase(curves: tuple[Curve, ...]) -> None:
     for curve in curves:
         data = prepare(curve, EPSILON, make_grid(curve, INTERVALS), 1)
         _, units = guess(data)
-        assert len(parameters(nlp, data, units, 1.0)) == nlp.solver.size1_in("p")
+        assert len(parameters(nlp, data, units, 1.0)) == nlp.solver.function.size1_in("p")
 
 
 @pytest.mark.parametrize("objective", Objective)
@@ -205,8 +208,8 @@ def test_building_stays_linear(objective: Objective) -> None:
 
     Otherwise the Jacobian would have to be found one unknown at a time.
     """
-    x, p = build_path_nlp(4, INTERVALS, objective).solver.oracle().sx_in()
-    _, g = build_path_nlp(4, INTERVALS, objective).solver.oracle()(x, p)
+    x, p = build_path_nlp(4, INTERVALS, objective).solver.function.oracle().sx_in()
+    _, g = build_path_nlp(4, INTERVALS, objective).solver.function.oracle()(x, p)
     pattern = ca.jacobian(g, x).sparsity()
     rows, columns = (np.array(part) for part in pattern.get_triplet())
     assert np.bincount(columns).max() <= 14
@@ -215,7 +218,7 @@ def test_building_stays_linear(objective: Objective) -> None:
 
 def test_effort_is_not_symbolic_in_the_data() -> None:
     """The same expression graph for every phase: no number of a scene is built in."""
-    oracle = build_path_nlp(4, INTERVALS, Objective.EFFORT).solver.oracle()
+    oracle = build_path_nlp(4, INTERVALS, Objective.EFFORT).solver.function.oracle()
     x, p = oracle.sx_in()
     free = ca.symvar(ca.vertcat(*oracle(x, p)))
     assert len(free) == x.numel() + p.numel()

@@ -72,7 +72,8 @@ class Change(NamedTuple):
 
     def __str__(self) -> str:
         limit = self.limit
-        return f"{limit.name} = {self.value:g} {limit.unit} instead of {limit.value:g}"
+        value = f"{self.value:g} {limit.unit}".rstrip()
+        return f"{limit.name} = {value} instead of {limit.value:g}"
 
 
 def rank_shortfalls(shortfalls: Iterable[Shortfall]) -> str:
@@ -109,6 +110,27 @@ def find_changes(
         if value is not None:
             changes.append(Change(limit, value))
     return changes
+
+
+def bracket(
+    limit: Limit, farthest: float, can_plan: Callable[[float], bool], halvings: int = 5
+) -> float | None:
+    """A value that can be planned with, between a limit and `farthest`, as near to it as found.
+
+    For limits that a planner cannot relax within one solve; None if `farthest` does not do.
+    """
+    if farthest == limit.value or not can_plan(farthest):
+        return None
+    enough, short = farthest, limit.value
+    for _ in range(halvings):
+        middle = round_outwards((enough + short) / 2, limit.sign)
+        if middle in (enough, short):
+            break
+        if can_plan(middle):
+            enough = middle
+        else:
+            short = middle
+    return enough
 
 
 def _find_enough(least: float, sign: int, can_plan: Callable[[float], bool]) -> float | None:

@@ -68,7 +68,7 @@ class Solver:
     """An NLP solver that an interrupt ends: CasADi would stop it and go on as if it had failed."""
 
     def __init__(self, function: Expression) -> None:
-        self._function = function
+        self.function = function
 
     def __call__(self, **arguments: Any) -> dict[str, Expression]:
         """Solve; inputs and outputs are those of a CasADi NLP solver.
@@ -78,13 +78,13 @@ class Solver:
         KeyboardInterrupt
             If a signal stopped the solver.
         """
-        result: dict[str, Expression] = self._function(**arguments)
+        result: dict[str, Expression] = self.function(**arguments)
         check()
-        if self._function.stats()["return_status"] == STOPPED:
+        if self.function.stats()["return_status"] == STOPPED:
             raise KeyboardInterrupt
         return result
 
     def stats(self) -> dict[str, Any]:
         """Statistics of the last call."""
-        statistics: dict[str, Any] = self._function.stats()
+        statistics: dict[str, Any] = self.function.stats()
         return statistics

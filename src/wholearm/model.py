@@ -45,6 +45,8 @@ from .require import Array as Array
 from .require import require_number as require_number
 from .require import require_vector
 
+LIGHT = 1e-4
+"""Weight, over what the weaker finger can press with, that is next to nothing."""
 TOUCHING = 3e-6
 """Gap below which features count as touching, in radii of gyration of the object."""
 
@@ -124,8 +126,8 @@ class Scales(NamedTuple):
     mass : float, [kg]
         Of the object.
     force : float, [N]
-        Weight of the object, or a hundredth of what the weaker finger can press with at its tip
-        where that is more.
+        Weight of the object; next to nothing, or without gravity, a hundredth of what the weaker
+        finger can press with at its tip.
     """
 
     length: float
@@ -198,7 +200,8 @@ class Scene:
         """Units that fit the scene: tolerances count in them."""
         mass = self.polygon.mass
         press = min(finger.torque_limit / finger.length for finger in self.fingers)
-        force = max(mass * self.gravity, press / 100)
+        weight = mass * self.gravity
+        force = weight if weight > LIGHT * press else press / 100
         return Scales(self.polygon.gyration_radius, mass, force)
 
     @cached_property

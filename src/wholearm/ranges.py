@@ -47,17 +47,17 @@ LENGTH = Range(0.03, 100.0)
 """Length of a link, over the size of the object."""
 RADIUS = Range(1e-4, 1.0)
 """Half thickness of a link over its length, unless it is zero."""
-JOINT = Range(1e-8, 1e8)
+JOINT = Range(1e-8, 1e3)
 """Inertia of a joint, over that of the object's mass at the tip."""
-TORQUE = Range(1e-6, 1e6)
+TORQUE = Range(1e-6, 1e3)
 """Torque limit, over what the weight makes at the tip."""
 STRENGTH = Range(1e-6, 1e6)
 """What one finger can press with at its tip, over what the other can."""
-VISCOUS = Range(0.0, 1e4)
-"""Viscous friction, over the torque limit at one radian in the scene's time."""
+VISCOUS = Range(0.0, 200.0)
+"""Viscous friction, over the torque limit or m g length at one radian in the scene's time."""
 DRY = Range(0.0, 1e3)
-"""Dry friction, over the torque limit."""
-SPEED = Range(1e-6, 1e6)
+"""Dry friction, over the torque limit or m g length."""
+SPEED = Range(1e-3, 1e6)
 """Speed limit, in radians in the scene's time."""
 EPSILON = Range(0.0, 1e3)
 """Least normal force, over the weight or what the stronger finger can press with."""
@@ -124,10 +124,11 @@ def _check_joint(scene: Scene, finger: Finger) -> None:
 
 
 def _check_friction(scene: Scene, finger: Finger) -> None:
-    limit, time = finger.torque_limit, scene.scales.time
+    time, weight = scene.scales.time, scene.polygon.mass * scene.gravity
+    much = max(finger.torque_limit, weight * finger.length)
+    of = "times the torque limit or m g length"
     key = f"{finger.name}.viscous"
-    of = f"times the torque limit x {time:.3g} s"
-    VISCOUS.check(key, finger.viscous, "N m s", limit * time, of)
-    DRY.check(f"{finger.name}.dry", finger.dry, "N m", limit, "times the torque limit")
+    VISCOUS.check(key, finger.viscous, "N m s", much * time, f"{of}, x {time:.3g} s")
+    DRY.check(f"{finger.name}.dry", finger.dry, "N m", much, of)
     if finger.speed_limit < float("inf"):
         SPEED.check(f"{finger.name}.speed_limit", finger.speed_limit, "rad/s", 1 / time)

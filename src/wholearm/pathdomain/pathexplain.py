@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..advice import Limit, Shortfall, describe_changes, find_changes, rank_shortfalls
+from ..advice import Limit, Shortfall, bracket, describe_changes, find_changes, rank_shortfalls
 from ..cones import hold_least, name_holds
 from ..curve import Curve, describe_pose
 from ..errors import InfeasibleError, JammingError, SolverError
+from ..formation import Formation
 from ..model import Array
 from ..options import Objective
 from .pathdata import PhaseData, Relaxation, cut, join, name_phases
@@ -32,6 +34,8 @@ from .pathnlp import (
 
 _SHORT = 5e-5
 """Least shortfall that counts, over the scene's force or the torque limit."""
+_ROUGH = 4.0
+"""How much rougher a rolling contact may be made."""
 _TORQUE = 15.0
 """Unit of the torques' shortfalls, over the scene's torque: as bad as one of its force."""
 _FORCE = 5.0
@@ -42,10 +46,10 @@ Replan = Callable[[Sequence[Curve], float], object]
 
 
 class _Candidate(NamedTuple):
-    """A limit that may give way, and what the NLP's relaxation is to it."""
+    """A limit that may give way, and what the NLP's relaxation is to it, if there is one."""
 
     limit: Limit
-    relaxation: Relaxation
+    relaxation: Relaxation | None
     key: str
     finger: int | None
 
@@ -59,6 +63,9 @@ class _Candidate(NamedTuple):
     def apply(self, parts: Sequence[PhaseData], value: float) -> tuple[list[Curve], float]:
         """Curves and epsilon with another value of the limit."""
         curves = [part.curve for part in parts]
+        if self.relaxation is None:
+            changed = [with_friction(curve, self.key, value) for curve in curves]
+            return changed, parts[0].epsilon
         if self.finger is None:
             return curves, value
         changed = [with_limit(curve, self.finger, self.key, value) for curve in curves]
@@ -102,16 +109,19 @@ def explain(
         return SolverError(f"{stopped} although limits can be kept")
     units = _quicken(data, units)
     candidates = _list_candidates(data, units)
+    if len(parts) == 1:
+        # Where impacts join phases, their velocities depend on friction too.
+        candidates += _list_frictions(data.curve.formation)
 
     def find_least(index: int) -> float | None:
-        return _relax(data, eased, units, candidates[index])
+        limit, relaxation = candidates[index].limit, candidates[index].relaxation
+        if relaxation is not None:
+            return _relax(data, eased, units, candidates[index], relaxation)
+        farthest = 0.0 if limit.sign < 0 else _ROUGH * limit.value
+        return bracket(limit, farthest, partial(can_plan, index))
 
     def can_plan(index: int, value: float) -> bool:
-        try:
-            replan(*candidates[index].apply(parts, value))
-        except (InfeasibleError, SolverError, JammingError):
-            return False
-        return True
+        return _succeeds(replan, *candidates[index].apply(parts, value))
 
     limits = [candidate.limit for candidate in candidates]
     changes = find_changes(limits, find_least, can_plan)
@@ -119,6 +129,29 @@ def explain(
         f"{name_phases(phases, 'infeasible')}: {rank_shortfalls(shortfalls)}; "
         f"{describe_changes(changes)}"
     )
+
+
+def explain_jam(curve: Curve, epsilon: float, jam: JammingError, replan: Replan) -> JammingError:
+    """Add to an error which single friction would let a phase be planned."""
+    candidates = _list_frictions(curve.formation)
+
+    def can_plan(index: int, value: float) -> bool:
+        return _succeeds(replan, [with_friction(curve, candidates[index].key, value)], epsilon)
+
+    def find_least(index: int) -> float | None:
+        limit = candidates[index].limit
+        return bracket(limit, 0.0, partial(can_plan, index)) if limit.sign < 0 else None
+
+    changes = find_changes([candidate.limit for candidate in candidates], find_least, can_plan)
+    return JammingError(f"{jam}; {describe_changes(changes)}")
+
+
+def _succeeds(replan: Replan, curves: Sequence[Curve], epsilon: float) -> bool:
+    try:
+        replan(curves, epsilon)
+    except (InfeasibleError, SolverError, JammingError):
+        return False
+    return True
 
 
 def _quicken(data: PhaseData, units: Units) -> Units:
@@ -190,9 +223,30 @@ def _list_candidates(data: PhaseData, units: Units) -> list[_Candidate]:
     return [*found, _Candidate(limit, Relaxation(every), "epsilon", None)]
 
 
-def _relax(data: PhaseData, profile: Profile, units: Units, candidate: _Candidate) -> float | None:
+def _list_frictions(formation: Formation) -> list[_Candidate]:
+    """Friction of what is touched: to be lowered, and where a contact rolls to be raised."""
+    parts = dict.fromkeys(contact.finger for contact in formation.contacts)
+    rolls = {contact.finger for contact in formation.rolling}
+    found = []
+    for finger in parts:
+        name = "palm" if finger is None else f"finger {finger + 1}"
+        key = name.replace(" ", "")
+        value = formation.scene.friction.of(finger)
+        for sign in (-1, 1) if finger in rolls else (-1,):
+            limit = Limit(f"friction of {name}", value, "", sign)
+            found.append(_Candidate(limit, None, key, finger))
+    return found
+
+
+def _relax(
+    data: PhaseData,
+    profile: Profile,
+    units: Units,
+    candidate: _Candidate,
+    relaxation: Relaxation,
+) -> float | None:
     """The value at which one limit just lets all others be kept, if there is one."""
-    formation, relaxation = data.curve.formation, candidate.relaxation
+    formation = data.curve.formation
     intervals, n_c = len(data.grid.s) - 1, formation.n_contacts
     nlp = build_path_nlp(n_c, intervals, Objective.RELAX, formation.n_rolling)
     short, worth = _shortfalls(data, profile).max(axis=0), relaxation.worth[:-1]
@@ -206,6 +260,13 @@ def _relax(data: PhaseData, profile: Profile, units: Units, candidate: _Candidat
         return None
     relaxed = unpack(nlp, data.grid, result["x"].full()[:, 0], units)[1]
     return candidate.value(relaxed, units)
+
+
+def with_friction(curve: Curve, part: str, value: float) -> Curve:
+    """The curve with another coefficient of friction of `palm`, `finger1` or `finger2`."""
+    scene, change = curve.formation.scene, {part: value}
+    other = replace(scene, friction=replace(scene.friction, **change))
+    return replace(curve, formation=replace(curve.formation, scene=other))
 
 
 def with_limit(curve: Curve, finger: int, key: str, value: float) -> Curve:

@@ -39,6 +39,8 @@ class Units(NamedTuple):
         Of each joint.
     power : float, [(N m)^2]
         Of the effort's integrand.
+    press : float, [N]
+        What the hand can press with: a squeeze so large is nothing to be avoided.
     """
 
     length: float
@@ -46,6 +48,7 @@ class Units(NamedTuple):
     force: float
     torque: Array
     power: float
+    press: float
 
     @property
     def profile(self) -> Array:
@@ -184,7 +187,8 @@ def parameters(
         rates = data.relative_rates(data.nodes, relaxation.finger)
         blocks += [relaxation.worth / rows, rates**2 * b_unit]
     steps, weight = data.grid.steps / units.length, time_weight / units.power
-    return np.concatenate([[0.0, 0.0], steps, [weight], *(b.ravel("F") for b in blocks)])
+    scalars = [weight, force / units.press]
+    return np.concatenate([[0.0, 0.0], steps, scalars, *(b.ravel("F") for b in blocks)])
 
 
 def make_bounds(

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..curve import Curve
-from ..errors import InfeasibleError, SolverError, WholearmError
+from ..errors import InfeasibleError, JammingError, SolverError, WholearmError
 from ..model import Array
 from ..options import Objective, PlanOptions
 from ..phaseplan import PhasePlan
@@ -43,10 +43,18 @@ ROUNDS = 40
 """Most times that the NLP is solved for one phase."""
 _COARSE = 1.5e-4
 """Miss, over the typical force or torque, above which the grid is drawn together."""
+_FAST = 1e-2
+"""The same for the square of a speed limit, relatively."""
 _LEVER = 30.0
 """Lever at which the typical force makes the typical torque, in radii of gyration."""
+_FINER = (1, 2, 4)
+"""Intervals to try, over those that are asked for."""
 _SLOW = -12
 """Height of the slowest guess, as a power of two times that of a fall."""
+_QUICK = 30.0
+"""How much faster, squared, than the torque limits alone allow a guess may be."""
+_FIRM = 40.0
+"""Largest range of the squeeze that a guess is amid, over the scene's force or the least of it."""
 _LIGHT = 0.5
 """Least unit of force, over the scene's: where forces are next to nothing they do not count."""
 _OVER = 1.05
@@ -71,6 +79,10 @@ class _StuckError(SolverError):
     def __init__(self, parts: Sequence[PhaseData], message: str) -> None:
         self.parts = parts
         super().__init__(message)
+
+
+class _TightError(_StuckError):
+    """Limits can be kept at the nodes, but not between them on so coarse a grid."""
 
 
 def plan_path(
@@ -119,8 +131,18 @@ def plan_curves(
         If the solver stops without an answer.
     """
     where = name_phases(phases)
+
+    def replan(changed: Sequence[Curve], least: float) -> object:
+        return _plan(changed, least, options, phases, duration)
+
     try:
-        plans = _plan(curves, epsilon, options, phases, duration)
+        plans = _plan_finer(curves, epsilon, options, phases, duration)
+    except JammingError as jam:
+        if not explained or len(curves) > 1:
+            raise
+        from .pathexplain import explain_jam
+
+        raise explain_jam(curves[0], epsilon, jam, replan) from None
     except _StuckError as stuck:
         if not explained:
             raise
@@ -132,9 +154,9 @@ def plan_curves(
             *guess_slowly(join(stuck.parts)),
             phases,
             str(stuck),
-            lambda changed, least: _plan(changed, least, options, phases, duration),
+            replan,
         ) from None
-    if options.goal is Objective.MARGIN and plans[0].value < epsilon - MISS:
+    if options.goal is Objective.MARGIN and plans[0].value < epsilon - MISS * _force_of(curves[0]):
         late = _explain_duration(curves, epsilon, options, phases, duration)
         raise late or SolverError(f"{where}: the margin found is below epsilon")
     return plans
@@ -173,6 +195,27 @@ def _explain_duration(
     )
 
 
+def _plan_finer(
+    curves: Sequence[Curve],
+    epsilon: float,
+    options: PlanOptions,
+    phases: Sequence[int],
+    duration: float | None,
+) -> list[PhasePlan[PathMotion]]:
+    """Plan, on a finer grid where limits that hold between the nodes leave nothing."""
+    least = epsilon - MISS * _force_of(curves[0])
+    for finer in _FINER:
+        try:
+            own = replace(options, intervals=finer * options.intervals)
+            plans = _plan(curves, epsilon, own, phases, duration)
+            below = options.goal is Objective.MARGIN and plans[0].value < least
+            if not below or finer == _FINER[-1]:
+                return plans
+        except _TightError as error:
+            tight = error
+    raise tight
+
+
 def _plan(
     curves: Sequence[Curve],
     epsilon: float,
@@ -195,7 +238,8 @@ def _plan(
         try:
             solution = _solve(nlp, data, units, tightening, solution, options.time_weight)
         except _StoppedError as stop:
-            raise _StuckError(parts, f"{name_phases(phases)}: {stop}") from None
+            kind = _StuckError if solves == 1 else _TightError
+            raise kind(parts, f"{name_phases(phases)}: {stop}") from None
         profile, margin = solution.profile, solution.margin
         motions = [
             PathMotion(part.curve, part.grid, own)
@@ -206,7 +250,7 @@ def _plan(
         late = max(0.0, total / duration - 1) if duration else 0.0
         if max((short / data.spans).max(), speeding.max(), late) <= MISS:
             break
-        coarse = _weigh(data, short, units)
+        coarse = _weigh(data, short, speeding, units)
         if solves == 1 and coarse.max() > 1:
             old = data.grid
             shares = np.split(coarse, np.cumsum([len(part.solid) for part in parts])[:-1])
@@ -230,9 +274,8 @@ def _plan(
         if (short / data.spans).max() <= MISS:
             over = max(speeding.max(), late)
             missed = f"the speed limit or the duration is still exceeded by {over:.2g} of it"
-        raise SolverError(
-            f"{name_phases(phases)}: after {ROUNDS} solves {missed}; plan with more intervals"
-        )
+        missed = f"after {ROUNDS} solves {missed}; plan with more intervals"
+        raise _TightError(parts, f"{name_phases(phases)}: {missed}")
     plans: list[PhasePlan[PathMotion]] = []
     for part, motion in zip(parts, motions, strict=True):
         torque, squares = fit_torque(part, motion)
@@ -248,11 +291,12 @@ def _plan(
     return plans
 
 
-def _weigh(data: PhaseData, short: Array, units: Units) -> Array:
+def _weigh(data: PhaseData, short: Array, speeding: Array, units: Units) -> Array:
     """How much each solid interval misses of what draws the grid together, shape (n_solid,)."""
     count, lever = len(data.least), _LEVER * data.curve.formation.scene.scales.length
     held, torque = short[:, :count].max(axis=1), short[:, count:].max(axis=1)
-    return np.asarray(np.maximum(held, torque / lever) / (_COARSE * units.force))
+    forces = np.maximum(held, torque / lever) / (_COARSE * units.force)
+    return np.asarray(np.maximum(forces, speeding / _FAST))
 
 
 def _solve(
@@ -263,10 +307,13 @@ def _solve(
     start: _Solution,
     time_weight: float,
 ) -> _Solution:
+    bounds = make_bounds(nlp, data, units, tightening)
+    if (bounds["lbg"] > bounds["ubg"]).any():
+        raise _StoppedError("limits that hold between the nodes too leave nothing")
     result = nlp.solver(
         x0=pack(nlp, start.profile, units, start.margin),
         p=parameters(nlp, data, units, time_weight),
-        **make_bounds(nlp, data, units, tightening),
+        **bounds,
         **start.multipliers,
     )
     stats = nlp.solver.stats()
@@ -310,9 +357,22 @@ def guess_slowly(data: PhaseData) -> tuple[Profile, Units]:
     return _guess_at(data, 0.7 * _fall(data) * 2.0**_SLOW)
 
 
+def _force_of(curve: Curve) -> float:
+    return curve.formation.scene.scales.force
+
+
 def _fall(data: PhaseData) -> float:
-    """The b of a fall over the length of the curve [m^2/s^2]."""
-    return 2 * data.curve.formation.scene.scales.acceleration * float(data.grid.s[-1])
+    """The b of a fall over the length of the curve, or of what joints may do [m^2/s^2]."""
+    length, forces = float(data.grid.s[-1]), data.nodes.forces
+    fall = 2 * data.curve.formation.scene.scales.acceleration * length
+
+    def usual(coefficients: Array) -> float:
+        """Where this coefficient alone would take a joint to its torque limit."""
+        return 1 / max(float((np.abs(coefficients) / data.torque_limit).max(axis=1).mean()), 1e-100)
+
+    b_max = data.largest_b(data.nodes)
+    inertia, drag = 2 * length * usual(forces.Ta), usual(forces.Tv) ** 2
+    return min(fall, _QUICK * min(inertia, drag, float(np.median(b_max))))
 
 
 def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
@@ -337,13 +397,17 @@ def _squeeze_range(data: PhaseData, height: float) -> tuple[Array, Array]:
 
 def _guess_at(data: PhaseData, height: float, time_weight: float = 0.0) -> tuple[Profile, Units]:
     low, high = _squeeze_range(data, height)
-    middle = np.where(np.isfinite(low + high) & (low <= high), (low + high) / 2, 0.0)
+    weight = data.curve.formation.scene.scales.force
+    open_ = np.isfinite(low + high) & (low <= high)
+    press = float(np.abs(np.where(open_, (low + high) / 2, 0.0)).mean())
+    # A strong hand could press far harder than any motion needs.
+    high = np.minimum(high, low + _FIRM * np.maximum(weight, np.abs(low)))
+    middle = np.where(open_, (low + high) / 2, 0.0)
     length = float(data.grid.s[-1])
     duration = np.pi / 2 * length / np.sqrt(height)
-    weight = data.curve.formation.scene.scales.force
     force = max(_LIGHT * weight, data.epsilon, float(np.abs(middle).mean()))
     profile = Profile(*_parabola(data, height), middle)
     torque = data.torque_limit
     squares = np.minimum(np.abs(data.nodes.forces.tau(*profile)), torque) ** 2
     power = time_weight + float(squares.sum(axis=1).mean())
-    return profile, Units(length, 0.6 * duration, force, torque, power)
+    return profile, Units(length, 0.6 * duration, force, torque, power, max(force, press))

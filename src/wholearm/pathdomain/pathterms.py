@@ -46,12 +46,13 @@ def write_terms(
 
     The unknowns are (b, a, squeeze, extras) node by node, without b at the two ends. The extras
     are shortfalls for `elastic`, the least margin for `margin` and the relaxation for `relax`. The
-    parameters are the speeds at the ends, the steps, the weight of time, and the coefficients of
-    `PathForces` but for C0 and T0, which are part of the bounds; for `effort` also T0 and the
-    weight of each joint's torque, for `relax` what the relaxation is worth for each limit, and b's
-    coefficients in the speed limit. The rows are the N of b' = 2 a, those that chain the margin or
-    the relaxation, and the changes of a over the first and the last interval; then node by node H c
-    and tau, and the speed for `relax`; last T for `margin`.
+    parameters are the speeds at the ends, the steps, the weight of time, what the unit of squeeze
+    counts for where it is kept calm, and the coefficients of `PathForces` but for C0 and T0, which
+    are part of the bounds; for `effort` also T0 and the weight of each joint's torque, for `relax`
+    what the relaxation is worth for each limit, and b's coefficients in the speed limit. The rows
+    are the N of b' = 2 a, those that chain the margin or the relaxation, and the changes of a over
+    the first and the last interval; then node by node H c and tau, and the speed for `relax`; last
+    T for `margin`.
 
     Parameters
     ----------
@@ -69,7 +70,8 @@ def write_terms(
     b_inner, ends = ca.SX.sym("b", n - 2), ca.SX.sym("ends", 2)
     a, squeeze = ca.SX.sym("a", n), ca.SX.sym("squeeze", n)
     extra = ca.SX.sym("extra", n, count_extras(objective, n_held))
-    h, weight = ca.SX.sym("h", intervals), ca.SX.sym("weight")
+    h = ca.SX.sym("h", intervals)
+    weight, calm = ca.SX.sym("weight"), ca.SX.sym("calm")
     coefficients = [ca.SX.sym(name, n, m) for name in ("Pa", "Pb", "Pl")] + [ca.SX.sym("Tv", n, 2)]
     b = ca.vertcat(ends[0] ** 2, b_inner, ends[1] ** 2)
     speed = ca.vertcat(ends[0], ca.sqrt(b_inner), ends[1])
@@ -84,8 +86,9 @@ def write_terms(
     node_weights = ca.vertcat(0, h) + ca.vertcat(h, 0)
     # What is relaxed has to be as little as possible, whatever the motion is like.
     share = 1e-3 if objective is Objective.RELAX else 1.0
-    node_costs = share * _CALM * node_weights * squeeze**2
-    link_costs = share * _SMOOTH * h * ((a[1:] - a[:-1]) ** 2 + (squeeze[1:] - squeeze[:-1]) ** 2)
+    squeezed = calm * squeeze
+    node_costs = share * _CALM * node_weights * squeezed**2
+    link_costs = share * _SMOOTH * h * ((a[1:] - a[:-1]) ** 2 + (squeezed[1:] - squeezed[:-1]) ** 2)
     links = [b[1:] - b[:-1] - h * (a[1:] + a[:-1])]
     c_rows, tau_rows = held, tau
     last: tuple[Expression, ...] = ()
@@ -124,7 +127,7 @@ def write_terms(
     rows = ca.horzcat(c_rows, tau_rows)
     return {
         "x": ca.vertcat(nodes[1:, 0], ca.vec(nodes[:, 1:-1]), nodes[1:, -1]),
-        "p": ca.vertcat(ends, h, weight, *(ca.vec(block) for block in coefficients)),
+        "p": ca.vertcat(ends, h, weight, calm, *(ca.vec(block) for block in coefficients)),
         "f": ca.sum1(link_costs) + ca.sum1(node_costs),
         "g": ca.vertcat(*links, a[1] - a[0], a[-1] - a[-2], ca.vec(rows.T), *last),
     }
