@@ -391,7 +391,8 @@ def build_clearance(contact: Contact, scene: Scene, touching: bool) -> Limit:
     if contact.feature == "e" and contact.finger is not None and not touching:
         gaps = build_features(scene).links[contact.finger].edge_gap
         for other in range(scene.polygon.n_vertices):
-            gap = ca.fmax(gap, gaps[other] - own)
+            if other != contact.index:
+                gap = ca.fmax(gap, gaps[other] - own)
     if contact.finger is not None and not (touching and contact.surface == "finger"):
         for limit in build_limits(contact, scene):
             gap = ca.fmax(gap, -limit.value)

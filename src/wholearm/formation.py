@@ -41,6 +41,7 @@ from .contact import (
 from .errors import InputError
 from .links import build_finger_limit
 from .model import Array, Finger, Scene
+from .obstacles import build_obstacles, face
 from .sharing import Keeper, Store, exclusive, kept_property
 from .slip import build_slip
 
@@ -211,7 +212,11 @@ class Formation(Keeper):
             if tips and not on_side and (on_tip or contact.index not in behind):
                 continue
             limits.append(build_clearance(contact, self.scene, bool(on_side)))
-        return limits
+        if finger is None:
+            return limits
+        if not held:
+            limits = face(self.scene, finger, limits)
+        return limits + build_obstacles(self.scene, finger, held)
 
     @kept_property
     def limit_function(self) -> Expression:
