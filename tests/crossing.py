@@ -26,6 +26,17 @@ def hexagon(
     return build_problem(table | {"fingers_collide": solid})
 
 
+def make_way(solid: bool) -> Problem:
+    """Finger 2 pushes the hexagon below a free finger 1, which has to make way for the other."""
+    table = tomllib.loads(HEXAGON.read_text(encoding="utf-8"))
+    for finger in table["fingers"].values():
+        finger["length"] = 0.19
+    table["fingers"]["2"]["base"][0] = -0.085
+    table["start"]["x"] = -0.03
+    push = {"contacts": ["v0-palm", "v1-palm", "v5-finger2"], "until": {"x": 0.0}}
+    return build_problem(table | {"fingers_collide": solid, "phases": [push]})
+
+
 def place_links(scene: Scene, z: Array) -> list[Array]:
     """Ends of both segments at n configurations, shape (n, 2, 2) each [m]."""
     ends = []

@@ -6,19 +6,23 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from plane import make_formation, measure_gaps
+from crossing import make_way, measure_fingers
+from plane import finger_gap, make_formation, measure_gaps
 from thrown import heave
 from timed import instants, landing, plan_landing, stages_of
+from wholearm.links import FINGERS_TOUCH
 from wholearm.options import PlanOptions
-from wholearm.timedomain.between import GRAZE, MISS, Limits, find_misses
+from wholearm.plan import solve
+from wholearm.timedomain.between import GRAZE, MISS, Limits, find_misses, watch_missed
 from wholearm.timedomain.collocation import make_scheme
 from wholearm.timedomain.ownunits import to_si
 from wholearm.timedomain.stage import Stage
 from wholearm.timedomain.staging import outline_stages
-from wholearm.timedomain.timemotion import StageMotion, make_motions
+from wholearm.timedomain.timemotion import StageMotion, TimeMotion, make_motions
 from wholearm.timedomain.timenlp import CLEAR
 from wholearm.timedomain.timeplan import plan_phases
 from wholearm.timedomain.timesearch import Search
+from wholearm.trajectory import Trajectory
 
 EPSILON = 0.05
 SCHEME = make_scheme("radau", 3)
@@ -139,3 +143,40 @@ def test_tightening_holds_limits_that_points_alone_do_not() -> None:
     assert worst[0] > 100 * allowed and worst[1] < 2 * allowed
     # Limits cost little, about as much as halved intervals gain.
     assert held.cost == pytest.approx(loose.cost, rel=0.03)
+
+
+@lru_cache(maxsize=1)
+def make_way_twice() -> tuple[Trajectory, Trajectory]:
+    """Plans of least effort with fingers that pass each other, and with solid ones."""
+    passing, solid = (solve(make_way(solid), "effort") for solid in (False, True))
+    return passing, solid
+
+
+def test_the_links_are_kept_apart_between_points_too() -> None:
+    """Left alone, finger 1 would let the other link swing through it."""
+    passing, solid = make_way_twice()
+    scene = make_way(solid=True).scene
+    least = []
+    for plan in (passing, solid):
+        (motion,) = plan.motions
+        z = motion.evaluate(np.linspace(0.0, motion.duration, 4001)).z
+        least.append(float(measure_fingers(scene, z).min()))
+        for k in (0, 1):
+            gaps = [finger_gap(scene, row[:3], k, row[3 + k])[0] for row in z[::20]]
+            assert min(gaps) > -1e-8
+    assert least[0] < -5e-3 and least[1] > -2e-8
+    assert passing.meta["value"] < solid.meta["value"] < 1.01 * passing.meta["value"]
+
+
+def test_what_is_broken_between_points_is_watched() -> None:
+    """In the plan of fingers that pass each other the gap is, in the other nothing."""
+    formation = make_way(solid=True).phases[0].formation
+    (gap,) = [k for k, limit in enumerate(formation.limits) if limit.text == FINGERS_TOUCH]
+    for plan, watched in zip(make_way_twice(), ((gap,), ()), strict=True):
+        (whole,) = plan.motions
+        assert isinstance(whole, TimeMotion)
+        motions = [replace(part, formation=formation) for part in whole.stages]
+        stages = [as_stage(part) for part in motions]
+        found = watch_missed(stages, motions)
+        assert {k for stage in found or stages for k in stage.watched} == set(watched)
+        assert (found is None) == (watched == ())

@@ -21,11 +21,11 @@ from wholearm.contact import (
     Contact,
     build_features,
     build_geometry,
-    build_limits,
     candidate_contacts,
     parse_contact,
 )
 from wholearm.errors import InputError
+from wholearm.limits import build_limits
 from wholearm.model import Array, Scene
 from wholearm.problem import Problem
 

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from crossing import measure_fingers
+from plane import finger_gap
 from timed import fastest
 from wholearm.outline import load
 from wholearm.plan import solve
@@ -26,6 +28,8 @@ FLIPS = ("heptagon", "hexagon", "square", "triangle")
 """Problems that end on edge 1."""
 GOAL = 1e-5
 """Distance between plan and replay at the end of a phase [m or rad]."""
+OVERLAP = 2e-8
+"""Depth of a contact that is rounding, and collocation [m]."""
 FIGURES = ("status", "objective", "phase_durations", "least_margin")
 
 
@@ -74,6 +78,12 @@ def test_plans_hold_in_simulation(path: Path, objective: str) -> None:
     for phase in report.phases:
         assert phase.end_deviation is not None
         assert max(phase.end_deviation.position, phase.end_deviation.angle) < GOAL
+    assert report.finger_gap is not None and report.finger_gap.least > 0
+    for motion in plan.motions:
+        z = motion.evaluate(np.linspace(0.0, motion.duration, 61)).z
+        assert measure_fingers(problem.scene, z).min() > 0
+        gaps = [finger_gap(problem.scene, row[:3], k, row[3 + k])[0] for row in z for k in (0, 1)]
+        assert min(gaps) > -OVERLAP
 
 
 @pytest.mark.parametrize("name", FLIPS)

@@ -31,17 +31,14 @@ from .contact import (
     Contact,
     Expression,
     Limit,
-    build_clearance,
     build_features,
     build_gap,
     build_geometry,
-    build_limits,
     candidate_contacts,
 )
 from .errors import InputError
-from .links import build_finger_limit
+from .limits import build_clearance, list_limits
 from .model import Array, Finger, Scene
-from .obstacles import build_obstacles, face
 from .sharing import Keeper, Store, exclusive, kept_property
 from .slip import build_slip
 
@@ -183,40 +180,8 @@ class Formation(Keeper):
 
     @kept_property
     def limits(self) -> tuple[Limit, ...]:
-        """Where this formation stops being valid.
-
-        For every contact, for every other feature of object and hand, and between the links.
-        """
-        limits = [limit for c in self.contacts for limit in build_limits(c, self.scene)]
-        for finger in (None, 0, 1):
-            limits += self._clearances(finger)
-        return tuple(limits + build_finger_limit(self.scene))
-
-    def _clearances(self, finger: int | None) -> list[Limit]:
-        held = [contact for contact in self.contacts if contact.finger == finger]
-        on_side = {contact.index for contact in held if contact.surface == "finger"}
-        count = self.scene.polygon.n_vertices
-        # A link that touches a vertex can only turn onto the edge that leads from it to the tip;
-        # one whose tip touches an edge is outside the edge's line, and only the end of the edge
-        # that is behind the tip can come to its side.
-        ahead = {(index - (finger or 0)) % count for index in on_side}
-        tips = [contact for contact in held if contact.surface == "tip"]
-        behind = {(c.index + (finger or 0)) % count for c in tips if c.feature == "e"}
-        limits = []
-        for contact in candidate_contacts(self.scene, finger):
-            if contact in held:
-                continue
-            on_tip = contact.surface == "tip"
-            if on_side and on_tip and not (contact.feature == "e" and contact.index in ahead):
-                continue
-            if tips and not on_side and (on_tip or contact.index not in behind):
-                continue
-            limits.append(build_clearance(contact, self.scene, bool(on_side)))
-        if finger is None:
-            return limits
-        if not held:
-            limits = face(self.scene, finger, limits)
-        return limits + build_obstacles(self.scene, finger, held)
+        """Where this formation stops being valid."""
+        return tuple(list_limits(self.scene, self.contacts))
 
     @kept_property
     def limit_function(self) -> Expression:

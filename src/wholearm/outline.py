@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .contact import build_limits
 from .curve import Curve, metric_weights, tangent_basis
 from .dynamics import Directions
 from .errors import InputError
 from .explore import Ending, close, explore, is_inside
 from .formation import Formation
+from .limits import build_limits
 from .model import Array
 from .path import require_touching, runs_on_curve, trace_phase, trace_phases
 from .problem import Phase, Problem, read_problem

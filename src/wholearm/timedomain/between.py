@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -79,6 +80,19 @@ def find_misses(stage: Stage, motion: StageMotion, epsilon: float, margin: float
     shape = (stage.intervals, LOOKS)
     slack = (find_least(table.reshape(*shape, table.shape[1])) for table in tables)
     return Limits(*(np.maximum(-part, 0.0) for part in slack))
+
+
+def watch_missed(stages: Sequence[Stage], motions: Sequence[StageMotion]) -> list[Stage] | None:
+    """Stages that also watch the limits which are broken between points; None if none is."""
+    changed, places = [], np.linspace(0.0, 1.0, LOOKS)
+    for stage, motion in zip(stages, motions, strict=True):
+        z = motion.evaluate(stage.guess.places(places).ravel() * motion.duration).z
+        values = stage.formation.evaluate_limits(z).reshape(stage.intervals, LOOKS, -1)
+        deepest = -GRAZE * stage.formation.scene.scales.length
+        broken = np.flatnonzero(find_least(values).min(axis=0) < deepest).tolist()
+        changed.append(replace(stage, watched=tuple(sorted({*stage.watched, *broken}))))
+    news = [one.watched != other.watched for one, other in zip(changed, stages, strict=True)]
+    return changed if any(news) else None
 
 
 def raise_bounds(
