@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 from crossing import hexagon, measure_fingers
 from plane import (
@@ -378,3 +379,21 @@ def test_fingers_that_touch_end_a_curve() -> None:
     s = np.linspace(0.0, curve.length, 50)
     gaps = measure_fingers(problem.scene, curve.evaluate(s).z)
     assert gaps[-1] == pytest.approx(0.0, abs=1e-9) and (gaps[:-1] > 0).all()
+
+
+@pytest.mark.parametrize("least", [-1e-7, 1e-7])
+def test_fingers_that_graze_are_noticed(least: float) -> None:
+    """The gap dips to just below, and just above, zero while the tip passes the other link."""
+    phase = 2
+    free = trace_phases(hexagon(solid=False))[phase]
+    z = free.evaluate(np.linspace(0.0, free.length, 20001)).z
+
+    def dip(length: float) -> float:
+        return float(measure_fingers(hexagon((0.18, length), solid=False).scene, z).min()) - least
+
+    length = float(brentq(dip, 0.17, 0.18, xtol=1e-13))
+    problem = hexagon((0.18, length))
+    formation, until = problem.phases[phase].formation, problem.phases[phase].until
+    curve = trace_curve(formation, z[0], free.panels[0].z_s[0], until)
+    assert curve.reached == (least > 0)
+    assert curve.reached or curve.ending.startswith("finger 1 touches finger 2 at x = ")

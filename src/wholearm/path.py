@@ -28,6 +28,8 @@ HELD = 3e-5
 """Distance to `until`, in radii of gyration or radians, below which there is nothing to do."""
 ROUNDING = 3e-10
 """Below zero by no more than this, in radii of gyration, a limit counts as kept."""
+CLOSER = 4
+"""Times that dips of a limit between two places are looked at more closely."""
 LONGEST = 60.0
 """Longest curve that is traced, in radii of gyration: several turns of the object."""
 
@@ -237,6 +239,14 @@ def _first_crossing(
     """
     grid = refine(panel.s, panel.s[-1])
     values = margins(panel.interpolate(grid)[0])
+    for _ in range(CLOSER):
+        inner = _look_closer(grid, values)
+        if not len(inner):
+            break
+        grid = np.append(grid, inner)
+        order = grid.argsort()
+        values = np.vstack([values, margins(panel.interpolate(inner)[0])])[order]
+        grid = grid[order]
     # What starts closed (the contact just given up) has to open; rounding is not closing.
     broken = values < -ROUNDING
     if not broken.any():
@@ -257,6 +267,20 @@ def _first_crossing(
     return first, sorted(
         set(np.flatnonzero(closed).tolist()) | {k for k in roots if roots[k] == first}
     )
+
+
+def _look_closer(grid: Array, values: Array) -> Array:
+    """More places around dips that may fall below zero between two places, shape (n,).
+
+    The gap of the fingers falls and rises again at a steady rate where a tip passes the other
+    link, so a dip is no deeper than half the second difference.
+    """
+    before, here, after = values[:-2], values[1:-1], values[2:]
+    dips = (here <= before) & (here <= after) & (here > ROUNDING)
+    rows = np.flatnonzero((dips & (here < before - 2 * here + after)).any(axis=1))
+    inner = np.linspace(0.0, 1.0, 14)[1:-1]
+    low, high = grid[rows, None], grid[rows + 2, None]
+    return np.unique(np.setdiff1d(low + (high - low) * inner, grid))
 
 
 def _build_panel(
