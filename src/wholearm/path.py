@@ -278,9 +278,11 @@ def _look_closer(grid: Array, values: Array) -> Array:
     before, here, after = values[:-2], values[1:-1], values[2:]
     dips = (here <= before) & (here <= after) & (here > ROUNDING)
     rows = np.flatnonzero((dips & (here < before - 2 * here + after)).any(axis=1))
+    if not len(rows):
+        return rows.astype(float)
     inner = np.linspace(0.0, 1.0, 14)[1:-1]
     low, high = grid[rows, None], grid[rows + 2, None]
-    return np.unique(np.setdiff1d(low + (high - low) * inner, grid))
+    return np.setdiff1d(low + (high - low) * inner, grid)
 
 
 def _build_panel(
