@@ -13,7 +13,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from .errors import InfeasibleError
-from .model import Array
+from .metric import measure_speed
+from .model import Array, Scene
 from .options import Objective, PlanOptions
 from .path import runs_on_curve, trace_phase, trace_phases
 from .pathdomain.chain import Chain, make_chain
@@ -23,7 +24,9 @@ from .problem import End, Phase, Problem
 from .trajectory import Motion
 
 MOVED = 1e-9
-"""Distance from which on a block starts somewhere else [m or rad]."""
+"""Distance from which on a block starts somewhere else, in radii of gyration or radians."""
+SHORT = 5e-7
+"""How far below epsilon a margin may be by rounding, over the scene's force."""
 
 Plans = list[PhasePlan[Motion]]
 
@@ -155,9 +158,9 @@ def _plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str],
     z = problem.start
     for index, phases in enumerate(split_blocks(problem)):
         known = planning.blocks[index] if planning.blocks else None
-        moved = known is None or float(np.abs(known.start - z).max()) > MOVED
+        moved = known is None or _distance(problem.scene, known.start, z) > MOVED
         fastest: Plans = [] if moved or known is None else known.fastest
-        if moved and least and _distance(least[phases[0].index].motion, z) > MOVED:
+        if moved and least and _starts_off(problem.scene, least[phases[0].index].motion, z):
             fastest = _plan_block(problem, phases, z, _for_time(options), None)[0]
         if fastest:
             _share_again(allowed, phases, least, fastest)
@@ -218,7 +221,7 @@ def _require_margin(planning: Planning) -> Planning:
         return planning
     epsilon = planning.problem.epsilon
     for phase, plan in zip(planning.problem.phases, planning.plans, strict=True):
-        if plan.value < epsilon - 1e-6:
+        if plan.value < epsilon - SHORT * planning.problem.scene.scales.force:
             raise InfeasibleError(
                 f"phase {phase.number}: in its share of the duration, "
                 f"{planning.allowed[phase.index]:.5g} s, the largest least c_n is "
@@ -231,9 +234,14 @@ def _for_time(options: PlanOptions) -> PlanOptions:
     return replace(options, objective=Objective.TIME, duration=None)
 
 
-def _distance(motion: Motion, z: Array) -> float:
-    """How far from `z` a motion starts [m or rad]."""
-    return float(np.abs(motion.evaluate(np.zeros(1)).z[0] - z).max())
+def _distance(scene: Scene, one: Array, other: Array) -> float:
+    """Distance of two configurations, in radii of gyration or radians."""
+    return measure_speed(scene, one - other) / scene.scales.length
+
+
+def _starts_off(scene: Scene, motion: Motion, z: Array) -> bool:
+    """Whether a motion starts somewhere else than at `z`."""
+    return _distance(scene, motion.evaluate(np.zeros(1)).z[0], z) > MOVED
 
 
 def _share_again(

@@ -42,9 +42,6 @@ from .model import Array, Finger, Scene
 from .sharing import Keeper, Store, exclusive, kept_property
 from .slip import build_slip
 
-TOUCHING = 1e-7
-"""Gap [m] below which features count as touching: above rounding, below any real clearance."""
-
 
 class Kinematics(NamedTuple):
     """A formation at n configurations.

@@ -188,7 +188,7 @@ def draw_snapshot(
     axes.set_aspect("equal", adjustable="datalim")
     vertices = place_vertices(scene, z)
     bases = [np.asarray(finger.base)[0] for finger in scene.fingers]
-    ends = np.concatenate([bases, vertices[vertices[:, 1] < 1e-6, 0]])
+    ends = np.concatenate([bases, vertices[vertices[:, 1] < scene.touching, 0]])
     palm = Rectangle((ends.min(), -0.004), np.ptp(ends), 0.004, fc=_INK, linewidth=0, zorder=1)
     artists: list[Artist] = [axes.add_patch(palm)]
     for finger, angle, (line, face) in zip(scene.fingers, z[3:], _FINGERS, strict=True):
@@ -257,7 +257,7 @@ def draw_margins(
 def _scale_margins(axes: Axes, margins: Array, epsilon: float) -> None:
     """Set a scale that is linear within a hundredth of the largest margin, ticks and limits."""
     largest, smallest = float(np.nanmax(margins)), float(np.nanmin(margins))
-    reach = max(largest, -smallest, 2 * epsilon, 1e-6)
+    reach = max(largest, -smallest, 2 * epsilon) or 1.0
     linear = 10.0 ** (round(math.log10(reach)) - 2)
     transform = SymmetricalLogTransform(10, linear, 1.0)
     ends = transform.transform(np.array([min(smallest, -epsilon), max(largest, 2 * linear)]))

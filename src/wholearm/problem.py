@@ -16,7 +16,7 @@ import numpy as np
 
 from .contact import Contact, parse_contact
 from .errors import InputError, name_source
-from .formation import TOUCHING, Formation, close_finger, describe, find_touching, place_flush
+from .formation import Formation, close_finger, describe, find_touching, place_flush
 from .links import evaluate_finger_gap
 from .model import Array, Finger, Friction, Polygon, Scene, require_number
 from .problemtable import change_table, match_table, name_keys
@@ -412,7 +412,7 @@ def _check_start(problem: Problem) -> None:
     if not scene.fingers_collide:
         return
     gap = float(evaluate_finger_gap(scene, problem.start[None])[0])
-    if gap < -TOUCHING:
+    if gap < -scene.touching:
         raise InputError(
             "",
             "start.x",
