@@ -36,7 +36,7 @@ def find_first(run: Replay, start: Array, h: float, among: range | None = None) 
         if not left:
             return [k for k in seen if after[k] <= s.slack[k] or k == done[-1]]
         seen += [k for k in left if k not in seen]
-        share = {k: before[k] / (before[k] - after[k]) for k in left}
+        share = {k: max(before[k], 0.0) / (max(before[k], 0.0) - after[k]) for k in left}
         k = rows.speed if rows.speed in left else min(left, key=share.__getitem__)
         place, offset = s.to.events.start + k, float(shift[k])
 

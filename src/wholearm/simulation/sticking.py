@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,11 @@ from .tolerances import Tolerances, find_tolerances, measure_units
 
 _AHEAD = 1e-5
 """How far ahead along the free direction signs and gaps are looked for, in units of the scene."""
+_LOOKS = 9
+"""At how many places of a piece that is not linear forces at rest are looked at."""
+_CLEAR = 1e3
+"""Acceleration halfway to the next change with which a motion starts, over that which is rounding:
+where changes are that close nothing is decided but by rounding."""
 _CLOSED = 3e-15
 """Gap that counts as rounding, relative to the scene's length."""
 
@@ -157,48 +163,78 @@ class Rest:
             None if the formation rests to the end of the piece.
         """
         tau = _evaluate(coefficients, x)
-        for way in self.ways:
+        for way in chain(self.ways, self.all_ways):
             if way.moves(tau):
                 return way.depart(x, tau)
-        for way in self.all_ways:
-            if way.moves(tau):
-                return way.depart(x, tau)
+        least = _CLEAR * find_tolerances(self.formation.scene).drive
+        doubt = self._find_doubt(coefficients, x)
         ends = self._changes(coefficients, x)
-        for start, stop in zip(ends, [*ends[1:], 1.0], strict=True):
-            middle = (start + stop) / 2
-            tau = _evaluate(coefficients, middle)
-            ways = sorted(self.all_ways, key=lambda way: -way.drive(tau))
-            for way in ways:
-                if way.moves(tau):
+        torques = _evaluate(coefficients, (np.array(ends) + np.array([*ends[1:], 1.0])) / 2)
+        for start, tau, moving in zip(ends, torques.T, self._list_moving(torques), strict=True):
+            if doubt is not None and start > doubt[0]:
+                doubt = self._narrow(coefficients, *doubt)
+                if start > doubt[1]:
+                    break
+            ways = [self.all_ways[k] for k in np.flatnonzero(moving)]
+            for way in sorted(ways, key=lambda way: -way.drive(tau)):
+                if way.drive(tau) > least and way.moves(tau):
                     return way.depart(start, tau)
-            # Torques that balance form a convex set: the ends of a linear piece speak for it all.
-            linear = coefficients.shape[1] <= 2
-            for place in (start, stop) if linear else (start, middle, stop):
-                if not self._balances(coefficients, place):
-                    return self._collapse(coefficients, start, place)
-        return None
+        if doubt is None:
+            return None
+        return self._collapse(coefficients, self._narrow(coefficients, *doubt)[1])
+
+    @cached_property
+    def _margins(self) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Rows and offsets of the margins of all ways, and where those of each way begin."""
+        parts = [way.margins for way in self.all_ways]
+        rows = np.array([row for part in parts for row, _ in part])
+        offsets = np.array([offset for part in parts for _, offset in part])
+        return rows, offsets, np.cumsum([0, *(len(part) for part in parts[:-1])])
+
+    def _list_moving(self, torques: Array) -> NDArray[np.bool_]:
+        """Which of all ways keep their margins under torques, shape (2, n); shape (n, n_ways)."""
+        rows, offsets, starts = self._margins
+        values = rows[:, :1] + rows[:, 1:] @ torques + offsets[:, None]
+        return np.asarray(np.logical_and.reduceat(values >= 0, starts, axis=0).T)
 
     def _changes(self, coefficients: Array, x: float) -> list[float]:
         """Where on the piece an acceleration or a normal force changes sign, from `x` on."""
-        margins = [margin for way in self.all_ways for margin in way.margins]
-        rows = np.array([row for row, _ in margins])
+        rows, offsets, _ = self._margins
         polynomials = rows[:, 1:] @ coefficients
-        polynomials[:, 0] += rows[:, 0] + [offset for _, offset in margins]
-        places = {x}
-        for polynomial in np.unique(polynomials, axis=0):
-            places |= {root for root in _roots(polynomial) if x < root < 1}
-        return sorted(places)
+        polynomials[:, 0] += rows[:, 0] + offsets
+        if polynomials.shape[1] == 2:
+            level, slope = polynomials[polynomials[:, 1] != 0].T
+            places = set((-level / slope).tolist())
+        else:
+            places = {root for one in np.unique(polynomials, axis=0) for root in _roots(one)}
+        return [x, *sorted(place for place in places if x < place < 1)]
 
     def _balances(self, coefficients: Array, x: float) -> bool:
         tau = _evaluate(coefficients, x)
         return balances(self.formation.scene, self.touching, self.z, tau)
 
-    def _collapse(self, coefficients: Array, low: float, high: float) -> Collapse:
-        if not self._balances(coefficients, low):
-            high = low
+    def _find_doubt(self, coefficients: Array, x: float) -> tuple[float, float] | None:
+        """Places from `x` on between which forces first fail to balance; None if nowhere.
+
+        Torques that balance form a convex set: the ends of a linear piece speak for it all.
+        """
+        places = np.linspace(x, 1.0, 2 if coefficients.shape[1] <= 2 else _LOOKS).tolist()
+        low = x
+        for high in places:
+            if not self._balances(coefficients, high):
+                return low, high
+            low = high
+        return None
+
+    def _narrow(self, coefficients: Array, low: float, high: float) -> tuple[float, float]:
+        """Bisect to where balance is lost."""
         while high - low > 1e-10:
             middle = (low + high) / 2
             low, high = (middle, high) if self._balances(coefficients, middle) else (low, middle)
+        return low, high
+
+    def _collapse(self, coefficients: Array, high: float) -> Collapse:
+        """Why nothing balances at a place of the piece."""
         tau = _evaluate(coefficients, high)
         free = [way for way in self.all_ways if way.slides(tau)]
         pulls = find_pulls(self.formation.scene, self.touching, self.z, tau)
@@ -341,8 +377,10 @@ def close_contacts(
     return z
 
 
-def _evaluate(coefficients: Array, x: float) -> Array:
-    return np.asarray(coefficients @ x ** np.arange(coefficients.shape[1]))
+def _evaluate(coefficients: Array, x: float | Array) -> Array:
+    """Torques at one place of a piece, shape (2,), or at n places, shape (2, n)."""
+    powers = np.power.outer(np.asarray(x), np.arange(coefficients.shape[1]))
+    return np.asarray(coefficients @ powers.T)
 
 
 def _roots(polynomial: Array) -> list[float]:
