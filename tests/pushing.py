@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
-from plane import accelerate, make_formation, make_scene, stack_rows
-from wholearm.formation import close_finger, place_flush
+from plane import accelerate, make_formation, make_scene, rotate, stack_rows
+from wholearm.formation import Formation, close_finger, place_flush
 from wholearm.model import Array, Friction, Scene
 from wholearm.problem import Phase, Problem, Until
 from wholearm.torque import TorqueProfile
@@ -119,5 +120,87 @@ class Push:
                 values = [self.torque(float(one), stage) for one in t]
                 own = np.polynomial.polynomial.polyfit(nodes, values, degree)
                 coefficients.append([own, [1e-3] + [0.0] * degree])
+                breaks.append(high)
+        return TorqueProfile(np.array(breaks), np.array(coefficients))
+
+
+@dataclass(frozen=True, eq=False)
+class Roll:
+    """An object turned by plan over a vertex on the palm, which slides, rolls and slides again.
+
+    Vertex 1 is on the palm, and both links touch; phi falls from rest. The torques follow by
+    inverse dynamics: three normal forces and two torques from five equations, where the vertex has
+    `share` of what friction could give as it rolls.
+
+    Attributes
+    ----------
+    formation : Formation
+        Vertex 1 on the palm, then a vertex on each link.
+    start : ndarray, shape (5,)
+    share : float
+    run : float, [m]
+        How far it slides each time.
+    times : tuple of float, [s]
+        When it starts, rolls, slides again and ends.
+    """
+
+    formation: Formation
+    start: Array
+    share: float = 0.3
+    run: float = 1e-3
+    times: tuple[float, ...] = (0.0, 0.06, 0.1, 0.15)
+
+    def law(self, t: float, stage: int) -> tuple[float, float, float, float]:
+        """X' and x of the vertex, phi' and phi."""
+        start, stop = self.times[stage : stage + 2]
+        u, rate = np.pi * (t - start) / (stop - start), np.pi / (stop - start)
+        x = (0.0, self.run, self.run)[stage]
+        slip = 0.0
+        if stage != 1:
+            x += self.run / 2 * (1 - np.cos(u))
+            slip = self.run / 2 * rate * np.sin(u)
+        return slip, x, -3.0 * t, self.start[2] - 1.5 * t**2
+
+    def move(self, t: float, stage: int) -> tuple[Array, Array]:
+        """Configuration and velocity, shape (5,) each."""
+        scene = self.formation.scene
+        slip, x, turning, phi = self.law(t, stage)
+        vertex = rotate(phi, scene.polygon.vertices[1])
+        origin = self.start[0] + rotate(self.start[2], scene.polygon.vertices[1])[0]
+        q = np.array([origin + x - vertex[0], -vertex[1], phi])
+        z = np.array([*q, *(close_finger(scene, q, k) for k in (0, 1))])
+        q_dot = np.array([slip + turning * vertex[1], -turning * vertex[0], turning])
+        normal, _ = stack_rows(self.formation, z)
+        joints = -np.linalg.solve(normal[1:, 3:], normal[1:, :3] @ q_dot)
+        return z, np.array([*q_dot, *joints])
+
+    def torque(self, t: float, stage: int) -> Array:
+        """Torques of both fingers, shape (2,)."""
+        scene, h = self.formation.scene, 1e-6
+        z, v = self.move(t, stage)
+        a = (self.move(t + h, stage)[1] - self.move(t - h, stage)[1]) / (2 * h)
+        normal, tangent = stack_rows(self.formation, z)
+        # At the ends of a stage the directions are those inside.
+        middle = np.clip(t, self.times[stage] + 1e-4, self.times[stage + 1] - 1e-4)
+        inner, inner_dot = self.move(float(middle), stage)
+        slips = np.sign(stack_rows(self.formation, inner)[1] @ inner_dot)
+        if stage == 1:
+            slips[0] = self.share
+        force = normal - (self.formation.friction * slips)[:, None] * tangent
+        drag = scene.viscous * v + scene.dry * np.sign(inner_dot)
+        right = scene.mass_diagonal * a - scene.applied_force + drag
+        answer = np.linalg.solve(np.hstack([force.T, np.eye(5)[:, 3:]]), right)
+        return np.asarray(answer[3:])
+
+    def fit(self, pieces: int = 6, degree: int = 7) -> TorqueProfile:
+        """The torques as polynomials, which step between the stages."""
+        breaks, coefficients = [0.0], []
+        nodes = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
+        for stage in range(3):
+            edges = np.linspace(self.times[stage], self.times[stage + 1], pieces + 1)
+            for low, high in pairwise(edges):
+                t = (low + high + nodes * (high - low)) / 2
+                values = np.array([self.torque(float(one), stage) for one in t])
+                coefficients.append(np.polynomial.polynomial.polyfit(nodes, values, degree).T)
                 breaks.append(high)
         return TorqueProfile(np.array(breaks), np.array(coefficients))

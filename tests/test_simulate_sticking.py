@@ -9,7 +9,7 @@ import pytest
 
 from plane import make_formation, measure_slip, place_corners
 from planned import plan_landing
-from pushing import Push, evaluate, linear, pushed, rocking
+from pushing import Push, Roll, evaluate, linear, pushed, rocking
 from stepping import march
 from test_simulate_rolling import fall
 from tipping import constant, falling
@@ -225,3 +225,32 @@ def test_a_vertex_sticks_and_slips_in_a_landing_of_the_heptagon() -> None:
         )  # fmt: skip
         errors.append(float(np.abs(z[-1] - end[:5]).max()))
     assert errors[1] < 0.65 * errors[0] < 0.01
+
+
+@pytest.mark.parametrize("share", [0.3, -0.8])
+@pytest.mark.parametrize("late", [-3e-10, 0.0, 3e-10])
+def test_a_vertex_that_rolls_by_plan_in_a_sliding_phase(share: float, late: float) -> None:
+    """It sticks where it comes to rest and the torques step, and slips where they step again."""
+    problem, trajectory = plan_landing()
+    last = problem.phases[1]
+    start = trajectory.motions[1].evaluate(np.array([0.1])).z[0]
+    roll = Roll(last.formation, start, share)
+    phase = dataclasses.replace(last, index=0)
+    problem = dataclasses.replace(problem, start=start, phases=(phase,))
+    exact = roll.fit()
+    inner = np.where((exact.breaks > 0) & (exact.breaks < 0.15), late, 0.0)
+    torque = TorqueProfile(exact.breaks + inner, exact.coefficients)
+    simulation = simulate(problem, torque, tolerance=1e-11, times=[0.08])
+    palm = [e for e in simulation.events if e.contact == "v1-palm" and e.time < 0.14]
+    for planned, kind in ((0.06, EventKind.STICK), (0.1, EventKind.SLIP)):
+        here = [e.kind for e in palm if abs(e.time - planned) < 1e-6]
+        assert here[-1] is kind
+        palm = palm[len(here) :]
+    assert not palm
+    row = int(np.flatnonzero(simulation.t == 0.08)[0])
+    column = simulation.contacts.index("v1-palm")
+    taken = simulation.c_t[row, column] / simulation.c_n[row, column]
+    assert taken == pytest.approx(-0.1 * share, abs=1e-4)
+    # The object turns much farther than the joints: errors of the torques grow as much.
+    assert np.allclose(simulation.z[-1], roll.move(0.15, 2)[0], atol=1e-5, rtol=0)
+    assert_balanced(simulation)
