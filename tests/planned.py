@@ -74,7 +74,9 @@ class CosineMotion:
             forces = inverse(
                 self.curve.formation, point.z[mine], point.z_s[mine], point.z_ss[mine], directions
             )
-            squeeze = self.squeeze * (1 - self.fade * t[mine] / self.duration)
+            # The sense of the null vector is that of the curve; here a squeeze always presses.
+            sense = np.where(forces.Cl.sum(axis=1) < 0, -1.0, 1.0)
+            squeeze = sense * self.squeeze * (1 - self.fade * t[mine] / self.duration)
             c_n[mine] = forces.c(a[mine], v[mine] ** 2, squeeze)
             tau[mine] = forces.tau(a[mine], v[mine] ** 2, squeeze)
             Xi[mine] = segment.Xi
