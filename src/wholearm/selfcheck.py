@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .blocks import Planning, refine_block
+from .blocks import BlockPlan, Planning, refine_block
 from .errors import InfeasibleError, ReplayError, SolverError
 from .model import Array
 from .newton_euler import balance
@@ -131,7 +131,7 @@ def replay_plan(
             check = accepted
             break
         if refined is None:
-            raise ReplayError(_describe(planning, accepted))
+            raise ReplayError(_describe(planning.blocks[index], number, accepted))
         planning, trajectory = refined, build(refined)
     return planning, trajectory, _list_figures(planning, check)
 
@@ -216,11 +216,10 @@ def _refine(planning: Planning, index: int, report: Callable[[str], None]) -> Pl
         return None
 
 
-def _describe(planning: Planning, check: Check) -> str:
-    """The error for a plan that does not hold."""
+def _describe(block: BlockPlan, number: int, check: Check) -> str:
+    """The error for a plan that does not hold, from phase `number` of a block on."""
     assert check.failure is not None
-    number, reason = check.failure
-    times = 2 ** max(block.finer for block in planning.blocks)
+    reason, times = check.failure[1], 2**block.finer
     finer = f", with {times} times the intervals" if times > 1 else ""
     return (
         f"the plan of phase {number} does not hold in its replay{finer}: {reason}; other intervals "

@@ -1,0 +1,158 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from conftest import HEPTAGON
+from planned import change, plan
+from wholearm import selfcheck
+from wholearm.blocks import Planning, plan_blocks
+from wholearm.errors import InputError, ReplayError, SolverError
+from wholearm.model import Array
+from wholearm.options import PlanOptions
+from wholearm.outline import load
+from wholearm.phaseplan import PhasePlan
+from wholearm.plan import solve
+from wholearm.problem import Problem
+from wholearm.selfcheck import check_plan, divide_pieces, find_residual, pick_times, replay_plan
+from wholearm.torque import TorqueProfile
+from wholearm.trajectory import Trajectory
+from wholearm.verdict import Allowance
+from wholearm.verify import verify
+
+
+def brake_less(starts: Array, c: Array) -> Array:
+    c[(starts > 0.3) & (starts < 0.4 - 1e-9)] *= 0.97
+    return c
+
+
+def test_a_plan_that_holds() -> None:
+    problem, trajectory = plan()
+    check = check_plan(problem, trajectory, Allowance())
+    assert check.failure is None and check.residual.size < 1e-9
+    # Every piece is a step; only phases with few pieces are looked at in between.
+    assert check.report.steps < len(trajectory.torque.coefficients) + 150
+
+
+def test_torques_that_do_not_carry_the_motion_are_found() -> None:
+    problem, trajectory = plan()
+    weak = replace(trajectory, torque=change(trajectory.torque, brake_less))
+    check = check_plan(problem, weak, Allowance())
+    assert check.failure is not None and check.failure == (2, verify(problem, weak).reason)
+    # The first phase departs by the braking that it lacks.
+    assert check.find_culprit(problem.scene.scales.length, 1e-5) == 1
+
+
+def test_friction_the_wrong_way_is_found_by_the_residual() -> None:
+    problem, trajectory = plan()
+    tau, rows = trajectory.tau.copy(), np.flatnonzero(trajectory.phase == 2)[90:100]
+    dry = problem.scene.dry[4]
+    tau[rows, 1] -= 2 * dry * np.sign(trajectory.theta_dot[rows, 1])
+    wrong = replace(trajectory, tau=tau)
+    found = find_residual(problem, wrong)
+    assert found.phase == 3
+    assert found.size == pytest.approx(2 * dry / problem.scene.scales.torque, rel=1e-6)
+    assert "finger 2" in found.text and "as joint 2 moves against the sense" in found.text
+    times = [f"at t = {t:.5g} s, phase 3" for t in trajectory.t[rows]]
+    assert any(found.text.endswith(time) for time in times)
+    failure = check_plan(problem, wrong, Allowance()).failure
+    assert failure == (3, found.text)
+
+
+def test_few_instants() -> None:
+    torque = TorqueProfile(np.array([0.0, 0.1, 0.11, 1.0]), np.zeros((3, 2, 1)))
+    times = divide_pieces(torque, np.array([0.0, 0.11, 1.0]), np.array([0.02, 0.5]))
+    inner = np.array([0.1 * k / 6 for k in range(1, 6)])
+    np.testing.assert_allclose(times, [*inner, 0.11 + 0.89 / 2])
+    _, trajectory = plan()
+    few = pick_times(trajectory)
+    assert np.isin(trajectory.phase_starts, few).all() and len(few) < len(trajectory.t) / 10
+
+
+class Spoiled:
+    """Planning in which the torques of one phase are weak until it is refined often enough."""
+
+    def __init__(self, problem: Problem, phase: int, cured: int) -> None:
+        self.problem, self.phase, self.cured = problem, phase, cured
+        self.refined: list[int] = []
+        options = PlanOptions(intervals=20)
+        self.planning = plan_blocks(problem, options, lambda _: None)
+
+    def build(self, planning: Planning) -> Trajectory:
+        from wholearm.plan import _assemble
+
+        if planning.blocks[self.phase].finer >= self.cured:
+            return _assemble(planning)
+        block = planning.blocks[self.phase]
+        (own,) = block.plans
+        coefficients = own.torque.coefficients.copy()
+        coefficients[len(coefficients) // 2 :] *= 0.9
+        weak: PhasePlan[Any] = own._replace(torque=TorqueProfile(own.torque.breaks, coefficients))
+        blocks = list(planning.blocks)
+        blocks[self.phase] = replace(block, plans=[weak])
+        return _assemble(replace(planning, blocks=tuple(blocks)))
+
+    def run(self) -> tuple[Planning, Trajectory, dict[str, Any]]:
+        first = self.build(self.planning)
+        return replay_plan(self.planning, first, self.build, lambda _: None)
+
+
+@pytest.mark.parametrize("cured", [0, 1, 2])
+def test_only_what_does_not_hold_is_refined(heptagon: Problem, cured: int) -> None:
+    spoiled = Spoiled(heptagon, 1, cured)
+    planning, trajectory, figures = spoiled.run()
+    assert [block.finer for block in planning.blocks] == [0, cured, 0, 0, 0]
+    assert figures["refinements"] == [0, cured, 0, 0, 0]
+    for k in 0, 2, 3, 4:
+        assert planning.blocks[k] is spoiled.planning.blocks[k]
+    assert verify(heptagon, trajectory).ok
+    # Twice the intervals, but for those of no length where a direction reverses.
+    pieces = [len(block.plans[0].torque.coefficients) for block in planning.blocks]
+    assert pieces[1] >= 2**cured * 20 - 2
+
+
+def test_refining_is_bounded_and_the_error_says_where(heptagon: Problem) -> None:
+    spoiled = Spoiled(heptagon, 1, 99)
+    with pytest.raises(ReplayError) as caught:
+        spoiled.run()
+    text = str(caught.value)
+    assert caught.value.exit_status == 1
+    assert text.startswith("the plan of phase 2 does not hold in its replay, with 8 times the ")
+    assert ", phase " in text and " at t = " in text and "--no-replay" in text
+
+
+def test_a_finer_plan_that_is_not_found_leaves_the_error(
+    heptagon: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> Planning:
+        raise SolverError("no plan")
+
+    spoiled = Spoiled(heptagon, 1, 1)
+    monkeypatch.setattr(selfcheck, "refine_block", fail)
+    with pytest.raises(ReplayError, match="the plan of phase 2 does not hold in its replay: "):
+        spoiled.run()
+
+
+def test_meta_keeps_the_figures(heptagon: Problem, trajectory: Trajectory) -> None:
+    figures = trajectory.meta["replay"]
+    report = verify(heptagon, trajectory)
+    margins = [(c.least, c.contact, p.number) for p in report.phases for c in p.contacts]
+    assert figures["least_c_n"]["value"] == pytest.approx(min(margins)[0], abs=1e-6)
+    assert (figures["least_c_n"]["contact"], figures["least_c_n"]["phase"]) in [
+        margin[1:] for margin in margins if margin[0] < min(margins)[0] + 1e-6
+    ]
+    for own, phase in zip(figures["phases"], report.phases, strict=True):
+        assert own["arrival"] == pytest.approx(phase.arrival, abs=1e-9)
+        assert max(own["end_deviation"].values()) < 1e-9
+        assert max(own["deviation"].values()) < 1e-9 and own["end_speed"] < 1e-6
+    assert figures["residual"] < 1e-11 and figures["refinements"] == [0] * 5
+
+
+def test_without_a_replay() -> None:
+    meta = solve(load(str(HEPTAGON)), intervals=20, replay=False).meta
+    assert meta["replay"] is None
+    with pytest.raises(InputError, match="replay: 'no' given"):
+        PlanOptions(replay="no")  # type: ignore[arg-type]
