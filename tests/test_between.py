@@ -13,7 +13,14 @@ from timed import instants, landing, plan_landing, stages_of
 from wholearm.links import FINGERS_TOUCH
 from wholearm.options import PlanOptions
 from wholearm.plan import solve
-from wholearm.timedomain.between import GRAZE, MISS, Limits, find_misses, watch_missed
+from wholearm.timedomain.between import (
+    GRAZE,
+    MISS,
+    Limits,
+    find_misses,
+    look_between,
+    watch_missed,
+)
 from wholearm.timedomain.collocation import make_scheme
 from wholearm.timedomain.ownunits import to_si
 from wholearm.timedomain.stage import Stage
@@ -33,6 +40,10 @@ def as_stage(motion: StageMotion, **fields: object) -> Stage:
     return replace(stage, **fields)  # type: ignore[arg-type]
 
 
+def look(stage: Stage, motion: StageMotion, *least: float) -> Limits:
+    return find_misses(stage, look_between(stage, motion), *least)
+
+
 @lru_cache(maxsize=1)
 def landed() -> list[StageMotion]:
     return stages_of(plan_landing(time_intervals=6))
@@ -48,7 +59,7 @@ def heaved() -> StageMotion:
 
 def test_what_a_plan_misses_is_within_what_is_allowed() -> None:
     for motion in landed():
-        misses = find_misses(as_stage(motion), motion, EPSILON)
+        misses = look(as_stage(motion), motion, EPSILON)
         assert misses.c_n.shape == (len(motion.points.fractions), motion.formation.n_contacts)
         assert misses.worst <= 1
 
@@ -60,14 +71,14 @@ def test_forces_are_missed_by_what_their_least_value_lacks() -> None:
         t = motion.duration * motion.points.places(inside).ravel()
         dense = motion.evaluate(t).c_n.reshape(stage.intervals, 401, -1)
         asked = float(np.median(dense))
-        misses = find_misses(stage, motion, asked)
+        misses = look(stage, motion, asked)
         expected = np.maximum(asked - dense.min(axis=1), 0.0)
         # Parabolas through 25 looks, of forces that are smooth inside an interval.
         np.testing.assert_allclose(misses.c_n, expected, atol=1e-3 * np.ptp(dense))
         most = max(misses.c_n.max(), misses.cone.max(initial=0.0))
         assert misses.worst == pytest.approx(most / MISS)
         # A margin asks for as much as a larger epsilon.
-        same = find_misses(stage, motion, EPSILON, asked - EPSILON)
+        same = look(stage, motion, EPSILON, asked - EPSILON)
         np.testing.assert_allclose(same.c_n, misses.c_n, atol=1e-12 * asked)
 
 
@@ -79,12 +90,12 @@ def test_cones_are_missed_by_what_epsilon_takes_from_them_but_the_margin_does_no
     dense = motion.evaluate(instants(motion, 200))
     grip = mu * dense.c_n[:, row] - np.abs(dense.c_t[:, row])
     least = grip.reshape(stage.intervals, 200).min(axis=1)
-    assert not find_misses(stage, motion, EPSILON).cone.any()
+    assert not look(stage, motion, EPSILON).cone.any()
     large = 1.0 + least.min() / mu
-    misses = find_misses(stage, motion, large)
+    misses = look(stage, motion, large)
     np.testing.assert_allclose(misses.cone[:, 0], np.maximum(mu * large - least, 0), atol=0.02)
     assert misses.cone.max() > 1.0
-    assert not find_misses(stage, motion, EPSILON, large).cone.any()
+    assert not look(stage, motion, EPSILON, large).cone.any()
 
 
 def test_released_contacts_have_to_be_clear_in_the_second_half() -> None:
@@ -96,7 +107,7 @@ def test_released_contacts_have_to_be_clear_in_the_second_half() -> None:
     gaps = make_formation(formation.scene, "v3-finger1")
     fields = {"watched": (k,), "released": (k,), "opens": True}
     stage = as_stage(motion, **fields)
-    assert find_misses(stage, motion, EPSILON).gap.max() <= GRAZE
+    assert look(stage, motion, EPSILON).gap.max() <= GRAZE
     # Played backwards it is clear at first, and touches at the end.
     part = motion.points
     back = part._replace(
@@ -108,7 +119,7 @@ def test_released_contacts_have_to_be_clear_in_the_second_half() -> None:
         tau=part.tau[::-1, ::-1],
     )
     reverse = replace(motion, points=back)
-    misses = find_misses(as_stage(reverse, **fields), reverse, EPSILON).gap[:, 0]
+    misses = look(as_stage(reverse, **fields), reverse, EPSILON).gap[:, 0]
     end = measure_gaps(gaps, reverse.evaluate(np.array([motion.duration])).z[0])[0]
     assert misses[-1] == pytest.approx(CLEAR / 2 - end, abs=1e-7)
     assert misses[0] == 0.0
@@ -177,6 +188,7 @@ def test_what_is_broken_between_points_is_watched() -> None:
         assert isinstance(whole, TimeMotion)
         motions = [replace(part, formation=formation) for part in whole.stages]
         stages = [as_stage(part) for part in motions]
-        found = watch_missed(stages, motions)
+        looks = [look_between(*pair) for pair in zip(stages, motions, strict=True)]
+        found = watch_missed(stages, looks)
         assert {k for stage in found or stages for k in stage.watched} == set(watched)
         assert (found is None) == (watched == ())

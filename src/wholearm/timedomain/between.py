@@ -11,6 +11,7 @@ import numpy as np
 from ..cones import hold_least, slip_margins
 from ..minima import find_least
 from ..model import Array
+from ..trajectory import Samples
 from .stage import Stage
 from .timemotion import StageMotion
 from .timenlp import CLEAR, TimeNLP
@@ -57,7 +58,32 @@ class Limits(NamedTuple):
         return max(float(t.max(initial=0.0)) / a for t, a in zip(self, allowed, strict=True))
 
 
-def find_misses(stage: Stage, motion: StageMotion, epsilon: float, margin: float = 0.0) -> Limits:
+class Look(NamedTuple):
+    """A stage at `LOOKS` places of each of its K intervals, one after the other.
+
+    Attributes
+    ----------
+    places : ndarray, shape (K LOOKS,)
+        Shares of the duration.
+    samples : Samples
+        Motion and forces there.
+    limits : ndarray, shape (K LOOKS, n_limits), [m]
+        Values of every limit of the formation.
+    """
+
+    places: Array
+    samples: Samples
+    limits: Array
+
+
+def look_between(stage: Stage, motion: StageMotion) -> Look:
+    """Look at a stage between its points."""
+    places = stage.guess.places(np.linspace(1e-9, 1 - 1e-9, LOOKS)).ravel()
+    samples = motion.evaluate(places * motion.duration)
+    return Look(places, samples, stage.formation.evaluate_limits(samples.z))
+
+
+def find_misses(stage: Stage, look: Look, epsilon: float, margin: float = 0.0) -> Limits:
     """By how much limits are missed in each interval, at worst.
 
     Parameters
@@ -65,29 +91,25 @@ def find_misses(stage: Stage, motion: StageMotion, epsilon: float, margin: float
     epsilon, margin : float
         Least c_n, and what c_n but no friction cone has to exceed it by.
     """
-    formation, inner = stage.formation, np.linspace(1e-9, 1 - 1e-9, LOOKS)
-    places = stage.guess.places(inner).ravel()
-    samples = motion.evaluate(places * motion.duration)
-    grip = slip_margins(formation, samples.c_n - epsilon, samples.c_t)
-    gaps = formation.evaluate_limits(samples.z)[:, list(stage.watched)]
+    samples = look.samples
+    grip = slip_margins(stage.formation, samples.c_n - epsilon, samples.c_t)
     clear = CLEAR / 2 * np.isin(stage.watched, stage.released)
-    later = (not stage.opens) | (places > 1 / 2)
+    later = (not stage.opens) | (look.places > 1 / 2)
     tables = (
         samples.c_n - (epsilon + margin),
         grip,
-        gaps - np.outer(later, clear),
+        look.limits[:, list(stage.watched)] - np.outer(later, clear),
     )
     shape = (stage.intervals, LOOKS)
     slack = (find_least(table.reshape(*shape, table.shape[1])) for table in tables)
     return Limits(*(np.maximum(-part, 0.0) for part in slack))
 
 
-def watch_missed(stages: Sequence[Stage], motions: Sequence[StageMotion]) -> list[Stage] | None:
+def watch_missed(stages: Sequence[Stage], looks: Sequence[Look]) -> list[Stage] | None:
     """Stages that also watch the limits which are broken between points; None if none is."""
-    changed, places = [], np.linspace(0.0, 1.0, LOOKS)
-    for stage, motion in zip(stages, motions, strict=True):
-        z = motion.evaluate(stage.guess.places(places).ravel() * motion.duration).z
-        values = stage.formation.evaluate_limits(z).reshape(stage.intervals, LOOKS, -1)
+    changed = []
+    for stage, look in zip(stages, looks, strict=True):
+        values = look.limits.reshape(stage.intervals, LOOKS, -1)
         deepest = -GRAZE * stage.formation.scene.scales.length
         broken = np.flatnonzero(find_least(values).min(axis=0) < deepest).tolist()
         changed.append(replace(stage, watched=tuple(sorted({*stage.watched, *broken}))))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..options import Objective, PlanOptions
 from ..problem import Problem
-from .between import Limits, find_misses, raise_bounds, watch_missed
+from .between import Limits, find_misses, look_between, raise_bounds, watch_missed
 from .collocation import Scheme, make_scheme
 from .ownunits import in_own_units, scale_options
 from .revising import adopt, halve, watch_broken
@@ -212,7 +212,11 @@ class Search:
         limits = [Limits.none(stage) for stage in solution.stages]
         for _ in range(ROUNDS):
             motions = make_motions(solution.stages, self.scheme)
-            watching = watch_missed(solution.stages, motions)
+            looks = [
+                look_between(stage, motion)
+                for stage, motion in zip(solution.stages, motions, strict=True)
+            ]
+            watching = watch_missed(solution.stages, looks)
             if watching is not None:
                 solution = self.solve(watching, solution)
                 if not solution.success:
@@ -220,8 +224,8 @@ class Search:
                 limits = [Limits.none(stage) for stage in solution.stages]
                 continue
             misses = [
-                find_misses(stage, motion, self.problem.epsilon, solution.margin)
-                for stage, motion in zip(solution.stages, motions, strict=True)
+                find_misses(stage, look, self.problem.epsilon, solution.margin)
+                for stage, look in zip(solution.stages, looks, strict=True)
             ]
             worst = max(miss.worst for miss in misses)
             marked = [
