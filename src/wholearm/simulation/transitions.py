@@ -13,13 +13,13 @@ from ..impact import Obstacle, strike, transfer
 from ..model import Array
 from ..problem import End, Phase
 from .choosing import measure_rates
+from .closing import close_contacts
 from .events import EventKind, Outcome, OutcomeKind
 from .jumps import Ending, look_again
 from .modes import Mode, find_fixed, find_grips, list_units
 from .replay import Replay
 from .starting import Departure
 from .stepper import open_limits
-from .sticking import close_contacts
 from .tolerances import REACHED, STANDING, is_slower, measure_until
 
 _OUTCOMES = {
