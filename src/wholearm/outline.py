@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -135,7 +135,13 @@ def _find_goal(problem: Problem, phase: Phase, z: Array) -> Array:
     """Nearest configuration at which the phase ends."""
     key = f"phases[{phase.number}].until"
     if phase.until.is_release:
-        raise InputError(problem.source, key, "is missing; only one freedom needs none")
+        if phase.index + 1 == len(problem.phases):
+            raise InputError(problem.source, key, "is missing; only one freedom needs none")
+        # On the way to where the next phase ends, as far as this one's contacts lead there.
+        coming = replace(phase, until=problem.phases[phase.index + 1].until)
+        ahead = _find_goal(problem, coming, z)
+        middle = close(phase.formation, (z + ahead) / 2, phase.formation.evaluate_slip(z[None])[0])
+        return ahead if middle is None else middle
     slip, reasons, goals = phase.formation.evaluate_slip(z[None])[0], [], []
     ends = _list_ends(phase)
     for end in ends:

@@ -24,6 +24,8 @@ class PhasePlan(NamedTuple, Generic[M_co]):
         Of the solver in all, and how often it ran. Of phases in one NLP only the first one counts.
     build_time, solve_time : float, [s]
         The same for them.
+    sequences : int
+        Sequences of contact modes that were tried; none along curves.
     """
 
     motion: M_co
@@ -33,3 +35,4 @@ class PhasePlan(NamedTuple, Generic[M_co]):
     solves: int
     build_time: float
     solve_time: float
+    sequences: int = 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,10 +16,11 @@ from .blocks import Planning, plan_blocks
 from .options import Objective, PlanOptions
 from .path import trace_phases
 from .pathdomain.chainplan import assess, combine
+from .phaseplan import PhasePlan
 from .problem import Problem
 from .sharing import exclusive
 from .torque import TorqueProfile
-from .trajectory import Trajectory, assemble
+from .trajectory import Motion, Trajectory, assemble
 from .transition import Transition
 
 UNITS = {Objective.TIME: "s", Objective.EFFORT: "(N m)^2 s", Objective.MARGIN: "N"}
@@ -108,13 +109,22 @@ def _assemble(planning: Planning) -> Trajectory:
     torque = TorqueProfile.chain([plan.torque for plan in planning.plans])
     motions = [plan.motion for plan in planning.plans]
     # What rolls is a part of the trajectory that is kept in `meta`.
-    meta = {"rolling": _list_rolling(planning.problem)}
+    meta = {
+        "rolling": _list_rolling(planning.problem),
+        "modes": _list_modes(planning.plans),
+        "phase_durations": [motion.duration for motion in motions],
+    }
     return assemble(motions, torque, meta, planning.options.samples)
 
 
 def _list_rolling(problem: Problem) -> list[list[str]]:
     """Names of the rolling contacts of each phase."""
     return [[c.name for c in phase.formation.rolling] for phase in problem.phases]
+
+
+def _list_modes(plans: Sequence[PhasePlan[Motion]]) -> list[list[dict[str, Any]]]:
+    """Contact modes of each phase, with times from its start; none where it runs on a curve."""
+    return [getattr(plan.motion, "modes", []) for plan in plans]
 
 
 def _describe(planning: Planning) -> dict[str, Any]:
@@ -130,6 +140,8 @@ def _describe(planning: Planning) -> dict[str, Any]:
         "epsilon": problem.epsilon,
         "phase_values": values,
         "rolling": _list_rolling(problem),
+        "modes": _list_modes(plans),
+        "sequences": [plan.sequences for plan in plans],
         "phase_durations": [plan.motion.duration for plan in plans],
         "intervals": options.intervals,
         "transcription": options.transcription,

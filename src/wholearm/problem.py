@@ -390,8 +390,15 @@ def _check_end(phase: Phase, following: Phase | None) -> None:
         raise InputError(
             "", key, f"{given}, but phase {following.number} has {', '.join(extra)} too"
         )
-    if until.is_release and set(contacts) == set(phase.formation.contacts):
-        raise InputError("", key, f"phase {following.number} releases no contact")
+    same = set(contacts) == set(phase.formation.contacts)
+    if (
+        until.is_release
+        and same
+        and set(following.formation.rolling) == set(phase.formation.rolling)
+    ):
+        raise InputError(
+            "", key, f"phase {following.number} releases no contact, and none rolls or slides anew"
+        )
 
 
 def _check_first_formation(problem: Problem) -> None:

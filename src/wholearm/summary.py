@@ -30,6 +30,7 @@ def summarise(trajectory: Trajectory, output: str, table: Mapping[str, Any] | No
         least = c_n[c_n == c_n].min()
         torque = abs(trajectory.tau[rows]).max()
         lines.append(f"{index + 1:>5}  {duration:>12.6f}  {least:>13.6f}  {torque:>19.6f}")
+    lines += _list_modes(meta)
     lines += _list_transitions(meta)
     value = f"{meta['objective']} = {meta['value']:.6f} {meta['value_unit']}"
     lines += _list_replay(meta.get("replay"))
@@ -71,6 +72,21 @@ def _list_table(table: Mapping[str, Any]) -> list[str]:
         padded = [cell.rjust(len(name)) for cell, name in zip(cells, header, strict=True)]
         lines.append("  ".join([*padded, row["contact"] or "-"]))
     return lines
+
+
+def _list_modes(meta: Mapping[str, Any]) -> list[str]:
+    """Contact modes of the phases that were planned in the time domain; empty if none was."""
+    lines: list[str] = []
+    words = {"+": " slides +", "-": " slides -", "rolls": " rolls"}
+    for index, (modes, tried) in enumerate(zip(meta["modes"], meta["sequences"], strict=True)):
+        for mode in modes:
+            contacts = ", ".join(name + words[how] for name, how in mode["contacts"].items())
+            span = f"{mode['start']:.4f} to {mode['stop']:.4f} s"
+            joints = " ".join(mode["joints"])
+            lines.append(f"{index + 1:>5}  {span}: {contacts}; joints turn {joints}")
+        if tried:
+            lines[-1] += f"; best of {tried} sequences of modes"
+    return ["", "modes, from the start of each phase", *lines, ""] if lines else []
 
 
 def _list_transitions(meta: Mapping[str, Any]) -> list[str]:

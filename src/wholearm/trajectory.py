@@ -110,10 +110,17 @@ class Trajectory:
 
     @property
     def rolling(self) -> NDArray[np.bool_]:
-        """Which contacts roll, shape (n, m), as `meta` names them phase by phase."""
+        """Which contacts roll, shape (n, m), as `meta` names them by phases and modes."""
         mask = np.zeros(self.c_t.shape, dtype=bool)
         for index, names in enumerate(self.meta.get("rolling", [])):
             mask[self.phase == index] = [name in names for name in self.contacts]
+        starts = self.phase_starts
+        for index, modes in enumerate(self.meta.get("modes", [])):
+            for mode in modes:
+                passed = self.t - starts[index]
+                rows = (self.phase == index) & (passed >= mode["start"]) & (passed <= mode["stop"])
+                rolls = [mode["contacts"].get(name) == "rolls" for name in self.contacts]
+                mask[rows] |= rolls
         return mask
 
     @property

@@ -18,14 +18,14 @@ from ..model import Array
 from .collocation import Scheme
 from .modes import drop, link, merge, mode_of, release_earlier, split
 from .stage import Stage
-from .timenlp import least_rates
+from .timenlp import SHORTEST, least_rates
 
 _STALLED = 1e-6
 """Rate over the largest one at which a direction of friction counts as held back."""
 _LEANS = 1e-4
 """Margin to the friction cone over mu c_n at which a rolling contact counts as leaning on it."""
-_GONE = 1e-4
-"""Share of the whole duration below which a stage counts as shrunk to nothing."""
+_GONE = 2.0
+"""Duration of a stage over the least one below which it counts as shrunk to nothing."""
 
 
 class Run(NamedTuple):
@@ -78,9 +78,8 @@ def list_moves(
         ]
         yield from _apply(stages, scheme, runs)
         return
-    total = sum(stage.guess.duration for stage in stages)
     for index, stage in enumerate(stages):
-        if stage.guess.duration < _GONE * total:
+        if stage.guess.duration < _GONE * SHORTEST * stage.intervals:
             left = drop(stages, index)
             if left is not None:
                 yield link(merge(left))

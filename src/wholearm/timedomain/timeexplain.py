@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..advice import Limit, Shortfall, describe_changes, find_changes, rank_shortfalls
+from ..curve import describe_pose
 from ..errors import InfeasibleError, InputError, SolverError
 from ..model import Array
 from ..options import Objective
@@ -29,6 +30,33 @@ def ease(search: Search, stages: Sequence[Stage]) -> list[Stage] | None:
     """The motion with the least shortfalls when every limit is soft, or None."""
     solution = search.aiming(Objective.ELASTIC).solve(list(stages))
     return solution.stages if solution.success else None
+
+
+def refuse(search: Search, problem: Problem, phase: Phase, stage: Stage) -> None:
+    """Raise an error if no motion can begin from rest where a stage starts.
+
+    Raises
+    ------
+    InfeasibleError
+        With the contact that would have to pull.
+    """
+    from .resting import find_block
+
+    blocked = find_block(stage.formation, stage.guess.nodes[0, 0], search.problem.epsilon)
+    if blocked is None:
+        return
+    where = describe_pose(to_si(stage, problem).guess.nodes[0, 0])
+    text = (
+        f"phase {phase.number} is infeasible: from rest at its start, {where}, no "
+        "motion begins in any contact mode"
+    )
+    if blocked.contact:
+        amount = blocked.short * problem.scene.scales.force
+        least = f"epsilon = {problem.epsilon:g} N"
+        text += f": c_n of {blocked.contact} >= {least} is {amount:.3g} N short at best"
+    else:
+        text += " within the torque limits"
+    raise InfeasibleError(text)
 
 
 def explain(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -187,6 +188,22 @@ class TimeMotion:
     def torque(self) -> TorqueProfile:
         """Torque from the start of the phase."""
         return TorqueProfile.chain([stage.torque for stage in self.stages])
+
+    @property
+    def modes(self) -> list[dict[str, Any]]:
+        """What slides and turns which way and what rolls in each stage, from when to when."""
+        found = []
+        for stage, start in zip(self.stages, self.starts[:-1].tolist(), strict=True):
+            formation, (Xi, sigma) = stage.formation, stage.directions
+            rolls = formation.rolling_rows
+            contacts = {
+                name: "rolls" if k in rolls else "+" if Xi[k] > 0 else "-"
+                for k, name in enumerate(formation.names)
+            }
+            joints = ["+" if sign > 0 else "-" for sign in sigma]
+            stop = start + stage.duration
+            found.append({"start": start, "stop": stop, "contacts": contacts, "joints": joints})
+        return found
 
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""

@@ -63,8 +63,8 @@ of gyration."""
 SLIDING = 3e-4
 """Least sliding, over the radius of gyration, and least speed of a joint, in the scene's unit of
 time: what does not move at all would have no sense."""
-SHORTEST = 1e-7
-"""Least duration of an interval, in the scene's unit: a stage may shrink to nothing."""
+SHORTEST = 1e-4
+"""Least duration of an interval, in the scene's unit; stages that shrink to it are dropped."""
 EVEN = 0.2
 """Least duration of an interval that chooses its share over that of its neighbour."""
 _HURRY = 3e-4

@@ -32,6 +32,8 @@ FIRST = 10
 """Most intervals of a phase to start with."""
 CONVINCING = 2
 """Motions that miss limits least, from different guesses, after which there seems to be no plan."""
+PATIENCE = 600
+"""Most iterations of further attempts before there seems to be no plan."""
 _PACES = (2.0, 4.0, 1.0)
 """Guessed durations to try, in units of that of a fall."""
 
@@ -81,9 +83,11 @@ def plan_phases(
     solution = _solve(search, first, halvings)
     if solution.success:
         return _summarise(problem, search, phases, solution)
-    from .timeexplain import ease, explain, list_shortfalls
+    from .timeexplain import ease, explain, list_shortfalls, refuse
 
+    refuse(search, problem, phases[0], first[0])
     status, short = solution.status, list[list[Stage]]()
+    spent = search.effort.iterations
     for times, guess in _list_guesses(first, halvings, outline if patient else None):
         if guess is not first:
             solution = _solve(search, guess, times)
@@ -94,7 +98,7 @@ def plan_phases(
             solution = _solve(search, eased, times)
         if solution.success:
             return _summarise(problem, search, phases, solution)
-        if len(short) == CONVINCING:
+        if len(short) == CONVINCING or search.effort.iterations - spent > PATIENCE:
             break
 
     def replan(other: Problem) -> object:
@@ -157,5 +161,6 @@ def _summarise(
         solves=effort.solves,
         build_time=effort.build_time,
         solve_time=effort.solve_time,
+        sequences=effort.sequences,
     )
     return plans
