@@ -84,10 +84,6 @@ class Solver:
             raise KeyboardInterrupt
         return result
 
-    def get_function(self, name: str) -> Expression:
-        """A function of the NLP, by the name that CasADi gives it."""
-        return self._function.get_function(name)
-
     def stats(self) -> dict[str, Any]:
         """Statistics of the last call."""
         statistics: dict[str, Any] = self.function.stats()

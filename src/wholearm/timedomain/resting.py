@@ -130,10 +130,11 @@ class _Programme:
             rows.append(np.concatenate([-row, np.zeros(self.size - f)]))
             most.append(0.0)
         self.rows, self.most = np.array([*rows, self.speed]), np.array([*most, 1.0])
-        limits = [(None, None)] * f + [(epsilon, None)] * n_c + [(None, None)] * len(sticks)
+        free: tuple[float | None, float | None] = (None, None)
+        limits = [free] * f + [(epsilon, None)] * n_c + [free] * len(sticks)
         limits += [(-float(scene.dry[3 + k]), float(scene.dry[3 + k])) for k in held]
         limits += [(-float(limit), float(limit)) for limit in scene.torque_limit]
-        self.limits: list[tuple[float | None, float | None]] = limits
+        self.limits = limits
 
     @property
     def size(self) -> int:
@@ -158,7 +159,7 @@ class _Programme:
         presses[:, own], presses[:, -1] = -np.eye(self.n_c), -1.0
         moving = np.append(-self.speed, 0.0)[None]
         limits = [*self.limits, (0.0, None)]
-        limits[own] = [(None, None)] * self.n_c
+        limits[own] = [self.limits[0]] * self.n_c
         answer = linprog(
             np.append(np.zeros(n), 1.0),
             np.vstack([wide, presses, moving]),

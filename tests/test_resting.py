@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from timed import landing
+from wholearm.errors import InfeasibleError
+from wholearm.options import PlanOptions
+from wholearm.path import trace_phases
+from wholearm.timedomain.ownunits import in_own_units, scale_state
+from wholearm.timedomain.resting import find_block, list_ways
+from wholearm.timedomain.timeplan import plan_phases
+
+
+@pytest.mark.parametrize("freedoms, count", [(1, 2), (2, 20)])
+def test_every_way_to_set_things_in_motion_is_listed_once(freedoms: int, count: int) -> None:
+    rng = np.random.default_rng(2)
+    rates = rng.normal(size=(5, freedoms))
+    ways = np.array(list_ways(rates))
+    signs = np.sign(np.round(ways @ rates.T, 9))
+    assert len(ways) == count == len(np.unique(signs, axis=0))
+    # Any acceleration is of one of these ways.
+    for way in rng.normal(size=(50, freedoms)):
+        assert (np.sign(rates @ way) == signs).all(axis=1).sum() == 1
+
+
+@pytest.mark.parametrize("phase", range(4))
+def test_what_is_planned_can_begin(phase: int) -> None:
+    problem = landing()
+    start = trace_phases(problem)[phase - 1].end if phase else problem.start
+    own, z = in_own_units(problem), scale_state(start, problem.scene.scales)
+    assert find_block(own.phases[phase].formation, z, own.epsilon) is None
+
+
+def test_what_limits_forbid_at_rest_is_refused_at_once() -> None:
+    problem = landing()
+    z = scale_state(problem.start, problem.scene.scales)
+    formation = in_own_units(problem).phases[0].formation
+    # Torques of 2 N m press a heptagon of 2 N with less than 100 N.
+    blocked = find_block(formation, z, 50.0)
+    assert blocked is not None and blocked.contact in formation.names and blocked.short > 1.0
+
+
+def test_a_finger_that_would_have_to_pull_is_named() -> None:
+    """All contacts of the flip would have to press with twenty times the weight."""
+    problem = landing()
+    start = trace_phases(problem)[-1].end
+    phases = problem.phases[4:]
+    feeble = problem.with_(epsilon=40.0)
+    with pytest.raises(InfeasibleError, match="no motion begins in any contact mode: c_n of v"):
+        plan_phases(feeble, feeble.phases[4:], start, PlanOptions(time_intervals=4))
+    assert plan_phases(problem, phases, start, PlanOptions(time_intervals=4))
