@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from conftest import HEPTAGON
-from planned import change, plan
+from planned import change, plan, plan_landing
 from wholearm import selfcheck
 from wholearm.blocks import Planning, plan_blocks
 from wholearm.errors import InputError, ReplayError, SolverError
@@ -20,7 +20,7 @@ from wholearm.problem import Problem
 from wholearm.selfcheck import check_plan, divide_pieces, find_residual, pick_times, replay_plan
 from wholearm.torque import TorqueProfile
 from wholearm.trajectory import Trajectory
-from wholearm.verdict import Allowance
+from wholearm.verdict import Allowance, find_least_force
 from wholearm.verify import verify
 
 
@@ -149,6 +149,24 @@ def test_meta_keeps_the_figures(heptagon: Problem, trajectory: Trajectory) -> No
         assert max(own["end_deviation"].values()) < 1e-9
         assert max(own["deviation"].values()) < 1e-9 and own["end_speed"] < 1e-6
     assert figures["residual"] < 1e-11 and figures["refinements"] == [0] * 5
+
+
+def test_a_contact_that_is_let_go_is_not_the_least() -> None:
+    problem, trajectory = plan_landing()
+    report = verify(problem, trajectory)
+    phase = report.phases[0]
+    assert phase.until == "release of v3-finger1"
+    gone = next(margin for margin in phase.contacts if margin.contact == "v3-finger1")
+    others = [margin.least for margin in phase.contacts if margin is not gone]
+    found = find_least_force(phase)
+    assert found is not None and phase.arrival is not None
+    if abs(gone.time - phase.arrival) < 1e-6:
+        assert found.least == min(others)
+    late = replace(gone, least=-1.0, time=phase.arrival)
+    early = replace(gone, least=-1.0, time=phase.arrival - 0.01)
+    kept = [margin for margin in phase.contacts if margin is not gone]
+    assert find_least_force(replace(phase, contacts=(*kept, late))).least == min(others)  # type: ignore[union-attr]
+    assert find_least_force(replace(phase, contacts=(*kept, early))) is early
 
 
 def test_without_a_replay() -> None:

@@ -7,7 +7,6 @@ few instants, since those are what it costs: the plan keeps its limits in betwee
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -18,10 +17,10 @@ from .errors import InfeasibleError, ReplayError, SolverError
 from .model import Array
 from .newton_euler import balance
 from .problem import Problem
-from .report import ContactMargin, Deviation, PhaseReport, Report
+from .report import Deviation, Report
 from .torque import TorqueProfile
 from .trajectory import Samples, Trajectory, assemble
-from .verdict import Allowance, measure_departure
+from .verdict import Allowance, find_least_force, measure_departure
 from .verify import choose_times, inspect
 
 REFINEMENTS = 3
@@ -229,13 +228,14 @@ def _describe(block: BlockPlan, number: int, check: Check) -> str:
 
 def _list_figures(planning: Planning, check: Check) -> dict[str, Any]:
     """What `meta` keeps of a replay."""
-    margins = [(c, phase) for phase in check.report.phases for c in phase.contacts]
-    least, phase = min(margins, key=_least)
+    found = [(find_least_force(phase), phase.number) for phase in check.report.phases]
+    known = [(least, number) for least, number in found if least is not None]
+    least, number = min(known, key=lambda pair: pair[0].least)
     return {
         "least_c_n": {
             "value": least.least,
             "contact": least.contact,
-            "phase": phase.number,
+            "phase": number,
             "time": least.time,
         },
         "phases": [
@@ -251,11 +251,6 @@ def _list_figures(planning: Planning, check: Check) -> dict[str, Any]:
         "refinements": [block.finer for block in planning.blocks for _ in block.phases],
         "steps": check.report.steps,
     }
-
-
-def _least(pair: tuple[ContactMargin, PhaseReport]) -> float:
-    least = pair[0].least
-    return math.inf if math.isnan(least) else least
 
 
 def _list_deviation(deviation: Deviation | None) -> dict[str, float] | None:

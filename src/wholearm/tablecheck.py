@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,11 +9,11 @@ import numpy as np
 from .errors import JammingError, ReplayError, SimulationError
 from .model import Array
 from .problem import Problem
-from .report import ContactMargin, PhaseReport, Report
+from .report import Report
 from .selfcheck import PIECES, divide_pieces, pick_times
 from .torquetable import ERROR, place_rows, read_rows, sample_rows
 from .trajectory import Trajectory
-from .verdict import Allowance
+from .verdict import Allowance, find_least_force
 from .verify import inspect
 
 FINER = 8.0
@@ -134,14 +133,8 @@ def _compare_phase(trajectory: Trajectory, index: int, report: Report) -> dict[s
     }
     if index < len(report.phases):
         phase = report.phases[index]
-        least = _find_least(phase)
+        least = find_least_force(phase)
         found["arrival"] = phase.arrival
         if least is not None:
             found |= {"least_c_n": least.least, "contact": least.contact}
     return found
-
-
-def _find_least(phase: PhaseReport) -> ContactMargin | None:
-    """The contact with the least normal force; None if nothing moved."""
-    known = [margin for margin in phase.contacts if not math.isnan(margin.least)]
-    return min(known, key=lambda margin: margin.least, default=None)

@@ -15,7 +15,7 @@ from .links import FINGERS_TOUCH
 from .margins import SHORTEST
 from .model import Array, Scene, require_number
 from .problem import End, Problem
-from .report import Deviation, Failure, FingerGap, PhaseReport
+from .report import ContactMargin, Deviation, Failure, FingerGap, PhaseReport
 from .simulation.events import EventKind, OutcomeKind, Simulation
 
 DEPARTURE = 1e-3
@@ -190,3 +190,22 @@ def describe_thin(
         and (phase.number, c.contact) not in lost
         and abs(c.time - let_go.get((phase.number, c.contact), math.inf)) > shortest
     ]
+
+
+def find_least_force(phase: PhaseReport) -> ContactMargin | None:
+    """The contact with the least normal force in a phase; None if nothing moved.
+
+    Contacts that are let go count until just before.
+    """
+    released = phase.until.startswith("release of ") and phase.arrival is not None
+    known = [
+        margin
+        for margin in phase.contacts
+        if not math.isnan(margin.least)
+        and not (
+            released
+            and margin.contact in phase.until
+            and abs(margin.time - (phase.arrival or 0.0)) <= SHORTEST
+        )
+    ]
+    return min(known, key=lambda margin: margin.least, default=None)
