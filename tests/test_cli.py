@@ -292,9 +292,9 @@ BAD_PROBLEMS: dict[str, tuple[Edit, str, str]] = {
     ),
     "start out of reach": (put("start", "x", 0.5), "start", "finger 1 is too short to reach"),
     "three contacts": (
-        put("phases", 0, "contacts", ["v0-palm", "v1-palm", "v3-finger1"]),
+        put("phases", 0, "contacts", ["v0-palm", "v1-palm", "v4-finger1"]),
         "phases[1].contacts",
-        "v0-palm v1-palm v3-finger1 given, but the closed fingers touch",
+        "v0-palm v1-palm v4-finger1 given, but the closed fingers touch",
     ),
 }
 

@@ -66,7 +66,7 @@ def build(
 
 
 def call(nlp: TimeNLP, part: str, x: Array) -> Array:
-    values: Any = nlp.solver.get_function(part)(x, [])
+    values: Any = nlp.solver.function.get_function(part)(x, [])
     return np.asarray(values.full()[:, 0])
 
 
@@ -262,8 +262,8 @@ def test_derivatives_of_the_whole_are_its_differences() -> None:
     rng = np.random.default_rng(4)
     x = packed(nlp, [first, second], 0.1)
     step = rng.normal(size=len(x))
-    jacobian: Any = nlp.solver.get_function("nlp_jac_g")
-    hessian: Any = nlp.solver.get_function("nlp_hess_l")
+    jacobian: Any = nlp.solver.function.get_function("nlp_jac_g")
+    hessian: Any = nlp.solver.function.get_function("nlp_hess_l")
     lam = rng.normal(size=len(nlp.rows.bounds[0]))
 
     def slope(x: Array) -> Any:
