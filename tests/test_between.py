@@ -11,7 +11,7 @@ from plane import finger_gap, make_formation, measure_gaps
 from thrown import heave
 from timed import instants, landing, plan_landing, stages_of
 from wholearm.links import FINGERS_TOUCH
-from wholearm.options import PlanOptions
+from wholearm.options import CLEARANCE, PlanOptions
 from wholearm.plan import solve
 from wholearm.timedomain.between import (
     GRAZE,
@@ -26,7 +26,6 @@ from wholearm.timedomain.ownunits import to_si
 from wholearm.timedomain.stage import Stage
 from wholearm.timedomain.staging import outline_stages
 from wholearm.timedomain.timemotion import StageMotion, TimeMotion, make_motions
-from wholearm.timedomain.timenlp import CLEAR
 from wholearm.timedomain.timeplan import plan_phases
 from wholearm.timedomain.timesearch import Search
 from wholearm.trajectory import Trajectory
@@ -121,7 +120,7 @@ def test_released_contacts_have_to_be_clear_in_the_second_half() -> None:
     reverse = replace(motion, points=back)
     misses = look(as_stage(reverse, **fields), reverse, EPSILON).gap[:, 0]
     end = measure_gaps(gaps, reverse.evaluate(np.array([motion.duration])).z[0])[0]
-    assert misses[-1] == pytest.approx(CLEAR / 2 - end, abs=1e-7)
+    assert misses[-1] == pytest.approx(CLEARANCE / 2 - end, abs=1e-7)
     assert misses[0] == 0.0
 
 

@@ -15,7 +15,7 @@ from wholearm.curve import Curve, metric_weights, tangent_basis
 from wholearm.dynamics import Directions
 from wholearm.formation import Formation
 from wholearm.model import Array
-from wholearm.options import Objective
+from wholearm.options import CLEARANCE, OPENING, Objective
 from wholearm.outline import load
 from wholearm.path import trace_phases
 from wholearm.timedomain.between import Limits, raise_bounds
@@ -23,8 +23,6 @@ from wholearm.timedomain.collocation import Scheme, make_scheme
 from wholearm.timedomain.stage import Stage, StagePoints
 from wholearm.timedomain.timelayout import MARGIN, V, pack
 from wholearm.timedomain.timenlp import (
-    CLEAR,
-    OPENING,
     SHORTEST,
     SLIDING,
     TimeNLP,
@@ -343,7 +341,7 @@ def test_released_contacts_open_and_stay_clear(name: str) -> None:
     low, _ = nlp.rows.bounds
     rows = nlp.rows_of[0].watches
     later = opens.guess.places(scheme.points) > 1 / 3
-    np.testing.assert_allclose(low[rows[..., 0]], np.where(later, CLEAR, 0.0))
+    np.testing.assert_allclose(low[rows[..., 0]], np.where(later, CLEARANCE, 0.0))
     values = call(nlp, "nlp_g", packed(nlp, [opens]))[rows[..., 0]]
     gaps = make_formation(formation.scene, "v0-finger2")
     expected = [measure_gaps(gaps, z)[0] for z in stage.guess.z.reshape(-1, 5)]

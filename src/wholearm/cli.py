@@ -91,6 +91,14 @@ def build_parser() -> argparse.ArgumentParser:
     solve.add_argument("--time-weight", type=float, help="weight of time [(N m)^2], for effort")
     solve.add_argument("--samples", type=int, help="rows per phase of the trajectory file")
     solve.add_argument("--transcription", help="auto, or time for the time domain throughout")
+    solve.add_argument(
+        "--opening", type=float, help="least acceleration of contacts that are let go, over gravity"
+    )
+    solve.add_argument(
+        "--clearance",
+        type=float,
+        help="least gap of contacts that were let go, over the radius of gyration",
+    )
     solve.add_argument("--time-intervals", type=int, help="intervals of a phase in the time domain")
     solve.add_argument("--degree", type=int, help="collocation points of an interval there")
     solve.add_argument("--scheme", help="radau (the default) or legendre points")

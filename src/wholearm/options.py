@@ -29,6 +29,11 @@ CHOICES = tuple(
 )
 """Objectives that a user can ask for."""
 
+OPENING = 0.01
+"""Least acceleration of a gap that opens, over gravity."""
+CLEARANCE = 5e-4
+"""Least gap of a contact that has been let go, over the radius of gyration."""
+
 
 @dataclass(frozen=True)
 class PlanOptions:
@@ -49,6 +54,12 @@ class PlanOptions:
     transcription : str
         ``"auto"`` plans phases with one freedom that are joined at rest or by impacts along their
         curves and others in the time domain; ``"time"`` plans all in the time domain.
+    opening : float
+        Least acceleration, over gravity, with which the gap of a contact that a smooth phase lets
+        go opens in the time domain.
+    clearance : float
+        What that gap is at least, over the object's radius of gyration, from a third of the first
+        stage without the contact on.
     time_intervals : int, optional
         Intervals of each phase in the time domain, at least 4; when left out, 32 for a phase with
         one freedom that is planned alone and 16 for others.
@@ -72,6 +83,8 @@ class PlanOptions:
     samples: int = 201
     transcription: str = "auto"
     time_intervals: int | None = None
+    opening: float = OPENING
+    clearance: float = CLEARANCE
     degree: int = 3
     scheme: str = "radau"
     replay: bool = True
@@ -97,6 +110,9 @@ class PlanOptions:
             raise InputError("", "transcription", f"{given!r} given; allowed are auto and time")
         if not isinstance(self.replay, bool):
             raise InputError("", "replay", f"{self.replay!r} given; allowed are true and false")
+        for key in ("opening", "clearance"):
+            value = require_number(getattr(self, key), key, nonnegative=True)
+            object.__setattr__(self, key, value)
         weight = require_number(self.time_weight, "time_weight", positive=True)
         object.__setattr__(self, "time_weight", weight)
         if self.duration is not None:

@@ -14,7 +14,7 @@ from ..model import Array
 from ..trajectory import Samples
 from .stage import Stage
 from .timemotion import StageMotion
-from .timenlp import CLEAR, TimeNLP
+from .timenlp import TimeNLP
 
 MISS = 2.5e-7
 """Largest miss of a force limit between points, over the weight of the object."""
@@ -93,7 +93,7 @@ def find_misses(stage: Stage, look: Look, epsilon: float, margin: float = 0.0) -
     """
     samples = look.samples
     grip = slip_margins(stage.formation, samples.c_n - epsilon, samples.c_t)
-    clear = CLEAR / 2 * np.isin(stage.watched, stage.released)
+    clear = stage.clearance / 2 * np.isin(stage.watched, stage.released)
     later = (not stage.opens) | (look.places > 1 / 2)
     tables = (
         samples.c_n - (epsilon + margin),

@@ -10,6 +10,7 @@ import numpy as np
 from ..dynamics import Directions
 from ..formation import Formation
 from ..model import Array
+from ..options import CLEARANCE, OPENING
 from ..problem import Until
 
 
@@ -81,6 +82,10 @@ class Stage:
         Limits of the contacts that were let go where the phase began.
     opens : bool
         Whether they are let go at the start of this stage.
+    opening : float
+        Least acceleration with which the gaps of contacts that are let go open, over gravity.
+    clearance : float
+        What these gaps are at least after a third of the first stage, over the radius of gyration.
     adapts : float
         What it costs to change the duration of an interval; nothing if they keep their shares.
     """
@@ -96,6 +101,8 @@ class Stage:
     watched: tuple[int, ...] = ()
     released: tuple[int, ...] = ()
     opens: bool = False
+    opening: float = OPENING
+    clearance: float = CLEARANCE
     adapts: float = 0.0
 
     @property

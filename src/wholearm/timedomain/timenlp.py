@@ -55,11 +55,6 @@ from .timelayout import MARGIN, StageLayout, V, Z, lay_out
 from .timelimits import Give, LimitRows, add_limits
 from .timerows import Rows
 
-OPENING = 0.01
-"""Least acceleration with which the gap of a released contact opens, over gravity."""
-CLEAR = 5e-4
-"""Gap of a released contact after a third of the first stage without it at least, over the radius
-of gyration."""
 SLIDING = 3e-4
 """Least sliding, over the radius of gyration, and least speed of a joint, in the scene's unit of
 time: what does not move at all would have no sense."""
@@ -231,7 +226,7 @@ def _add_stage(
     gained = [formation.limits[k].gained for k in stage.released]
     for contact in [c for c in gained if c is not None and stage.opens]:
         columns = [layout.z[0], layout.v[0], layout.a[0]]
-        own = rows.nonlinear(scheme.degree, 1, low=OPENING, high=np.inf)
+        own = rows.nonlinear(scheme.degree, 1, low=stage.opening, high=np.inf)
         rows.repeat(opening_kernel(formation, contact), np.hstack(columns), own)
     goal = goal_kernel(formation, stage.until, stage.turns, stage.gained)
     if goal is not None:
@@ -331,7 +326,7 @@ def _watch(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Ind
         return np.zeros((K, d, 0), dtype=np.int64)
     released = np.isin(stage.watched, stage.released)
     later = (not stage.opens) | (stage.guess.places(scheme.points)[..., None] > 1 / 3)
-    low = CLEAR * (later & released)
+    low = stage.clearance * (later & released)
     goal = None if stage.until is None else stage.until.contact
     reached = [goal is not None and formation.limits[k].gained == goal for k in stage.watched]
     if scheme.ends:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -77,7 +78,9 @@ def plan_phases(
 
     def outline(times: int, pace: float, onwards: bool = False) -> list[Stage]:
         count = math.ceil(wanted / 2**times)
-        return outline_stages(problem, phases, z, search.scheme, count, pace, onwards)
+        stages = outline_stages(problem, phases, z, search.scheme, count, pace, onwards)
+        opening, clearance = options.opening, options.clearance
+        return [replace(stage, opening=opening, clearance=clearance) for stage in stages]
 
     first = outline(halvings, _PACES[0])
     solution = _solve(search, first, halvings)
