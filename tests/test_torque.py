@@ -148,3 +148,10 @@ def test_chain_puts_profiles_one_after_the_other() -> None:
     # Shifting the times costs rounding only.
     np.testing.assert_allclose(both.at(1.0 + t), two.at(t), atol=1e-14)
     np.testing.assert_array_equal(both.at(np.array([0.7])), [[1.0, 2.0]])
+
+
+def test_numbers_that_overflow_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "torques.csv"
+    path.write_text("t,tau1,tau2\n0,0,0\n1,-1e308,0\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"tau1: -1e308 on line 3 given; allowed are -1e\+30"):
+        read_torque_csv(str(path))

@@ -300,3 +300,15 @@ def test_meta_that_is_not_json_is_named(tmp_path: Path, trajectory: Trajectory, 
     np.savez(path, **arrays | {"meta": np.array(text)})
     with pytest.raises(InputError, match=r"plan\.npz: meta: is n"):
         load_trajectory(path)
+
+
+@pytest.mark.parametrize("name", ["q", "c_n", "torque_coefficients"])
+def test_numbers_that_overflow_are_named(tmp_path: Path, trajectory: Trajectory, name: str) -> None:
+    path = tmp_path / "plan.npz"
+    trajectory.save(path)
+    with np.load(path) as data:
+        arrays = {key: data[key] for key in data.files}
+    arrays[name].flat[0] = -1e308
+    np.savez(path, **arrays)
+    with pytest.raises(InputError, match=rf"plan\.npz: {name}: holds numbers beyond 1e\+30"):
+        load_trajectory(path)

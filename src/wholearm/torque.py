@@ -13,6 +13,8 @@ from .errors import InputError
 from .model import Array
 
 COLUMNS = ("t", "tau1", "tau2")
+MOST = 1e30
+"""Largest number in a file of torques or of a trajectory: its square and cube are still numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,5 +153,8 @@ def _read_row(path: str, line: int, row: list[str], where: list[int]) -> list[fl
             value = math.nan
         if not math.isfinite(value):
             raise InputError(str(path), column, f"{text!r} on line {line} is not a finite number")
+        if abs(value) > MOST:
+            problem = f"{text} on line {line} given; allowed are -{MOST:g} to {MOST:g}"
+            raise InputError(str(path), column, problem)
         values.append(value)
     return values

@@ -15,7 +15,7 @@ from .archive import read_arrays
 from .errors import InputError
 from .files import write_text, write_whole
 from .model import Array
-from .torque import TorqueProfile
+from .torque import MOST, TorqueProfile
 from .torquetable import format_rows, place_rows
 
 
@@ -330,6 +330,8 @@ def _check_shape(source: str, name: str, arrays: Mapping[str, Any], tail: tuple[
         raise InputError(source, name, f"holds {array.dtype}; numbers are needed")
     elif np.isinf(array).any() or (name not in ("c_n", "c_t") and np.isnan(array).any()):
         raise InputError(source, name, "holds numbers that are not finite")
+    elif (np.abs(array.astype(float)) > MOST).any():
+        raise InputError(source, name, f"holds numbers beyond {MOST:g}, the largest allowed")
 
 
 def _check_order(source: str, arrays: Mapping[str, Any]) -> None:

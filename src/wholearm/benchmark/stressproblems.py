@@ -25,13 +25,17 @@ SPREAD = 0.1
 
 
 def list_trials(paths: list[str]) -> list[tuple[str, str, str, int]]:
-    """Every (problem file, objective, what is done, number) of this part of the study."""
+    """Every (problem file, objective, what is done, number) of this part of the study.
+
+    All problems come once before any comes again.
+    """
     return [
         (path, objective, what, number)
+        for number in range(max(SEEDS, CHANGES))
+        for what, count in (("noise", SEEDS), ("change", CHANGES))
+        if number < count
         for path in paths
         for objective in ("time", "effort", "margin")
-        for what, count in (("noise", SEEDS), ("change", CHANGES))
-        for number in range(count)
     ]
 
 
