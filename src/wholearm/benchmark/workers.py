@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 MEMORY = 6 * 2**30
 """Address space that a worker may take [byte]: a claim beyond it fails instead of swapping."""
 
-PATIENCE = 4.0
+PATIENCE = 20.0
 """Wall-clock time that a task may take over its bound of processor time: others may run too."""
 _CPU = getattr(signal, "SIGXCPU", 24)
 """Signal that ends a process whose processor time is used up."""
