@@ -102,6 +102,10 @@ def test_a_journal_goes_on_after_half_a_line(tmp_path: Path) -> None:
     again = Journal(path, stamp)
     again.add({"scene": [2, "time"]})
     assert [r["scene"][0] for r in Journal(path, stamp).records] == [0, 2]
+    again.add({"scene": [3, "time"], "findings": [["hang", ""]]})
+    again.add({"scene": [4, "time"], "findings": []})
+    kept = Journal(path, stamp, again=True).records
+    assert [record["scene"][0] for record in kept] == [0, 2, 4]
     assert Journal(path, {"seed": 2}).records == []
 
 

@@ -41,6 +41,7 @@ def add_bench(bench: argparse.ArgumentParser, progress: Callable[[], object]) ->
     stress.add_argument("--jobs", type=int, help="worker processes (default: all cores)")
     words = "start anew instead of going on with the records in the folder"
     stress.add_argument("--fresh", action="store_true", help=words)
+    stress.add_argument("--again", action="store_true", help="run again what had findings")
     stress.add_argument("-o", "--output", default="results", help="folder for records and table")
     stress.set_defaults(run=lambda options: _stress(options, progress))
 
@@ -69,6 +70,7 @@ def _stress(options: argparse.Namespace, progress: Callable[[], object]) -> int:
         only=options.only,
         jobs=(os.cpu_count() or 1) if options.jobs is None else options.jobs,
         fresh=options.fresh,
+        again=options.again,
     )
     for path in chosen.problems:
         load(path)

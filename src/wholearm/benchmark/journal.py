@@ -20,6 +20,8 @@ class Journal:
         What the records belong to; those of another stamp are dropped.
     fresh : bool
         Drop all records that are there.
+    again : bool
+        Drop those with findings, so that their tasks are run again.
 
     Raises
     ------
@@ -27,9 +29,13 @@ class Journal:
         If the file cannot be written.
     """
 
-    def __init__(self, path: str, stamp: dict[str, Any], fresh: bool = False) -> None:
+    def __init__(
+        self, path: str, stamp: dict[str, Any], fresh: bool = False, again: bool = False
+    ) -> None:
         self.path = path
         self.records: list[dict[str, Any]] = [] if fresh else _read(path, stamp)
+        if again:
+            self.records = [record for record in self.records if not record.get("findings")]
         try:
             # Written anew, so that what an interrupt left of a last line is gone.
             with open(f"{path}.part", "w", encoding="utf-8") as stream:

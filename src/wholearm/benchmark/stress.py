@@ -41,6 +41,8 @@ class StressOptions:
         Worker processes.
     fresh : bool
         Begin anew, instead of going on with the records in the folder.
+    again : bool
+        Run again what had findings.
 
     Raises
     ------
@@ -55,6 +57,7 @@ class StressOptions:
     only: int | None = None
     jobs: int = 1
     fresh: bool = False
+    again: bool = False
 
     def __post_init__(self) -> None:
         for key, least in (("scenes", 0), ("files", 0), ("seed", 0), ("only", 0), ("jobs", 1)):
@@ -83,7 +86,7 @@ def run_stress(
         raise InputError(folder, "", f"cannot be made: {error.strerror}") from None
     stem = os.path.join(folder, "bench_stress")
     stamp = {"study": "stress", "seed": options.seed, "version": __version__}
-    journal = Journal(f"{stem}.jsonl", stamp, options.fresh)
+    journal = Journal(f"{stem}.jsonl", stamp, options.fresh, options.again)
     report = progress or (lambda _: None)
     _run_part(journal, "scene", run_scene, _scenes(options), SCENE_BOUND, options, report)
     _run_part(journal, "file", run_file, _files(options), FILE_BOUND, options, report)
