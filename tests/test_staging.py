@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -8,8 +9,10 @@ import pytest
 from plane import measure_gaps
 from thrown import lift
 from timed import landing
+from tipping import roll, tilting
 from wholearm.outline import outline_phase
 from wholearm.path import trace_phases
+from wholearm.problem import End, Until
 from wholearm.timedomain.collocation import make_scheme
 from wholearm.timedomain.modes import LEAST_INTERVALS
 from wholearm.timedomain.ownunits import in_own_units
@@ -111,3 +114,17 @@ def test_joints_that_turn_after_a_release_have_stages_of_their_own() -> None:
     # The outline of one contact moves finger 2 on, that before turns it back.
     assert stages[1].turns == (2,)
     assert [stage.directions.sigma[1] for stage in stages] == [-1.0, -1.0, 1.0]
+
+
+def test_what_has_rolled_slides_the_way_of_its_own_outline() -> None:
+    sliding = tilting()
+    (phase,) = sliding.phases
+    before = replace(phase, formation=roll(phase.formation, "v1-palm"), until=Until())
+    phases = (replace(before, end=End.SMOOTH), replace(phase, index=1))
+    problem = replace(sliding, phases=phases)
+    stages = outline_stages(problem, phases, problem.start, SCHEME, 6, 2.0)
+    assert [stage.phase for stage in stages] == [0, 1]
+    # A direction of zero would leave it without friction.
+    assert np.abs(stages[1].directions.Xi).min() == 1.0
+    alone = outline_stages(sliding, sliding.phases, sliding.start, SCHEME, 6, 2.0)
+    np.testing.assert_array_equal(stages[1].directions.Xi, alone[0].directions.Xi)

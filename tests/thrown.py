@@ -56,6 +56,17 @@ def lift(turn: float = 0.02) -> tuple[Problem, float]:
     return Problem("lift", scene, 0.05, start, phases), _rising_time(0.4, 0.4 + turn, False)
 
 
+def raised(stop: float = 0.5) -> Problem:
+    """Both fingers turn the square over vertex 0 to `stop` [rad], from rest to rest.
+
+    The vertex slides without friction, so that either finger may go either way.
+    """
+    scene = _with_palm(0.02, 0.0)
+    start = _close(scene, _tip(scene, 0.3), 0.0)
+    phase = Phase(0, Formation(scene, find_touching(scene, start)), Until(None, "phi", stop))
+    return Problem("raise", scene, 0.05, start, (phase,))
+
+
 def _with_palm(fingers: float, palm: float) -> Scene:
     scene = make_scene()
     return Scene(scene.polygon, scene.fingers, Friction(palm, fingers, fingers), scene.gravity)

@@ -39,6 +39,15 @@ def tip() -> Curve:
     return trace_phases(box())[1]
 
 
+@lru_cache(maxsize=1)
+def tilting() -> Problem:
+    """That phase alone, in which the vertex may slide as well."""
+    problem = box()
+    formation = replace(problem.phases[1].formation, rolling=())
+    phase = Phase(0, formation, problem.phases[1].until)
+    return replace(problem, start=trace_phases(problem)[0].end, phases=(phase,))
+
+
 def roll(formation: Formation, *names: str) -> Formation:
     """The formation with some of its contacts rolling."""
     rolling = tuple(contact for contact in formation.contacts if contact.name in names)

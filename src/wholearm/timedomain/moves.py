@@ -22,6 +22,8 @@ from .timenlp import SHORTEST, least_rates
 
 _STALLED = 1e-6
 """Rate over the largest one at which a direction of friction counts as held back."""
+_SLOW = 1e-2
+"""Rate over the largest one below which what is held back stays in all of an interval."""
 _LEANS = 1e-4
 """Margin to the friction cone over mu c_n at which a rolling contact counts as leaning on it."""
 _GONE = 2.0
@@ -148,7 +150,11 @@ def _change(
 
 
 def _find_held(stage: Stage, scheme: Scheme) -> list[Run]:
-    """Stretches over which a least rate holds something back."""
+    """Stretches over which a least rate holds something back.
+
+    A polynomial that is held back touches the least rate at few points of an interval, so whole
+    intervals count that touch it and are slow throughout.
+    """
     formation, part = stage.formation, stage.guess
     z, v = part.z.reshape(-1, 5), part.v.reshape(-1, 5)
     slip = np.einsum("nij,nj->ni", formation.evaluate(z, v).A_t, v)
@@ -156,8 +162,11 @@ def _find_held(stage: Stage, scheme: Scheme) -> list[Run]:
     senses = rates * np.concatenate(stage.directions)
     fast = np.abs(v[:, 2:]).max()
     least = 1.01 * least_rates(stage, scheme).reshape(-1, 1)
-    held = senses < least + _STALLED * fast
-    held &= (np.abs(senses).max(axis=1) > 1e-3 * fast)[:, None]
+    touches = senses < least + _STALLED * fast
+    touches &= (np.abs(senses).max(axis=1) > 1e-3 * fast)[:, None]
+    shape = (stage.intervals, scheme.degree, -1)
+    slow = (senses < least + _SLOW * fast).reshape(shape).all(axis=1)
+    held = np.repeat(slow & touches.reshape(shape).any(axis=1), scheme.degree, axis=0)
     held[:, list(formation.rolling_rows)] = False
     return _find_runs(held, stage, scheme, np.zeros(held.shape[1]))
 

@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+import wholearm.timedomain.timeplan as timeplan
+from plane import measure_slip
+from thrown import raised
+from timed import instants
+from tipping import tilting
+from wholearm.dynamics import Directions
+from wholearm.options import PlanOptions
+from wholearm.problem import Problem
+from wholearm.timedomain.modes import in_mode, link, mode_of, sign_sequence, split
+from wholearm.timedomain.modesearch import WORTH, improve
+from wholearm.timedomain.stage import Stage
+from wholearm.timedomain.staging import outline_stages
+from wholearm.timedomain.timeplan import plan_phases
+from wholearm.timedomain.timesearch import Search
+
+OPTIONS = PlanOptions(time_intervals=10)
+
+
+def outlined(problem: Problem, count: int = 10) -> tuple[Search, list[Stage]]:
+    search = Search.of(problem, OPTIONS)
+    start = problem.start
+    return search, outline_stages(problem, problem.phases, start, search.scheme, count, 2.0)
+
+
+def turn_joint(stages: list[Stage], joint: int) -> list[Stage]:
+    """The same stages with a joint that turns the other way."""
+    turned = []
+    for stage in stages:
+        sigma = stage.directions.sigma.copy()
+        sigma[joint] *= -1
+        turned.append(replace(stage, directions=Directions(stage.directions.Xi, sigma)))
+    return link(turned)
+
+
+def test_a_joint_that_is_guessed_the_wrong_way_is_corrected() -> None:
+    search, stages = outlined(raised())
+    right = improve(search, search.solve(stages))
+    wrong = search.solve(turn_joint(stages, 1))
+    assert right.success and wrong.success
+    corrected = improve(search, wrong)
+    assert corrected.cost < 0.9 * wrong.cost
+    # Whichever way was guessed, what is found is the same.
+    assert corrected.cost == pytest.approx(right.cost, rel=WORTH)
+    assert sign_sequence(corrected.stages) == sign_sequence(right.stages)
+
+
+def test_plans_are_the_same_whichever_way_a_joint_is_guessed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem = raised()
+
+    def guess_wrong(*given: object, **named: object) -> list[Stage]:
+        return turn_joint(outline_stages(*given, **named), 1)  # type: ignore[arg-type]
+
+    (right,) = plan_phases(problem, problem.phases, problem.start, OPTIONS)
+    monkeypatch.setattr(timeplan, "outline_stages", guess_wrong)
+    (plan,) = plan_phases(problem, problem.phases, problem.start, OPTIONS)
+    assert plan.sequences > 1
+    assert plan.motion.duration == pytest.approx(right.motion.duration, rel=1e-3)
+    for stage in plan.motion.stages:
+        samples = stage.evaluate(instants(stage, 12))
+        states = zip(samples.z, samples.z_dot, strict=True)
+        slip = np.array([measure_slip(stage.formation, z, v) for z, v in states])
+        joints = samples.z_dot[:, 3:]
+        assert (slip * stage.directions.Xi).min() > -1e-4 * np.abs(slip).max()
+        assert (joints * stage.directions.sigma).min() > -1e-4 * np.abs(joints).max()
+
+
+def test_rolling_for_a_while_is_found_where_it_is_the_best_of_all_sequences() -> None:
+    # The box turns over one vertex one way, so that only its own mode is in question.
+    search, (stage,) = outlined(tilting(), 6)
+    modes = [mode_of(stage).changed((0,), sign) for sign in (-1.0, 0.0, 1.0)]
+    guesses = [[in_mode(stage, mode)] for mode in modes]
+    for first, second in permutations(modes, 2):
+        guesses.append(split(in_mode(stage, first), search.scheme, 3, 6, second))
+    solutions = [search.solve(link(guess), most=60) for guess in guesses]
+    feasible = [solution for solution in solutions if solution.success]
+    # Sliding throughout and rolling throughout are possible; doing both in turn is quicker.
+    assert {1, 2} == {len(solution.stages) for solution in feasible}
+    best = min(feasible, key=lambda solution: solution.cost)
+    palm = [mode_of(part).signs[0] for part in best.stages]
+    assert len(palm) == 2 and 0.0 in palm
+    found = improve(search, search.solve([stage]))
+    assert [mode_of(part).signs[0] for part in found.stages] == palm
+    # Their intervals differ, which is worth half a percent here.
+    assert found.cost == pytest.approx(best.cost, rel=1e-2)
+    # It rolls for a while, and leans on its cone less epsilon at most.
+    rolling = found.stages[palm.index(0.0)]
+    assert rolling.guess.duration > 0.1 * found.cost
+    c_n, c_t = rolling.guess.forces[..., 0], rolling.guess.forces[..., -1]
+    mu = rolling.formation.friction[0]
+    assert (mu * (c_n - search.problem.epsilon) - np.abs(c_t)).min() > -1e-6
