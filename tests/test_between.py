@@ -10,6 +10,7 @@ from crossing import make_way, measure_fingers
 from plane import finger_gap, make_formation, measure_gaps
 from thrown import heave
 from timed import instants, landing, plan_landing, stages_of
+from wholearm.dynamics import Directions
 from wholearm.links import FINGERS_TOUCH
 from wholearm.options import CLEARANCE, PlanOptions
 from wholearm.plan import solve
@@ -19,6 +20,7 @@ from wholearm.timedomain.between import (
     Limits,
     find_misses,
     look_between,
+    raise_bounds,
     watch_missed,
 )
 from wholearm.timedomain.collocation import make_scheme
@@ -26,8 +28,9 @@ from wholearm.timedomain.ownunits import to_si
 from wholearm.timedomain.stage import Stage
 from wholearm.timedomain.staging import outline_stages
 from wholearm.timedomain.timemotion import StageMotion, TimeMotion, make_motions
+from wholearm.timedomain.timenlp import bound_unknowns
 from wholearm.timedomain.timeplan import plan_phases
-from wholearm.timedomain.timesearch import Search
+from wholearm.timedomain.timesearch import Search, Solution
 from wholearm.trajectory import Trajectory
 
 EPSILON = 0.05
@@ -128,7 +131,7 @@ def test_limits_rise_by_more_than_they_are_missed() -> None:
     motion = heaved()
     stage = as_stage(motion, watched=(0, 1))
     plain = Limits.none(stage)
-    assert [table.shape[1] for table in plain] == [2, 1, 2] and plain.worst == 0.0
+    assert [table.shape[1] for table in plain] == [2, 1, 2, 4] and plain.worst == 0.0
     missed = Limits(*(table + k * 1e-3 for k, table in enumerate(plain)))
     raised = missed.raised(missed)
     for before, after in zip(missed, raised, strict=True):
@@ -153,6 +156,54 @@ def test_tightening_holds_limits_that_points_alone_do_not() -> None:
     assert worst[0] > 100 * allowed and worst[1] < 2 * allowed
     # Limits cost little, about as much as halved intervals gain.
     assert held.cost == pytest.approx(loose.cost, rel=0.03)
+
+
+@lru_cache(maxsize=1)
+def solve_at_points() -> Solution:
+    """The heptagon's landing on few intervals, with limits at the points alone."""
+    problem = landing()
+    start = plan_landing(time_intervals=6)[0].motion.stages[0].points.nodes[0, 0]
+    stages = outline_stages(problem, problem.phases[4:], start, SCHEME, 6, 2.0)
+    solution = Search.of(problem, PlanOptions()).solve(stages)
+    assert solution.success
+    return solution
+
+
+def test_rates_against_the_directions_of_a_stage_are_missed() -> None:
+    solution = solve_at_points()
+    motions = make_motions(solution.stages, SCHEME)
+    for stage, motion in zip(solution.stages, motions, strict=True):
+        seen, formation = look_between(stage, motion), stage.formation
+        z, v = seen.samples.z, seen.samples.z_dot
+        slip = np.einsum("nij,nj->ni", formation.evaluate(z, v).A_t, v)
+        rates = np.hstack([slip / formation.scene.scales.length, v[:, 3:]])
+        senses = rates * np.concatenate(stage.directions)
+        # With every direction turned round, each rate is missed by what it is.
+        turned = Directions(-stage.directions.Xi, -stage.directions.sigma)
+        missed = find_misses(replace(stage, directions=turned), seen, EPSILON).sense
+        largest = senses.reshape(stage.intervals, -1, senses.shape[1]).max(axis=1)
+        np.testing.assert_allclose(missed, largest.clip(0.0), atol=2e-3 * senses.max())
+
+
+def test_raised_rates_are_bounds_of_contacts_and_joints() -> None:
+    solution = solve_at_points()
+    stages, nlp = solution.stages, solution.nlp
+    k = next(i for i, stage in enumerate(stages) if stage.formation.n_constraints < 4)
+    tables = []
+    for rise in (0.0, 0.5):
+        limits = [Limits.none(stage) for stage in stages]
+        limits[k].sense[:] = rise
+        bounds = bound_unknowns(nlp, stages, SCHEME)
+        tables.append((*bounds, raise_bounds(nlp, stages, limits, EPSILON, bounds)[0]))
+    (low, high, rows), (low_up, high_up, rows_up) = tables
+    own = nlp.rows_of[k].points[:, :, -stages[k].formation.n_contacts :]
+    known = np.isfinite(rows[own])
+    assert known.sum() > 10
+    np.testing.assert_allclose(rows_up[own][known] - rows[own][known], 0.5)
+    for joint, sigma in enumerate(stages[k].directions.sigma):
+        column = nlp.layouts[k].v[:-1, :, 3 + joint]
+        plain, raised = (low, low_up) if sigma > 0 else (-high, -high_up)
+        np.testing.assert_allclose(raised[column] - plain[column], 0.5)
 
 
 @lru_cache(maxsize=1)

@@ -187,9 +187,9 @@ def test_progress_tells_what_is_planned(problem: Problem) -> None:
     assert told == [
         "tracing the phases",
         "phase 1-2-3-4-5 of 5: time",
+        "replaying the plan",
         "phase 1: what its impact saves",
         "phase 2: what its impact saves",
-        "sampling",
     ]
 
 

@@ -122,7 +122,7 @@ def test_a_slippery_palm_is_named() -> None:
 @pytest.mark.parametrize("mu, epsilon", [(0.5, 1.0), (0.8, 0.7)])
 def test_an_epsilon_that_cones_allow_is_advised(mu: float, epsilon: float) -> None:
     """Rolling contacts need c_n >= epsilon and a cone that is narrower by mu epsilon."""
-    options = PlanOptions(intervals=20)
+    options = PlanOptions(intervals=60)
     with pytest.raises(InfeasibleError) as caught:
         plan_path(tip_on(mu), epsilon, options, 2)
     _, found, advised = str(caught.value).rpartition("epsilon = ")

@@ -118,7 +118,7 @@ def test_a_known_motion_keeps_the_limits(name: str, degree: int) -> None:
     nlp = build([stage], scheme)
     x = packed(nlp, [stage])
     low_x, high_x = bound_unknowns(nlp, [stage], scheme)
-    low, _ = raise_bounds(nlp, [stage], [Limits.none(stage)], 0.05, low_x)
+    low, _ = raise_bounds(nlp, [stage], [Limits.none(stage)], 0.05, (low_x, high_x))
     nlp.rows.bounds[0][:] = low
     _, inequalities = misses(nlp, x)
     # Slip and joint speeds start from nothing.
@@ -154,11 +154,11 @@ def test_raised_limits_are_missed_by_as_much(name: str) -> None:
     scheme, stage = make_scheme(name, 3), driven(name, 3, 8)
     nlp = build([stage], scheme)
     x = packed(nlp, [stage])
-    low_x, _ = bound_unknowns(nlp, [stage], scheme)
+    low_x, high_x = bound_unknowns(nlp, [stage], scheme)
     limits = Limits.none(stage)
     least = stage.guess.forces[3, :, 1].min()
     limits.c_n[3, 1] = least + 0.25 - 0.05
-    low, _ = raise_bounds(nlp, [stage], [limits], 0.05, low_x)
+    low, _ = raise_bounds(nlp, [stage], [limits], 0.05, (low_x, high_x))
     pressed = nlp.rows_of[0].limits.presses[3, :, 1]
     values = call(nlp, "nlp_g", x)
     assert (low_x - x).max() == pytest.approx(0.25, abs=1e-12)
@@ -189,8 +189,8 @@ def test_what_is_made_least(objective: Objective) -> None:
 def test_the_margin_raises_what_forces_have_to_exceed(name: str) -> None:
     scheme, stage = make_scheme(name, 3), driven(name, 3, 8)
     nlp = build([stage], scheme, Objective.MARGIN)
-    low_x, _ = bound_unknowns(nlp, [stage], scheme)
-    low, _ = raise_bounds(nlp, [stage], [Limits.none(stage)], 0.05, low_x)
+    low_x, high_x = bound_unknowns(nlp, [stage], scheme)
+    low, _ = raise_bounds(nlp, [stage], [Limits.none(stage)], 0.05, (low_x, high_x))
     assert not np.isfinite(low_x[nlp.layouts[0].forces]).any()
     # The polynomial through the points may pass a little below them at the ends of an interval.
     room = stage.guess.forces.min() - 0.05
@@ -310,8 +310,8 @@ def test_unknowns_are_bounded(scheme_name: str) -> None:
 def test_what_two_freedoms_leave_must_not_stand_still() -> None:
     scheme = make_scheme("radau", 3)
     one, two = driven("radau", 3, 8, 4), driven("radau", 3, 8, 3)
-    assert not least_rates(one, scheme).any()
-    rates = least_rates(two, scheme)
+    assert not least_rates(one, one.guess.places(scheme.points)).any()
+    rates = least_rates(two, two.guess.places(scheme.points))
     assert rates.max() == SLIDING and rates[-1, -1] == 0.0 and (rates.ravel()[:-1] > 0).all()
     # Even in time, from both ends.
     places = two.guess.places(scheme.points)

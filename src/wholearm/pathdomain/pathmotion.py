@@ -107,9 +107,11 @@ class PathMotion:
         run = local * (speed * _sinh_ratio(x) + a[k] * local * _cosh_ratio(x))
         run = np.clip(run, 0.0, h)
         part = run / h
+        # The speed as a function of time: that of the place would lose half its digits near rest.
+        speed = speed * (1 + x * _cosh_ratio(x)) + a[k] * local * _sinh_ratio(x)
         here = Profile(
             a[k] + slope * run,
-            np.maximum(b[k] + run * (2 * a[k] + slope * run), 0.0),
+            np.maximum(speed, 0.0) ** 2,
             squeeze[k] + part * (squeeze[k + 1] - squeeze[k]),
         )
         return self.grid.s[k] + run, self.grid.segment[k], here

@@ -14,12 +14,15 @@ from ..model import Array
 from ..trajectory import Samples
 from .stage import Stage
 from .timemotion import StageMotion
-from .timenlp import TimeNLP
+from .timenlp import SLIDING, TimeNLP, least_rates
 
 MISS = 2.5e-7
 """Largest miss of a force limit between points, over the weight of the object."""
 GRAZE = 3e-7
 """Deepest overlap between points, over the radius of gyration."""
+FALTER = 0.1
+"""How far a rate may fall below half of the least one between points, over the least one: what
+turned there for an instant might be held by friction in a replay."""
 LOOKS = 25
 """Places per interval at which limits are looked at."""
 _OVER = 1.5
@@ -34,17 +37,21 @@ class Limits(NamedTuple):
     c_n : ndarray, shape (K, n_c)
     cone : ndarray, shape (K, R)
     gap : ndarray, shape (K, n_watched)
+    sense : ndarray, shape (K, n_c + 2)
+        Of the rates of contacts and joints; nothing of rolling contacts.
     """
 
     c_n: Array
     cone: Array
     gap: Array
+    sense: Array
 
     @staticmethod
     def none(stage: Stage) -> Limits:
         """Nothing is raised."""
         formation = stage.formation
-        widths = (formation.n_contacts, formation.n_rolling, len(stage.watched))
+        n_c = formation.n_contacts
+        widths = (n_c, formation.n_rolling, len(stage.watched), n_c + 2)
         return Limits(*(np.zeros((stage.intervals, width)) for width in widths))
 
     def raised(self, misses: Limits) -> Limits:
@@ -54,7 +61,7 @@ class Limits(NamedTuple):
     @property
     def worst(self) -> float:
         """The largest, over what is allowed."""
-        allowed = (MISS, MISS, GRAZE)
+        allowed = (MISS, MISS, GRAZE, FALTER * SLIDING)
         return max(float(t.max(initial=0.0)) / a for t, a in zip(self, allowed, strict=True))
 
 
@@ -99,10 +106,21 @@ def find_misses(stage: Stage, look: Look, epsilon: float, margin: float = 0.0) -
         samples.c_n - (epsilon + margin),
         grip,
         look.limits[:, list(stage.watched)] - np.outer(later, clear),
+        _measure_senses(stage, samples) - 0.5 * least_rates(stage, look.places)[:, None],
     )
     shape = (stage.intervals, LOOKS)
     slack = (find_least(table.reshape(*shape, table.shape[1])) for table in tables)
     return Limits(*(np.maximum(-part, 0.0) for part in slack))
+
+
+def _measure_senses(stage: Stage, samples: Samples) -> Array:
+    """Rates in a stage's directions, shape (n, n_c + 2); those of rolling contacts are 1."""
+    formation, v = stage.formation, samples.z_dot
+    slip = np.einsum("nij,nj->ni", formation.evaluate(samples.z, v).A_t, v)
+    rates = np.hstack([slip / formation.scene.polygon.gyration_radius, v[:, 3:]])
+    senses = rates * np.concatenate(stage.directions)
+    senses[:, list(formation.rolling_rows)] = 1.0
+    return np.asarray(senses)
 
 
 def watch_missed(stages: Sequence[Stage], looks: Sequence[Look]) -> list[Stage] | None:
@@ -118,9 +136,13 @@ def watch_missed(stages: Sequence[Stage], looks: Sequence[Look]) -> list[Stage] 
 
 
 def raise_bounds(
-    nlp: TimeNLP, stages: Sequence[Stage], limits: Sequence[Limits], epsilon: float, low_x: Array
+    nlp: TimeNLP,
+    stages: Sequence[Stage],
+    limits: Sequence[Limits],
+    epsilon: float,
+    bounds: tuple[Array, Array],
 ) -> tuple[Array, Array]:
-    """Bounds of the NLP's rows; raises those of its unknowns in `low_x` in place.
+    """Bounds of the NLP's rows; raises `bounds`, those of its unknowns, in place.
 
     Parameters
     ----------
@@ -128,6 +150,7 @@ def raise_bounds(
         Least c_n.
     """
     low, high = nlp.rows.bounds
+    low_x, high_x = bounds
     for k, (stage, raised) in enumerate(zip(stages, limits, strict=True)):
         formation, own = stage.formation, nlp.rows_of[k]
         floor = epsilon + raised.c_n
@@ -139,4 +162,11 @@ def raise_bounds(
         cushion = hold_least(formation, epsilon)[formation.n_contacts :]
         low[own.limits.cones] = cushion + np.tile(raised.cone, 2)[:, None]
         low[own.watches] += raised.gap[:, None]
+        sliding = [i for i in range(formation.n_contacts) if i not in formation.rolling_rows]
+        senses = own.points[:, :, own.points.shape[2] - len(sliding) :]
+        low[senses] += raised.sense[:, None, sliding]
+        for joint, sigma in enumerate(stage.directions.sigma):
+            rates, more = nlp.layouts[k].v[..., 3 + joint], raised.sense[:, -2 + joint, None]
+            low_x[rates] += more * (sigma > 0)
+            high_x[rates] -= more * (sigma < 0)
     return low, high

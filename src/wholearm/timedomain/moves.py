@@ -161,7 +161,7 @@ def _find_held(stage: Stage, scheme: Scheme) -> list[Run]:
     rates = np.hstack([slip, v[:, 3:]])
     senses = rates * np.concatenate(stage.directions)
     fast = np.abs(v[:, 2:]).max()
-    least = 1.01 * least_rates(stage, scheme).reshape(-1, 1)
+    least = 1.01 * least_rates(stage, stage.guess.places(scheme.points)).reshape(-1, 1)
     touches = senses < least + _STALLED * fast
     touches &= (np.abs(senses).max(axis=1) > 1e-3 * fast)[:, None]
     shape = (stage.intervals, scheme.degree, -1)

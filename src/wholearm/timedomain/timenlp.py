@@ -285,7 +285,7 @@ def _balance(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last
     parameters = np.empty((*shape, n_c + 4))
     parameters[..., : n_c + 2] = signs
     parameters[..., n_c + 2] = scheme.points
-    parameters[..., n_c + 3] = least_rates(stage, scheme)
+    parameters[..., n_c + 3] = least_rates(stage, stage.guess.places(scheme.points))
     sliding = [k for k in range(n_c) if k not in formation.rolling_rows]
     still = find_still(stage, last) if scheme.ends else set()
     senses = kernel.outputs - len(sliding)
@@ -299,15 +299,14 @@ def _balance(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last
     return own
 
 
-def least_rates(stage: Stage, scheme: Scheme) -> Array:
-    """Least rate of each point, shape (K, d).
+def least_rates(stage: Stage, places: Array) -> Array:
+    """Least rate at `places`, shares of a stage's duration, in their shape.
 
     It is nothing where motion starts, stops or turns, and in a stage with one freedom: there all
     moves together, and friction cannot hold one contact alone.
     """
-    at = stage.guess.places(scheme.points)
     free = stage.formation.n_constraints < 4
-    return np.asarray(SLIDING * free * np.minimum(1.0, 8 * np.minimum(at, 1 - at)))
+    return np.asarray(SLIDING * free * np.minimum(1.0, 8 * np.minimum(places, 1 - places)))
 
 
 def find_still(stage: Stage, last: bool) -> set[int]:
@@ -364,7 +363,8 @@ def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tup
         low[layout.short] = 0.0
         low[layout.h] = SHORTEST
         still = find_still(stage, stage is stages[-1]) if scheme.ends else set()
-        rate, fastest = least_rates(stage, scheme), stage.formation.scene.speed_limit
+        rate = least_rates(stage, stage.guess.places(scheme.points))
+        fastest = stage.formation.scene.speed_limit
         for joint, sigma in enumerate(stage.directions.sigma):
             own = layout.v[..., 3 + joint]
             ends = np.zeros_like(own, dtype=bool)

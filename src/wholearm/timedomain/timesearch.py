@@ -165,7 +165,7 @@ class Search:
     ) -> Solution:
         """Run the solver once."""
         low, high = bound_unknowns(nlp, stages, self.scheme)
-        low_g, high_g = raise_bounds(nlp, stages, limits, self.problem.epsilon, low)
+        low_g, high_g = raise_bounds(nlp, stages, limits, self.problem.epsilon, (low, high))
         if self.duration is not None and nlp.lasts >= 0:
             high_g[nlp.lasts] = self.duration
         solver = nlp.first_solver if multipliers is None else nlp.solver
