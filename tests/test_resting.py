@@ -50,3 +50,19 @@ def test_a_finger_that_would_have_to_pull_is_named() -> None:
     with pytest.raises(InfeasibleError, match="no motion begins in any contact mode: c_n of v"):
         plan_phases(feeble, feeble.phases[4:], start, PlanOptions(time_intervals=4))
     assert plan_phases(problem, phases, start, PlanOptions(time_intervals=4))
+
+
+@pytest.mark.parametrize("phase", range(4))
+def test_what_is_planned_can_come_to_rest(phase: int) -> None:
+    problem = landing()
+    own = in_own_units(problem)
+    z = scale_state(trace_phases(problem)[phase].end, problem.scene.scales)
+    assert find_block(own.phases[phase].formation, z, own.epsilon, ends=True) is None
+
+
+def test_an_end_at_which_nothing_comes_to_rest_is_refused() -> None:
+    problem = landing()
+    z = scale_state(trace_phases(problem)[0].end, problem.scene.scales)
+    formation = in_own_units(problem).phases[0].formation
+    blocked = find_block(formation, z, 50.0, ends=True)
+    assert blocked is not None and blocked.contact in formation.names and blocked.short > 1.0

@@ -123,7 +123,7 @@ def outline_phase(
         curve = trace_phase(problem, phase, z)
         return outline_curve(curve, release_at if phase.until.is_release else 1.0)
     goal = _find_goal(problem, phase, z)
-    return [_connect(formation, z, goal)]
+    return [connect(formation, z, goal)]
 
 
 def count_freedoms(formation: Formation, z: Array) -> int:
@@ -143,7 +143,7 @@ def _find_goal(problem: Problem, phase: Phase, z: Array) -> Array:
         middle = close(phase.formation, (z + ahead) / 2, phase.formation.evaluate_slip(z[None])[0])
         return ahead if middle is None else middle
     slip, reasons, goals = phase.formation.evaluate_slip(z[None])[0], [], []
-    ends = _list_ends(phase)
+    ends = list_ends(phase)
     for end in ends:
         goal, reason = _settle(end, z, slip)
         reasons.append(reason)
@@ -161,7 +161,7 @@ def _find_goal(problem: Problem, phase: Phase, z: Array) -> Array:
     raise InputError(problem.source, key, text)
 
 
-def _list_ends(phase: Phase) -> list[Ending]:
+def list_ends(phase: Phase) -> list[Ending]:
     """What has to hold where a phase ends; a contact may be gained in more than one way."""
     formation, until = phase.formation, phase.until
     if until.value is not None:
@@ -211,7 +211,7 @@ def outline_onwards(phase: Phase, before: Outline) -> list[Outline]:
     for share in _AHEAD:
         goal = close(ending, z + share * far * step, slip)
         if goal is not None and is_inside(ending, goal):
-            outlines.append(_connect(formation, z, goal))
+            outlines.append(connect(formation, z, goal))
     return outlines
 
 
@@ -237,7 +237,7 @@ def _look_around(formation: Formation, ending: Formation, z: Array, slip: Array)
     return best
 
 
-def _connect(formation: Formation, start: Array, goal: Array) -> Outline:
+def connect(formation: Formation, start: Array, goal: Array) -> Outline:
     """A straight line, pulled onto the contacts, with the directions of its middle."""
     points, slip = [start], formation.evaluate_slip(start[None])[0]
     for x in np.linspace(0.0, 1.0, POINTS)[1:]:

@@ -7,7 +7,8 @@ At rest nothing is left of the equations of motion that is not linear,
 and friction is that of the way in which the acceleration a sets things in motion: c_t = -mu Xi c_n
 with Xi A_t a > 0 where a contact will slide, |c_t| <= mu (c_n - epsilon) with A_t a = 0 where it
 will not. With two freedoms the ways are the sectors and rays between a handful of lines. If none of
-them admits an acceleration other than zero, no plan exists, whatever the solver says.
+them admits an acceleration other than zero, no plan exists, whatever the solver says. Where a
+motion comes to rest the same holds with the acceleration against the way that things move.
 """
 
 from __future__ import annotations
@@ -42,10 +43,20 @@ class Blocked(NamedTuple):
     short: float
 
 
-def find_block(formation: Formation, z: Array, epsilon: float) -> Blocked | None:
-    """Say why no motion begins from rest at `z`, or None if one may.
+def find_block(
+    formation: Formation, z: Array, epsilon: float, ends: bool = False
+) -> Blocked | None:
+    """Say why no motion begins from rest at `z`, or ends there; None if one may.
 
     Formations with more than two freedoms always may.
+
+    Parameters
+    ----------
+    formation : Formation
+    z : ndarray, shape (5,)
+    epsilon : float
+    ends : bool
+        Whether the motion ends at rest at `z`: then it moved against its acceleration.
     """
     N = tangent_basis(formation, z)
     metric = np.array([1.0, 1.0, *(3 * [formation.scene.polygon.gyration_radius**2])])
@@ -62,7 +73,7 @@ def find_block(formation: Formation, z: Array, epsilon: float) -> Blocked | None
             np.where(np.abs(rates @ way) > _STILL * np.abs(rates).max(), rates @ way, 0)
         )
         signs[list(formation.rolling_rows)] = 0.0
-        programme = _Programme(formation, epsilon, N, A, A_t, rates, signs)
+        programme = _Programme(formation, epsilon, -N if ends else N, A, A_t, rates, signs)
         if programme.moves():
             return None
         short = programme.find_short()

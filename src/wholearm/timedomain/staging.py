@@ -34,16 +34,18 @@ def outline_stages(
     pace: float,
     onwards: bool = False,
     release_at: float = RELEASE_AT,
+    way: Sequence[Outline] | None = None,
 ) -> list[Stage]:
     """Stages of phases that are planned as one, with a first guess, in the scene's own units.
 
     The guessed duration is `pace` times that of a fall over the length of the outlines. With
     `onwards`, phases that go on in motion may end farther away where that takes fewer reversals.
     A phase that ends by a release is guessed to do so at the share `release_at` of its curve.
+    A single phase may be guessed to take the outlines `way` instead of its own.
     """
     parts: list[tuple[Phase, Outline, bool]] = []
     for phase in phases:
-        outlines = outline_phase(problem, phase, z, release_at)
+        outlines = list(way or outline_phase(problem, phase, z, release_at))
         if parts and parts[-1][0].end is End.SMOOTH:
             outlines = [*_turn_first(outlines[0], parts[-1][1]), *outlines[1:]]
             if onwards:
@@ -217,6 +219,5 @@ def _choose_watched(phase: Phase, outline: Outline) -> tuple[int, ...]:
     """Limits that are near zero along the outline, and the phase's own end."""
     values = outline.formation.evaluate_limits(outline.z)
     near = values.min(axis=0) < _NEAR
-    gained = [limit.gained == phase.until.contact for limit in outline.formation.limits]
-    mine = np.array(gained) & (phase.until.contact is not None)
+    mine = np.array([limit.gains(phase.until.contact) for limit in outline.formation.limits])
     return tuple(np.flatnonzero(near | mine).tolist())

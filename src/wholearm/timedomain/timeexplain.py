@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -12,12 +13,17 @@ from ..curve import describe_pose
 from ..errors import InfeasibleError, InputError, SolverError
 from ..model import Array
 from ..options import Objective
+from ..outline import count_freedoms
 from ..problem import Phase, Problem
 from .ownunits import to_si
 from .stage import Stage
 from .timelimits import Give
 from .timesearch import Search
 
+LONGEST = 3.0
+"""Most processor time [s] of one run of the solver that looks for the least shortfalls."""
+ADVICE = 5.0
+"""Processor time [s] after which no further change of a limit is tried."""
 SHORT = 1e-4
 """Least shortfall that counts, of forces over the weight, of torques over that times the radius
 of gyration of the object."""
@@ -28,12 +34,16 @@ Replan = Callable[[Problem], object]
 
 def ease(search: Search, stages: Sequence[Stage]) -> list[Stage] | None:
     """The motion with the least shortfalls when every limit is soft, or None."""
-    solution = search.aiming(Objective.ELASTIC).solve(list(stages))
+    solution = search.aiming(Objective.ELASTIC).solve(list(stages), seconds=LONGEST)
     return solution.stages if solution.success else None
 
 
-def refuse(search: Search, problem: Problem, phase: Phase, stage: Stage) -> None:
-    """Raise an error if no motion can begin from rest where a stage starts.
+def refuse(
+    search: Search, problem: Problem, phases: Sequence[Phase], stages: Sequence[Stage]
+) -> None:
+    """Raise an error if no motion can begin from rest at the start, or come to rest at the end.
+
+    The end counts where it is one point: where a single phase with one freedom leads.
 
     Raises
     ------
@@ -42,14 +52,19 @@ def refuse(search: Search, problem: Problem, phase: Phase, stage: Stage) -> None
     """
     from .resting import find_block
 
-    blocked = find_block(stage.formation, stage.guess.nodes[0, 0], search.problem.epsilon)
+    epsilon, last = search.problem.epsilon, stages[-1]
+    stage, node, phase = stages[0], 0, phases[0]
+    blocked = find_block(stage.formation, stage.guess.nodes[0, 0], epsilon)
+    say = "from rest at its start, {}, no motion begins in any contact mode"
+    alone = len(phases) == 1 and not phase.until.is_release
+    if blocked is None and alone and count_freedoms(last.formation, last.guess.nodes[-1, 0]) == 1:
+        stage, node = last, -1
+        blocked = find_block(last.formation, last.guess.nodes[-1, 0], epsilon, ends=True)
+        say = "at its end, {}, no motion comes to rest in any contact mode"
     if blocked is None:
         return
-    where = describe_pose(to_si(stage, problem).guess.nodes[0, 0])
-    text = (
-        f"phase {phase.number} is infeasible: from rest at its start, {where}, no "
-        "motion begins in any contact mode"
-    )
+    where = describe_pose(to_si(stage, problem).guess.nodes[node, 0])
+    text = f"phase {phase.number} is infeasible: {say.format(where)}"
     if blocked.contact:
         amount = blocked.short * problem.scene.scales.force
         least = f"epsilon = {problem.epsilon:g} N"
@@ -85,7 +100,9 @@ def explain(
     numbers = " and ".join(str(phase.number) for phase in phases)
     what = f"phase{'s' if len(phases) > 1 else ''} {numbers}"
     if not short:
-        return SolverError(f"no plan for {what}: {status}; try other time_intervals")
+        names = " and ".join(" ".join(phase.formation.names) for phase in phases)
+        text = f"no plan for {what} ({names}, until {phases[-1].until}): {status}"
+        return SolverError(f"{text}; try other time_intervals")
     scales = problem.scene.scales
 
     def sum_up(stages: list[Stage]) -> float:
@@ -105,21 +122,33 @@ def explain(
     gives = [Give(0.0, (1.0, 0.0)), Give(0.0, (0.0, 1.0)), Give(1.0)]
     units = [scales.torque, scales.torque, scales.force]
 
+    stop, undecided = time.thread_time() + ADVICE, list[int]()
+
     def find_least(index: int) -> float | None:
-        solution = search.aiming(Objective.RELAX, gives[index]).solve(eased)
+        if time.thread_time() > stop:
+            undecided.append(index)
+            return None
+        solution = search.aiming(Objective.RELAX, gives[index]).solve(eased, seconds=LONGEST)
+        if not solution.success:
+            undecided.append(index)
         limit = limits[index]
         cost = units[index] * solution.cost
         return limit.value + limit.sign * cost if solution.success else None
 
     def can_plan(index: int, value: float) -> bool:
+        if time.thread_time() > stop:
+            undecided.append(index)
+            return False
         try:
             replan(change_limit(problem, index, value))
         except (InfeasibleError, SolverError, InputError):
             return False
         return True
 
-    changes = describe_changes(find_changes(limits, find_least, can_plan))
-    return InfeasibleError(f"{text}; {changes}")
+    changes = find_changes(limits, find_least, can_plan)
+    if undecided and not changes:
+        return InfeasibleError(f"{text}; no single limit was found that makes it feasible")
+    return InfeasibleError(f"{text}; {describe_changes(changes)}")
 
 
 def list_shortfalls(problem: Problem, stages: Sequence[Stage]) -> list[Shortfall]:

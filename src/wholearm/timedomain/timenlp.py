@@ -64,6 +64,8 @@ EVEN = 0.2
 """Least duration of an interval that chooses its share over that of its neighbour."""
 _HURRY = 3e-4
 """Weight of time against shortfalls: keeps a motion that is short of something brisk."""
+LONGEST = 120.0
+"""Most processor time of one run of the solver [s]: iterations need not end by themselves."""
 NEAR, FAR = 1e-6, 1e-2
 """How far from its bounds a start is kept: a solution, and a first guess."""
 
@@ -103,6 +105,8 @@ class TimeNLP:
     assembled : Assembled
     max_iter : int
         Most iterations of the solver.
+    seconds : float, [s]
+        Most processor time of the solver.
     layouts : list of StageLayout
     rows : Rows
     rows_of : list of StageRows
@@ -115,6 +119,7 @@ class TimeNLP:
 
     assembled: Assembled
     max_iter: int
+    seconds: float
     layouts: list[StageLayout]
     rows: Rows
     rows_of: list[StageRows]
@@ -134,7 +139,14 @@ class TimeNLP:
 
     def _build(self, push: float) -> Expression:
         built = self.assembled
-        return build_solver("time_nlp", built.nlp, push, built.derivatives, max_iter=self.max_iter)
+        return build_solver(
+            "time_nlp",
+            built.nlp,
+            push,
+            built.derivatives,
+            max_iter=self.max_iter,
+            max_cpu_time=self.seconds,
+        )
 
 
 def build_time_nlp(
@@ -144,6 +156,7 @@ def build_time_nlp(
     time_weight: float,
     max_iter: int,
     give: Give | None = None,
+    seconds: float = LONGEST,
 ) -> TimeNLP:
     """Build the NLP of stages that follow one another and end at rest.
 
@@ -158,6 +171,8 @@ def build_time_nlp(
         Most iterations of the solver.
     give : Give, optional
         Which limits give way, for `relax`; for `margin` it is every c_n.
+    seconds : float, [s]
+        Most processor time of the solver.
     """
     started = time.perf_counter()
     if objective is Objective.MARGIN:
@@ -194,8 +209,8 @@ def build_time_nlp(
     rows.put(rest[:, None], end[V], N.T)
     built = assemble_nlp(len(cost), rows.triplets, rows.linear_rows, rows.blocks, cost)
     soft = np.array(give.tau if give else (0.0, 0.0)) + (objective is Objective.ELASTIC) > 0
-    seconds = time.perf_counter() - started
-    return TimeNLP(built, max_iter, layouts, rows, rows_of, lasts, soft, seconds)
+    build_time = time.perf_counter() - started
+    return TimeNLP(built, max_iter, seconds, layouts, rows, rows_of, lasts, soft, build_time)
 
 
 def _add_stage(
@@ -327,7 +342,7 @@ def _watch(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Ind
     later = (not stage.opens) | (stage.guess.places(scheme.points)[..., None] > 1 / 3)
     low = stage.clearance * (later & released)
     goal = None if stage.until is None else stage.until.contact
-    reached = [goal is not None and formation.limits[k].gained == goal for k in stage.watched]
+    reached = [formation.limits[k].gains(goal) for k in stage.watched]
     if scheme.ends:
         low[-1, -1, reached] = -np.inf
     own = rows.nonlinear(K, d, len(stage.watched), low=low, high=np.inf)

@@ -12,6 +12,7 @@ it is a better guess, or says why there is no plan.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
@@ -24,19 +25,28 @@ from ..problem import Phase, Problem
 from .modesearch import adapt, improve
 from .ownunits import to_si, unit_of
 from .revising import halve
+from .slowguess import AMPLE, SlowWay, Way, list_slow_ways
 from .stage import Stage
 from .staging import outline_stages
 from .timemotion import TimeMotion, make_motions
+from .timenlp import LONGEST
 from .timesearch import Search, Solution
 
 FIRST = 10
 """Most intervals of a phase to start with."""
 CONVINCING = 2
 """Motions that miss limits least, from different guesses, after which there seems to be no plan."""
-PATIENCE = 600
-"""Most iterations of further attempts before there seems to be no plan."""
+BUDGET = 5.0
+"""Processor time [s] of this thread after which no further guess is begun: of one block."""
+ATTEMPT = 1.5
+"""Most processor time of the first run of the solver from a further guess, in seconds or, if that
+is longer, over the time of the first guess."""
+WAYS = 3
+"""Most ways along which a slow motion is guessed."""
 _PACES = (2.0, 4.0, 1.0)
 """Guessed durations to try, in units of that of a fall."""
+_SLOW_PACES = (4.0, 12.0)
+"""Those of slow motions."""
 
 
 def plan_phases(
@@ -76,50 +86,93 @@ def plan_phases(
     wanted = options.time_intervals or _choose_intervals(phases)
     halvings = max(0, math.ceil(math.log2(wanted / FIRST)))
 
-    def outline(times: int, pace: float, onwards: bool = False) -> list[Stage]:
+    def outline(
+        times: int, pace: float, onwards: bool = False, way: Way | None = None
+    ) -> list[Stage]:
         count = math.ceil(wanted / 2**times)
-        stages = outline_stages(problem, phases, z, search.scheme, count, pace, onwards)
+        stages = outline_stages(problem, phases, z, search.scheme, count, pace, onwards, way=way)
         opening, clearance = options.opening, options.clearance
         return [replace(stage, opening=opening, clearance=clearance) for stage in stages]
 
+    started = time.thread_time()
     first = outline(halvings, _PACES[0])
     solution = _solve(search, first, halvings)
     if solution.success:
         return _summarise(problem, search, phases, solution)
     from .timeexplain import ease, explain, list_shortfalls, refuse
 
-    refuse(search, problem, phases[0], first[0])
-    status, short = solution.status, list[list[Stage]]()
-    spent = search.effort.iterations
-    for times, guess in _list_guesses(first, halvings, outline if patient else None):
+    refuse(search, problem, phases, first)
+    spent = time.thread_time() - started
+    attempt = max(ATTEMPT, ATTEMPT * spent)
+    ways = list_slow_ways(problem, phases[0], z, WAYS) if patient and len(phases) == 1 else []
+    sure = any(way.margin > AMPLE for way in ways)
+    lost = "" if solution.status.startswith("Ipopt") else f"{solution.status}; "
+    short, tried = list[list[Stage]](), dict.fromkeys(["the nearest end"])
+    # Each further guess has a share of the budget, however long the first took.
+    stop = started + spent + max(BUDGET - spent, BUDGET / 2, spent)
+    guesses = _list_guesses(first, halvings, outline if patient else None, ways, len(phases) > 1)
+    for name, times, guess in guesses:
+        tried[name] = None
         if guess is not first:
-            solution = _solve(search, guess, times)
-        eased = None if solution.success else ease(search, guess)
+            solution = _solve(search, guess, times, attempt)
+        eased = None if solution.success or sure else ease(search, guess)
         if eased is not None and list_shortfalls(problem, eased):
             short.append(eased)
         elif eased is not None:
-            solution = _solve(search, eased, times)
+            solution = _solve(search, eased, times, attempt)
         if solution.success:
             return _summarise(problem, search, phases, solution)
-        if len(short) == CONVINCING or search.effort.iterations - spent > PATIENCE:
+        if len(short) == CONVINCING or time.thread_time() > stop:
             break
+    reason = f"none was found, also of least shortfalls, from {', '.join(tried)}"
+    if sure:
+        # What a local least of shortfalls says is then no reason.
+        short = []
+        reason = f"none was found, although a slow motion keeps limits, from {', '.join(tried)}"
+
+    reason = lost + reason
 
     def replan(other: Problem) -> object:
         own = [other.phases[phase.index] for phase in phases]
         return plan_phases(other, own, z, options, explained=False, patient=False)
 
-    raise explain(search, problem, phases, short, status, replan if explained else None)
+    raise explain(search, problem, phases, short, reason, replan if explained else None)
 
 
 def _list_guesses(
-    first: list[Stage], halvings: int, outline: Callable[..., list[Stage]] | None
-) -> Iterator[tuple[int, list[Stage]]]:
-    """Guesses, with how often their intervals are to be halved; only the first without others."""
-    yield halvings, first
+    first: list[Stage],
+    halvings: int,
+    outline: Callable[..., list[Stage]] | None,
+    ways: Sequence[SlowWay],
+    onwards: bool,
+) -> Iterator[tuple[str, int, list[Stage]]]:
+    """Guesses by name, with how often their intervals are halved; only the first without others.
+
+    Parameters
+    ----------
+    first : list of Stage
+        What has been tried.
+    halvings : int
+    outline : callable or None
+        Makes guesses.
+    ways : sequence of SlowWay
+    onwards : bool
+        Whether there are phases that go on in motion.
+    """
     if outline is not None:
-        for times in dict.fromkeys((halvings, 0)):
-            for pace in _PACES:
-                yield times, outline(times, pace, onwards=True)
+        sure = [way for way in ways if way.margin > AMPLE]
+        for pace in _SLOW_PACES if sure else _SLOW_PACES[:1]:
+            for way in sure or ways[:1]:
+                stages = outline(halvings, pace, way=way.stretches)
+                yield f"a straight way at {pace:g} times the duration of a fall", halvings, stages
+    yield "the nearest end", halvings, first
+    if outline is None:
+        return
+    for times in dict.fromkeys((halvings, 0)):
+        for pace in _PACES:
+            if onwards or times != halvings or pace != _PACES[0]:
+                name = f"{'an end ahead' if onwards else 'the nearest end'} at {pace:g}"
+                yield f"{name} times the duration of a fall", times, outline(times, pace, onwards)
 
 
 def _choose_intervals(phases: Sequence[Phase]) -> int:
@@ -127,9 +180,11 @@ def _choose_intervals(phases: Sequence[Phase]) -> int:
     return 32 if len(phases) == 1 and phases[0].formation.n_constraints == 4 else 10
 
 
-def _solve(search: Search, stages: list[Stage], halvings: int) -> Solution:
+def _solve(
+    search: Search, stages: list[Stage], halvings: int, seconds: float = LONGEST
+) -> Solution:
     """Solve, find modes and intervals, halve these, and make limits hold in between."""
-    solution = search.solve(stages)
+    solution = search.solve(stages, seconds=seconds)
     if not solution.success:
         return solution
     solution = adapt(search, improve(search, solution))

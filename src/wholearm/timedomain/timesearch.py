@@ -19,7 +19,7 @@ from .stage import Stage
 from .timelayout import pack, unpack
 from .timelimits import Give
 from .timemotion import make_motions
-from .timenlp import TimeNLP, bound_unknowns, build_time_nlp
+from .timenlp import LONGEST, TimeNLP, bound_unknowns, build_time_nlp
 from .warmstart import FIRST_SIZE, Multipliers, carry_multipliers, first_multipliers
 
 ROUNDS = 24
@@ -124,7 +124,11 @@ class Search:
         return replace(self, goal=goal, give=give, duration=None)
 
     def solve(
-        self, stages: list[Stage], before: Solution | None = None, most: int = 150
+        self,
+        stages: list[Stage],
+        before: Solution | None = None,
+        most: int = 150,
+        seconds: float = LONGEST,
     ) -> Solution:
         """Solve from the stages' guesses, until no limit is broken at the points.
 
@@ -132,9 +136,11 @@ class Search:
         ----------
         most : int
             Most iterations.
+        seconds : float, [s]
+            Most processor time of each run of the solver.
         """
         while True:
-            nlp = self.build(stages, most)
+            nlp = self.build(stages, most, seconds)
             multipliers = None
             if before is not None and before.watched == [stage.watched for stage in stages]:
                 multipliers = carry_multipliers(
@@ -148,10 +154,10 @@ class Search:
                 return solution
             stages = watching
 
-    def build(self, stages: Sequence[Stage], most: int = 150) -> TimeNLP:
+    def build(self, stages: Sequence[Stage], most: int = 150, seconds: float = LONGEST) -> TimeNLP:
         """Build the NLP."""
         weight, limit = self.options.time_weight, _ITERATIONS.get(self.goal, most)
-        nlp = build_time_nlp(stages, self.scheme, self.goal, weight, limit, self.give)
+        nlp = build_time_nlp(stages, self.scheme, self.goal, weight, limit, self.give, seconds)
         self.effort.build_time += nlp.build_time
         return nlp
 
