@@ -149,7 +149,7 @@ class _Model:
         formation = mode.formation
         z = build_features(formation.scene).z
         limits = formation.limits
-        gained = [limit for limit in limits if limit.gained == until.contact]
+        gained = [limit for limit in limits if limit.gains(until.contact)]
         if until.is_release:
             distance = ca.SX(1)
         elif until.contact is None:
@@ -239,9 +239,7 @@ class _Model:
 
 def open_limits(formation: Formation, until: Until) -> list[Limit]:
     """Limits that end a phase early: all but that of the contact to be gained."""
-    return [
-        limit for limit in formation.limits if limit.gained is None or limit.gained != until.contact
-    ]
+    return [limit for limit in formation.limits if not limit.gains(until.contact)]
 
 
 def _project(mode: Mode, y: Expression, kept: Expression) -> Expression:

@@ -280,9 +280,12 @@ def find_rest(formation: Formation, z: Array) -> Rest:
     step = _AHEAD / np.abs(heading / units).max()
     limits = formation.evaluate_limits(z + step * np.array([[0.0], [1.0], [-1.0]]) * heading)
     near = np.abs(limits[0]) < scene.touching
-    # The curvature of the path cancels in the difference of both ways.
-    rise = (limits[1, near] - limits[2, near]) / 2
-    closes = [bool((sign * rise < -find_tolerances(scene).limit).any()) for sign in (1.0, -1.0)]
+    # The curvature of the path cancels in the difference of both ways. A limit that opens both
+    # ways, as of a pointed tip at a vertex, has no slope but a kink.
+    here, ahead, behind = limits[:, near]
+    rise = (ahead - behind) / 2
+    changes = np.maximum([rise, -rise], [ahead - here, behind - here])
+    closes = (changes < -find_tolerances(scene).limit).any(axis=1).tolist()
     rates = np.concatenate([kinematics.A_t[0] @ heading, heading[3:]])
     rates[list(formation.rolling_rows)] = 0.0
     # How fast each slides or turns over how fast anything moves.
