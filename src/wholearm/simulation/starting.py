@@ -1,13 +1,15 @@
-"""A formation with two or more freedoms at rest: with which directions it could start to move.
+"""The ways in which a formation at rest could start to move.
 
-Each choice of the directions in which contacts slide and joints turn, and of what sticks and is
-held, makes the accelerations affine in the torques. A choice is consistent if contacts and joints
-then accelerate in those directions, friction can hold the others, every contact presses, and
-nothing that touches closes further. Choices in which nothing is held are tried first.
+With one freedom these are the two ways along the free direction. With more, each choice of the
+directions in which contacts slide and joints turn, and of what sticks and is held, makes the
+accelerations affine in the torques. A choice is consistent if contacts and joints then accelerate
+in those directions, friction can hold the others, every contact presses, and nothing that touches
+closes further. Choices in which nothing is held are tried first.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple, Protocol
@@ -18,11 +20,16 @@ from numpy.typing import NDArray
 from ..dynamics import Directions
 from ..formation import Formation, Kinematics
 from ..model import Array
-from .modes import Mode, Response, Rows, find_grips, list_units, respond
-from .tolerances import ROUNDING_FORCE, find_tolerances, measure_units
+from .modes import Grips, Mode, Response, Rows, find_grips, list_units, respond
+from .tolerances import ROUNDING_FORCE, Tolerances, find_tolerances, measure_units
 
 _STEP = 3e-5
 """Step of the difference quotient, in units of the scene."""
+_KINK = 1e-2
+"""Rise of a limit both ways, over the step, from which it has a kink and no gradient."""
+_GRAZE = 1e-3
+"""Acceleration with which a gap may close, over those of sliding and turning in all: planned
+motions that graze a link between their nodes do. How far it then closes is looked at on the way."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +80,60 @@ class Way(Protocol):
         """Start this way at `x` of a piece, where the torques are `tau`."""
 
 
+@dataclass(frozen=True, eq=False)
+class RestDirection:
+    """One way in which a formation at rest could move.
+
+    Attributes
+    ----------
+    heading : ndarray, shape (5,)
+        The direction, of length one in the metric M5.
+    directions : Directions
+        The friction that opposes it.
+    acceleration : ndarray, shape (3,)
+        Acceleration along `heading` is acceleration @ (1, tau_1, tau_2).
+    holds : ndarray, shape (n_c + 2 R, 3)
+        Likewise what has to be positive for the contacts to hold, H c [N] (`wholearm.cones`).
+    ratio : float
+        Reduced inertia over that without friction; jammed at zero and below.
+    closes : bool
+        Whether it would push features that touch already into one another.
+    tolerances : Tolerances
+    """
+
+    heading: Array
+    directions: Directions
+    acceleration: Array
+    holds: Array
+    ratio: float
+    closes: bool
+    tolerances: Tolerances
+
+    @property
+    def margins(self) -> list[tuple[Array, float]]:
+        """Rows r and offsets d with r @ (1, tau_1, tau_2) + d >= 0 while it moves this way."""
+        rounding = self.tolerances
+        holds = [(row, rounding.force) for row in self.holds]
+        return [(self.acceleration, -rounding.drive), *holds]
+
+    def drive(self, tau: Array) -> float:
+        """How strongly it accelerates this way, in the metric M5."""
+        return float(self.acceleration @ [1.0, *tau])
+
+    def slides(self, tau: Array) -> bool:
+        """Whether it accelerates this way, if every contact can press or pull."""
+        return self.drive(tau) > self.tolerances.drive and not self.closes
+
+    def moves(self, tau: Array) -> bool:
+        """Whether the formation starts to move this way under torques `tau`, shape (2,)."""
+        keeps = float((self.holds @ [1.0, *tau]).min()) >= -self.tolerances.force
+        return self.ratio > 0 and keeps and self.slides(tau)
+
+    def depart(self, x: float, tau: Array) -> Departure:
+        """Start this way at `x` of a piece; the torques do not matter."""
+        return Departure(x, self.heading, self.directions)
+
+
 class Slack(NamedTuple):
     """What counts as rounding in the rows of a pattern of the same names."""
 
@@ -81,6 +142,40 @@ class Slack(NamedTuple):
     grips: Array
     holds: Array
     openings: Array
+
+
+class Touching:
+    """What touches at a configuration `z` but is not in the formation: the limits `near` zero.
+
+    Attributes
+    ----------
+    gradient : ndarray, shape (k, 5)
+        Of those that have one. Where a pointed tip is at a vertex the gap of an edge has none.
+    """
+
+    def __init__(self, formation: Formation, z: Array, near: NDArray[np.bool_]) -> None:
+        self.formation, self.z = formation, z
+        self.units = measure_units(formation.scene)[:5]
+        self.gradient, self.kinked = np.zeros((0, 5)), np.zeros(0, dtype=np.int64)
+        if not near.any():
+            return
+        ahead = _STEP * self.units
+        values = formation.evaluate_limits(z + np.vstack([np.diag(ahead), -np.diag(ahead)]))
+        values = (values - formation.evaluate_limits(z[None]))[:, near]
+        rises = (values[:5] + values[5:]).max(axis=0)
+        kinked = rises > _KINK * _STEP * formation.scene.scales.length
+        self.kinked = np.flatnonzero(near)[kinked]
+        self.gradient = (values[:5] - values[5:])[:, ~kinked].T / (2 * ahead)
+
+    def opens(self, acceleration: Array) -> bool:
+        """Whether what has a kink does not close along an acceleration, shape (5,)."""
+        if not len(self.kinked):
+            return True
+        step = _STEP / np.abs(acceleration / self.units).max()
+        places = self.z + np.array([[0.0], [step]]) * acceleration
+        here, ahead = self.formation.evaluate_limits(places)[:, self.kinked]
+        closing = _GRAZE * _STEP * self.formation.scene.scales.length
+        return bool((ahead - here >= -closing).all())
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +197,11 @@ class Pattern:
     grips : ndarray, shape (2 k, 3), [N, N m]
         What has to be positive for friction to hold what has no direction.
     openings : ndarray, shape (k, 3), [m/s^2]
-        Accelerations of the gaps of what touches but is not in the formation.
+        Accelerations of the gaps of what touches but is not in the formation, plus what counts as
+        grazing.
     ratio : float
     slack : Slack
+    touching : Touching
     """
 
     directions: Directions
@@ -116,6 +213,7 @@ class Pattern:
     openings: Array
     ratio: float
     slack: Slack
+    touching: Touching
 
     @property
     def margins(self) -> list[tuple[Array, float]]:
@@ -143,6 +241,7 @@ class Pattern:
             and bool((self.slips @ load >= -slack.slips).all())
             and bool((self.grips @ load >= -slack.grips).all())
             and bool((self.openings @ load >= -slack.openings).all())
+            and self.touching.opens(self.acceleration @ load)
         )
 
     def moves(self, tau: Array) -> bool:
@@ -157,8 +256,8 @@ class Pattern:
 
 def find_patterns(
     formation: Formation, z: Array, near: NDArray[np.bool_], held: bool
-) -> tuple[Pattern, ...]:
-    """Every choice of directions at a configuration at rest; contacts that roll have none.
+) -> Iterator[Pattern]:
+    """Yield every choice of directions at a configuration at rest; contacts that roll have none.
 
     Parameters
     ----------
@@ -167,18 +266,13 @@ def find_patterns(
     near : ndarray of bool, shape (n_limits,)
         Which limits of the formation are zero at `z`.
     held : bool
-        Whether to return those in which friction holds something, the least first, or the others.
+        Whether to yield those in which friction holds something, the least first, or the others.
     """
     kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
-    gradient = np.zeros((0, 5))
-    if near.any():
-        ahead = _STEP * measure_units(formation.scene)[:5]
-        steps = np.concatenate([np.diag(ahead), -np.diag(ahead)])
-        values = formation.evaluate_limits(z + steps)[:, near]
-        gradient = (values[:5] - values[5:]).T / (2 * ahead)
+    touching = Touching(formation, z, near)
     units = list_units(formation)
     choices = [(1.0, -1.0, 0.0) if held and unit.grips else (1.0, -1.0) for unit in units]
-    patterns = []
+    modes: dict[Grips, Mode] = {}
     for options in sorted(product(*choices), key=lambda options: options.count(0.0)):
         count = options.count(0.0)
         if (count > 0) != held or formation.n_constraints + count > 4:
@@ -186,10 +280,11 @@ def find_patterns(
         signs = np.zeros(formation.n_contacts + 2)
         for unit, sign in zip(units, options, strict=True):
             signs[list(unit.rows)] = sign
-        pattern = _build_pattern(formation, signs, kinematics, gradient)
+        grips = find_grips(formation, signs)
+        mode = modes.setdefault(grips, Mode(formation, grips))
+        pattern = _build_pattern(mode, signs, kinematics, touching)
         if pattern is not None:
-            patterns.append(pattern)
-    return tuple(patterns)
+            yield pattern
 
 
 def respond_at_rest(mode: Mode, signs: Array, kinematics: Kinematics) -> Response | None:
@@ -200,31 +295,34 @@ def respond_at_rest(mode: Mode, signs: Array, kinematics: Kinematics) -> Respons
 
 
 def _build_pattern(
-    formation: Formation, signs: Array, kinematics: Kinematics, gradient: Array
+    mode: Mode, signs: Array, kinematics: Kinematics, touching: Touching
 ) -> Pattern | None:
-    mode, count = Mode(formation, find_grips(formation, signs)), formation.n_contacts
+    formation, count = mode.formation, mode.formation.n_contacts
     response = respond_at_rest(mode, signs, kinematics)
     if response is None:
         return None
     declared = np.array([mode.declares(k) for k in range(len(mode.holders))] * 2, dtype=bool)
     cones, cone_units = response.holds[count:], mode.hold_units[count:]
-    tolerances = find_tolerances(formation.scene)
+    tolerances, length = find_tolerances(formation.scene), formation.scene.scales.length
+    slips = signs[:, None] * response.rates
+    graze = _GRAZE * np.repeat([1.0, length], [count, 2]) @ slips
     units = np.concatenate([mode.hold_units[:count], cone_units[declared]])
     slack = Slack(
         drive=tolerances.drive,
         slips=np.repeat([tolerances.still, tolerances.still_joint], [count, 2]),
         grips=ROUNDING_FORCE * cone_units[~declared],
         holds=ROUNDING_FORCE * units,
-        openings=np.full(len(gradient), tolerances.closing),
+        openings=np.full(len(touching.gradient), tolerances.closing),
     )
     return Pattern(
         directions=Directions(signs[:count], signs[count:]),
         mass=formation.scene.mass_diagonal,
         acceleration=response.acceleration,
         holds=np.vstack([response.holds[:count], cones[declared]]),
-        slips=signs[:, None] * response.rates,
+        slips=slips,
         grips=cones[~declared],
-        openings=gradient @ response.acceleration,
+        openings=touching.gradient @ response.acceleration + graze,
         ratio=response.ratio,
         slack=slack,
+        touching=touching,
     )

@@ -11,9 +11,9 @@ them the instant of starting is a root of a polynomial.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +26,9 @@ from ..formation import Formation, Kinematics
 from ..model import Array
 from .closing import close_contacts
 from .modes import Mode
-from .starting import Departure, Way, find_patterns, respond_at_rest
+from .starting import Departure, RestDirection, Way, find_patterns, respond_at_rest
 from .statics import balances, find_pulls
-from .tolerances import Tolerances, find_tolerances, measure_units
+from .tolerances import find_tolerances, measure_units
 
 _AHEAD = 1e-5
 """How far ahead along the free direction signs and gaps are looked for, in units of the scene."""
@@ -37,60 +37,6 @@ _LOOKS = 9
 _CLEAR = 1e3
 """Acceleration halfway to the next change with which a motion starts, over that which is rounding:
 where changes are that close nothing is decided but by rounding."""
-
-
-@dataclass(frozen=True, eq=False)
-class RestDirection:
-    """One way in which a formation at rest could move.
-
-    Attributes
-    ----------
-    heading : ndarray, shape (5,)
-        The direction, of length one in the metric M5.
-    directions : Directions
-        The friction that opposes it.
-    acceleration : ndarray, shape (3,)
-        Acceleration along `heading` is acceleration @ (1, tau_1, tau_2).
-    holds : ndarray, shape (n_c + 2 R, 3)
-        Likewise what has to be positive for the contacts to hold, H c [N] (`wholearm.cones`).
-    ratio : float
-        Reduced inertia over that without friction; jammed at zero and below.
-    closes : bool
-        Whether it would push features that touch already into one another.
-    tolerances : Tolerances
-    """
-
-    heading: Array
-    directions: Directions
-    acceleration: Array
-    holds: Array
-    ratio: float
-    closes: bool
-    tolerances: Tolerances
-
-    @property
-    def margins(self) -> list[tuple[Array, float]]:
-        """Rows r and offsets d with r @ (1, tau_1, tau_2) + d >= 0 while it moves this way."""
-        rounding = self.tolerances
-        holds = [(row, rounding.force) for row in self.holds]
-        return [(self.acceleration, -rounding.drive), *holds]
-
-    def drive(self, tau: Array) -> float:
-        """How strongly it accelerates this way, in the metric M5."""
-        return float(self.acceleration @ [1.0, *tau])
-
-    def slides(self, tau: Array) -> bool:
-        """Whether it accelerates this way, if every contact can press or pull."""
-        return self.drive(tau) > self.tolerances.drive and not self.closes
-
-    def moves(self, tau: Array) -> bool:
-        """Whether the formation starts to move this way under torques `tau`, shape (2,)."""
-        keeps = float((self.holds @ [1.0, *tau]).min()) >= -self.tolerances.force
-        return self.ratio > 0 and keeps and self.slides(tau)
-
-    def depart(self, x: float, tau: Array) -> Departure:
-        """Start this way at `x` of a piece; the torques do not matter."""
-        return Departure(x, self.heading, self.directions)
 
 
 @dataclass(frozen=True)
@@ -142,9 +88,23 @@ class Rest:
     @cached_property
     def all_ways(self) -> tuple[Way, ...]:
         """The ways it could move, with those in which friction holds some contact or joint."""
+        return tuple(self._find_ways())
+
+    @cached_property
+    def _held(self) -> tuple[list[Way], Iterator[Way]]:
+        """Ways in which friction holds something: those found so far, and those still to find."""
         if self.formation.n_constraints >= 4:
-            return self.ways
-        return self.ways + find_patterns(self.formation, self.z, self.near, held=True)
+            return [], iter(())
+        return [], find_patterns(self.formation, self.z, self.near, held=True)
+
+    def _find_ways(self) -> Iterator[Way]:
+        """Yield the ways it could move as they are wanted, since most are never looked at."""
+        found, others = self._held
+        yield from self.ways
+        yield from found
+        for way in others:
+            found.append(way)
+            yield way
 
     def wait(self, coefficients: Array, x: float) -> Departure | Collapse | None:
         """Find what ends the rest on one piece of the torques, from `x` on.
@@ -162,7 +122,7 @@ class Rest:
             None if the formation rests to the end of the piece.
         """
         tau = _evaluate(coefficients, x)
-        for way in chain(self.ways, self.all_ways):
+        for way in self._find_ways():
             if way.moves(tau):
                 return way.depart(x, tau)
         least = _CLEAR * find_tolerances(self.formation.scene).drive
@@ -272,7 +232,7 @@ def find_rest(formation: Formation, z: Array) -> Rest:
         )
     if rank < 4:
         near = np.abs(formation.evaluate_limits(z[None])[0]) < formation.scene.touching
-        patterns = find_patterns(formation, z, near, held=False)
+        patterns = tuple(find_patterns(formation, z, near, held=False))
         return Rest(formation, z, patterns, formation.contacts + _gained(formation, near), near)
     heading = right[4] / root
     scene = formation.scene
@@ -285,7 +245,7 @@ def find_rest(formation: Formation, z: Array) -> Rest:
     here, ahead, behind = limits[:, near]
     rise = (ahead - behind) / 2
     changes = np.maximum([rise, -rise], [ahead - here, behind - here])
-    closes = (changes < -find_tolerances(scene).limit).any(axis=1).tolist()
+    closes = [bool((change < -find_tolerances(scene).limit).any()) for change in changes]
     rates = np.concatenate([kinematics.A_t[0] @ heading, heading[3:]])
     rates[list(formation.rolling_rows)] = 0.0
     # How fast each slides or turns over how fast anything moves.
