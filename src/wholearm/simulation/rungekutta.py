@@ -12,6 +12,7 @@ section II.5 and the code DOP853, whose coefficients these are.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import casadi as ca
 
@@ -105,17 +106,35 @@ def build_step(
     end, fifth, third : expression, shape (n,)
         The state at t + h, and the errors of the embedded formulas of order 5 and 3.
     """
-    rates: Expression = ca.SX(y.shape[0], 0)
+    stages, last = _build_combinations(y.shape[0])
+    rates: list[Expression] = []
+    for combine, row in zip(stages, _ROWS, strict=True):
+        rates.append(rate(*combine(y, t, h, *(rates[j] for j in row))))
+    end, fifth, third = last(y, t, h, *rates)
+    return end, fifth, third
+
+
+@lru_cache(maxsize=8)
+def _build_combinations(n: int) -> tuple[list[Expression], Expression]:
+    """CasADi functions of y, t, h and rates of stages, for states of length n.
+
+    Those of the stages return where and when each one's rate is taken, from the rates that it
+    takes in; the last one, from all rates, the end and both errors. They are the same for every
+    right-hand side, and each step calls them.
+    """
+    y, t, h = ca.SX.sym("y", n), ca.SX.sym("t"), ca.SX.sym("h")
+    rates = [ca.SX.sym(f"rate_{j}", n) for j in range(len(_ROWS))]
 
     def combine(weights: dict[int, float]) -> Expression:
-        column = ca.DM.zeros(rates.shape[1], 1)
-        for stage, weight in weights.items():
-            column[stage] = weight
-        return h * (rates @ ca.sparsify(column))
+        used = ca.horzcat(ca.SX(n, 0), *(rates[stage] for stage in weights))
+        return h * (used @ ca.DM(list(weights.values())))
 
-    for node, row in zip(_NODES, _ROWS, strict=True):
-        rates = ca.horzcat(rates, rate(y + combine(row), t + node * h))
-    return y + combine(_WEIGHTS), combine(_ERROR_5), combine(_ERROR_3)
+    stages = [
+        ca.Function("stage", [y, t, h, *(rates[j] for j in row)], [y + combine(row), t + node * h])
+        for node, row in zip(_NODES, _ROWS, strict=True)
+    ]
+    ends = [y + combine(_WEIGHTS), combine(_ERROR_5), combine(_ERROR_3)]
+    return stages, ca.Function("last", [y, t, h, *rates], ends)
 
 
 def build_error(

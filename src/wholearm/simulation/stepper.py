@@ -110,31 +110,26 @@ def _compile(
     mode = Mode(formation, grips)
     n_c, held = formation.n_contacts, len(mode.holders)
     at = Inputs(*lay_out(STATE, None, None, None, n_c, 2, held, 5, 2, 2 * (degree + 1)))
-    packed = ca.SX.sym("packed", at.size)
-    model = _Model(mode, until, side, packed, at)
-    y, forces = packed[at.y], []
-
-    def rate(state: Expression, t: Expression) -> Expression:
-        rates, c, *_ = model.dynamics(state, t, packed)
-        forces.append(model.hold(c) / mode.hold_units)
-        return rates
-
-    end, fifth, third = build_step(rate, y, packed[at.t], packed[at.h])
-    units = ca.DM(measure_units(formation.scene))
-    error = build_error(fifth[:10], third[:10], y[:10], units, packed[at.tolerance])
-    dip = ca.mmin(ca.vertcat(*forces))
-    end = _project(mode, end, packed[at.kept])
     limits = len(open_limits(formation, until))
     rows = EventRows(*lay_out(n_c, 2 * held, n_c, 2, limits, None, None))
-    time = packed[at.t] + packed[at.h]
-    at_end = ca.SX.sym("state", STATE), ca.SX.sym("time"), ca.SX.sym("error"), ca.SX.sym("dip")
-    outputs, to = model.outputs(*at_end, _slack(mode, rows))
-    report = ca.Function("report", [*at_end, packed], [outputs])
-    results = report(end, time, error, dip, packed), report(y, packed[at.t], 0, 0, packed)
-    functions = [
-        ca.Function(name, [packed], [result])
-        for name, result in zip(("step", "look"), results, strict=True)
-    ]
+    model = _Model(mode, until, side, ca.SX.sym("packed", at.size), at)
+    report, to = model.build_report(_slack(mode, rows))
+    stage, finish = model.build_stage(), model.build_finish()
+    # What follows only says what calls what, which is quicker than writing out every stage.
+    packed, forces = ca.MX.sym("packed", at.size), []
+    y, t, h = packed[at.y], packed[at.t], packed[at.h]
+
+    def rate(state: Expression, time: Expression) -> Expression:
+        rates, force = stage(state, time, packed)
+        forces.append(force)
+        return rates
+
+    end, error = finish(*build_step(rate, y, t, h), packed)
+    results = {
+        "step": report(end, t + h, error, ca.mmin(ca.vertcat(*forces)), packed),
+        "look": report(y, t, 0, 0, packed),
+    }
+    functions = [ca.Function(name, [packed], [result]) for name, result in results.items()]
     return mode, functions, at, to, rows
 
 
@@ -161,7 +156,6 @@ class _Model:
         values = ca.vertcat(*(limit.value for limit in open_limits(formation, until)))
         rate = ca.jacobian(distance, z)
         self.geometry = ca.Function("geometry", [z], [values, distance, rate])
-        # The stages of a step call this, which is quicker than writing it out for each.
         state, time = ca.SX.sym("state", STATE), ca.SX.sym("time")
         self.dynamics = ca.Function("dynamics", [state, time, packed], self._move(state, time))
 
@@ -200,10 +194,26 @@ class _Model:
         powers.append(ca.dot(drag, v_t))
         return [ca.vertcat(v, acceleration, *powers), c, v_t, tau, K, P]
 
-    def outputs(
-        self, y: Expression, t: Expression, error: Expression, dip: Expression, slack: Array
-    ) -> tuple[Expression, Outputs]:
-        """All outputs at a state, packed, and their layout."""
+    def build_stage(self) -> Expression:
+        """CasADi function (state, time, packed) -> (its rates, the least that holds it)."""
+        state, time = ca.SX.sym("state", STATE), ca.SX.sym("time")
+        rates, c, *_ = self.dynamics(state, time, self.packed)
+        least = ca.mmin(self.hold(c) / self.mode.hold_units)
+        return ca.Function("stage", [state, time, self.packed], [rates, least])
+
+    def build_finish(self) -> Expression:
+        """CasADi function (end, fifth, third, packed) -> (end on the contacts, error)."""
+        end, fifth, third = (ca.SX.sym(name, STATE) for name in ("end", "fifth", "third"))
+        units = ca.DM(measure_units(self.mode.formation.scene))
+        start, tolerance = self.packed[self.at.y][:10], self.packed[self.at.tolerance]
+        error = build_error(fifth[:10], third[:10], start, units, tolerance)
+        projected = _project(self.mode, end, self.packed[self.at.kept])
+        return ca.Function("finish", [end, fifth, third, self.packed], [projected, error])
+
+    def build_report(self, slack: Array) -> tuple[Expression, Outputs]:
+        """CasADi function (state, time, error, dip, packed) -> all outputs, and their layout."""
+        y, t = ca.SX.sym("state", STATE), ca.SX.sym("time")
+        error, dip = ca.SX.sym("error"), ca.SX.sym("dip")
         mode, formation = self.mode, self.mode.formation
         rates, c, v_t, tau, K, P = self.dynamics(y, t, self.packed)
         c_n = c[: formation.n_contacts]
@@ -234,7 +244,9 @@ class _Model:
             events,
         ]
         sizes = [None if k in (6, 7, 8, 9, 10) else part.shape[0] for k, part in enumerate(parts)]
-        return ca.densify(ca.vertcat(*parts)), Outputs(*lay_out(*sizes))
+        packed = ca.densify(ca.vertcat(*parts))
+        report = ca.Function("report", [y, t, error, dip, self.packed], [packed])
+        return report, Outputs(*lay_out(*sizes))
 
 
 def open_limits(formation: Formation, until: Until) -> list[Limit]:
