@@ -16,7 +16,6 @@ from .errors import InputError
 from .files import write_text, write_whole
 from .model import Array
 from .torque import MOST, TorqueProfile
-from .torquetable import format_rows, place_rows
 
 
 class Samples(NamedTuple):
@@ -180,6 +179,8 @@ class Trajectory:
         InputError
             If the file cannot be written.
         """
+        from .torquetable import format_rows, place_rows
+
         write_text(path, format_rows(place_rows(self.torque)))
 
 

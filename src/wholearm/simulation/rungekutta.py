@@ -109,7 +109,8 @@ def build_step(
     stages, last = _build_combinations(y.shape[0])
     rates: list[Expression] = []
     for combine, row in zip(stages, _ROWS, strict=True):
-        rates.append(rate(*combine(y, t, h, *(rates[j] for j in row))))
+        place = combine(y, t, h, *(rates[j] for j in row)) if row else (y, t)
+        rates.append(rate(*place))
     end, fifth, third = last(y, t, h, *rates)
     return end, fifth, third
 

@@ -305,5 +305,5 @@ def _roots(polynomial: Array) -> list[float]:
     significant = np.flatnonzero(np.abs(polynomial) > 1e-14 * np.abs(polynomial).max())
     if not len(significant) or significant[-1] == 0:
         return []
-    roots = np.polynomial.polynomial.polyroots(polynomial[: significant[-1] + 1])
+    roots = np.roots(polynomial[significant[-1] :: -1])
     return [float(root.real) for root in roots if abs(root.imag) < 1e-9]
