@@ -7,19 +7,23 @@ import numpy as np
 import pytest
 
 import wholearm.timedomain.timeplan as timeplan
-from plane import measure_slip
-from thrown import raised
-from timed import instants
-from tipping import tilting
+from plane import make_formation, measure_gaps, measure_slip
+from thrown import parting, raised
+from timed import instants, landing, plan_landing, total
+from tipping import roll, tilting
 from wholearm.dynamics import Directions
+from wholearm.formation import find_touching
 from wholearm.options import PlanOptions
-from wholearm.problem import Problem
+from wholearm.path import trace_phases
+from wholearm.plan import solve
+from wholearm.problem import End, Problem, Until
 from wholearm.timedomain.modes import in_mode, link, mode_of, sign_sequence, split
 from wholearm.timedomain.modesearch import WORTH, improve
 from wholearm.timedomain.stage import Stage
 from wholearm.timedomain.staging import outline_stages
 from wholearm.timedomain.timeplan import plan_phases
-from wholearm.timedomain.timesearch import Search
+from wholearm.timedomain.timesearch import MOST, Search
+from wholearm.verify import verify
 
 OPTIONS = PlanOptions(time_intervals=10)
 
@@ -98,3 +102,57 @@ def test_rolling_for_a_while_is_found_where_it_is_the_best_of_all_sequences() ->
     c_n, c_t = rolling.guess.forces[..., 0], rolling.guess.forces[..., -1]
     mu = rolling.formation.friction[0]
     assert (mu * (c_n - search.problem.epsilon) - np.abs(c_t)).min() > -1e-6
+
+
+@pytest.mark.parametrize("noise", [2.04e-10, -8e-11])
+def test_rounding_of_masses_decides_nothing(noise: float) -> None:
+    problem = landing()
+    noisy = problem.with_(mass=problem.scene.polygon.mass * (1 + noise))
+    start = trace_phases(problem)[-1].end
+    options = PlanOptions(time_intervals=10)
+    plans = plan_phases(noisy, noisy.phases[4:], start, options)
+    assert total(plans) == pytest.approx(total(plan_landing(time_intervals=10)), rel=1e-7)
+
+
+def test_a_first_phase_lets_go_what_touches_at_the_start() -> None:
+    problem = parting()
+    (phase,) = problem.phases
+    touching = find_touching(problem.scene, problem.start)
+    (left,) = {c.name for c in touching} - set(phase.formation.names)
+    plan = solve(problem, transcription="time", time_intervals=8)
+    report = verify(problem, plan)
+    assert report.ok, report.to_text()
+    motion = plan.motions[0]
+    samples = motion.evaluate(np.linspace(0.0, motion.duration, 50))
+    gap = np.array([measure_gaps(make_formation(problem.scene, left), z)[0] for z in samples.z])
+    assert abs(gap[0]) < 1e-9
+    # It opens at once and does not touch again [m].
+    assert (gap[1:] > 1e-6).all()
+
+
+def test_a_contact_rolls_in_one_phase_and_slides_in_the_next() -> None:
+    sliding = tilting()
+    (phase,) = sliding.phases
+    formation = roll(phase.formation, "v1-palm")
+    first = replace(phase, formation=formation, until=Until(), end=End.SMOOTH)
+    problem = replace(sliding, phases=(first, replace(phase, index=1)))
+    plans = plan_phases(problem, problem.phases, problem.start, PlanOptions(time_intervals=6))
+    before, after = (plan.motion.stages for plan in plans)
+    assert {stage.formation.rolling for stage in before} == {formation.rolling}
+    # No interval is halved for ever, and neither phase shrinks to nothing.
+    assert sum(len(stage.points.fractions) for stage in (*before, *after)) <= 2 * MOST
+    assert min(plan.motion.duration for plan in plans) > 0.1 * total(plans)
+    for stage in after:
+        samples = stage.evaluate(instants(stage, 12))
+        slip = np.array(
+            [
+                measure_slip(stage.formation, *pair)[0]
+                for pair in zip(samples.z, samples.z_dot, strict=True)
+            ]
+        )
+        # Friction is that of sliding, against the motion.
+        assert (slip * stage.directions.Xi[0]).min() > -1e-4 * np.abs(slip).max()
+        mu = stage.formation.friction[0]
+        expected = -mu * stage.directions.Xi[0] * samples.c_n[:, 0]
+        np.testing.assert_allclose(samples.c_t[:, 0], expected, rtol=1e-9)
+        assert mu > 0 and abs(stage.directions.Xi[0]) == 1.0

@@ -67,6 +67,16 @@ def raised(stop: float = 0.5) -> Problem:
     return Problem("raise", scene, 0.05, start, (phase,))
 
 
+def parting() -> Problem:
+    """Finger 1 pushes a box over the palm that finger 2 touches as well at the start."""
+    corners = [[-0.045, -0.03], [0.045, -0.03], [0.045, 0.09], [-0.045, 0.09]]
+    scene = make_scene(corners, base=0.1)
+    start = _close(scene, place_flush(scene, 0, 0.0), 0.0)
+    formation = Formation(scene, find_touching(scene, start)[:3])
+    phase = Phase(0, formation, Until(None, "x", -0.015))
+    return Problem("part", scene, 0.05, start, (phase,))
+
+
 def _with_palm(fingers: float, palm: float) -> Scene:
     scene = make_scene()
     return Scene(scene.polygon, scene.fingers, Friction(palm, fingers, fingers), scene.gravity)

@@ -23,6 +23,8 @@ from .phaseplan import PhasePlan
 from .problem import End, Phase, Problem
 from .trajectory import Motion
 
+FINEST = 64
+"""Most intervals of a phase in the time domain that refining asks for."""
 MOVED = 1e-9
 """Distance from which on a block starts somewhere else, in radii of gyration or radians."""
 SHORT = 5e-7
@@ -67,6 +69,16 @@ class BlockPlan:
             return self.chain.curves[-1].end
         motion = self.plans[-1].motion
         return np.asarray(motion.evaluate(np.array([motion.duration])).z[0])
+
+    @property
+    def intervals(self) -> int:
+        """Most intervals of a phase in the time domain: each is a piece of the torques."""
+        return max(len(plan.torque.coefficients) for plan in self.plans)
+
+    @property
+    def is_finest(self) -> bool:
+        """Whether it is planned in the time domain with all the intervals that it may have."""
+        return self.chain is None and self.intervals >= FINEST
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,9 +195,7 @@ def _refine(options: PlanOptions, known: BlockPlan | None, finer: int) -> PlanOp
         return options
     wanted = options.time_intervals
     if known is not None and known.chain is None:
-        # Each interval in the time domain is a piece of the torques.
-        had = max(len(plan.torque.coefficients) for plan in known.plans)
-        wanted = had * 2 ** (finer - known.finer)
+        wanted = min(known.intervals * 2 ** (finer - known.finer), FINEST)
     return replace(options, intervals=options.intervals * 2**finer, time_intervals=wanted)
 
 

@@ -124,7 +124,8 @@ def replay_plan(
             if number in [phase.number for phase in block.phases]
         )
         most = REFINEMENTS if accepted.failure is not None else 1
-        finer = planning.blocks[index].finer < most
+        block = planning.blocks[index]
+        finer = block.finer < most and not block.is_finest
         refined = _refine(planning, index, report) if finer else None
         if refined is None and accepted.failure is None:
             check = accepted

@@ -49,8 +49,8 @@ def adapt(search: Search, solution: Solution) -> Solution:
     count = sum(stage.intervals for stage in solution.stages)
     price = STRETCH * abs(solution.cost) / count
     loose = [replace(stage, adapts=price) for stage in solution.stages]
-    moved = search.solve(loose, most=PATIENCE)
-    fixed = search.solve([replace(stage, adapts=0.0) for stage in moved.stages])
+    moved = search.solve(loose, solution, most=PATIENCE)
+    fixed = search.solve([replace(stage, adapts=0.0) for stage in moved.stages], moved)
     return fixed if fixed.success and fixed.cost < solution.cost else solution
 
 

@@ -26,6 +26,8 @@ ROUNDS = 24
 """Most times that limits are tightened."""
 REFINEMENTS = 8
 """Most times that intervals are halved because of misses."""
+MOST = 256
+"""Intervals of all stages from which on none is halved."""
 DEFECT = 2e-8
 """What collocation may miss z and z' by at the end of an interval, in the scene's own units."""
 DEAR = 1e-5
@@ -238,7 +240,8 @@ class Search:
                 dear | (np.abs(motion.defects).max(axis=(1, 2)) > DEFECT)
                 for dear, motion in zip(self.find_dear(solution, misses), motions, strict=True)
             ]
-            if refined < REFINEMENTS and any(mine.any() for mine in marked):
+            few = sum(stage.intervals for stage in solution.stages) < MOST
+            if few and refined < REFINEMENTS and any(mine.any() for mine in marked):
                 refined += 1
                 finer = self.solve(halve(solution.stages, self.scheme, marked), solution)
                 if finer.success:
