@@ -173,7 +173,10 @@ def test_failures_that_no_limit_explains_are_the_solvers() -> None:
     problem, _ = shove()
     failed = explain(search(problem), problem, problem.phases, [], "Restoration_Failed", None)
     assert isinstance(failed, SolverError)
-    assert str(failed).startswith("no plan for phases 1 and 2: Restoration_Failed; try other ")
+    text = str(failed)
+    assert text.startswith("no plan for phases 1 and 2 (") and "Restoration_Failed" in text
+    assert all(name in text for name in problem.phases[0].formation.names)
+    assert text.endswith("; try other time_intervals") and "\n" not in text
 
 
 def test_the_motion_that_is_short_of_least_is_described() -> None:

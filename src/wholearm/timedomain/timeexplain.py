@@ -129,11 +129,12 @@ def explain(
             undecided.append(index)
             return None
         solution = search.aiming(Objective.RELAX, gives[index]).solve(eased, seconds=LONGEST)
-        if not solution.success:
+        # A limit that may be tighter is not what keeps the others from being kept.
+        if not solution.success or solution.cost < 0.0:
             undecided.append(index)
+            return None
         limit = limits[index]
-        cost = units[index] * solution.cost
-        return limit.value + limit.sign * cost if solution.success else None
+        return limit.value + limit.sign * units[index] * solution.cost
 
     def can_plan(index: int, value: float) -> bool:
         if time.thread_time() > stop:
