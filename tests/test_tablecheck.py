@@ -45,9 +45,9 @@ def test_a_table_that_loses_a_contact_is_an_error() -> None:
 def test_samples_at_a_rate_are_reported(interpolation: str) -> None:
     """The closer the samples, the nearer arrivals and forces are to those of the plan."""
     problem, trajectory = plan()
-    fine = sample_table(problem, trajectory, 20000.0, interpolation).figures
+    fine = sample_table(problem, trajectory, 8000.0, interpolation).figures
     coarse = sample_table(problem, trajectory, 60.0, interpolation).figures
-    assert (fine["sample_rate"], fine["interpolation"]) == (20000.0, interpolation)
+    assert (fine["sample_rate"], fine["interpolation"]) == (8000.0, interpolation)
     assert not coarse["replay"]["ok"] and " phase " in coarse["replay"]["reason"]
 
     def find_errors(figures: dict[str, object]) -> Array:

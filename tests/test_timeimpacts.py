@@ -32,8 +32,9 @@ def problem() -> Problem:
 
 @lru_cache(maxsize=4)
 def planned(objective: str) -> Trajectory:
-    """A plan for least time with the default number of intervals, for another goal with fewer."""
-    options: dict[str, Any] = {} if objective == "time" else {"time_intervals": 8}
+    """Plans on few intervals, whose replay is a test of its own."""
+    intervals = 16 if objective == "time" else 6
+    options: dict[str, Any] = {"time_intervals": intervals, "replay": False}
     return solve(problem(), objective, transcription="time", **options)
 
 
@@ -127,7 +128,7 @@ def test_least_effort_with_impacts_is_near_that_along_the_curves() -> None:
 def test_an_impact_that_is_not_possible_next_to_a_landing_is_a_stop() -> None:
     path = HEPTAGON.with_name("heptagon.toml")
     table: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
-    options: dict[str, Any] = {"time_intervals": 8}
+    options: dict[str, Any] = {"time_intervals": 8, "replay": False}
     stopped = solve(build_problem(table), **options)
     table["phases"][3]["end"] = "impact"
     struck = solve(build_problem(table), **options)
