@@ -16,6 +16,7 @@ from wholearm.path import trace_phases
 from wholearm.pathdomain.pathplan import plan_path
 from wholearm.phaseplan import PhasePlan
 from wholearm.problem import Problem
+from wholearm.timedomain import timeexplain
 from wholearm.timedomain.collocation import make_scheme
 from wholearm.timedomain.stage import Stage
 from wholearm.timedomain.staging import outline_stages
@@ -54,16 +55,25 @@ def outline(problem: Problem, index: int = 0) -> Stage:
     return replace(stage, guess=stage.guess._replace(forces=forces, tau=tau))
 
 
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Advice takes the time that it needs, however slow the machine is."""
+    monkeypatch.setattr(timeexplain, "ADVICE", np.inf)
+
+
 def test_a_force_that_weight_limits_has_its_closed_form() -> None:
     text = why_not(lambda: plan_all(change_limit(shove()[0], 2, 1.0)))
     found = re.fullmatch(
-        r"phases 1 and 2 are infeasible: c_n of v1-palm >= epsilon = 1 N is (\S+) N short "
-        r"at t = 0\.\d{4} s, phase 2; feasible with epsilon = (\S+) N instead of 1",
+        r"phase 1 is infeasible: from rest at its start, x = 20 mm, phi = 0 deg, no motion begins "
+        r"in any contact mode: c_n of v1-palm >= epsilon = 1 N is (\S+) N short at best; "
+        r"feasible with epsilon = (\S+) N instead of 1",
         text,
     )
     assert found, text
-    assert float(found[1]) == pytest.approx(1 - LEAST, abs=5e-4)  # Three digits.
-    assert float(found[2]) == pytest.approx(LEAST, abs=1e-3) and float(found[2]) < LEAST
+    # What is short at the start is no more than what is short while it slows down.
+    assert 0 < float(found[1]) <= 1 - LEAST
+    # Advice is meant to be within 2 % of what is needed.
+    assert 0.98 * LEAST < float(found[2]) < LEAST
 
 
 @pytest.mark.parametrize(

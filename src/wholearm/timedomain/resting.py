@@ -13,6 +13,7 @@ motion comes to rest the same holds with the acceleration against the way that t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -44,7 +45,11 @@ class Blocked(NamedTuple):
 
 
 def find_block(
-    formation: Formation, z: Array, epsilon: float, ends: bool = False
+    formation: Formation,
+    z: Array,
+    epsilon: float,
+    ends: bool = False,
+    torque_limit: Array | None = None,
 ) -> Blocked | None:
     """Say why no motion begins from rest at `z`, or ends there; None if one may.
 
@@ -57,7 +62,10 @@ def find_block(
     epsilon : float
     ends : bool
         Whether the motion ends at rest at `z`: then it moved against its acceleration.
+    torque_limit : ndarray, shape (2,), optional
+        In place of the scene's.
     """
+    torque = formation.scene.torque_limit if torque_limit is None else torque_limit
     N = tangent_basis(formation, z)
     metric = np.array([1.0, 1.0, *(3 * [formation.scene.polygon.gyration_radius**2])])
     N = N / metric[:, None]
@@ -73,13 +81,40 @@ def find_block(
             np.where(np.abs(rates @ way) > _STILL * np.abs(rates).max(), rates @ way, 0)
         )
         signs[list(formation.rolling_rows)] = 0.0
-        programme = _Programme(formation, epsilon, -N if ends else N, A, A_t, rates, signs)
+        programme = _Programme(formation, epsilon, torque, -N if ends else N, A, A_t, rates, signs)
         if programme.moves():
             return None
         short = programme.find_short()
         if short is not None and (least is None or short.short < least.short):
             least = short
     return least or Blocked("", 0.0)
+
+
+def find_largest(allows: Callable[[float], bool], most: float) -> float | None:
+    """The largest value below `most` that allows a motion, to a thousandth; None if none does."""
+    low, high = 0.0, most
+    if not allows(low):
+        return None
+    while high - low > 1e-3 * most:
+        middle = (low + high) / 2
+        low, high = (middle, high) if allows(middle) else (low, middle)
+    return low or None
+
+
+def find_smallest(allows: Callable[[float], bool], least: float) -> float | None:
+    """The smallest value above `least` that allows a motion, to a thousandth; None if none does.
+
+    More than a thousand times as much is not looked at.
+    """
+    low, high = least, 2 * least
+    while not allows(high):
+        low, high = high, 2 * high
+        if high > 1e3 * least:
+            return None
+    while high - low > 1e-3 * low:
+        middle = (low + high) / 2
+        low, high = (low, middle) if allows(middle) else (middle, high)
+    return high
 
 
 def list_ways(rates: Array) -> list[Array]:
@@ -100,6 +135,7 @@ class _Programme:
         self,
         formation: Formation,
         epsilon: float,
+        torque_limit: Array,
         N: Array,
         A: Array,
         A_t: Array,
@@ -144,7 +180,7 @@ class _Programme:
         free: tuple[float | None, float | None] = (None, None)
         limits = [free] * f + [(epsilon, None)] * n_c + [free] * len(sticks)
         limits += [(-float(scene.dry[3 + k]), float(scene.dry[3 + k])) for k in held]
-        limits += [(-float(limit), float(limit)) for limit in scene.torque_limit]
+        limits += [(-float(limit), float(limit)) for limit in torque_limit]
         self.limits = limits
 
     @property

@@ -39,18 +39,23 @@ def ease(search: Search, stages: Sequence[Stage]) -> list[Stage] | None:
 
 
 def refuse(
-    search: Search, problem: Problem, phases: Sequence[Phase], stages: Sequence[Stage]
+    search: Search,
+    problem: Problem,
+    phases: Sequence[Phase],
+    stages: Sequence[Stage],
+    replan: Replan | None,
 ) -> None:
     """Raise an error if no motion can begin from rest at the start, or come to rest at the end.
 
-    The end counts where it is one point: where a single phase with one freedom leads.
+    The end counts where it is one point: where a single phase with one freedom leads. `replan` is
+    as for `explain`.
 
     Raises
     ------
     InfeasibleError
-        With the contact that would have to pull.
+        With the contact that would have to pull, and what single change would do.
     """
-    from .resting import find_block
+    from .resting import find_block, find_largest, find_smallest
 
     epsilon, last = search.problem.epsilon, stages[-1]
     stage, node, phase = stages[0], 0, phases[0]
@@ -71,7 +76,24 @@ def refuse(
         text += f": c_n of {blocked.contact} >= {least} is {amount:.3g} N short at best"
     else:
         text += " within the torque limits"
-    raise InfeasibleError(text)
+    ends, z = node == -1, stage.guess.nodes[node, 0]
+
+    def find_least(index: int) -> float | None:
+        own = search.problem
+
+        def allows(value: float) -> bool:
+            torque = own.scene.torque_limit.copy()
+            torque[index : index + 1] = value
+            least = value if index == 2 else own.epsilon
+            return find_block(stage.formation, z, least, ends, torque) is None
+
+        if index == 2:
+            return scales.force * value if (value := find_largest(allows, epsilon)) else None
+        limit = float(own.scene.torque_limit[index])
+        return scales.torque * value if (value := find_smallest(allows, limit)) else None
+
+    scales = problem.scene.scales
+    raise _advise(problem, text, find_least, replan)
 
 
 def explain(
@@ -112,33 +134,63 @@ def explain(
     shortfalls = list_shortfalls(problem, eased)
     are = "are" if len(phases) > 1 else "is"
     text = f"{what} {are} infeasible: {rank_shortfalls(shortfalls)}"
-    if replan is None:
-        return InfeasibleError(text)
-    limits = [
-        Limit(f"torque limit of finger {k + 1}", float(problem.scene.torque_limit[k]), "N m", 1)
-        for k in range(2)
-    ]
-    limits.append(Limit("epsilon", problem.epsilon, "N", -1))
     gives = [Give(0.0, (1.0, 0.0)), Give(0.0, (0.0, 1.0)), Give(1.0)]
     units = [scales.torque, scales.torque, scales.force]
-
-    stop, undecided = time.thread_time() + ADVICE, list[int]()
+    limits, undecided = _list_limits(problem), list[int]()
 
     def find_least(index: int) -> float | None:
-        if time.thread_time() > stop:
-            undecided.append(index)
-            return None
         solution = search.aiming(Objective.RELAX, gives[index]).solve(eased, seconds=LONGEST)
         # A limit that may be tighter is not what keeps the others from being kept.
         if not solution.success or solution.cost < 0.0:
             undecided.append(index)
             return None
-        limit = limits[index]
-        return limit.value + limit.sign * units[index] * solution.cost
+        return limits[index].value + limits[index].sign * units[index] * solution.cost
+
+    return _advise(problem, text, find_least, replan, undecided)
+
+
+def _list_limits(problem: Problem) -> list[Limit]:
+    """The limits that may give way: both torque limits, and epsilon."""
+    torque = problem.scene.torque_limit
+    limits = [
+        Limit(f"torque limit of finger {k + 1}", float(torque[k]), "N m", 1) for k in range(2)
+    ]
+    return [*limits, Limit("epsilon", problem.epsilon, "N", -1)]
+
+
+def _advise(
+    problem: Problem,
+    text: str,
+    find_least: Callable[[int], float | None],
+    replan: Replan | None,
+    undecided: list[int] | None = None,
+) -> InfeasibleError:
+    """The error with `text` and what single change of a limit would make a plan possible.
+
+    Parameters
+    ----------
+    problem : Problem
+    text : str
+    find_least : callable
+        As for `wholearm.advice.find_changes`.
+    replan : callable or None
+        Without it no change is looked for.
+    undecided : list of int, optional
+        Limits of which `find_least` could not tell.
+    """
+    if replan is None:
+        return InfeasibleError(text)
+    stop, open_ones = time.thread_time() + ADVICE, [] if undecided is None else undecided
+
+    def look(index: int) -> float | None:
+        if time.thread_time() > stop:
+            open_ones.append(index)
+            return None
+        return find_least(index)
 
     def can_plan(index: int, value: float) -> bool:
         if time.thread_time() > stop:
-            undecided.append(index)
+            open_ones.append(index)
             return False
         try:
             replan(change_limit(problem, index, value))
@@ -146,8 +198,8 @@ def explain(
             return False
         return True
 
-    changes = find_changes(limits, find_least, can_plan)
-    if undecided and not changes:
+    changes = find_changes(_list_limits(problem), look, can_plan)
+    if open_ones and not changes:
         return InfeasibleError(f"{text}; no single limit was found that makes it feasible")
     return InfeasibleError(f"{text}; {describe_changes(changes)}")
 

@@ -101,7 +101,11 @@ def plan_phases(
         return _summarise(problem, search, phases, solution)
     from .timeexplain import ease, explain, list_shortfalls, refuse
 
-    refuse(search, problem, phases, first)
+    def replan(other: Problem) -> object:
+        own = [other.phases[phase.index] for phase in phases]
+        return plan_phases(other, own, z, options, explained=False, patient=False)
+
+    refuse(search, problem, phases, first, replan if explained else None)
     spent = time.thread_time() - started
     attempt = max(ATTEMPT, ATTEMPT * spent)
     ways = list_slow_ways(problem, phases[0], z, WAYS) if patient and len(phases) == 1 else []
@@ -131,10 +135,6 @@ def plan_phases(
         reason = f"none was found, although a slow motion keeps limits, from {', '.join(tried)}"
 
     reason = lost + reason
-
-    def replan(other: Problem) -> object:
-        own = [other.phases[phase.index] for phase in phases]
-        return plan_phases(other, own, z, options, explained=False, patient=False)
 
     raise explain(search, problem, phases, short, reason, replan if explained else None)
 
