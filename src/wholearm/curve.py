@@ -211,7 +211,11 @@ def border(P: Array, last: Array) -> Array:
 
 
 def tangent_basis(formation: Formation, z: Array) -> Array:
-    """Basis of the null space of P at `z`, shape (5, f), orthonormal in radii of gyration."""
+    """Covectors N of the null space of P at `z`, shape (5, f), in radii of gyration.
+
+    N^T dz are the coordinates of a displacement in an orthonormal basis of that space; N over the
+    metric spans it.
+    """
     metric = metric_weights(formation.scene)
     P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
     _, values, right = np.linalg.svd(P / np.sqrt(metric))
