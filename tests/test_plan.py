@@ -293,7 +293,7 @@ def test_a_block_that_starts_elsewhere_gets_another_share() -> None:
     path = HEPTAGON.with_name("heptagon_twice.toml")
     problem, fastest_plan = load(str(path)), fastest(path)
     allowed = 1.02 * fastest_plan.duration
-    plan = solve(problem, "margin", duration=allowed, replay=False)
+    plan = solve(problem, "margin", duration=allowed)
     times = np.array(fastest_plan.meta["phase_durations"])
     ratios = np.array(plan.meta["phase_durations"]) / times
     starts = [each.motions[6].evaluate(np.zeros(1)).z[0] for each in (plan, fastest_plan)]

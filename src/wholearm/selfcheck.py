@@ -14,7 +14,7 @@ import numpy as np
 
 from .blocks import BlockPlan, Planning, refine_block
 from .errors import InfeasibleError, ReplayError, SolverError
-from .model import Array
+from .model import Array, Scales
 from .newton_euler import balance
 from .problem import Problem
 from .report import Deviation, Report
@@ -72,11 +72,16 @@ class Check(NamedTuple):
         assert self.report.failed_phase is not None
         return self.report.failed_phase, self.report.reason
 
-    def find_culprit(self, length: float, departure: float) -> int:
-        """Number of the phase to refine: the first one that departs, or else that fails."""
+    def find_culprit(self, scales: Scales, allowance: Allowance) -> int:
+        """Number of the phase to refine: the first that departs or does not stop, or that fails."""
         assert self.failure is not None
         for phase in self.report.phases:
-            if phase.deviation and measure_departure(phase.deviation, length) > departure:
+            departs = (
+                phase.deviation is not None
+                and measure_departure(phase.deviation, scales.length) > allowance.departure
+            )
+            fast = (phase.end_speed or 0.0) > allowance.rest_speed * scales.speed
+            if departs or fast:
                 return min(phase.number, self.failure[0])
         return self.failure[0]
 
@@ -117,7 +122,7 @@ def replay_plan(
         if check.failure is None:
             break
         accepted = check_plan(problem, trajectory, usual, closely=True)
-        number = check.find_culprit(problem.scene.scales.length, strict.departure)
+        number = check.find_culprit(problem.scene.scales, strict)
         index = next(
             k
             for k, block in enumerate(planning.blocks)
