@@ -115,12 +115,9 @@ def find_misses(stage: Stage, look: Look, epsilon: float, margin: float = 0.0) -
 
 def _measure_senses(stage: Stage, samples: Samples) -> Array:
     """Rates in a stage's directions, shape (n, n_c + 2); those of rolling contacts are 1."""
-    formation, v = stage.formation, samples.z_dot
-    slip = np.einsum("nij,nj->ni", formation.evaluate(samples.z, v).A_t, v)
-    rates = np.hstack([slip / formation.scene.polygon.gyration_radius, v[:, 3:]])
-    senses = rates * np.concatenate(stage.directions)
-    senses[:, list(formation.rolling_rows)] = 1.0
-    return np.asarray(senses)
+    senses = stage.measure_senses(samples.z, samples.z_dot)
+    senses[:, list(stage.formation.rolling_rows)] = 1.0
+    return senses
 
 
 def watch_missed(stages: Sequence[Stage], looks: Sequence[Look]) -> list[Stage] | None:

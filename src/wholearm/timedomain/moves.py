@@ -157,9 +157,7 @@ def _find_held(stage: Stage, scheme: Scheme) -> list[Run]:
     """
     formation, part = stage.formation, stage.guess
     z, v = part.z.reshape(-1, 5), part.v.reshape(-1, 5)
-    slip = np.einsum("nij,nj->ni", formation.evaluate(z, v).A_t, v)
-    rates = np.hstack([slip, v[:, 3:]])
-    senses = rates * np.concatenate(stage.directions)
+    senses = stage.measure_senses(z, v)
     fast = np.abs(v[:, 2:]).max()
     least = 1.01 * least_rates(stage, stage.guess.places(scheme.points)).reshape(-1, 1)
     touches = senses < least + _STALLED * fast

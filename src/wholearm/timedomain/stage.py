@@ -109,3 +109,18 @@ class Stage:
     def intervals(self) -> int:
         """Number of intervals K."""
         return len(self.guess.fractions)
+
+    def measure_senses(self, z: Array, v: Array) -> Array:
+        """Rates of contacts and joints in the stage's directions, shape (n, n_c + 2) [rad/s].
+
+        Those of contacts are over the radius of gyration; what moves against its direction has a
+        negative one.
+
+        Parameters
+        ----------
+        z, v : ndarray, shape (n, 5)
+            Configurations and velocities.
+        """
+        slip = np.einsum("nij,nj->ni", self.formation.evaluate(z, v).A_t, v)
+        rates = np.hstack([slip / self.formation.scene.polygon.gyration_radius, v[:, 3:]])
+        return np.asarray(rates * np.concatenate(self.directions))
