@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wholearm.benchmark.lpmotion import fast_margin, inertia_ratio, rest_margin, slow_margin
+from wholearm.benchmark.lpmotion import fast_margin, inertia_ratio, slow_margin
 from wholearm.benchmark.tracing import follow, spread
 from wholearm.curve import Curve
 from wholearm.dynamics import Directions, reduced_inertia
@@ -44,8 +44,15 @@ def test_without_strength_no_motion_exists(heptagon: Problem, course: tuple[Phas
     scene = _weaker(heptagon.scene, 0.01)
     assert slow_margin(scene, phase, heptagon.epsilon, z, z_s)[0] < 0.0
     assert fast_margin(scene, phase, heptagon.epsilon, (s, z, z_s)) < 0.0
-    assert rest_margin(scene, phase, 1.0, z[0]) < 0.0
-    assert rest_margin(heptagon.scene, phase, heptagon.epsilon, z[0]) > 0.0
+
+
+def test_friction_that_may_be_any_in_its_cone_only_allows_more(
+    heptagon: Problem, course: tuple[Phase, Course]
+) -> None:
+    phase, curve = course
+    scene = replace(heptagon.scene, friction=Friction(0.4, 0.4, 0.4))
+    strict = fast_margin(scene, phase, heptagon.epsilon, curve)
+    assert fast_margin(scene, phase, heptagon.epsilon, curve, loose=10.0) > strict + 1e-3
 
 
 def test_a_larger_epsilon_takes_no_more_than_itself_from_the_margin(

@@ -136,8 +136,9 @@ def run_leg(leg: Leg, objective: str) -> Outcome:
             return Outcome("iteration limit", "", text, seconds)
         if isinstance(error, SolverError) or not isinstance(error, InfeasibleError | InputError):
             return Outcome("no answer", type(error).__name__, text, seconds)
-        verdict = judge(leg.problem, error, leg.stops)
-        return Outcome(f"refused, {verdict.kind}", name_argument(text), text, seconds)
+        verdict = judge(leg.problem, error, leg.stops, objective)
+        said = f"{text} [{verdict.kind}: {verdict.reason}]"
+        return Outcome(f"refused, {verdict.kind}", name_argument(text), said, seconds)
     except Exception as error:
         return Outcome("traceback", "", repr(error), spent())
     seconds = spent()

@@ -18,6 +18,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linprog
 from scipy.sparse import coo_array
 
@@ -80,6 +81,7 @@ def fast_margin(
     epsilon: float,
     curve: tuple[Array, Array, Array],
     rests: tuple[bool, bool] = (True, True),
+    loose: float = 0.0,
 ) -> float:
     """Margin of the best motion along a curve.
 
@@ -89,15 +91,21 @@ def fast_margin(
         As of `tracing.spread`.
     rests : (bool, bool)
         Whether the motion is at rest at the start and at the end of the curve.
+    loose : float
+        Rate of sliding over that of the whole motion below which a contact may also roll, or slide
+        the other way, on a curve nearby: its friction may then be any in its cone.
     """
     s, z, z_s = curve
     size, speed = scene.scales.length, scene.scales.speed
     signs = _signs(scene, phase, z, z_s)
     z_ss = np.gradient(z_s, s, axis=0, edge_order=1)
+    contacts = phase.formation.n_contacts
+    slow = np.abs(slides(scene, phase, z, z_s)[:, :contacts]) < loose
+    free = slow[1:] | slow[:-1] if loose else None
     count, forces = len(s), []
     for left in (True, False):
         at = slice(0, count - 1) if left else slice(1, count)
-        forces.append(_limits(scene, phase, epsilon, z[at], z_s[at], z_ss[at], signs))
+        forces.append(_limits(scene, phase, epsilon, z[at], z_s[at], z_ss[at], signs, free))
     width, slots = forces[0].hold.shape[2] - 3, np.arange(count - 1)
     run = np.diff(s) / size
     # Unknowns: b at the nodes, then v at the nodes, then c at both ends of every interval, margin.
@@ -160,68 +168,6 @@ def inertia_ratio(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
     return np.asarray(np.minimum(*ratios))
 
 
-def rest_margin(scene: Scene, phase: Phase, epsilon: float, z: Array) -> float:
-    """Best margin of any motion that leaves or reaches rest at one configuration, shape (5,).
-
-    Every sense of sliding that the accelerations can give is tried, and every sense that friction
-    of a contact or joint at rest can take is allowed: what is impossible here is impossible.
-    """
-    formation = phase.formation
-    touches = [locate(scene, name, z[None]) for name in formation.names]
-    rolling = formation.rolling_rows
-    force, length = scene.scales.force, scene.scales.length
-    count = len(touches)
-    # Unknowns: z'' (over the scene's), c_n and c_t over the weight, dry torques over D, margin.
-    total = 5 + 2 * count + 2 + 1
-    mass = scene.mass_diagonal * np.array([1.0, 1.0, *[1 / length] * 3]) * scene.scales.acceleration
-    scale = force * np.array([1.0, 1.0, length])
-    equal = np.zeros((3, total))
-    equal[:, :5] = np.diag(mass)[:3]
-    upper: list[Array] = []
-    right: list[float] = []
-
-    def require(row: Array, least: float, share: float) -> None:
-        row = row.copy()
-        row[-1] -= share
-        upper.append(-row)
-        right.append(-least)
-
-    torque = np.zeros((2, total))
-    torque[:, 3:5] = np.diag(mass)[3:, 3:]
-    keep = []
-    for k, touch in enumerate(touches):
-        for column, row in ((5 + k, touch.normal[0]), (5 + count + k, touch.tangent[0])):
-            equal[:, column] = -row[:3] * force
-            torque[:, column] = -row[3:] * force
-        unit = np.zeros(total)
-        unit[5 + k] = 1.0
-        require(unit, epsilon / force, 1.0)
-        for sign in (-1.0, 1.0):
-            cone = touch.friction * unit
-            cone[5 + count + k] = sign
-            require(cone, 0.0, 0.0)
-        closed = np.zeros(total)
-        closed[:5] = touch.normal[0] * np.array([1.0, 1.0, *[1 / length] * 3])
-        keep.append(closed)
-        if k in rolling:
-            held = np.zeros(total)
-            held[:5] = touch.tangent[0] * np.array([1.0, 1.0, *[1 / length] * 3])
-            keep.append(held)
-    for joint in range(2):
-        torque[joint, 5 + 2 * count + joint] = scene.dry[3 + joint]
-        row = torque[joint] / scene.torque_limit[joint]
-        require(-row, -1.0, 1.0)
-        require(row, -1.0, 1.0)
-    bounds = [(None, None)] * (5 + 2 * count) + [(-1.0, 1.0)] * 2 + [(None, 1.0)]
-    cost = np.zeros(total)
-    cost[-1] = -1.0
-    answer = linprog(
-        cost, np.array(upper), np.array(right), np.vstack([equal / scale[:, None], *keep]),
-        np.append(scene.applied_force[:3] / scale, np.zeros(len(keep))), bounds, method="highs",
-    )  # fmt: skip
-    return float(-answer.fun) if answer.status == 0 else -np.inf if answer.status == 2 else np.nan
-
-
 def _top(scene: Scene, z_s: Array) -> Array:
     """Largest s'^2 that the joints' speed limits and `FASTEST` allow, shape (n,)."""
     with np.errstate(divide="ignore"):
@@ -236,18 +182,28 @@ def _signs(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
 
 
 def _limits(
-    scene: Scene, phase: Phase, epsilon: float, z: Array, z_s: Array, z_ss: Array, signs: Array
+    scene: Scene,
+    phase: Phase,
+    epsilon: float,
+    z: Array,
+    z_s: Array,
+    z_ss: Array,
+    signs: Array,
+    free: NDArray[np.bool_] | None = None,
 ) -> Forces:
+    """Limits at n places; where `free`, shape (n, n_c), friction of a contact is in its cone."""
     length, force = scene.scales.length, scene.scales.force
     limit, square = scene.torque_limit, scene.scales.speed**2
     names, rolling = phase.formation.names, phase.formation.rolling_rows
     pushes, holds, least, share = [], [], [], []
-    width = 3 + len(names) + len(rolling)
+    width = 3 + len(names) + len(rolling) + (0 if free is None else len(names))
     touches = [locate(scene, name, z) for name in names]
     for k, touch in enumerate(touches):
         slip = 0.0 if k in rolling else touch.friction
         pushes.append(touch.normal - slip * signs[:, [k]] * touch.tangent)
     pushes += [touches[k].tangent for k in rolling]
+    if free is not None:
+        pushes += [touch.tangent for touch in touches]
     push = np.stack(pushes, axis=2) * force  # (n, 5, width - 3) per unit of c
     mass = scene.mass_diagonal
     drive = np.stack(
@@ -274,6 +230,14 @@ def _limits(
             row[:, 3 + own] = touches[own].friction
             row[:, 3 + len(names) + k] = sign
             limit_row(row, np.full(n, touches[own].friction * epsilon / force), 1.0)
+    if free is not None:
+        for k in range(len(names)):
+            # What is left of friction against the sliding, between nothing and twice its amount.
+            for sign, most in ((1.0, 0.0), (-1.0, 2.0)):
+                row = np.zeros((n, width))
+                row[:, 3 + k] = most * touches[k].friction * free[:, k]
+                row[:, width - len(names) + k] = sign * signs[:, k]
+                limit_row(row, np.zeros(n), 0.0)
     for joint in range(2):
         row = np.concatenate([drive[:, 3 + joint], -push[:, 3 + joint]], axis=1) / limit[joint]
         dry = scene.dry[3 + joint] * signs[:, len(names) + joint] / limit[joint]
@@ -340,4 +304,4 @@ def _maximise(total: int, upper: _Rows, equal: _Rows, bounds: Bounds) -> float:
     return -np.inf if answer.status == 2 else np.nan
 
 
-__all__ = ["fast_margin", "inertia_ratio", "rest_margin", "slow_margin"]
+__all__ = ["fast_margin", "inertia_ratio", "slow_margin"]

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from ..errors import InputError, WholearmError
 from ..model import Array, Scene
+from ..plan import solve
 from ..problem import End, Phase, Problem
-from .lpmotion import fast_margin, inertia_ratio, rest_margin, slow_margin
-from .newton import locate
-from .overlap import clearances
-from .tracing import OVERLAP, Trace, close, follow, spread, weights
+from .cellcurves import best_end, find_best, list_ends
+from .lpmotion import fast_margin, inertia_ratio, slow_margin
+from .lprest import rest_margin
+from .tracing import Trace, follow, spread, weights
 
 PLACES = 60
 """Places along a curve at which limits are looked at."""
@@ -24,6 +26,8 @@ UNABLE = -1e-7
 FREE = 0.02
 """Reduced inertia over that without friction above which nothing jams."""
 
+SURE = 0.02
+"""What the best of many curves misses limits by, as a margin, where surely none keeps them."""
 HELD = 1e-3
 """Length of a phase over the radius of gyration below which it may count as nothing to do."""
 
@@ -43,14 +47,25 @@ class Verdict(NamedTuple):
     reason: str
 
 
-def judge(problem: Problem, error: WholearmError, stops: list[tuple[float, float]]) -> Verdict:
-    """Judge a refusal to plan a problem whose phases stop at the poses `stops` (x, phi)."""
+def judge(
+    problem: Problem,
+    error: WholearmError,
+    stops: list[tuple[float, float]],
+    objective: str = "time",
+) -> Verdict:
+    """Judge a refusal to plan a problem whose phases stop at the poses `stops` (x, phi).
+
+    Phases after one with two freedoms begin where the plan of the phases before ends, for the
+    `objective` that was asked for.
+    """
     number = _find_phase(str(error))
     z = problem.start
     open_end = Verdict("open", "")
+    planned = False
     for phase in problem.phases:
-        stop = stops[phase.index] if phase.index < len(stops) else None
         own = number in (None, phase.number)
+        if planned and not own:
+            continue
         if phase.formation.n_constraints == 4 and not phase.until.is_release:
             trace = _reach(problem.scene, phase, z)
             if (
@@ -67,17 +82,28 @@ def judge(problem: Problem, error: WholearmError, stops: list[tuple[float, float
                 open_end = verdict
             z = trace.z[-1]
             continue
-        if stop is None:
+        if own and phase.index < len(stops):
+            return _judge_cell(problem, phase, z, stops[phase.index])
+        before = None if own or number is None else _find_start(problem, number, objective)
+        if before is None:
             return Verdict("open", f"phase {phase.number} ends where the planner chooses")
-        path = _straight(problem.scene, phase, z, stop)
-        if own:
-            return _judge_cell(problem, phase, z, path)
-        if path is None:
-            return Verdict("open", f"phase {phase.number} is not a straight leg")
-        z = path[-1]
+        z, planned = before, True
     if isinstance(error, InputError) and not open_end.reason:
         return Verdict("refuted", "every phase reaches its until")
     return open_end
+
+
+def _find_start(problem: Problem, number: int, objective: str) -> Array | None:
+    """Where the plan of the phases before one ends at rest; None if there is none."""
+    before = problem.phases[: number - 1]
+    if not before or before[-1].end is not End.REST:
+        return None
+    try:
+        plan = solve(replace(problem, phases=before), objective, replay=False)
+    except WholearmError:
+        return None
+    motion = plan.motions[-1]
+    return np.asarray(motion.evaluate(np.array([motion.duration])).z[0])
 
 
 def _length(scene: Scene, trace: Trace) -> float:
@@ -122,49 +148,24 @@ def _stops_before(problem: Problem, phase: Phase) -> bool:
     return phase.index == 0 or problem.phases[phase.index - 1].end is End.REST
 
 
-def _straight(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -> Array | None:
-    """Configurations on the straight leg of (x, phi) from `z`, shape (n, 5); None if it breaks."""
-    points = [z]
-    scale = np.sqrt(weights(scene))
-    for share in np.linspace(0.0, 1.0, PLACES)[1:]:
-        goal = points[0][[0, 2]] + share * (np.array(stop) - points[0][[0, 2]])
-        guess = points[-1].copy()
-        for _ in range(8):
-            guess[[0, 2]] = goal
-            closer = close(scene, phase, guess, points[-1])
-            if closer is None:
-                return None
-            change = np.abs((closer - guess) * scale).max()
-            guess = closer
-            if change < 1e-12 * scene.scales.length:
-                break
-        for name in phase.formation.names:
-            touch = locate(scene, name, guess[None])
-            if min(touch.low[0], touch.high[0]) < -OVERLAP * scene.scales.length:
-                return None
-        apart = clearances(scene, guess[None])
-        if min(gap[0] for gap in apart.values()) < -OVERLAP * scene.scales.length:
-            return None
-        points.append(guess)
-    return np.array(points)
-
-
-def _judge_cell(problem: Problem, phase: Phase, z: Array, path: Array | None) -> Verdict:
-    scene, epsilon = problem.scene, problem.epsilon
-    at = f"phase {phase.number}"
-    if path is not None:
-        steps = np.gradient(path, axis=0)
-        z_s = steps / np.sqrt(steps**2 @ weights(scene))[:, None]
-        slow, _ = slow_margin(scene, phase, epsilon, path, z_s)
-        free = float(inertia_ratio(scene, phase, path, z_s).min())
-        if slow > CLEAR and free > FREE:
-            return Verdict("refuted", f"{at}: a slow motion straight on keeps limits by {slow:.3g}")
-        for end, name in ((path[0], "start"), (path[-1], "end")):
-            rest = rest_margin(scene, phase, epsilon, end)
-            if rest < UNABLE:
-                return Verdict("confirmed", f"{at}: no motion to or from rest at the {name}")
-        return Verdict("open", f"{at}: straight on, {slow:.3g}")
-    rest = rest_margin(scene, phase, epsilon, z)
-    if rest < UNABLE:
-        return Verdict("confirmed", f"{at}: no motion from rest at the start, {rest:.3g}")
-    return Verdict("open", f"{at}: not a straight leg")
+def _judge_cell(problem: Problem, phase: Phase, z: Array, stop: tuple[float, float]) -> Verdict:
+    scene, epsilon, at = problem.scene, problem.epsilon, f"phase {phase.number}"
+    if not _stops_before(problem, phase) or phase.end is not End.REST or phase.until.is_release:
+        return Verdict("open", f"{at} does not go from rest to rest")
+    begins = rest_margin(scene, phase, epsilon, z)
+    if begins < -CLEAR:
+        return Verdict("confirmed", f"{at}: no motion from rest at the start, {begins:.3g}")
+    ends = list_ends(scene, phase, z, stop)
+    if not len(ends):
+        return Verdict("open", f"{at}: no place of its end was found")
+    stopped = best_end(scene, phase, epsilon, ends)
+    if stopped < -CLEAR:
+        reason = f"{at}: no motion comes to rest at any of {len(ends)} places, {stopped:.3g}"
+        return Verdict("confirmed", reason)
+    best = find_best(scene, phase, epsilon, z, ends)
+    text = f"{at}: of {best.curves} curves to {best.ends} places the best has {best.margin:.3g}"
+    if best.margin > CLEAR:
+        return Verdict("refuted", text)
+    text += f", {best.loose:.3g} if slow contacts may stick"
+    least = max(best.margin, best.loose)
+    return Verdict("confirmed" if best.curves and least < -SURE else "close", text)

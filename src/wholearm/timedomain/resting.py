@@ -13,7 +13,6 @@ motion comes to rest the same holds with the acceleration against the way that t
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -22,10 +21,14 @@ from ..curve import tangent_basis
 from ..formation import Formation
 from ..model import Array
 
-MOVES = 1e-7
-"""Least sum of rates, of a sum that may be 1, that counts as a motion."""
+MOVES = 1e-5
+"""Least sum of accelerations, over the scene's own, that counts as a motion."""
 _STILL = 1e-9
 """Rate over the largest one below which something does not move."""
+
+
+EPSILON = 2
+"""Index of epsilon among the limits that may give way, after both torque limits."""
 
 
 class Blocked(NamedTuple):
@@ -45,11 +48,7 @@ class Blocked(NamedTuple):
 
 
 def find_block(
-    formation: Formation,
-    z: Array,
-    epsilon: float,
-    ends: bool = False,
-    torque_limit: Array | None = None,
+    formation: Formation, z: Array, epsilon: float, ends: bool = False
 ) -> Blocked | None:
     """Say why no motion begins from rest at `z`, or ends there; None if one may.
 
@@ -62,59 +61,37 @@ def find_block(
     epsilon : float
     ends : bool
         Whether the motion ends at rest at `z`: then it moved against its acceleration.
-    torque_limit : ndarray, shape (2,), optional
-        In place of the scene's.
     """
-    torque = formation.scene.torque_limit if torque_limit is None else torque_limit
-    N = tangent_basis(formation, z)
-    metric = np.array([1.0, 1.0, *(3 * [formation.scene.polygon.gyration_radius**2])])
-    N = N / metric[:, None]
-    freedoms = N.shape[1]
-    if not 1 <= freedoms <= 2:
+    modes = _list_modes(formation, z, epsilon, ends)
+    if not modes or any(mode.moves() for mode in modes):
         return None
-    kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
-    A, A_t = kinematics.A[0], kinematics.A_t[0]
-    rates = np.vstack([A_t, np.eye(5)[3:]]) @ N
-    least: Blocked | None = None
-    for way in list_ways(rates):
-        signs = np.sign(
-            np.where(np.abs(rates @ way) > _STILL * np.abs(rates).max(), rates @ way, 0)
-        )
-        signs[list(formation.rolling_rows)] = 0.0
-        programme = _Programme(formation, epsilon, torque, -N if ends else N, A, A_t, rates, signs)
-        if programme.moves():
-            return None
-        short = programme.find_short()
-        if short is not None and (least is None or short.short < least.short):
-            least = short
-    return least or Blocked("", 0.0)
+    shorts = [short for mode in modes if (short := mode.find_short()) is not None]
+    return min(shorts, key=lambda short: short.short, default=Blocked("", 0.0))
 
 
-def find_largest(allows: Callable[[float], bool], most: float) -> float | None:
-    """The largest value below `most` that allows a motion, to a thousandth; None if none does."""
-    low, high = 0.0, most
-    if not allows(low):
-        return None
-    while high - low > 1e-3 * most:
-        middle = (low + high) / 2
-        low, high = (middle, high) if allows(middle) else (low, middle)
-    return low or None
+def find_change(
+    formation: Formation, z: Array, epsilon: float, index: int, ends: bool = False
+) -> float | None:
+    """The value of one limit with which a motion can begin from rest at `z`, or end there.
 
+    Parameters
+    ----------
+    index : int
+        0 or 1 for the torque limit of that finger, of which the least value is sought; 2 for
+        epsilon, of which the largest is.
+    formation, z, epsilon, ends
+        As of `find_block`.
 
-def find_smallest(allows: Callable[[float], bool], least: float) -> float | None:
-    """The smallest value above `least` that allows a motion, to a thousandth; None if none does.
-
-    More than a thousand times as much is not looked at.
+    Returns
+    -------
+    float or None
+        None if no value does.
     """
-    low, high = least, 2 * least
-    while not allows(high):
-        low, high = high, 2 * high
-        if high > 1e3 * least:
-            return None
-    while high - low > 1e-3 * low:
-        middle = (low + high) / 2
-        low, high = (low, middle) if allows(middle) else (middle, high)
-    return high
+    found = [mode.find_limit(index) for mode in _list_modes(formation, z, epsilon, ends)]
+    values = [value for value in found if value is not None]
+    if not values:
+        return None
+    return max(values) if index == EPSILON else min(values)
 
 
 def list_ways(rates: Array) -> list[Array]:
@@ -128,6 +105,25 @@ def list_ways(rates: Array) -> list[Array]:
     return [np.array([np.cos(t), np.sin(t)]) for t in np.concatenate([middles, angles])]
 
 
+def _list_modes(formation: Formation, z: Array, epsilon: float, ends: bool) -> list[_Programme]:
+    """One programme for each way to set things in motion; none with other than 1 or 2 freedoms."""
+    N = tangent_basis(formation, z)
+    metric = np.array([1.0, 1.0, *(3 * [formation.scene.polygon.gyration_radius**2])])
+    N = N / metric[:, None]
+    if not 1 <= N.shape[1] <= 2:
+        return []
+    kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
+    A, A_t = kinematics.A[0], kinematics.A_t[0]
+    rates = np.vstack([A_t, np.eye(5)[3:]]) @ N
+    least = _STILL * np.abs(rates).max()
+    modes = []
+    for way in list_ways(rates):
+        signs = np.sign(np.where(np.abs(rates @ way) > least, rates @ way, 0))
+        signs[list(formation.rolling_rows)] = 0.0
+        modes.append(_Programme(formation, epsilon, -N if ends else N, A, A_t, rates, signs))
+    return modes
+
+
 class _Programme:
     """Accelerations and forces of one mode: x = (y, c_n, c_t of what sticks, f of joints, tau)."""
 
@@ -135,7 +131,6 @@ class _Programme:
         self,
         formation: Formation,
         epsilon: float,
-        torque_limit: Array,
         N: Array,
         A: Array,
         A_t: Array,
@@ -162,7 +157,7 @@ class _Programme:
         still = np.hstack([rates[signs == 0], np.zeros((int((signs == 0).sum()), self.size - f))])
         self.equal = np.vstack([self.equal, still])
         self.equal_to = np.append(self.equal_to, np.zeros(len(still)))
-        rows, most = [], []
+        rows, most, gives = [], [], []
         for k, contact in enumerate(sticks.tolist()):
             for side in (1.0, -1.0):
                 row = np.zeros(self.size)
@@ -170,17 +165,20 @@ class _Programme:
                 row[f + contact] = -mu[contact]
                 rows.append(row)
                 most.append(-mu[contact] * epsilon)
+                gives.append(mu[contact])
         moving = signs != 0
         self.speed = np.zeros(self.size)
         self.speed[:f] = (signs[moving, None] * rates[moving]).sum(axis=0)
         for row in signs[moving, None] * rates[moving]:
             rows.append(np.concatenate([-row, np.zeros(self.size - f)]))
             most.append(0.0)
-        self.rows, self.most = np.array([*rows, self.speed]), np.array([*most, 1.0])
+        self.rows, self.most = np.array(rows), np.array(most)
+        # What epsilon adds to each row.
+        self.gives = np.append(gives, np.zeros(len(self.rows) - len(gives)))
         free: tuple[float | None, float | None] = (None, None)
         limits = [free] * f + [(epsilon, None)] * n_c + [free] * len(sticks)
         limits += [(-float(scene.dry[3 + k]), float(scene.dry[3 + k])) for k in held]
-        limits += [(-float(limit), float(limit)) for limit in torque_limit]
+        limits += [(-float(limit), float(limit)) for limit in scene.torque_limit]
         self.limits = limits
 
     @property
@@ -193,29 +191,63 @@ class _Programme:
         from scipy.optimize import linprog
 
         answer = linprog(-self.speed, self.rows, self.most, self.equal, self.equal_to, self.limits)
-        # What is not decided counts as possible.
+        # What is not decided, or has no bound, counts as possible.
         return bool(answer.status not in (0, 2) or (answer.status == 0 and -answer.fun > MOVES))
 
     def find_short(self) -> Blocked | None:
         """What the normal forces lack to move with a speed of 1, the largest made least."""
+        own = slice(self.f, self.f + self.n_c)
+        wide = np.hstack([self.rows, np.zeros((len(self.rows), 1))])
+        answer = self._minimise(1.0, wide, self.most, self._press(-1.0, self.epsilon), own)
+        if answer is None:
+            return None
+        worst = int(np.argmin(answer[own]))
+        return Blocked(self.names[worst], float(answer[-1]))
+
+    def find_limit(self, index: int) -> float | None:
+        """The least torque limit of a finger, or the largest epsilon, with which things move."""
+        if index == EPSILON:
+            own = slice(self.f, self.f + self.n_c)
+            wide = np.column_stack([self.rows, self.gives])
+            most = self.most + self.gives * self.epsilon
+            answer = self._minimise(-1.0, wide, most, self._press(1.0, 0.0), own)
+        else:
+            at = self.size - 2 + index
+            wide = np.column_stack([self.rows, np.zeros(len(self.rows))])
+            torque = np.zeros((2, self.size + 1))
+            torque[:, at], torque[:, -1] = [1.0, -1.0], -1.0
+            own = slice(at, at + 1)
+            answer = self._minimise(1.0, wide, self.most, (torque, np.zeros(2)), own)
+        return None if answer is None else float(answer[-1])
+
+    def _press(self, share: float, least: float) -> tuple[Array, Array]:
+        """Rows c_n >= least + share r."""
+        rows = np.zeros((self.n_c, self.size + 1))
+        rows[:, self.f : self.f + self.n_c], rows[:, -1] = -np.eye(self.n_c), share
+        return rows, np.full(self.n_c, -least)
+
+    def _minimise(
+        self, cost: float, rows: Array, most: Array, more: tuple[Array, Array], own: slice
+    ) -> Array | None:
+        """Minimise `cost` times one more unknown r >= 0 while things move; None if they cannot.
+
+        Parameters
+        ----------
+        rows, most : ndarray, shape (n, size + 1) and (n,)
+        more : (rows, most)
+            Further ones, that take the place of the bounds of the unknowns `own`.
+        """
         from scipy.optimize import linprog
 
-        n, own = self.size, slice(self.f, self.f + self.n_c)
-        wide = np.hstack([self.rows, np.zeros((len(self.rows), 1))])
-        presses = np.zeros((self.n_c, n + 1))
-        presses[:, own], presses[:, -1] = -np.eye(self.n_c), -1.0
         moving = np.append(-self.speed, 0.0)[None]
         limits = [*self.limits, (0.0, None)]
-        limits[own] = [self.limits[0]] * self.n_c
+        limits[own] = [self.limits[0]] * (own.stop - own.start)
         answer = linprog(
-            np.append(np.zeros(n), 1.0),
-            np.vstack([wide, presses, moving]),
-            np.concatenate([self.most, np.full(self.n_c, -self.epsilon), [-MOVES]]),
+            np.append(np.zeros(self.size), cost),
+            np.vstack([rows, more[0], moving]),
+            np.concatenate([most, more[1], [-MOVES]]),
             np.hstack([self.equal, np.zeros((len(self.equal), 1))]),
             self.equal_to,
             limits,
         )
-        if answer.status != 0:
-            return None
-        worst = int(np.argmin(answer.x[own]))
-        return Blocked(self.names[worst], float(answer.fun))
+        return answer.x if answer.status == 0 else None

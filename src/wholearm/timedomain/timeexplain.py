@@ -55,7 +55,7 @@ def refuse(
     InfeasibleError
         With the contact that would have to pull, and what single change would do.
     """
-    from .resting import find_block, find_largest, find_smallest
+    from .resting import EPSILON, find_block, find_change
 
     epsilon, last = search.problem.epsilon, stages[-1]
     stage, node, phase = stages[0], 0, phases[0]
@@ -79,18 +79,9 @@ def refuse(
     ends, z = node == -1, stage.guess.nodes[node, 0]
 
     def find_least(index: int) -> float | None:
-        own = search.problem
-
-        def allows(value: float) -> bool:
-            torque = own.scene.torque_limit.copy()
-            torque[index : index + 1] = value
-            least = value if index == 2 else own.epsilon
-            return find_block(stage.formation, z, least, ends, torque) is None
-
-        if index == 2:
-            return scales.force * value if (value := find_largest(allows, epsilon)) else None
-        limit = float(own.scene.torque_limit[index])
-        return scales.torque * value if (value := find_smallest(allows, limit)) else None
+        value = find_change(stage.formation, z, epsilon, index, ends)
+        unit = scales.force if index == EPSILON else scales.torque
+        return unit * value if value else None
 
     scales = problem.scene.scales
     raise _advise(problem, text, find_least, replan)
