@@ -164,7 +164,7 @@ class Mode:
             joints = [3 + joint for joint in self.grips.joints]
             held = ca.vertcat(held, z[joints])
             P = ca.vertcat(P, ca.DM(np.eye(5)[joints]))
-            P_dot_v = ca.vertcat(P_dot_v, ca.SX(len(joints), 1))
+            P_dot_v = ca.vertcat(P_dot_v, ca.DM(len(joints), 1))
         return held, P, P_dot_v, A_t
 
     def build_force_rows(self, P: Expression, A_t: Expression, Xi: Expression) -> Expression:
