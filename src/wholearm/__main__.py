@@ -1,6 +1,7 @@
 """Run the command line: ``wholearm`` and ``python -m wholearm``."""
 
 import atexit
+import contextlib
 import os
 import signal
 import sys
@@ -24,11 +25,12 @@ def run() -> None:
     # What the command had to do is done; exiting takes a moment, and would be a traceback.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
-    if status in ENDED:
-        # To delete large expressions one by one can take seconds.
-        atexit._run_exitfuncs()
-        os._exit(status)
-    sys.exit(status)
+    # To delete every object one by one takes a tenth of a short command, or seconds of a long one.
+    atexit._run_exitfuncs()
+    if status not in ENDED:
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+    os._exit(status)
 
 
 if __name__ == "__main__":
