@@ -62,7 +62,7 @@ class PlanOptions:
         stage without the contact on.
     time_intervals : int, optional
         Intervals of each phase in the time domain, at least 4; when left out, 32 for a phase with
-        one freedom that is planned alone and 16 for others.
+        one freedom that is planned alone and 10 for others.
     degree : int
         Collocation points per interval in the time domain, from 2 to 6.
     scheme : str
