@@ -15,7 +15,7 @@ from wholearm.formation import Formation
 from wholearm.minima import find_least
 from wholearm.model import Array, Friction, Scene
 from wholearm.options import PlanOptions
-from wholearm.pathdomain.pathdata import PhaseData, Places, fit_torque, prepare
+from wholearm.pathdomain.pathdata import PhaseData, Places, choose_fineness, fit_torque, prepare
 from wholearm.pathdomain.pathmotion import Profile, directions_of, make_grid
 from wholearm.pathdomain.pathplan import plan_path
 
@@ -65,8 +65,9 @@ def test_forces_between_nodes_are_carried_there(
 def test_looks_are_dense_enough(curves: tuple[Curve, ...]) -> None:
     for intervals, least in ((10, 33), (40, 33), (80, 15), (800, 15)):
         data = prepare(curves[0], EPSILON, make_grid(curves[0], intervals), 1)
-        for places in data.fine:
-            assert places[0] == 0.0 and places[-1] == 1.0
+        angles = np.arccos(1 - 2 * data.fine.looks) / np.pi
+        for places in (data.fine.knots, angles):
+            assert places[0] == 0.0 and places[-1] == pytest.approx(1.0)
             np.testing.assert_allclose(np.diff(places), 1 / (len(places) - 1), rtol=1e-12)
         assert len(data.fine.looks) >= least
 
@@ -210,3 +211,15 @@ def test_jamming_is_named(curves: tuple[Curve, ...]) -> None:
     curve = replace(curves[0], formation=Formation(rough, curves[0].formation.contacts))
     with pytest.raises(JammingError, match=r"phase 7: v0-palm v1-palm .* jams at x = .* inertia -"):
         prepare(curve, EPSILON, make_grid(curve, 20), 7)
+
+
+@pytest.mark.parametrize("nodes", [11, 81])
+@pytest.mark.parametrize("deepest", [3e-3, 0.01, 0.05])
+def test_dips_next_to_rest_are_found(nodes: int, deepest: float) -> None:
+    """Viscous friction goes with the root of the way: x - 2 sqrt(deepest x) is least there."""
+    x = choose_fineness(nodes).looks
+    values = x - 2 * np.sqrt(deepest * x)
+    for sampled in (values, values[::-1]):
+        least = find_least(sampled[None, :, None])[0, 0]
+        # A look next to the dip, and the parabola through it, miss little of it.
+        assert least == pytest.approx(-deepest, rel=0.1)
