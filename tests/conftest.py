@@ -1,22 +1,29 @@
 from __future__ import annotations
 
-from pathlib import Path
+import os
 
 import pytest
 
+from once import STORE
+from shipped import HEPTAGON, plan_of, problem_of
 from wholearm.curve import Curve
-from wholearm.outline import load
 from wholearm.path import trace_phases
-from wholearm.plan import solve
 from wholearm.problem import Problem
 from wholearm.trajectory import Trajectory
 
-HEPTAGON = Path(__file__).parents[1] / "problems" / "heptagon_four_contacts.toml"
+
+@pytest.fixture(scope="session", autouse=True)
+def store(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """One folder for the results that all workers of this run share."""
+    own = tmp_path_factory.getbasetemp()
+    shared = own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+    STORE.folder = shared / "once"
+    STORE.folder.mkdir(exist_ok=True)
 
 
 @pytest.fixture(scope="session")
 def heptagon() -> Problem:
-    return load(str(HEPTAGON))
+    return problem_of(HEPTAGON)
 
 
 @pytest.fixture(scope="session")
@@ -25,6 +32,6 @@ def curves(heptagon: Problem) -> tuple[Curve, ...]:
 
 
 @pytest.fixture(scope="session")
-def trajectory(heptagon: Problem) -> Trajectory:
+def trajectory() -> Trajectory:
     """The plan for the heptagon with every option at its default."""
-    return solve(heptagon)
+    return plan_of(HEPTAGON)

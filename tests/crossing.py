@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import tomllib
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plane import cross, point_to_segment
+from shipped import HEXAGON
 from wholearm.model import Array, Scene
 from wholearm.problem import Problem, build_problem
-
-HEXAGON = Path(__file__).parents[1] / "problems" / "hexagon.toml"
 
 
 def hexagon(

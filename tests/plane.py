@@ -1,13 +1,18 @@
-"""Plane geometry, hands and objects in plain NumPy: what the tests check the package against."""
+"""Plane geometry, hands and objects in plain NumPy: what the tests check the package against.
+
+Configurations, velocities and angles may have leading axes, which results then have too.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from wholearm.contact import Contact, parse_contact
+from wholearm.contact import parse_contact
 from wholearm.curve import Curve
 from wholearm.formation import Formation
 from wholearm.model import Array, Finger, Friction, Polygon, Scene
@@ -16,9 +21,18 @@ from wholearm.trajectory import Samples
 SQUARE = [[-0.03, -0.03], [0.03, -0.03], [0.03, 0.03], [-0.03, 0.03]]
 
 
-def rotate(angle: float, points: ArrayLike) -> Array:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.asarray(np.asarray(points, dtype=float) @ np.array([[c, s], [-s, c]]))
+def rotate(angle: ArrayLike, points: ArrayLike) -> Array:
+    """Points, shape (2,) or (n, 2), turned by one angle or each of several."""
+    places, angle = np.asarray(points, dtype=float), np.asarray(angle, dtype=float)
+    x, y = places[..., 0], places[..., 1]
+    c, s = (f(angle)[(..., *[None] * x.ndim)] for f in (np.cos, np.sin))
+    turned = np.empty((*angle.shape, *places.shape))
+    turned[..., 0], turned[..., 1] = c * x - s * y, s * x + c * y
+    return turned
+
+
+def dot(a: Array, b: Array) -> Array:
+    return np.asarray(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1])
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -28,8 +42,9 @@ def cross(a: Array, b: Array) -> Array:
 def point_to_segment(points: Array, start: Array, end: Array) -> Array:
     """Distance of points, shape (..., 2), from segments, shape (..., 2)."""
     run = end - start
-    part = np.clip(((points - start) * run).sum(-1) / (run * run).sum(-1), 0, 1)
-    return np.asarray(np.linalg.norm(points - start - part[..., None] * run, axis=-1))
+    part = np.clip(dot(points - start, run) / dot(run, run), 0, 1)
+    away = points - start - part[..., None] * run
+    return np.asarray(np.hypot(away[..., 0], away[..., 1]))
 
 
 def nearest_on_segment(point: Array, start: Array, end: Array) -> Array:
@@ -38,26 +53,24 @@ def nearest_on_segment(point: Array, start: Array, end: Array) -> Array:
 
 
 def polygon_to_segments(corners: Array, start: Array, ends: Array) -> Array:
-    """Distance of a polygon from n segments that leave one point, shape (n,); 0 if they overlap."""
-    after = np.roll(corners, -1, axis=0)
-    distances = np.concatenate(
-        [
-            point_to_segment(corners, start, ends[:, None]),
-            point_to_segment(ends[:, None], corners, after),
-            np.broadcast_to(point_to_segment(start, corners, after), (len(ends), len(corners))),
-        ],
-        axis=1,
-    ).min(axis=1)
-    run = (ends - start)[:, None]
+    """Distance of polygons, shape (..., n, 2), from segments that leave one point; 0: overlap."""
+    after, ends = np.roll(corners, -1, axis=-2), ends[..., None, :]
+    distances = [
+        point_to_segment(corners, start, ends),
+        point_to_segment(ends, corners, after),
+        point_to_segment(start, corners, after),
+    ]
+    least = np.minimum(np.minimum(*distances[:2]), distances[2]).min(axis=-1)
+    run = ends - start
     side = cross(run, corners - start) * cross(run, after - start) < 0
-    turn = cross(after - corners, start - corners) * cross(after - corners, ends[:, None] - corners)
-    inside = (cross(after - corners, start - corners) > 0).all()
-    return np.where((side & (turn < 0)).any(axis=1) | inside, 0.0, distances)
+    turn = cross(after - corners, start - corners) * cross(after - corners, ends - corners)
+    inside = (cross(after - corners, start - corners) > 0).all(axis=-1)
+    return np.where((side & (turn < 0)).any(axis=-1) | inside, 0.0, least)
 
 
 def place_corners(scene: Scene, z: Array) -> Array:
-    """World positions of the object's corners, shape (n_v, 2)."""
-    return np.asarray(z[:2] + rotate(z[2], scene.polygon.vertices))
+    """World positions of the object's corners, shape (..., n_v, 2)."""
+    return np.asarray(z[..., None, :2] + rotate(z[..., 2], scene.polygon.vertices))
 
 
 def place_tips(scene: Scene, finger: int, angles: ArrayLike) -> Array:
@@ -68,7 +81,7 @@ def place_tips(scene: Scene, finger: int, angles: ArrayLike) -> Array:
 
 
 def finger_gap(scene: Scene, q: Array, finger: int, angles: ArrayLike) -> Array:
-    """Distance between object and link at some joint angles, shape (n,); negative: overlap."""
+    """Distance between object and link at poses and joint angles, shape (n,); negative: overlap."""
     link = scene.fingers[finger]
     corners = place_corners(scene, q)
     tips = place_tips(scene, finger, np.atleast_1d(angles))
@@ -127,55 +140,76 @@ def with_speed_limit(curve: Curve, limits: tuple[float, float]) -> Curve:
     return replace(curve, formation=Formation(slow, curve.formation.contacts))
 
 
-def touch(scene: Scene, contact: Contact, z: Array) -> tuple[Array, Array]:
-    """Contact point and normal into the object of a vertex on the palm or on a link's side."""
-    assert contact.feature == "v" and contact.surface in ("palm", "finger")
-    corner = place_corners(scene, z)[contact.index]
-    if contact.finger is None:
-        return corner, np.array([0.0, 1.0])
-    heading = z[3 + contact.finger]
-    side = 1.0 if contact.finger == 0 else -1.0
-    return corner, side * np.array([-np.sin(heading), np.cos(heading)])
+class Touching(NamedTuple):
+    """What vertex contacts touch: the corners' numbers, and of palm and links, shape (n_c, ...)."""
+
+    corner: NDArray[np.int64]
+    base: Array
+    radius: Array
+    side: Array
+    joint: NDArray[np.int64]
+    """Coordinate of the link's angle; that of the palm does not count."""
+    turns: NDArray[np.bool_]
+
+
+@lru_cache(maxsize=16)
+def list_touching(formation: Formation) -> Touching:
+    assert all(c.feature == "v" and c.surface in ("palm", "finger") for c in formation.contacts)
+    rows = []
+    for contact in formation.contacts:
+        k = contact.finger
+        if k is None:
+            rows.append((contact.index, (0.0, 0.0), 0.0, 1.0, 3, False))
+            continue
+        link, side = formation.scene.fingers[k], 1.0 if k == 0 else -1.0
+        x, y = np.asarray(link.base).tolist()
+        rows.append((contact.index, (x, y), link.radius, side, 3 + k, True))
+    return Touching(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def touch(formation: Formation, z: Array) -> tuple[Array, Array]:
+    """Contact points and normals into the object of vertex contacts, shape (..., n_c, 2) each."""
+    own = list_touching(formation)
+    corners = place_corners(formation.scene, z)[..., own.corner, :]
+    heading = z[..., own.joint] * own.turns
+    normals = np.empty_like(corners)
+    normals[..., 0], normals[..., 1] = -own.side * np.sin(heading), own.side * np.cos(heading)
+    return corners, normals
+
+
+def turn_right(n: Array) -> Array:
+    """The tangents of some normals."""
+    t = np.empty_like(n)
+    t[..., 0], t[..., 1] = n[..., 1], -n[..., 0]
+    return t
 
 
 def measure_gaps(formation: Formation, z: Array) -> Array:
-    """Gaps of a formation of vertex contacts, shape (n_c,) [m]."""
-    gaps = []
-    for contact in formation.contacts:
-        point, normal = touch(formation.scene, contact, z)
-        link = None if contact.finger is None else formation.scene.fingers[contact.finger]
-        base = np.zeros(2) if link is None else np.asarray(link.base)
-        gaps.append((point - base) @ normal - (0.0 if link is None else link.radius))
-    return np.array(gaps)
+    """Gaps of a formation of vertex contacts, shape (..., n_c) [m]."""
+    own, (points, normals) = list_touching(formation), touch(formation, z)
+    return np.asarray(dot(points - own.base, normals) - own.radius)
 
 
 def measure_slip(formation: Formation, z: Array, v: Array) -> Array:
-    """Sliding velocities of a formation of vertex contacts, shape (n_c,) [m/s]."""
-    slips = []
-    for contact in formation.contacts:
-        point, n = touch(formation.scene, contact, z)
-        arm = point - z[:2]
-        speed = v[:2] + v[2] * np.array([-arm[1], arm[0]])
-        if contact.finger is not None:
-            lever = point - np.asarray(formation.scene.fingers[contact.finger].base)
-            speed = speed - v[3 + contact.finger] * np.array([-lever[1], lever[0]])
-        slips.append(speed @ np.array([n[1], -n[0]]))
-    return np.array(slips)
+    """Sliding velocities of a formation of vertex contacts, shape (..., n_c) [m/s]."""
+    return np.asarray((stack_rows(formation, z)[1] @ v[..., None])[..., 0])
 
 
 def stack_rows(formation: Formation, z: Array) -> tuple[Array, Array]:
-    """A and A_t of a formation of vertex contacts, shape (n_c, 5) each."""
-    normal: list[Array] = []
-    tangent: list[Array] = []
-    for contact in formation.contacts:
-        point, n = touch(formation.scene, contact, z)
-        for rows, along in ((normal, n), (tangent, np.array([n[1], -n[0]]))):
-            row = np.array([*along, cross(point - z[:2], along), 0.0, 0.0])
-            if contact.finger is not None:
-                base = np.asarray(formation.scene.fingers[contact.finger].base)
-                row[3 + contact.finger] = -cross(point - base, along)
-            rows.append(row)
-    return np.array(normal), np.array(tangent)
+    """A and A_t of a formation of vertex contacts, shape (..., n_c, 5) each."""
+    points, n = touch(formation, z)
+    return wrench(formation, z, points, n), wrench(formation, z, points, turn_right(n))
+
+
+def wrench(formation: Formation, z: Array, points: Array, forces: Array) -> Array:
+    """Forces on the object at some points, its moments, and moments of the links they push back."""
+    own = list_touching(formation)
+    rows = np.zeros((*forces.shape[:-1], 5))
+    rows[..., :2] = forces
+    rows[..., 2] = cross(points - z[..., None, :2], forces)
+    k = np.flatnonzero(own.turns)
+    rows[..., k, own.joint[k]] = -cross(points - own.base, forces)[..., k]
+    return rows
 
 
 def accelerate(
@@ -188,9 +222,9 @@ def accelerate(
     mass = np.array([body.mass, body.mass, body.inertia, *(f.inertia for f in scene.fingers)])
     drag = [f.viscous * v[3 + k] + f.dry * sigma[k] for k, f in enumerate(scene.fingers)]
     applied = np.array([0.0, -body.mass * scene.gravity, 0.0, *(tau - drag)])
-    A, A_t = stack_rows(formation, z)
     # Central differences along the motion, over a microsecond.
-    ahead, behind = (stack_rows(formation, z + step * v)[0] for step in (1e-6, -1e-6))
+    steps = np.array([[0.0], [1e-6], [-1e-6]])
+    (A, ahead, behind), (A_t, _, _) = stack_rows(formation, z + steps * v)
     A_dot_v = (ahead - behind) @ v / 2e-6
     G = A - (formation.friction * Xi)[:, None] * A_t
     c_n = np.linalg.solve((A / mass) @ G.T, -A_dot_v - A @ (applied / mass))
@@ -198,35 +232,29 @@ def accelerate(
 
 
 def unbalance(formation: Formation, row: Samples, sigma: Array) -> tuple[Array, Array]:
-    """What each body's balance misses, and the largest term in it, shape (5,) each.
+    """What each body's balance misses, and the largest term in it, shape (..., 5) each.
 
     Forces x and y and the moment of the object, then the moments of the joints.
 
     Parameters
     ----------
     row : Samples
-        Of one instant, without the axis over instants.
-    sigma : ndarray, shape (2,)
+        Of one instant, or of many along the first axis.
+    sigma : ndarray, shape (..., 2)
         Directions of the joints.
     """
     scene = formation.scene
-    body, terms = scene.polygon, [np.zeros(5)]
+    body = scene.polygon
     assert body.inertia is not None
-    terms.append(np.array([0.0, -body.mass * scene.gravity, 0.0, 0.0, 0.0]))
     masses = [body.mass, body.mass, body.inertia, *(link.inertia for link in scene.fingers)]
-    terms.append(-np.array(masses) * row.z_ddot)
-    terms.append(np.array([0.0, 0.0, 0.0, *row.tau]))
-    drag = [
-        link.viscous * row.z_dot[3 + k] + link.dry * sigma[k]
-        for k, link in enumerate(scene.fingers)
-    ]
-    terms.append(-np.array([0.0, 0.0, 0.0, *drag]))
-    for k, contact in enumerate(formation.contacts):
-        point, n = touch(scene, contact, row.z)
-        for force in (row.c_n[k] * n, row.c_t[k] * np.array([n[1], -n[0]])):
-            term = np.array([*force, cross(point - row.z[:2], force), 0.0, 0.0])
-            if contact.finger is not None:
-                base = np.asarray(scene.fingers[contact.finger].base)
-                term[3 + contact.finger] = cross(point - base, -force)
-            terms.append(term)
-    return np.sum(terms, axis=0), np.abs(terms).max(axis=0)
+    weight, joints, drag = (np.zeros_like(row.z) for _ in range(3))
+    weight[..., 1] = -body.mass * scene.gravity
+    joints[..., 3:] = row.tau
+    for k, link in enumerate(scene.fingers):
+        drag[..., 3 + k] = -link.viscous * row.z_dot[..., 3 + k] - link.dry * sigma[..., k]
+    terms = [weight, -np.array(masses) * row.z_ddot, joints, drag]
+    points, n = touch(formation, row.z)
+    forces = row.c_n[..., None] * n, row.c_t[..., None] * turn_right(n)
+    pushes = [wrench(formation, row.z, points, force) for force in forces]
+    every = np.concatenate([np.stack(terms, axis=-2), *pushes], axis=-2)
+    return np.asarray(every.sum(axis=-2)), np.asarray(np.abs(every).max(axis=-2))

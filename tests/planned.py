@@ -7,23 +7,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 from scipy.optimize import brentq
 
+from shipped import HEPTAGON, problem_of
 from wholearm.contact import parse_contact
 from wholearm.curve import Curve
 from wholearm.dynamics import Directions, inverse
 from wholearm.formation import Formation
 from wholearm.model import Array
-from wholearm.outline import load
 from wholearm.path import trace_phases
 from wholearm.problem import End, Phase, Problem, Until
 from wholearm.torque import TorqueProfile
 from wholearm.trajectory import Motion, Samples, Trajectory, assemble
 
-HEPTAGON = Path(__file__).parents[1] / "problems" / "heptagon_four_contacts.toml"
 DEPENDENT = [1, 3, 4]
 """Coordinates y, theta_1 and theta_2, which follow from x and phi."""
 SQUEEZES = np.geomspace(0.02, 40.0, 60)
@@ -250,7 +248,7 @@ def plan(
     duration: float = 0.4, least: float = 0.2, pieces: int = 60, degree: int = 7
 ) -> tuple[Problem, Trajectory]:
     """The heptagon's problem and a trajectory that carries it through, `duration` a phase."""
-    problem = load(str(HEPTAGON))
+    problem = problem_of(HEPTAGON)
     motions = [
         CosineMotion(curve, duration, choose_squeeze(curve, duration, least, 2.0))
         for curve in trace_phases(problem)

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from conftest import HEPTAGON
+from shipped import HEPTAGON
 from wholearm.benchmark.benchkernels import (
     Outcome,
     choose_kernel,

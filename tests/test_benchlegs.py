@@ -1,11 +1,9 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from planned import HEPTAGON
+from shipped import HEPTAGON
 from wholearm.benchmark.legs import (
     KINDS,
     Leg,
@@ -17,7 +15,7 @@ from wholearm.benchmark.legs import (
 )
 from wholearm.problem import build_problem, read_problem
 
-PROBLEMS = Path(HEPTAGON).parent
+PROBLEMS = HEPTAGON.parent
 
 
 def test_legs_slide_and_pass_through_cells_from_rest_to_rest() -> None:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from planned import HEPTAGON
+from shipped import HEPTAGON
 from wholearm.benchmark import benchstress
 from wholearm.benchmark.benchstress import measure_stress
 from wholearm.outline import load

@@ -7,13 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from conftest import HEPTAGON
 from plane import measure_gaps, measure_slip, unbalance
+from shipped import IMPACTS, plan_of, problem_of
 from wholearm.curve import metric_weights
 from wholearm.errors import InfeasibleError
 from wholearm.impact import strike
 from wholearm.model import Array
-from wholearm.outline import load
 from wholearm.path import trace_phases
 from wholearm.pathdomain.chain import make_chain
 from wholearm.pathdomain.chainplan import add_up
@@ -22,19 +21,18 @@ from wholearm.problem import Problem, build_problem
 from wholearm.trajectory import Samples, Trajectory, load_trajectory
 from wholearm.verify import verify
 
-IMPACTS = HEPTAGON.with_name("heptagon_impact.toml")
 OBJECTIVES = ["time", "effort", "margin"]
 LIMIT = 2.0
 
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    return load(str(IMPACTS))
+    return problem_of(IMPACTS)
 
 
 @pytest.fixture(scope="module")
-def plans(problem: Problem) -> dict[str, Trajectory]:
-    return {objective: solve(problem, objective) for objective in OBJECTIVES}
+def plans() -> dict[str, Trajectory]:
+    return {objective: plan_of(IMPACTS, objective) for objective in OBJECTIVES}
 
 
 def edited(*stops: int) -> Problem:

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 import wholearm
-from conftest import HEPTAGON
-from tipping import BOX, scale, tipped
+from shipped import BOX, HEPTAGON, IMPACTS, plan_of
+from tipping import scale, tipped
 from wholearm.cli import build_parser, main
 from wholearm.torquetable import format_rows, place_rows
 from wholearm.trajectory import Trajectory, load_trajectory
@@ -174,7 +174,7 @@ def test_solve_names_its_output_after_the_problem(folder: Path) -> None:
 
 
 def test_solve_lists_the_impacts(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    impacts = str(HEPTAGON.with_name("heptagon_impact.toml"))
+    impacts = str(IMPACTS)
     assert main(["solve", impacts, "-o", "a.npz", "--intervals", "40"]) == 0
     out, err = capsys.readouterr()
     lines = out.splitlines()
@@ -200,11 +200,9 @@ def test_an_impulse_that_pulls_has_exit_status_1(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Torques that the rough finger would make good, on the smooth one."""
-    impacts = HEPTAGON.with_name("heptagon_impact.toml")
-    assert main(["solve", str(impacts), "-o", "a.npz", "--objective", "effort"]) == 0
-    text = impacts.read_text(encoding="utf-8").replace("finger1 = 0.4", "finger1 = 0.33")
+    plan_of(IMPACTS, "effort").save("a.npz")
+    text = IMPACTS.read_text(encoding="utf-8").replace("finger1 = 0.4", "finger1 = 0.33")
     Path("smooth.toml").write_text(text)
-    capsys.readouterr()
     assert main(["verify", "smooth.toml", "a.npz"]) == 1
     assert re.search(
         r"impulse on v1-palm would be -\S+ N s in the impact at t = \S+ s, phase 2",
@@ -215,7 +213,7 @@ def test_an_impulse_that_pulls_has_exit_status_1(
 def test_impacts_are_listed_in_the_time_domain_too(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    whole = HEPTAGON.with_name("heptagon_impact.toml").read_text(encoding="utf-8")
+    whole = IMPACTS.read_text(encoding="utf-8")
     two = "[[phases]]".join(whole.split("[[phases]]")[:3])
     text = two.replace('until = "v6-finger2"\nend = "impact"', 'until = "v6-finger2"')
     Path("two.toml").write_text(text, encoding="utf-8")

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from conftest import HEPTAGON
+from shipped import HEPTAGON
 from wholearm.errors import InfeasibleError, JammingError
 from wholearm.outline import load
 from wholearm.plan import solve

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from conftest import HEPTAGON
 from crossing import hexagon, measure_fingers
 from plane import finger_gap, make_scene, place_corners, point_to_segment
+from shipped import HEPTAGON
 from wholearm.cli import main
 from wholearm.curve import Curve
 from wholearm.errors import InputError

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from conftest import HEPTAGON
 from moreau import collide
 from plane import SQUARE, cross, make_formation, make_scene, measure_gaps, measure_slip, touch
+from shipped import HEPTAGON, IMPACTS
 from wholearm.formation import Formation
 from wholearm.impact import Impact, Obstacle, strike, transfer
 from wholearm.model import Array, Friction, Scene
@@ -17,7 +17,6 @@ from wholearm.outline import load
 from wholearm.path import trace_phases
 from wholearm.pathdomain.chain import Chain, make_chain
 
-ROUGH = Path(HEPTAGON).parent / "heptagon_impact.toml"
 MASS = 0.2
 
 
@@ -29,7 +28,7 @@ def chain_of(path: Path) -> Chain:
 @pytest.fixture(scope="module")
 def rough() -> Chain:
     """With a rough right finger: two impacts that are possible, and two that are not."""
-    return chain_of(ROUGH)
+    return chain_of(IMPACTS)
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +60,9 @@ def check_momenta(impact: Impact, z: Array, before: Array) -> None:
     assert body.inertia is not None
     push, turn = np.zeros(2), 0.0
     joints = np.zeros(2)
-    for k, contact in enumerate(formation.contacts):
-        point, n = touch(scene, contact, z)
+    for k, (contact, point, n) in enumerate(
+        zip(formation.contacts, *touch(formation, z), strict=True)
+    ):
         along = np.array([n[1], -n[0]])
         slip = float(measure_slip(formation, z, impact.v)[k])
         impulse = impact.p[k] * (n - formation.friction[k] * np.sign(slip) * along)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from conftest import HEPTAGON
+from shipped import HEPTAGON
 from wholearm import interrupts
 from wholearm.benchmark.benchinterrupts import STARTED, interrupt
 from wholearm.files import together, write_whole

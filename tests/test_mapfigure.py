@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.text import Text
 
-from conftest import HEPTAGON
 from crossing import hexagon
+from shipped import HEPTAGON
 from wholearm import plots
 from wholearm.cli import main
 from wholearm.mapping.formationmap import FormationMap, Window, build_map

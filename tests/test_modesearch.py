@@ -71,8 +71,7 @@ def test_plans_are_the_same_whichever_way_a_joint_is_guessed(
     assert plan.motion.duration == pytest.approx(right.motion.duration, rel=1e-3)
     for stage in plan.motion.stages:
         samples = stage.evaluate(instants(stage, 12))
-        states = zip(samples.z, samples.z_dot, strict=True)
-        slip = np.array([measure_slip(stage.formation, z, v) for z, v in states])
+        slip = measure_slip(stage.formation, samples.z, samples.z_dot)
         joints = samples.z_dot[:, 3:]
         assert (slip * stage.directions.Xi).min() > -1e-4 * np.abs(slip).max()
         assert (joints * stage.directions.sigma).min() > -1e-4 * np.abs(joints).max()
@@ -124,7 +123,7 @@ def test_a_first_phase_lets_go_what_touches_at_the_start() -> None:
     assert report.ok, report.to_text()
     motion = plan.motions[0]
     samples = motion.evaluate(np.linspace(0.0, motion.duration, 50))
-    gap = np.array([measure_gaps(make_formation(problem.scene, left), z)[0] for z in samples.z])
+    gap = measure_gaps(make_formation(problem.scene, left), samples.z)[:, 0]
     assert abs(gap[0]) < 1e-9
     # It opens at once and does not touch again [m].
     assert (gap[1:] > 1e-6).all()
@@ -144,12 +143,7 @@ def test_a_contact_rolls_in_one_phase_and_slides_in_the_next() -> None:
     assert min(plan.motion.duration for plan in plans) > 0.1 * total(plans)
     for stage in after:
         samples = stage.evaluate(instants(stage, 12))
-        slip = np.array(
-            [
-                measure_slip(stage.formation, *pair)[0]
-                for pair in zip(samples.z, samples.z_dot, strict=True)
-            ]
-        )
+        slip = measure_slip(stage.formation, samples.z, samples.z_dot)[:, 0]
         # Friction is that of sliding, against the motion.
         assert (slip * stage.directions.Xi[0]).min() > -1e-4 * np.abs(slip).max()
         mu = stage.formation.friction[0]

@@ -28,8 +28,8 @@ def random_scene(rng: np.random.Generator, radius: float, count: int = 5) -> Sce
     return replace(scene, fingers_collide=False)
 
 
-def link_gap(scene: Scene, finger: int, z: Array) -> float:
-    return float(finger_gap(scene, z[:3], finger, z[3 + finger])[0])
+def link_gaps(scene: Scene, finger: int, z: Array) -> Array:
+    return finger_gap(scene, z[:, :3], finger, z[:, 3 + finger])
 
 
 def approach(rng: np.random.Generator, scene: Scene, finger: int) -> Array:
@@ -76,8 +76,7 @@ def test_a_free_link_and_the_object_overlap_where_a_limit_says_so(
         formation = make_formation(scene, "v0-palm")
         z = np.array([approach(rng, scene, finger) for _ in range(80)])
         values = formation.evaluate_limits(z)
-        for place, row in zip(z, values, strict=True):
-            gap = link_gap(scene, finger, place)
+        for gap, row in zip(link_gaps(scene, finger, z), values, strict=True):
             limits = limits_of(formation, finger, row)
             text = min(limits, key=limits.__getitem__)
             least = limits[text]
@@ -127,12 +126,11 @@ def test_a_link_that_touches_overlaps_elsewhere_where_a_limit_says_so(
         # A little smaller, the object touches nothing where it only touched.
         body = replace(scene.polygon, points=(1 - 1e-6) * scene.polygon.vertices)
         smaller = replace(scene, polygon=body)
-        for place, values in zip(z, formation.evaluate_limits(z), strict=True):
+        every = zip(z, formation.evaluate_limits(z), link_gaps(smaller, finger, z), strict=True)
+        for place, values, gap in every:
             least = min(limits_of(formation, finger, values).values())
-            clear = link_gap(smaller, finger, place) > -1e-7
-            if radius == 0:
-                clear = link_gap(smaller, finger, place) > 0
-            assert clear or least < 1e-7, (place, least, link_gap(smaller, finger, place))
+            clear = bool(gap > (-1e-7 if radius else 0.0))
+            assert clear or least < 1e-7, (place, least, gap)
             # An object behind a pointed link, which has no thickness, overlaps nothing.
             thick = radius > 0 or name.startswith("e")
             assert not (clear and thick and least < -2e-3), (place, least)
@@ -148,7 +146,7 @@ def test_the_gap_of_link_and_object_is_the_distance_measured(radius: float) -> N
         function = ca.Function("apart", [build_features(scene).z], [build_apart(scene, finger)])
         z = np.array([approach(rng, scene, finger) for _ in range(100)])
         z[:, :2] += rng.uniform(-0.01, 0.01, (100, 2))
-        measured = np.array([link_gap(scene, finger, place) for place in z])
+        measured = link_gaps(scene, finger, z)
         outside = measured > -radius
         found = function(z.T).full()[0]
         np.testing.assert_allclose(found[outside], measured[outside], atol=1e-14)

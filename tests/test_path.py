@@ -94,7 +94,7 @@ def test_a_box_tips_about_the_vertex_that_rolls() -> None:
     """Its centroid runs on a circle, and every point of the curve has the vertex in one place."""
     curve = tip()
     z = curve.evaluate(interior(curve, 40)).z
-    corners = np.array([place_corners(curve.formation.scene, point)[1] for point in z])
+    corners = place_corners(curve.formation.scene, z)[:, 1]
     place = place_corners(curve.formation.scene, curve.start)[1]
     np.testing.assert_allclose(corners, np.broadcast_to(place, corners.shape), atol=1e-15)
     assert np.ptp(z[:, 2]) > 1.4
@@ -114,7 +114,7 @@ def test_a_tip_rolls_on_an_edge() -> None:
     curve = trace_curve(formation, z, heading, NEVER)
     places = np.linspace(0, curve.length, 30)
     z = curve.evaluate(places).z
-    corners = np.array([place_corners(scene, point) for point in z])
+    corners = place_corners(scene, z)
     run = corners[:, 2] - corners[:, 1]
     tips = place_tips(scene, 0, z[:, 3])
     along = ((tips - corners[:, 1]) * run).sum(axis=1) / np.hypot(*run.T)
@@ -240,10 +240,9 @@ def check_clear(curve: Curve) -> None:
     scene = curve.formation.scene
     z, z_s = curve.evaluate(np.linspace(0, curve.length, 40))[:2]
     assert np.abs(curve.formation.evaluate(z, z_s).C).max() < 1e-12
-    for point in z:
-        assert place_corners(scene, point)[:, 1].min() > -1e-12
-        for finger in (0, 1):
-            assert finger_gap(scene, point[:3], finger, point[3 + finger])[0] > -1e-11
+    assert place_corners(scene, z)[..., 1].min() > -1e-12
+    for finger in (0, 1):
+        assert finger_gap(scene, z[:, :3], finger, z[:, 3 + finger]).min() > -1e-11
 
 
 def side_reach(length: float) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from conftest import HEPTAGON
+from shipped import HEPTAGON
 from wholearm.curve import Curve
 from wholearm.errors import InfeasibleError, SolverError, WholearmError
 from wholearm.model import Array
@@ -21,11 +21,11 @@ from wholearm.pathdomain.chainplan import plan_chain
 from wholearm.pathdomain.pathdata import prepare
 from wholearm.pathdomain.pathexplain import with_limit
 from wholearm.pathdomain.pathmotion import make_grid
-from wholearm.pathdomain.pathplan import plan_path
+from wholearm.pathdomain.pathplan import plan_curves, plan_path
 from wholearm.plan import solve
 from wholearm.problem import Problem, build_problem
 
-INTERVALS = 40
+INTERVALS = 30
 OPTIONS = PlanOptions(intervals=INTERVALS)
 NOTHING = "no single limit makes it feasible"
 LIMITS = ("torque limit of finger 1", "torque limit of finger 2", "epsilon")
@@ -47,8 +47,9 @@ def edited(limits: dict[str, float], friction: float = 0.1, viscous: float = 0.0
     return build_problem(table)
 
 
-def plan(problem: Problem, phase: int) -> None:
-    plan_path(trace_phases(problem)[phase - 1], problem.epsilon, OPTIONS, phase)
+def plan(problem: Problem, phase: int, explained: bool = True) -> None:
+    curve = trace_phases(problem)[phase - 1]
+    plan_curves((curve,), problem.epsilon, OPTIONS, (phase,), explained=explained)
 
 
 def ask(problem: Problem, phase: int) -> str:
@@ -78,7 +79,7 @@ def read_advice(message: str) -> dict[str, float]:
 
 def is_feasible(limits: dict[str, float], phase: int, **others: float) -> bool:
     try:
-        plan(edited(limits, **others), phase)
+        plan(edited(limits, **others), phase, explained=False)
     except WholearmError:
         return False
     return True
@@ -145,30 +146,28 @@ def relax_by_linear_program(curve: Curve, epsilon: float, name: str) -> float | 
     assert not forces.Tv.any()
     last = 3 * nodes
     rows: list[Array] = []
-    right: list[float] = []
+    right: list[Array] = []
     tau_limit = data.torque_limit
-    for k in range(nodes):
-        blocks = [
-            (forces.Ca[k], forces.Cb[k], forces.Cl[k], forces.C0[k]),
-            (forces.Ta[k], forces.Tb[k], forces.Tl[k], forces.T0[k]),
-        ]
-        for kind, (of_a, of_b, of_squeeze, free) in enumerate(blocks):
-            for i in range(n_c if kind == 0 else 2):
-                row = np.zeros(last + 1)
-                row[[k, nodes + k, 2 * nodes + k]] = of_a[i], of_b[i], of_squeeze[i]
-                give = name == ("epsilon" if kind == 0 else f"torque limit of finger {i + 1}")
-                if kind == 0:
-                    # c_n >= epsilon, or what epsilon is relaxed to.
-                    low = 0.0 if give else epsilon
-                    rows.append(-row + give * np.eye(last + 1)[last])
-                    right.append(free[i] - low)
-                else:
-                    high = 0.0 if give else tau_limit[i]
-                    rows += [
-                        row - give * np.eye(last + 1)[last],
-                        -row - give * np.eye(last + 1)[last],
-                    ]
-                    right += [high - free[i], high + free[i]]
+    relaxed = np.zeros((nodes, last + 1))
+    relaxed[:, last] = 1.0
+
+    def write(of_a: Array, of_b: Array, of_squeeze: Array) -> Array:
+        """Rows of one force or torque, one for each node."""
+        parts = [np.diag(part) for part in (of_a, of_b, of_squeeze)]
+        return np.hstack([*parts, np.zeros((nodes, 1))])
+
+    for i in range(n_c):
+        # c_n >= epsilon, or what epsilon is relaxed to.
+        give = name == "epsilon"
+        row = write(forces.Ca[:, i], forces.Cb[:, i], forces.Cl[:, i])
+        rows.append(give * relaxed - row)
+        right.append(forces.C0[:, i] - (not give) * epsilon)
+    for i in range(2):
+        give = name == f"torque limit of finger {i + 1}"
+        row = write(forces.Ta[:, i], forces.Tb[:, i], forces.Tl[:, i])
+        high = (not give) * tau_limit[i]
+        rows += [row - give * relaxed, -row - give * relaxed]
+        right += [high - forces.T0[:, i], high + forces.T0[:, i]]
     equal = np.zeros((nodes + 1, last + 1))
     for k, step in enumerate(steps):
         equal[k, [k, k + 1]] = -step
@@ -181,8 +180,8 @@ def relax_by_linear_program(curve: Curve, epsilon: float, name: str) -> float | 
     sign = -1.0 if name == "epsilon" else 1.0
     result = linprog(
         sign * np.eye(last + 1)[last],
-        A_ub=np.array(rows),
-        b_ub=np.array(right),
+        A_ub=np.vstack(rows),
+        b_ub=np.concatenate(right),
         A_eq=equal,
         b_eq=np.zeros(nodes + 1),
         bounds=[free_range] * nodes + b_range + [free_range] * nodes + [(0.0, None)],

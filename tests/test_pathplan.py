@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
-from conftest import HEPTAGON
 from plane import with_speed_limit
+from shipped import HEPTAGON, IMPACTS, problem_of
 from topp import PhasePlane
 from toys import Toy, constant
 from wholearm.curve import Curve
@@ -22,7 +22,6 @@ from wholearm.dynamics import inverse
 from wholearm.errors import InfeasibleError, JammingError, SolverError
 from wholearm.model import Array
 from wholearm.options import Objective, PlanOptions
-from wholearm.outline import load
 from wholearm.path import trace_phases
 from wholearm.pathdomain import pathplan
 from wholearm.pathdomain.chain import Chain, make_chain
@@ -34,7 +33,6 @@ from wholearm.phaseplan import PhasePlan
 from wholearm.plan import solve
 from wholearm.problem import Problem, build_problem
 
-IMPACTS = HEPTAGON.with_name("heptagon_impact.toml")
 PHASES = range(5)
 OBJECTIVES = ["time", "effort", "margin"]
 EPSILON = 0.05
@@ -112,7 +110,7 @@ def test_a_phase_that_only_a_quick_motion_carries(
 @pytest.fixture(scope="module")
 def chain() -> Chain:
     """Three phases that impacts join."""
-    problem = load(str(IMPACTS))
+    problem = problem_of(IMPACTS)
     return make_chain(problem.phases, trace_phases(problem)).split()[0]
 
 

@@ -71,16 +71,14 @@ def test_planned_forces_balance_every_body(objective: str) -> None:
     samples = sample(plan(objective), 200)
     formation = tip_on(0.5).formation
     place = place_corners(formation.scene, tip().start)[1]
-    for k in range(200):
-        row = Samples(*(part[k] for part in samples))
-        missing, size = unbalance(formation, row, np.sign(row.z_dot[3:]))
-        assert np.abs(missing).max() < 1e-10 * size.max()
-        assert np.abs(place_corners(formation.scene, row.z)[1] - place).max() < 1e-14
-        slip = measure_slip(formation, row.z, row.z_dot)
-        assert abs(slip[0]) < 1e-13
-        # The other two slide, and friction opposes that.
-        mu = formation.friction[1:]
-        np.testing.assert_allclose(row.c_t[1:], -mu * np.sign(slip[1:]) * row.c_n[1:], rtol=1e-12)
+    missing, size = unbalance(formation, samples, np.sign(samples.z_dot[:, 3:]))
+    assert (np.abs(missing).max(axis=1) < 1e-10 * size.max(axis=1)).all()
+    assert np.abs(place_corners(formation.scene, samples.z)[:, 1] - place).max() < 1e-14
+    slip = measure_slip(formation, samples.z, samples.z_dot)
+    assert np.abs(slip[:, 0]).max() < 1e-13
+    # The other two slide, and friction opposes that.
+    law = -formation.friction[1:] * np.sign(slip[:, 1:]) * samples.c_n[:, 1:]
+    np.testing.assert_allclose(samples.c_t[:, 1:], law, rtol=1e-12)
 
 
 def test_velocities_and_accelerations_are_derivatives() -> None:

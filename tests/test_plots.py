@@ -28,8 +28,6 @@ from wholearm.problem import Problem
 from wholearm.torque import TorqueProfile
 from wholearm.trajectory import Trajectory, assemble
 
-HEPTAGON = Path(__file__).parents[1] / "problems" / "heptagon_four_contacts.toml"
-
 
 @dataclasses.dataclass
 class Replayed:
@@ -40,13 +38,13 @@ class Replayed:
 
 
 @pytest.fixture(scope="module")
-def problem() -> Problem:
-    return wholearm.load(str(HEPTAGON))
+def problem(heptagon: Problem) -> Problem:
+    return heptagon
 
 
 @pytest.fixture(scope="module")
-def planned(problem: Problem) -> Trajectory:
-    return wholearm.solve(problem, intervals=20)
+def planned(trajectory: Trajectory) -> Trajectory:
+    return trajectory
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from conftest import HEPTAGON
 from plane import finger_gap, place_corners
+from shipped import HEPTAGON
 from wholearm.errors import InputError
 from wholearm.outline import load
 from wholearm.problem import End, Problem, build_problem, read_problem

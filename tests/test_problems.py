@@ -16,12 +16,9 @@ import pytest
 
 from crossing import measure_fingers
 from plane import finger_gap
-from timed import fastest
-from wholearm.outline import load
-from wholearm.plan import solve
+from shipped import FOLDER, plan_of, problem_of
 from wholearm.verify import verify
 
-FOLDER = Path(__file__).parents[1] / "problems"
 FILES = sorted(FOLDER.glob("*.toml"))
 OBJECTIVES = ("time", "effort", "margin")
 FLIPS = ("heptagon", "hexagon", "square", "triangle")
@@ -50,7 +47,7 @@ def measure(path: Path) -> dict[str, Any]:
 
     The least margin is that of the least normal force over epsilon.
     """
-    plan = fastest(path)
+    plan = plan_of(path)
     return {
         "status": plan.meta["status"],
         "objective": plan.meta["objective"],
@@ -76,8 +73,7 @@ def test_plans_have_their_reference_figures(path: Path) -> None:
 
 @pytest.mark.parametrize("path, objective", CASES, ids=lambda case: getattr(case, "stem", case))
 def test_plans_hold_in_simulation(path: Path, objective: str) -> None:
-    problem = load(str(path))
-    plan = fastest(path) if objective == "time" else solve(problem, objective)
+    problem, plan = problem_of(path), plan_of(path, objective)
     report = verify(problem, plan)
     assert report.ok, report.to_text()
     assert abs(report.missed_by) < GOAL
@@ -89,14 +85,14 @@ def test_plans_hold_in_simulation(path: Path, objective: str) -> None:
     for motion in plan.motions:
         z = motion.evaluate(np.linspace(0.0, motion.duration, 61)).z
         assert measure_fingers(problem.scene, z).min() > 0
-        gaps = [finger_gap(problem.scene, row[:3], k, row[3 + k])[0] for row in z for k in (0, 1)]
-        assert min(gaps) > -OVERLAP
+        gaps = [finger_gap(problem.scene, z[:, :3], k, z[:, 3 + k]) for k in (0, 1)]
+        assert np.min(gaps) > -OVERLAP
 
 
 @pytest.mark.parametrize("name", FLIPS)
 def test_flips_land_on_the_next_edge(name: str) -> None:
     path = FOLDER / f"{name}.toml"
-    plan, corners = fastest(path), load(str(path)).scene.polygon.vertices
+    plan, corners = plan_of(path), problem_of(path).scene.polygon.vertices
     heights = []
     for _, y, phi in plan.q:
         heights.append(y + np.sin(phi) * corners[:, 0] + np.cos(phi) * corners[:, 1])

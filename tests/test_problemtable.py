@@ -11,23 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from conftest import HEPTAGON
+from shipped import BOX, HEPTAGON
 from wholearm.contact import build_features
 from wholearm.errors import InputError
 from wholearm.model import Friction
-from wholearm.outline import load
 from wholearm.plan import solve
 from wholearm.problem import End, Problem, build_problem, read_problem
 from wholearm.problemtable import describe_scene
 from wholearm.simulation.simulate import simulate
 
 PROBLEMS = sorted(HEPTAGON.parent.glob("*.toml"))
-BOX = str(HEPTAGON.parent / "box_rolling.toml")
-
-
-@pytest.fixture(scope="module")
-def heptagon() -> Problem:
-    return load(str(HEPTAGON))
 
 
 def check_scene(problem: Problem) -> None:
@@ -172,7 +165,7 @@ def test_a_problem_without_a_table_cannot_be_changed_by_name(heptagon: Problem) 
 
 def test_other_phases_and_another_start_are_in_the_table(heptagon: Problem) -> None:
     check_table(replace(heptagon, phases=heptagon.phases[:2]))
-    box = read_problem(BOX)
+    box = read_problem(str(BOX))
     last = replace(box.phases[-1], end=End.REST)
     short = replace(box, phases=(*box.phases[:-1], last))
     check_table(short)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from planned import HEPTAGON
+from shipped import HEPTAGON
 from wholearm.benchmark.refusals import judge
 from wholearm.errors import InfeasibleError, InputError, JammingError
 from wholearm.problem import Problem, build_problem, read_problem

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import wholearm
-from conftest import HEPTAGON
+from shipped import HEPTAGON
 from wholearm.benchmark.scenes import random_route, random_scene
 from wholearm.curve import Curve
 from wholearm.errors import InputError

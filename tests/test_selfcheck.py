@@ -6,14 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from conftest import HEPTAGON
 from planned import change, plan, plan_landing
+from shipped import HEPTAGON, problem_of
 from wholearm import selfcheck
 from wholearm.blocks import Planning, plan_blocks
 from wholearm.errors import InputError, ReplayError, SolverError
 from wholearm.model import Array
 from wholearm.options import PlanOptions
-from wholearm.outline import load
 from wholearm.phaseplan import PhasePlan
 from wholearm.plan import solve
 from wholearm.problem import Problem
@@ -170,7 +169,7 @@ def test_a_contact_that_is_let_go_is_not_the_least() -> None:
 
 
 def test_without_a_replay() -> None:
-    meta = solve(load(str(HEPTAGON)), intervals=20, replay=False).meta
+    meta = solve(problem_of(HEPTAGON), intervals=20, replay=False).meta
     assert meta["replay"] is None
     with pytest.raises(InputError, match="replay: 'no' given"):
         PlanOptions(replay="no")  # type: ignore[arg-type]

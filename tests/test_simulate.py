@@ -8,9 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from crossing import HEXAGON, hexagon, measure_fingers
+from crossing import hexagon, measure_fingers
 from planned import CosineMotion, change, plan
-from timed import fastest
+from shipped import HEXAGON, plan_of
 from wholearm.benchmark.baseline_simulation import simulate_with_scipy, solve_motion
 from wholearm.contact import parse_contact
 from wholearm.dynamics import Directions, forward
@@ -380,7 +380,7 @@ def test_another_limit_ends_the_motion() -> None:
 def test_fingers_that_touch_end_the_motion(solid: bool) -> None:
     """The hexagon's plan replayed by a hand with a longer left finger."""
     problem = hexagon(solid=solid)
-    simulation = simulate(problem, fastest(HEXAGON).torque)
+    simulation = simulate(problem, plan_of(HEXAGON).torque)
     gaps = measure_fingers(problem.scene, simulation.z)
     if not solid:
         assert simulation.outcome.reached and gaps.min() < -1e-4

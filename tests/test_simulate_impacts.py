@@ -11,18 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from conftest import HEPTAGON
 from plane import stack_rows
 from planned import SQUEEZES, DepartingMotion, change
-from timed import fastest
+from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
 from wholearm.contact import parse_contact
 from wholearm.dynamics import energy
 from wholearm.formation import Formation
 from wholearm.impact import strike
 from wholearm.model import Array
-from wholearm.outline import load
 from wholearm.path import trace_phases
-from wholearm.plan import solve
 from wholearm.problem import End, Phase, Problem, build_problem
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
 from wholearm.simulation.simulate import simulate
@@ -30,17 +27,15 @@ from wholearm.torque import TorqueProfile
 from wholearm.trajectory import Trajectory
 from wholearm.verify import verify
 
-IMPACTS = HEPTAGON.with_name("heptagon_impact.toml")
-
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    return load(str(IMPACTS))
+    return problem_of(IMPACTS)
 
 
 @pytest.fixture(scope="module")
 def planned() -> Trajectory:
-    return fastest(IMPACTS)
+    return plan_of(IMPACTS)
 
 
 @pytest.fixture(scope="module")
@@ -194,7 +189,7 @@ def chords(torque: TorqueProfile, count: int) -> TorqueProfile:
 
 def test_a_planned_stop_is_that_of_a_phase_that_ends_at_rest(problem: Problem) -> None:
     """Linear torques between rows bring it there a little early, and not quite at rest."""
-    torque = chords(solve(problem, "margin").torque, 8)
+    torque = chords(plan_of(IMPACTS, "margin").torque, 8)
     first, second, *others = problem.phases
     stops = [dataclasses.replace(phase, end=End.REST) for phase in others]
     resting = dataclasses.replace(problem, phases=(first, second, *stops))
@@ -287,5 +282,5 @@ def test_verify_reports_the_impacts(problem: Problem, planned: Trajectory) -> No
 
 
 def test_reports_without_impacts_have_no_such_column(trajectory: Trajectory) -> None:
-    report = verify(load(str(HEPTAGON)), trajectory)
+    report = verify(problem_of(HEPTAGON), trajectory)
     assert "least impulse" not in report.to_text()

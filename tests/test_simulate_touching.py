@@ -7,9 +7,10 @@ import tomllib
 import numpy as np
 import pytest
 
-from crossing import HEXAGON, make_way
+from crossing import make_way
 from plane import make_formation
 from planned import CosineMotion, choose_squeeze, join
+from shipped import HEXAGON
 from wholearm.path import trace_phases
 from wholearm.problem import Problem, build_problem
 from wholearm.simulation.simulate import simulate

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from planned import HEPTAGON
+from shipped import HEPTAGON
 from wholearm.benchmark.lpmotion import slow_margin
 from wholearm.benchmark.tracing import weights
 from wholearm.options import PlanOptions

@@ -1,41 +1,49 @@
 from __future__ import annotations
 
-import tomllib
-from functools import lru_cache
+from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 
-from conftest import HEPTAGON
+from once import once
 from plane import measure_gaps
-from timed import fastest
+from shipped import IMPACTS, LANDING, plan_of, problem_of
 from wholearm.curve import metric_weights
 from wholearm.formation import Formation
 from wholearm.impact import strike
 from wholearm.model import Array
-from wholearm.outline import load
+from wholearm.path import trace_phases
 from wholearm.plan import solve
-from wholearm.problem import Problem, build_problem
+from wholearm.problem import End, Problem
 from wholearm.trajectory import Samples, Trajectory
 from wholearm.verify import verify
 
-IMPACTS = HEPTAGON.with_name("heptagon_impact.toml")
-STOPS = [3, 4]
-"""Phases whose end cannot be passed at speed."""
+PARTS = {"time": (0, 3), "effort": (1, 4)}
+"""Phases that are planned: two impacts; one, and a stop where no impact is possible."""
 
 
-@lru_cache(maxsize=1)
-def problem() -> Problem:
-    return load(str(IMPACTS))
+@cache
+def problem(objective: str) -> Problem:
+    first, last = PARTS[objective]
+    whole = problem_of(IMPACTS)
+    phases = [replace(phase, index=k) for k, phase in enumerate(whole.phases[first:last])]
+    phases[-1] = replace(phases[-1], end=End.REST)
+    start = trace_phases(whole)[first - 1].end if first else whole.start
+    return replace(whole, start=start, phases=tuple(phases))
 
 
-@lru_cache(maxsize=4)
+@once
 def planned(objective: str) -> Trajectory:
     """Plans on few intervals, whose replay is a test of its own."""
-    intervals = 16 if objective == "time" else 6
-    options: dict[str, Any] = {"time_intervals": intervals, "replay": False}
-    return solve(problem(), objective, transcription="time", **options)
+    options: dict[str, Any] = {"time_intervals": 6, "replay": False}
+    return solve(problem(objective), objective, transcription="time", **options)
+
+
+@cache
+def along(objective: str) -> Trajectory:
+    return solve(problem(objective), objective, intervals=40)
 
 
 def ends_of(trajectory: Trajectory, phase: int) -> tuple[Samples, Samples]:
@@ -56,21 +64,20 @@ def find_impulses(formation: Formation, z: Array, v: Array, v_next: Array) -> Ar
 
 
 def test_least_times_with_impacts_agree_with_those_along_the_curves() -> None:
-    within, along = planned("time"), fastest(IMPACTS)
+    within, expected = planned("time"), plan_of(IMPACTS).meta["phase_durations"][:3]
     # The planner along curves passes impacts by a condition on speeds alone.
-    assert 0 < within.duration / along.duration - 1 < 3e-3
-    np.testing.assert_allclose(
-        within.meta["phase_durations"], along.meta["phase_durations"], rtol=5e-3
-    )
-    report = verify(problem(), within)
+    assert 0 < within.duration / sum(expected) - 1 < 3e-3
+    np.testing.assert_allclose(within.meta["phase_durations"], expected, rtol=5e-3)
+    report = verify(problem("time"), within)
     assert report.ok, report.to_text()
     impulses = [phase.impact.impulse for phase in report.phases if phase.impact is not None]
     assert len(impulses) == 2 and min(impulses) > 0
 
 
-def test_transitions_agree_with_those_along_the_curves() -> None:
-    rows, others = (plan.meta["transitions"] for plan in (planned("time"), fastest(IMPACTS)))
-    assert [row["phase"] for row in rows] == [1, 2, *STOPS]
+@pytest.mark.parametrize("objective", ["time", "effort"])
+def test_transitions_agree_with_those_along_the_curves(objective: str) -> None:
+    rows, others = (plan(objective).meta["transitions"] for plan in (planned, along))
+    assert [row["phase"] for row in rows] == [1, 2]
     for row, other in zip(rows, others, strict=True):
         for key in ("phase", "gained", "possible", "least_impulse_contact"):
             assert row[key] == other[key]
@@ -86,10 +93,12 @@ def test_transitions_agree_with_those_along_the_curves() -> None:
 
 @pytest.mark.parametrize("objective", ["time", "effort"])
 def test_velocities_jump_by_the_impact_law(objective: str) -> None:
-    plan = planned(objective)
-    metric = metric_weights(problem().scene)
-    for k, row in enumerate(plan.meta["transitions"][:2]):
-        before, after = (phase.formation for phase in problem().phases[k : k + 2])
+    plan, own = planned(objective), problem(objective)
+    metric = metric_weights(own.scene)
+    for k, row in enumerate(plan.meta["transitions"]):
+        if not row["possible"]:
+            continue
+        before, after = (phase.formation for phase in own.phases[k : k + 2])
         end, start = ends_of(plan, k)
         z, v, v_next = end.z[0], end.z_dot[0], start.z_dot[0]
         np.testing.assert_allclose(start.z[0], z, rtol=0, atol=1e-7)
@@ -103,40 +112,38 @@ def test_velocities_jump_by_the_impact_law(objective: str) -> None:
         # The contacts of the next formation neither part nor press into one another.
         assert np.abs(measure_gaps(after, z)).max() < 1e-8
         assert np.abs(after.evaluate(z[None], v_next[None]).A[0] @ v_next).max() < 1e-5
-        energies = [0.5 * problem().scene.mass_diagonal @ u**2 for u in (v, v_next)]
+        energies = [0.5 * own.scene.mass_diagonal @ u**2 for u in (v, v_next)]
         assert energies[1] < energies[0]
 
 
-@pytest.mark.parametrize("objective", ["time", "effort"])
-def test_it_stops_where_no_impact_is_possible(objective: str) -> None:
-    plan = planned(objective)
-    for row in plan.meta["transitions"][2:]:
-        assert not row["possible"] and row["speed"] == 0.0
-        assert row["reason"].startswith("impulse on v") and row["reason"].endswith("per m/s")
-        for samples in ends_of(plan, row["phase"] - 1):
-            assert np.abs(samples.z_dot).max() < 1e-5
+def test_it_stops_where_no_impact_is_possible() -> None:
+    plan = planned("effort")
+    struck, row = plan.meta["transitions"]
+    assert struck["possible"] and not row["possible"] and row["speed"] == 0.0
+    assert row["reason"].startswith("impulse on v") and row["reason"].endswith("per m/s")
+    for samples in ends_of(plan, row["phase"] - 1):
+        assert np.abs(samples.z_dot).max() < 1e-5
 
 
 def test_least_effort_with_impacts_is_near_that_along_the_curves() -> None:
-    within, along = planned("effort"), solve(problem(), "effort", intervals=40)
-    # Torques that are linear in an eighth of a phase cannot be as gentle.
-    assert 0 < within.meta["value"] / along.meta["value"] - 1 < 1e-2
-    report = verify(problem(), within)
+    within = planned("effort")
+    # Torques that are linear in a sixth of a phase cannot be as gentle.
+    assert 0 < within.meta["value"] / along("effort").meta["value"] - 1 < 1e-2
+    report = verify(problem("effort"), within)
     assert report.ok, report.to_text()
 
 
 def test_an_impact_that_is_not_possible_next_to_a_landing_is_a_stop() -> None:
-    path = HEPTAGON.with_name("heptagon.toml")
-    table: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
-    options: dict[str, Any] = {"time_intervals": 8, "replay": False}
-    stopped = solve(build_problem(table), **options)
-    table["phases"][3]["end"] = "impact"
-    struck = solve(build_problem(table), **options)
+    """The heptagon's landing and the phase before it."""
+    whole, expected = problem_of(LANDING), plan_of(LANDING).meta["phase_durations"][3:]
+    phases = [replace(phase, index=k) for k, phase in enumerate(whole.phases[3:])]
+    phases[0] = replace(phases[0], end=End.IMPACT)
+    one = replace(whole, start=trace_phases(whole)[2].end, phases=tuple(phases))
+    struck = solve(one, time_intervals=8, replay=False)
     (row,) = struck.meta["transitions"]
-    assert (row["phase"], row["possible"], row["gained"]) == (4, False, "v4-finger1")
+    assert (row["phase"], row["possible"], row["gained"]) == (1, False, "v4-finger1")
     assert row["least_impulse"] < 0 and row["least_impulse_contact"] in row["reason"]
-    # Phase 4 is planned in the time domain then, and what follows is what it was.
-    got, expected = struck.meta["phase_durations"], stopped.meta["phase_durations"]
-    np.testing.assert_allclose(got[:3], expected[:3], rtol=1e-9)
-    assert 0 < got[3] / expected[3] - 1 < 1e-2
-    np.testing.assert_allclose(got[4:], expected[4:], rtol=1e-3)
+    # That phase is planned in the time domain then, and what follows is what it was.
+    got = struck.meta["phase_durations"]
+    assert 0 < got[0] / expected[0] - 1 < 1e-2
+    assert sum(got[1:]) == pytest.approx(sum(expected[1:]), rel=1e-3)

@@ -13,7 +13,6 @@ from wholearm.dynamics import Directions
 from wholearm.formation import Formation
 from wholearm.timedomain.collocation import make_scheme
 from wholearm.timedomain.timemotion import StageMotion, TimeMotion
-from wholearm.trajectory import Samples
 
 
 @pytest.fixture(scope="module")
@@ -30,13 +29,12 @@ def test_the_equations_of_motion_hold_at_any_instant(stages: list[StageMotion]) 
     rng = np.random.default_rng(8)
     for stage in stages:
         samples = stage.evaluate(np.sort(rng.uniform(0, stage.duration, 25)))
-        for k in range(25):
-            row = Samples(*(part[k] for part in samples))
-            residual, size = unbalance(stage.formation, row, stage.directions.sigma)
-            # Rounding of sums of a few terms.
-            assert (np.abs(residual) < 1e-11 * size).all()
-            law = -stage.formation.friction * stage.directions.Xi * row.c_n
-            np.testing.assert_allclose(row.c_t, law, rtol=1e-12)
+        sigma = np.tile(stage.directions.sigma, (25, 1))
+        residual, size = unbalance(stage.formation, samples, sigma)
+        # Rounding of sums of a few terms.
+        assert (np.abs(residual) < 1e-11 * size).all()
+        law = -stage.formation.friction * stage.directions.Xi * samples.c_n
+        np.testing.assert_allclose(samples.c_t, law, rtol=1e-12)
 
 
 def test_contacts_are_closed_and_stay_so_at_any_instant(stages: list[StageMotion]) -> None:
@@ -44,7 +42,7 @@ def test_contacts_are_closed_and_stay_so_at_any_instant(stages: list[StageMotion
     for stage in stages:
         formation = stage.formation
         samples = stage.evaluate(rng.uniform(0, stage.duration, 40))
-        assert max(np.abs(measure_gaps(formation, z)).max() for z in samples.z) < 1e-14
+        assert np.abs(measure_gaps(formation, samples.z)).max() < 1e-14
         kinematics = formation.evaluate(samples.z, samples.z_dot)
         opening = np.einsum("nij,nj->ni", kinematics.A, samples.z_dot)
         change = np.einsum("nij,nj->ni", kinematics.A, samples.z_ddot) + kinematics.A_dot_v
@@ -126,8 +124,7 @@ def test_a_phase_is_its_stages_one_after_the_other(motions: list[TimeMotion]) ->
 def test_friction_opposes_sliding(stages: list[StageMotion]) -> None:
     for stage in stages:
         samples = stage.evaluate(instants(stage, 8))
-        states = zip(samples.z, samples.z_dot, strict=True)
-        slip = np.array([measure_slip(stage.formation, z, v) for z, v in states])
+        slip = measure_slip(stage.formation, samples.z, samples.z_dot)
         power = samples.c_t * slip
         # Near a reversal slip is known to the error of collocation, 1e-5 of the largest.
         assert power.max() < 1e-4 * np.abs(power).max()

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from plane import make_formation, measure_gaps, with_speed_limit
-from planned import HEPTAGON, CosineMotion
+from planned import CosineMotion
+from shipped import HEPTAGON
 from timed import drive
 from tipping import roll
 from wholearm.curve import Curve, metric_weights, tangent_basis

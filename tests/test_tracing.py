@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from planned import HEPTAGON
+from shipped import HEPTAGON
 from wholearm.benchmark.tracing import follow, slides, spread
 from wholearm.curve import Curve
 from wholearm.outline import load

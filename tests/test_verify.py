@@ -8,13 +8,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from crossing import HEXAGON, hexagon, measure_fingers
+from crossing import hexagon, measure_fingers
 from planned import change, plan
-from timed import fastest
+from shipped import HEXAGON, plan_of, problem_of
 from tipping import box, scale, tipped
 from wholearm.errors import InputError
 from wholearm.model import Array
-from wholearm.outline import load
 from wholearm.simulation.simulate import simulate
 from wholearm.torque import TorqueProfile
 from wholearm.verify import verify
@@ -259,7 +258,7 @@ def test_a_slip_fails(later: float) -> None:
 
 
 def test_the_least_gap_of_the_fingers_is_reported() -> None:
-    problem, plan_ = load(str(HEXAGON)), fastest(HEXAGON)
+    problem, plan_ = problem_of(HEXAGON), plan_of(HEXAGON)
     report = verify(problem, plan_)
     assert report.ok and report.finger_gap is not None
     motions = zip(plan_.motions, plan_.phase_starts, strict=False)
@@ -276,10 +275,10 @@ def test_the_least_gap_of_the_fingers_is_reported() -> None:
 
 
 def test_fingers_that_touch_fail() -> None:
-    report = verify(hexagon(), fastest(HEXAGON))
+    report = verify(hexagon(), plan_of(HEXAGON))
     assert not report.ok and report.finger_gap is not None
     assert report.failures[0].startswith("finger 1 touches finger 2 at t = ")
     assert report.finger_gap.least < 1e-6
-    passing = verify(hexagon(solid=False), fastest(HEXAGON))
+    passing = verify(hexagon(solid=False), plan_of(HEXAGON))
     assert passing.ok and passing.finger_gap is None
     assert "gap of the fingers" not in passing.to_text()

@@ -6,46 +6,41 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from once import once
 from plane import accelerate
+from shipped import LANDING, plan_of, problem_of
 from wholearm.dynamics import Directions
 from wholearm.formation import Formation
 from wholearm.model import Array
 from wholearm.options import PlanOptions
-from wholearm.outline import load
 from wholearm.path import trace_phases
 from wholearm.phaseplan import PhasePlan
-from wholearm.plan import solve
 from wholearm.problem import Problem
 from wholearm.timedomain.collocation import Scheme
 from wholearm.timedomain.stage import StagePoints
 from wholearm.timedomain.timemotion import StageMotion, TimeMotion
 from wholearm.timedomain.timeplan import plan_phases
-from wholearm.trajectory import Trajectory
-
-HEPTAGON = Path(__file__).parents[1] / "problems" / "heptagon.toml"
 
 
-@lru_cache(maxsize=1)
 def landing() -> Problem:
     """A slide, a flip and a landing; its last two phases are joined smoothly."""
-    return load(str(HEPTAGON))
+    return problem_of(LANDING)
 
 
 @lru_cache(maxsize=1)
 def flip() -> Problem:
     """Phase 4 of the slide and the flip alone, in which nothing reverses."""
-    problem = load(str(HEPTAGON))
+    problem = landing()
     phase = replace(problem.phases[3], index=0)
     return replace(problem, start=trace_phases(problem)[2].end, phases=(phase,))
 
 
-@lru_cache(maxsize=32)
+@once
 def plan_landing(**options: Any) -> list[PhasePlan[TimeMotion]]:
     """Plan the flip's last formation and the landing, from rest to rest."""
     problem, duration = landing(), options.pop("duration", None)
@@ -53,15 +48,9 @@ def plan_landing(**options: Any) -> list[PhasePlan[TimeMotion]]:
     return plan_phases(problem, problem.phases[4:], start, PlanOptions(**options), duration)
 
 
-@lru_cache(maxsize=16)
-def fastest(path: Path) -> Trajectory:
-    """The plan of a problem file for least time, with every other option at its default."""
-    return solve(load(str(path)))
-
-
 def fastest_landing() -> list[TimeMotion]:
     """The motions of the same two phases for least time."""
-    motions = fastest(HEPTAGON).motions[4:]
+    motions = plan_of(LANDING).motions[4:]
     return [motion for motion in motions if isinstance(motion, TimeMotion)]
 
 

@@ -4,34 +4,30 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 
 from plane import make_formation, make_scene, rotate
-from timed import fastest
+from shipped import BOX, plan_of, problem_of
 from wholearm.curve import Curve
 from wholearm.formation import Formation
 from wholearm.model import Array, Friction, Scene
-from wholearm.outline import load
 from wholearm.path import trace_phases
 from wholearm.problem import Phase, Problem, Until
 from wholearm.torque import TorqueProfile
 from wholearm.trajectory import Trajectory
 
-BOX = Path(__file__).parents[1] / "problems" / "box_rolling.toml"
 POINTS = [[-0.02, -0.05], [0.02, -0.05], [0.02, 0.05], [-0.02, 0.05]]
 """A slender box; fallen over vertex 1, its centroid is ever farther right of it."""
 
 
-@lru_cache(maxsize=1)
 def box() -> Problem:
-    return load(str(BOX))
+    return problem_of(BOX)
 
 
 def tipped() -> Trajectory:
     """The plan of the box for least time."""
-    return fastest(BOX)
+    return plan_of(BOX)
 
 
 def tip() -> Curve:

@@ -1,0 +1,35 @@
+"""The problem files, and their plans with every other option at its default, each planned once."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+from once import once
+from wholearm.outline import load
+from wholearm.plan import solve
+from wholearm.problem import Problem
+from wholearm.trajectory import Trajectory
+
+FOLDER = Path(__file__).parents[1] / "problems"
+HEPTAGON = FOLDER / "heptagon_four_contacts.toml"
+"""Five phases along curves, joined at rest."""
+IMPACTS = FOLDER / "heptagon_impact.toml"
+"""The same with rough fingers, joined by impacts."""
+LANDING = FOLDER / "heptagon.toml"
+"""A slide, a flip and a landing; its last two phases are joined smoothly."""
+TWICE = FOLDER / "heptagon_twice.toml"
+"""Two of them, one after the other."""
+HEXAGON = FOLDER / "hexagon.toml"
+BOX = FOLDER / "box_rolling.toml"
+"""A box that tips over a vertex that rolls."""
+
+
+@cache
+def problem_of(path: Path) -> Problem:
+    return load(str(path))
+
+
+@once
+def plan_of(path: Path, objective: str = "time") -> Trajectory:
+    return solve(problem_of(path), objective)
