@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from planned import HEPTAGON
+from shipped import HEPTAGON
 from wholearm.benchmark.cellcurves import best_end, find_best, list_ends
 from wholearm.benchmark.lpmotion import slow_margin
 from wholearm.model import Array
