@@ -23,6 +23,12 @@ from wholearm.simulation.simulate import simulate
 PROBLEMS = sorted(HEPTAGON.parent.glob("*.toml"))
 
 
+@pytest.fixture
+def heptagon() -> Problem:
+    """Read anew, so that nothing is kept for its scene."""
+    return load(str(HEPTAGON))
+
+
 def check_scene(problem: Problem) -> None:
     assert all(phase.formation.scene is problem.scene for phase in problem.phases)
 
