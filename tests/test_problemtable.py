@@ -15,6 +15,7 @@ from shipped import BOX, HEPTAGON
 from wholearm.contact import build_features
 from wholearm.errors import InputError
 from wholearm.model import Friction
+from wholearm.outline import load
 from wholearm.plan import solve
 from wholearm.problem import End, Problem, build_problem, read_problem
 from wholearm.problemtable import describe_scene
