@@ -3,6 +3,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ LEAST = 0.35 * 0.2 * 9.81
 """Least c_n of the shoved square [N]: friction shifts 0.15 of its weight to the vertex ahead."""
 
 
-def plan_all(problem: Problem, **options: bool) -> list[PhasePlan[TimeMotion]]:
+def plan_all(problem: Problem, **options: Any) -> list[PhasePlan[TimeMotion]]:
     return plan_phases(problem, problem.phases, problem.start, COARSE, **options)
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from .costtogo import CostToGo
 from .errors import InfeasibleError
 from .metric import measure_speed
 from .model import Array, Scene
@@ -182,7 +183,8 @@ def _plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str],
             numbers = "-".join(str(phase.number) for phase in phases)
             report(f"phase {numbers} of {len(problem.phases)}: {options.goal.value}")
             own = _refine(options, known, finer[index])
-            made = _plan_block(problem, phases, z, own, allowed)
+            to_go = _look_ahead(problem, phases, own)
+            made = _plan_block(problem, phases, z, own, allowed, to_go)
             known = BlockPlan(phases, z, *wanted, fastest, *made)
         blocks.append(known)
         z = known.end
@@ -205,6 +207,7 @@ def _plan_block(
     z: Array,
     options: PlanOptions,
     allowed: Sequence[float | None] | None,
+    to_go: CostToGo | None = None,
 ) -> tuple[Plans, Chain | None]:
     """Plan a block from `z`, along its curves or in the time domain; also its curves."""
     plans: Plans = []
@@ -212,7 +215,7 @@ def _plan_block(
     if not runs_along_curves(block, options):
         from .timedomain.timeimpacts import plan_struck
 
-        plans += plan_struck(problem, block, z, options, add_up(block, allowed))
+        plans += plan_struck(problem, block, z, options, add_up(block, allowed), to_go)
         return plans, None
     curves, known = [], trace_phases(problem)
     for phase in block:
@@ -223,6 +226,29 @@ def _plan_block(
     for part in chain.split():
         plans += plan_chain(part, problem.epsilon, options, add_up(part.phases, allowed))
     return plans, chain
+
+
+def _look_ahead(problem: Problem, block: Sequence[Phase], options: PlanOptions) -> CostToGo | None:
+    """What follows a block in the time domain, if that decides where on a curve it should end."""
+    index = block[-1].index + 1
+    if runs_along_curves(block, options) or index == len(problem.phases):
+        return None
+    phase, ending = problem.phases[index], block[-1]
+    until = ending.until.contact
+    gained = set(phase.formation.contacts) - set(ending.formation.contacts)
+    following = next(own for own in split_blocks(problem) if own[0] is phase)
+    if (
+        options.goal is Objective.MARGIN
+        or until is None
+        or gained != {until}
+        or not runs_along_curves(following, options)
+    ):
+        return None
+
+    def value(z: Array) -> float:
+        return sum(plan.value for plan in _plan_block(problem, following, z, options, None)[0])
+
+    return CostToGo(problem, phase, value)
 
 
 def _require_margin(planning: Planning) -> Planning:

@@ -100,12 +100,11 @@ def find_misses(stage: Stage, look: Look, epsilon: float, margin: float = 0.0) -
     """
     samples = look.samples
     grip = slip_margins(stage.formation, samples.c_n - epsilon, samples.c_t)
-    clear = stage.clearance / 2 * np.isin(stage.watched, stage.released)
-    later = (not stage.opens) | (look.places > 1 / 2)
+    clear = stage.list_clearances(look.places, after=1 / 2) / 2
     tables = (
         samples.c_n - (epsilon + margin),
         grip,
-        look.limits[:, list(stage.watched)] - np.outer(later, clear),
+        look.limits[:, list(stage.watched)] - clear,
         _measure_senses(stage, samples) - 0.5 * least_rates(stage, look.places)[:, None],
     )
     shape = (stage.intervals, LOOKS)

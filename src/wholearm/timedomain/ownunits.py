@@ -71,7 +71,7 @@ def _scale_phase(phase: Phase, scene: Scene, scales: Scales) -> Phase:
 
 def scale_state(z: Array, scales: Scales) -> Array:
     """Configurations, shape (..., 5), in own units."""
-    return np.asarray(z / _lengths(scales))
+    return np.asarray(z / unit_lengths(scales))
 
 
 def scale_options(options: PlanOptions, scales: Scales) -> PlanOptions:
@@ -85,14 +85,15 @@ def unit_of(goal: Objective, scales: Scales) -> float:
     return {Objective.TIME: scales.time, Objective.EFFORT: efforts}.get(goal, scales.force)
 
 
-def _lengths(scales: Scales) -> Array:
+def unit_lengths(scales: Scales) -> Array:
+    """What one unit of each coordinate of z is in SI units, shape (5,)."""
     return np.array([scales.length, scales.length, 1.0, 1.0, 1.0])
 
 
 def to_si(stage: Stage, problem: Problem) -> Stage:
     """A stage in SI units, of the same problem in SI units."""
     scales, part = problem.scene.scales, stage.guess
-    lengths, unit = _lengths(scales), scales.time
+    lengths, unit = unit_lengths(scales), scales.time
     points = StagePoints(
         part.duration * unit,
         part.fractions,

@@ -86,6 +86,8 @@ class Stage:
         Least acceleration with which the gaps of contacts that are let go open, over gravity.
     clearance : float
         What these gaps are at least after a third of the first stage, over the radius of gyration.
+    apart : tuple of int
+        Watched limits that are as clear at the end: what comes next ends by closing them.
     adapts : float
         What it costs to change the duration of an interval; nothing if they keep their shares.
     """
@@ -103,12 +105,22 @@ class Stage:
     opens: bool = False
     opening: float = OPENING
     clearance: float = CLEARANCE
+    apart: tuple[int, ...] = ()
     adapts: float = 0.0
 
     @property
     def intervals(self) -> int:
         """Number of intervals K."""
         return len(self.guess.fractions)
+
+    def list_clearances(self, places: Array, after: float) -> Array:
+        """Least values of watched limits at `places`, shape (n,), of the stage: (n, n_watched).
+
+        From the share `after` of the stage on, but for contacts that were let go before it.
+        """
+        late = (places > after)[:, None]
+        released, apart = (np.isin(self.watched, own) for own in (self.released, self.apart))
+        return np.asarray(self.clearance * (released & (late | (not self.opens)) | apart & late))
 
     def measure_senses(self, z: Array, v: Array) -> Array:
         """Rates of contacts and joints in the stage's directions, shape (n, n_c + 2) [rad/s].

@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from ..costtogo import CostToGo
 from ..curve import measure_speed
 from ..errors import InfeasibleError, SolverError
 from ..impact import Impact, strike
@@ -36,6 +37,7 @@ def plan_struck(
     z: Array,
     options: PlanOptions,
     duration: float | None,
+    to_go: CostToGo | None = None,
 ) -> Plans:
     """Plan a block with the impacts that are possible, or else with stops.
 
@@ -47,6 +49,8 @@ def plan_struck(
     options : PlanOptions
     duration : float or None, [s]
         Longest duration of the block, for the objective `margin`.
+    to_go : CostToGo, optional
+        What follows a block without impacts.
 
     Raises
     ------
@@ -55,7 +59,7 @@ def plan_struck(
     """
     ends = [k + 1 for k, phase in enumerate(block) if phase.end is End.IMPACT]
     if not ends:
-        return plan_phases(problem, block, z, options, duration)
+        return plan_phases(problem, block, z, options, duration, to_go=to_go)
     stopped = _plan_stops(problem, block, z, options, duration, ends)
     blocked = [
         k for k in ends if _strike_at_stop(block[k - 1], block[k], stopped[k - 1]).hindrances

@@ -157,6 +157,7 @@ def build_time_nlp(
     max_iter: int,
     give: Give | None = None,
     seconds: float = LONGEST,
+    price: Array | None = None,
 ) -> TimeNLP:
     """Build the NLP of stages that follow one another and end at rest.
 
@@ -173,6 +174,8 @@ def build_time_nlp(
         Which limits give way, for `relax`; for `margin` it is every c_n.
     seconds : float, [s]
         Most processor time of the solver.
+    price : ndarray, optional, shape (5,)
+        What z at the end costs.
     """
     started = time.perf_counter()
     if objective is Objective.MARGIN:
@@ -204,6 +207,8 @@ def build_time_nlp(
         total = rows.linear(1, high=np.inf)
         rows.put(total, np.concatenate([layout.h for layout in layouts]), 1.0)
         lasts = int(total[0])
+    if price is not None:
+        cost[end[Z]] = price
     N = tangent_basis(last.formation, last.guess.nodes[-1, 0])
     rest = rows.linear(N.shape[1])
     rows.put(rest[:, None], end[V], N.T)
@@ -338,9 +343,8 @@ def _watch(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Ind
     formation, (K, d) = stage.formation, layout.z.shape[:2]
     if not stage.watched:
         return np.zeros((K, d, 0), dtype=np.int64)
-    released = np.isin(stage.watched, stage.released)
-    later = (not stage.opens) | (stage.guess.places(scheme.points)[..., None] > 1 / 3)
-    low = stage.clearance * (later & released)
+    places = stage.guess.places(scheme.points).ravel()
+    low = stage.list_clearances(places, after=1 / 3).reshape(K, d, -1)
     goal = None if stage.until is None else stage.until.contact
     reached = [formation.limits[k].gains(goal) for k in stage.watched]
     if scheme.ends:

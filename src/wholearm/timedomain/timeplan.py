@@ -18,10 +18,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..costtogo import CostToGo
 from ..model import Array
 from ..options import Objective, PlanOptions
 from ..phaseplan import PhasePlan
 from ..problem import Phase, Problem
+from .ending import choose_end, keep_apart
 from .modesearch import adapt, improve
 from .ownunits import to_si, unit_of
 from .revising import halve
@@ -56,6 +58,7 @@ def plan_phases(
     options: PlanOptions,
     duration: float | None = None,
     *,
+    to_go: CostToGo | None = None,
     explained: bool = True,
     patient: bool = True,
 ) -> list[PhasePlan[TimeMotion]]:
@@ -70,6 +73,8 @@ def plan_phases(
     options : PlanOptions
     duration : float, optional, [s]
         Longest duration of all these phases, for the objective `margin`.
+    to_go : CostToGo, optional
+        What follows, where the phases leave open where they end.
     explained : bool
         Whether to look for a change that would make a plan possible, where there is none.
     patient : bool
@@ -82,7 +87,7 @@ def plan_phases(
     InfeasibleError, SolverError
         If there is no plan.
     """
-    search = Search.of(problem, options, duration)
+    search = Search.of(problem, options, duration, to_go)
     wanted = options.time_intervals or _choose_intervals(phases)
     halvings = max(0, math.ceil(math.log2(wanted / FIRST)))
 
@@ -92,7 +97,10 @@ def plan_phases(
         count = math.ceil(wanted / 2**times)
         stages = outline_stages(problem, phases, z, search.scheme, count, pace, onwards, way=way)
         opening, clearance = options.opening, options.clearance
-        return [replace(stage, opening=opening, clearance=clearance) for stage in stages]
+        stages = [replace(stage, opening=opening, clearance=clearance) for stage in stages]
+        if to_go is not None:
+            stages[-1] = keep_apart(stages[-1], to_go.phase.until.contact)
+        return stages
 
     started = time.thread_time()
     first = outline(halvings, _PACES[0])
@@ -187,7 +195,7 @@ def _solve(
     solution = search.solve(stages, seconds=seconds)
     if not solution.success:
         return solution
-    solution = adapt(search, improve(search, solution))
+    search, solution = choose_end(search, adapt(search, improve(search, solution)))
     for _ in range(halvings):
         if solution.success:
             every = [np.ones(stage.intervals, dtype=bool) for stage in solution.stages]

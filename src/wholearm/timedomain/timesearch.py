@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..costtogo import CostToGo
+from ..model import Array
 from ..options import Objective, PlanOptions
 from ..problem import Problem
 from .between import Limits, find_misses, look_between, raise_bounds, watch_missed
 from .collocation import Scheme, make_scheme
-from .ownunits import in_own_units, scale_options
+from .ownunits import in_own_units, scale_options, unit_lengths, unit_of
 from .revising import adopt, halve, watch_broken
 from .stage import Stage
 from .timelayout import pack, unpack
@@ -49,6 +51,13 @@ class Effort:
     sequences: int = 1
 
 
+class Price(NamedTuple):
+    """What the end of stages costs: `gradient` @ (z - `origin`), both of shape (5,)."""
+
+    gradient: Array
+    origin: Array
+
+
 class Solution(NamedTuple):
     """Stages with what the solver found as their guess.
 
@@ -77,6 +86,11 @@ class Solution(NamedTuple):
     multipliers: Multipliers
 
     @property
+    def end(self) -> Array:
+        """Where the stages end, shape (5,)."""
+        return np.asarray(self.stages[-1].guess.nodes[-1, 0])
+
+    @property
     def watched(self) -> list[tuple[int, ...]]:
         """Limits that each stage watches."""
         return [stage.watched for stage in self.stages]
@@ -98,6 +112,9 @@ class Search:
     goal : Objective
     give : Give or None
         Which limits give way, for the objective `relax`.
+    to_go : callable or None
+        What follows costs from where stages end, and its gradient, each by the objective.
+    price : Price or None
     effort : Effort
     """
 
@@ -107,23 +124,42 @@ class Search:
     duration: float | None
     goal: Objective
     give: Give | None = None
+    to_go: Callable[[Array], tuple[float, Array]] | None = None
+    price: Price | None = None
     effort: Effort = field(default_factory=Effort)
 
     @staticmethod
-    def of(problem: Problem, options: PlanOptions, duration: float | None = None) -> Search:
-        """A search for a problem, options and a longest duration in SI units."""
+    def of(
+        problem: Problem,
+        options: PlanOptions,
+        duration: float | None = None,
+        to_go: CostToGo | None = None,
+    ) -> Search:
+        """A search for a problem, options, a longest duration and a cost-to-go in SI units."""
         scales = problem.scene.scales
+        lengths, unit = unit_lengths(scales), unit_of(options.goal, scales)
+
+        def expand(z: Array) -> tuple[float, Array]:
+            assert to_go is not None
+            value, gradient = to_go.expand(z * lengths)
+            return value / unit, gradient * lengths / unit
+
         return Search(
             in_own_units(problem),
             scale_options(options, scales),
             make_scheme(options.scheme, options.degree),
             None if duration is None else duration / scales.time,
             options.goal,
+            to_go=expand if to_go else None,
         )
 
     def aiming(self, goal: Objective, give: Give | None = None) -> Search:
         """The same search with another objective."""
-        return replace(self, goal=goal, give=give, duration=None)
+        return replace(self, goal=goal, give=give, duration=None, to_go=None, price=None)
+
+    def charge(self, z: Array) -> float:
+        """What it costs to end at `z`, shape (5,)."""
+        return float(self.price.gradient @ (z - self.price.origin)) if self.price else 0.0
 
     def solve(
         self,
@@ -159,7 +195,10 @@ class Search:
     def build(self, stages: Sequence[Stage], most: int = 150, seconds: float = LONGEST) -> TimeNLP:
         """Build the NLP."""
         weight, limit = self.options.time_weight, _ITERATIONS.get(self.goal, most)
-        nlp = build_time_nlp(stages, self.scheme, self.goal, weight, limit, self.give, seconds)
+        gradient = self.price.gradient if self.price else None
+        nlp = build_time_nlp(
+            stages, self.scheme, self.goal, weight, limit, self.give, seconds, gradient
+        )
         self.effort.build_time += nlp.build_time
         return nlp
 
@@ -190,6 +229,7 @@ class Search:
         self.effort.solves += 1
         self.effort.solve_time += stats["t_wall_total"]
         x, cost = result["x"].full()[:, 0], float(result["f"])
+        cost -= float(self.price.gradient @ self.price.origin) if self.price else 0.0
         return Solution(
             adopt(stages, unpack(x, nlp.layouts)),
             cost,

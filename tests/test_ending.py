@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from timed import landing
+from wholearm.errors import InfeasibleError
+from wholearm.model import Array
+from wholearm.options import PlanOptions
+from wholearm.path import trace_phases
+from wholearm.timedomain.ending import GAIN, choose_end, keep_apart
+from wholearm.timedomain.staging import outline_stages
+from wholearm.timedomain.timesearch import Search, Solution
+
+
+@lru_cache(maxsize=1)
+def landed() -> tuple[Search, Solution]:
+    """The landing alone: where along the palm it ends is left open."""
+    problem = landing()
+    search = Search.of(problem, PlanOptions())
+    start = trace_phases(problem)[-1].end
+    stages = outline_stages(problem, problem.phases[4:], start, search.scheme, 6, 2.0)
+    return search, search.solve(stages)
+
+
+def test_an_end_is_moved_to_where_what_follows_costs_less() -> None:
+    search, alone = landed()
+    price = 0.5 * np.eye(5)[0]
+    priced, moved = choose_end(replace(search, to_go=lambda z: (float(price @ z), price)), alone)
+    own = moved.cost - priced.charge(moved.end)
+    # The stages alone cost least where they ended, and with what follows less elsewhere.
+    assert own > alone.cost
+    assert own + price @ moved.end < alone.cost + price @ alone.end - GAIN * alone.cost
+    assert moved.end[0] < alone.end[0]
+
+
+def test_without_a_cost_to_go_nothing_changes() -> None:
+    search, alone = landed()
+    assert choose_end(search, alone) == (search, alone)
+
+
+def test_an_end_from_where_nothing_follows_is_kept() -> None:
+    search, alone = landed()
+
+    def fail(_: Array) -> tuple[float, Array]:
+        raise InfeasibleError("nothing")
+
+    assert choose_end(replace(search, to_go=fail), alone)[1] is alone
+
+
+def test_a_stage_ends_clear_of_what_comes_next() -> None:
+    _, alone = landed()
+    stage = alone.stages[-1]
+    open_limits = [limit for limit in stage.formation.limits if limit.gained is not None]
+    kept = keep_apart(stage, open_limits[0].gained)
+    row = next(k for k, limit in enumerate(stage.formation.limits) if limit is open_limits[0])
+    least = kept.list_clearances(np.array([0.1, 0.9]), after=1 / 3)[:, kept.watched.index(row)]
+    assert least.tolist() == [0.0, pytest.approx(kept.clearance)]
