@@ -12,7 +12,6 @@ from wholearm.timedomain.mesh import resample
 from wholearm.timedomain.modes import drop, in_mode, link, merge, mode_of, split
 from wholearm.timedomain.moves import list_moves
 from wholearm.timedomain.stage import Stage, StagePoints
-from wholearm.timedomain.timenlp import SHORTEST
 
 THREE = "v1-palm v4-finger1 v6-finger2"
 
@@ -146,10 +145,33 @@ def test_what_leans_on_its_cone_is_let_slide_that_way(sign: float) -> None:
 def test_a_stage_that_has_shrunk_to_nothing_is_dropped_first() -> None:
     stage = hold_back(make_stage(THREE), 0, 0, 0)
     first, gone, last = split(stage, SCHEME, 3, 6, turned(stage, 0))
-    gone = replace(gone, guess=gone.guess._replace(duration=1.5 * SHORTEST * gone.intervals))
+    gone = replace(gone, guess=gone.guess._replace(duration=1e-5))
     stages = link([first, gone, last])
     found = next(list_moves(stages, SCHEME, own_formations(stages), 0.05))
     # Its neighbours are in one mode, and so one stage.
     assert [mode_of(part) for part in found] == [mode_of(stage)]
     total = first.guess.duration + last.guess.duration
     assert found[0].guess.duration == pytest.approx(total, rel=1e-12)
+
+
+def test_what_the_next_phase_lets_roll_slides_until_then() -> None:
+    """Where it comes to rest its phase ends, so it does not roll before."""
+    held = hold_back(make_stage(THREE), 0, 0, 0)
+    formation = held.formation
+    v = held.guess.v.copy()
+    A_t = formation.evaluate(held.guess.z.reshape(-1, 5), v.reshape(-1, 5)).A_t.reshape(
+        *v.shape[:2], -1, 5
+    )
+    # Without what slides the first contact, it stands still over some intervals.
+    row = A_t[2:5, :, 0]
+    slip = np.einsum("kdi,kdi->kd", row, v[2:5]) / np.einsum("kdi,kdi->kd", row, row)
+    v[2:5] -= slip[..., None] * row
+    held = replace(held, guess=held.guess._replace(v=v))
+    rolling = in_mode(held, mode_of(held).changed((0,), 0.0))
+    later = replace(rolling, phase=held.phase + 1)
+    for own, rolls in (([formation, rolling.formation], False), ([formation] * 2, True)):
+        found = list(list_moves(link([held, later]), SCHEME, own, 0.05))
+        ways = [[mode_of(part).signs[0] for part in stages] for stages in found]
+        sign = mode_of(held).signs[0]
+        assert any(way[0] == sign and way[1] == 0.0 for way in ways) == rolls
+        assert any(way[0] == sign and way[1] == -sign for way in ways) != rolls

@@ -132,6 +132,26 @@ class PhaseReport:
     deviation: Deviation | None
 
 
+@dataclass(frozen=True)
+class ModeChange:
+    """A contact or joint that goes on in another mode while the rest moves.
+
+    Attributes
+    ----------
+    time : float, [s]
+    phase : int
+        Number of the phase.
+    what : str
+        The contact or joint.
+    kind : {"sticks", "slips", "reverses"}
+    """
+
+    time: float
+    phase: int
+    what: str
+    kind: str
+
+
 class Failure(NamedTuple):
     """Why torques are not good, and in which phase, by its number."""
 
@@ -197,6 +217,8 @@ class Report:
     tolerance : float
     steps : int
         Of the simulation.
+    changes : tuple of ModeChange
+        In the order of time.
     """
 
     name: str
@@ -212,6 +234,7 @@ class Report:
     finger_gap: FingerGap | None
     tolerance: float
     steps: int
+    changes: tuple[ModeChange, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -236,17 +259,9 @@ class Report:
 
     def to_text(self) -> str:
         """The verdict with its reason, then everything else as aligned tables."""
-        parts = [f"{self.name}: {'ok' if self.ok else 'FAILED'}: {self.reason}"]
-        parts += [f"failure: {text}" for text in self.failures[1:]]
-        if self.outcome not in (*self.failures, self.reason):
-            parts.append(f"end of the replay: {self.outcome}")
-        parts += [f"warning: {text}" for text in self.warnings]
-        if self.finger_gap is not None:
-            gap = self.finger_gap
-            parts.append(f"least gap of the fingers: {gap.least:.5g} m at t = {gap.time:.5g} s")
-        tables = [_contact_table, _rolling_table, _phase_table, _energy_table]
-        parts += [line for table in tables for line in _after_blank(table(self))]
-        return "\n".join(parts)
+        from .reporttext import write
+
+        return write(self)
 
 
 def _plain(value: Any) -> Any:
@@ -258,84 +273,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     return value
-
-
-def _contact_table(report: Report) -> list[str]:
-    rows = [
-        [str(p.number), c.contact, _show(c.least, ".4f"), _show(c.margin, "+.4f"),
-         _show(c.time, ".5f")]
-        for p in report.phases
-        for c in p.contacts
-    ]  # fmt: skip
-    return _table(["phase", "contact", "least c_n [N]", "margin [N]", "at t [s]"], rows, {1})
-
-
-def _rolling_table(report: Report) -> list[str]:
-    """Margins to slipping; nothing if no contact rolls."""
-    rows = [
-        [str(p.number), r.contact, _show(r.least, "+.4f"), _show(r.time, ".5f")]
-        for p in report.phases
-        for r in p.rolling
-    ]
-    header = ["phase", "rolling", "least mu c_n - |c_t| [N]", "at t [s]"]
-    return _table(header, rows, {1}) if rows else []
-
-
-def _phase_table(report: Report) -> list[str]:
-    header = ["phase", "until", "end", "arrival [s]", "rate [m/s, rad/s]", "left [m/s]"]
-    planned = any(p.deviation is not None for p in report.phases)
-    impacts = any(p.end == "impact" for p in report.phases)
-    header += ["least impulse [N s]", "on"] if impacts else []
-    header += ["end dev. [m]", "[rad]", "largest dev. [m]", "[rad]"] if planned else []
-    rows = []
-    for p in report.phases:
-        row = [
-            str(p.number),
-            p.until,
-            p.end,
-            _show(p.arrival, ".5f"),
-            _show(p.arrival_rate, ".1e"),
-            _show(p.end_speed, ".1e"),
-        ]
-        if impacts:
-            row += [_show(p.impact.impulse, ".4f"), p.impact.contact] if p.impact else ["-", "-"]
-        for deviation in (p.end_deviation, p.deviation) if planned else ():
-            pair = (deviation.position, deviation.angle) if deviation else (None, None)
-            row += [_show(value, ".1e") for value in pair]
-        rows.append(row)
-    return _table(header, rows, {1, 2, 7} if impacts else {1, 2})
-
-
-def _energy_table(report: Report) -> list[str]:
-    energy = report.energy
-    rows = [
-        ["work of the torques", energy.work],
-        ["change of kinetic energy", energy.kinetic],
-        ["change of potential energy", energy.potential],
-        ["viscous joint friction", energy.viscous],
-        ["dry joint friction", energy.dry],
-        ["sliding friction", energy.contact],
-        ["contacts gained", energy.impact],
-        ["residual", energy.residual],
-    ]
-    return _table(["energy", "[J]"], [[str(n), f"{v: .6e}"] for n, v in rows], {0})
-
-
-def _after_blank(lines: list[str]) -> list[str]:
-    return ["", *lines] if lines else []
-
-
-def _show(value: float | None, form: str) -> str:
-    return "-" if value is None or math.isnan(value) else format(value, form)
-
-
-def _table(header: list[str], rows: list[list[str]], left: set[int]) -> list[str]:
-    """Lines of a table with aligned columns; those in `left` are flush left."""
-    widths = [max(len(cell) for cell in column) for column in zip(header, *rows, strict=True)]
-    return [
-        "  ".join(
-            cell.ljust(width) if k in left else cell.rjust(width)
-            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in (header, *rows)
-    ]

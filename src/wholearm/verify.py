@@ -10,7 +10,15 @@ from .errors import InputError
 from .margins import find_finger_gap, list_contact_margins, list_slip_margins
 from .model import Array
 from .problem import End, Phase, Problem
-from .report import Deviation, EnergyBalance, Failure, LeastImpulse, PhaseReport, Report
+from .report import (
+    Deviation,
+    EnergyBalance,
+    Failure,
+    LeastImpulse,
+    ModeChange,
+    PhaseReport,
+    Report,
+)
 from .sharing import exclusive
 from .simulation.events import Event, EventKind, Simulation
 from .simulation.simulate import simulate
@@ -29,6 +37,7 @@ from .verdict import (
 )
 
 _ENDS = (EventKind.ARRIVAL, EventKind.RELEASE)
+_CHANGES = {EventKind.STICK: "sticks", EventKind.SLIP: "slips", EventKind.REVERSAL: "reverses"}
 SAMPLES = 2000
 """About how many instants normal forces are looked at, besides the simulation's own steps."""
 
@@ -117,6 +126,11 @@ def inspect(
         finger_gap=gap,
         tolerance=tolerance,
         steps=simulation.steps,
+        changes=tuple(
+            ModeChange(float(e.time), e.phase + 1, e.contact, _CHANGES[e.kind])
+            for e in simulation.events
+            if e.kind in _CHANGES and e.contact
+        ),
     )
 
 
@@ -197,9 +211,11 @@ def _measure(difference: Array, t: Array, length: float) -> Deviation:
 
 
 def _describe_end(events: list[Event], phase: Phase) -> str:
-    """What ends a phase, with the contacts released if there are."""
-    released = [event.contact for event in events if event.kind is EventKind.RELEASE]
-    return f"release of {released[0]}" if released else str(phase.until)
+    """What ends a phase, with the contacts that are released or change their mode."""
+    if not events or not phase.until.is_release:
+        return str(phase.until)
+    what = "release" if events[0].kind is EventKind.RELEASE else "change"
+    return f"{what} of {events[0].contact}"
 
 
 def _describe_torques(problem: Problem, torque: TorqueProfile) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -48,11 +49,26 @@ class Released:
     c_n: float
 
 
+@dataclass(frozen=True)
+class Switched:
+    """A contact comes to rest, or slips, as the next phase has it.
+
+    Attributes
+    ----------
+    contact : str
+    way : float
+        Direction in which it slips; 0 if it comes to rest.
+    """
+
+    contact: str
+    way: float = 0.0
+
+
 class Rested:
     """The motion has come to rest."""
 
 
-Ending = Arrival | Released | Rested | Outcome
+Ending = Arrival | Released | Switched | Rested | Outcome
 
 
 def look_again(
@@ -70,18 +86,23 @@ def look_again(
     enters : bool
         Whether a formation has just been entered.
     """
+    stuck = run.stuck
     if _decide(run, turned, time=time, enters=enters):
-        return _come_to_rest(run)
+        return come_to_rest(run)
     run.record()
     if _bridge(run):
-        return _come_to_rest(run)
+        return come_to_rest(run)
     s = run.stepper
     if not s.outputs[s.to.ratio] > 0:
         run.fail_to_step(float(s.outputs[s.to.ratio]))
+    if _holds(run, stuck, enters):
+        return _hold(run)
+    slipping = {s.mode.holders[k][0] for k in find_slipping(s)}
     pulling = np.flatnonzero(s.outputs[s.to.c_n] < -run.tolerances.force)
-    if len(pulling):
+    # Whether anything pulls where a contact slips by plan, its next formation says.
+    if len(pulling) and not slipping & run.slipping:
         return let_go(run, pulling.tolist())
-    return slip(run) if find_slipping(s) else None
+    return slip(run) if slipping else None
 
 
 def _decide(
@@ -102,9 +123,29 @@ def _decide(
     return False
 
 
-def _come_to_rest(run: Replay) -> Rested:
-    run.note(EventKind.REST, f"the object comes to rest {run.when()}")
-    return Rested()
+def come_to_rest(run: Replay) -> Rested | Switched:
+    """All motion ends; so does the phase if a contact was to come to rest."""
+    if not is_there(run):
+        run.note(EventKind.REST, f"the object comes to rest {run.when()}")
+    return _hold(run) if run.resting else Rested()
+
+
+def _holds(run: Replay, stuck: set[int], enters: bool) -> bool:
+    """Whether contacts have come to rest, of which `stuck` did before, where that ends the phase.
+
+    A planned motion may all but come to rest a little before the torques step; until they do it may
+    slip and stick again.
+    """
+    if enters or not run.resting or not run.resting <= run.stuck:
+        return False
+    if run.resting <= stuck:
+        return run.has_slid
+    run.has_slid = True
+    return not steps_within(run, min(run.tolerances.longest_window, run.t - run.last_step))
+
+
+def _hold(run: Replay) -> Switched:
+    return Switched(", ".join(run.phase.formation.names[row] for row in sorted(run.resting)))
 
 
 def let_go(run: Replay, contacts: Sequence[int]) -> Released | Outcome:
@@ -124,16 +165,23 @@ def let_go(run: Replay, contacts: Sequence[int]) -> Released | Outcome:
     return run.lose(name, min(0.0, forces[name]))
 
 
-def slip(run: Replay) -> Released | Outcome:
+def slip(run: Replay) -> Released | Switched | Outcome:
     """End because a rolling contact slips, or starts to part where its release is planned."""
     s = run.stepper
     formation = s.formation
     cones = _measure_reserves(s)
     declared = [k for k in range(len(cones)) if s.mode.declares(k)]
-    row = s.mode.holders[min(declared, key=cones.__getitem__)][0]
+    planned = [k for k in find_slipping(s) if s.mode.holders[k][0] in run.slipping]
+    row = s.mode.holders[min(planned or declared, key=cones.__getitem__)][0]
     if formation.names[row] in run.releasable:
         return let_go(run, [row])
-    return run.slip(row, float(s.outputs[s.to.c_n][row]), float(s.outputs[s.to.c_t][row]))
+    c_n, c_t = (float(s.outputs[part][row]) for part in (s.to.c_n, s.to.c_t))
+    if row in run.slipping:
+        # Forces recorded after a jump are those of a contact that has rolled until then.
+        if run.repeats():
+            run.drop()
+        return Switched(formation.names[row], -math.copysign(1.0, c_t))
+    return run.slip(row, c_n, c_t)
 
 
 def let_slip(run: Replay, events: Sequence[int]) -> Ending | None:

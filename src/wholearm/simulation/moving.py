@@ -12,8 +12,8 @@ from .events import EventKind, Outcome, OutcomeKind
 from .jumps import (
     Arrival,
     Ending,
-    Rested,
     coast_to_step,
+    come_to_rest,
     find_slipping,
     is_there,
     let_go,
@@ -128,9 +128,7 @@ def _stop_at_event(run: Replay, start: Array, h: float) -> Ending | None:
     if rows.until in kinds:
         return _pass_on(run) if run.phase.end is End.SMOOTH or _strikes(run) else _reach(run)
     if rows.speed in kinds:
-        if not is_there(run):
-            run.note(EventKind.REST, f"the object comes to rest {run.when()}")
-        return Rested()
+        return come_to_rest(run)
     pulling = [k for k in kinds if k < rows.force.stop]
     if pulling:
         return let_go(run, pulling)

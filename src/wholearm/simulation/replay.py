@@ -37,6 +37,12 @@ class Replay:
         What has happened when each of the stepper's limits is zero.
     releasable : tuple of str
         The contacts whose release ends the phase.
+    resting, slipping : frozenset of int
+        The contacts that come to rest, all of them, or slip, one of them, where the phase ends.
+    has_slid : bool
+        Whether those that come to rest have slid in the phase.
+    ways : dict
+        Directions in which contacts, by name, have just begun to slip.
     side : float
         Sign of (coordinate - value) before the end of the phase, if that is a coordinate's value.
     tolerances : Tolerances
@@ -53,6 +59,8 @@ class Replay:
     phase: Phase
     limits: list[str]
     releasable: tuple[str, ...]
+    resting: frozenset[int]
+    slipping: frozenset[int]
 
     def __init__(
         self,
@@ -80,6 +88,8 @@ class Replay:
         self.moving = False
         self.side = 1.0
         self.stuck: set[int] = set()
+        self.has_slid = False
+        self.ways: dict[str, float] = {}
         self.decided = (-math.inf, 0)
         self.sections: list[Section] = []
         self.events: list[Event] = []
@@ -192,8 +202,7 @@ class Replay:
     def run_out(self) -> Outcome:
         """End because the torques end."""
         if self.phase.until.is_release:
-            names = ", ".join(self.releasable)
-            text = f"the torques end {self.when()}, before {names} is released"
+            text = f"the torques end {self.when()}, before {self.describe_end()}"
             self.note(EventKind.END, text)
             return Outcome(OutcomeKind.GOAL_MISSED, text)
         distance = self.value(self.stepper.rows.until)
@@ -201,6 +210,16 @@ class Replay:
         text = f"the torques end {self.when()}, {distance:.3g} {unit} short of {self.phase.until}"
         self.note(EventKind.END, text, "", distance)
         return Outcome(OutcomeKind.GOAL_MISSED, text)
+
+    def describe_end(self) -> str:
+        """What ends a phase without an `until`, to follow "before"."""
+        names = self.phase.formation.names
+        rest, slip = (
+            ", ".join(names[k] for k in sorted(rows)) for rows in (self.resting, self.slipping)
+        )
+        if self.releasable:
+            return f"{', '.join(self.releasable)} is released"
+        return " or ".join([f"{rest} comes to rest"] * bool(rest) + [f"{slip} slips"] * bool(slip))
 
     def value(self, row: int) -> float:
         """One of the event values at the present state."""
@@ -225,6 +244,11 @@ class Replay:
         """When the torques step next, after the present piece, or infinity [s]."""
         k = bisect_left(self.step_times, self.breaks[self.piece + 1])
         return self.step_times[k] if k < len(self.step_times) else math.inf
+
+    @property
+    def last_step(self) -> float:
+        """When the torques last stepped, at their start or later [s]."""
+        return self.step_times[bisect_left(self.step_times, self.breaks[self.piece + 1]) - 1]
 
     def torque(self, t: float) -> Array:
         """Torques of the present piece at time `t`, also beyond its end, shape (2,) [N m]."""

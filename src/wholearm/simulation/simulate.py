@@ -8,8 +8,10 @@ a step with another length. At rest the formation waits until it can start (`sti
 When the end of a phase is reached the motion stops, if the phase ends at rest, and goes on from
 rest in the next phase's formation. If it ends smoothly the motion goes on with its velocity, less
 what the contacts of the next formation do not let through; contacts that this formation does not
-have are let go. If it ends with an impact, impulses of the next formation's contacts change the
-velocity, and all of them have to press (`wholearm.impact`).
+have are let go. A phase without an end of its own is over where that happens, where a contact slips
+that slides in the next phase, or where contacts come to rest that roll there. If a phase ends with
+an impact, impulses of the next formation's contacts change the velocity, and all of them have to
+press (`wholearm.impact`).
 
 Nothing here is shared with the planner but the contacts and the scene.
 """
@@ -27,7 +29,7 @@ from ..problem import End, Phase, Problem
 from ..sharing import exclusive
 from ..torque import TorqueProfile
 from .events import EventKind, Outcome, OutcomeKind, Simulation, collect
-from .jumps import Arrival, Ending, Released, Rested, is_there
+from .jumps import Arrival, Ending, Released, Rested, Switched, is_there
 from .moving import move
 from .replay import Replay
 from .starting import Departure
@@ -116,6 +118,9 @@ def _play(run: Replay, phase: Phase, following: Phase | None) -> Outcome | None:
         if isinstance(ending, Released):
             _release(run, ending)
             return None
+        if isinstance(ending, Switched):
+            _switch(run, ending)
+            return None
 
 
 def _arrive(run: Replay, arrival: Arrival, following: Phase | None) -> Outcome | None:
@@ -145,7 +150,15 @@ def _release(run: Replay, release: Released) -> None:
     run.moving = True
 
 
-def _rest(run: Replay) -> Departure | Arrival | Released | Outcome:
+def _switch(run: Replay, switch: Switched) -> None:
+    """End the phase where a contact goes on as the next one has it."""
+    does = "slips" if switch.way else "comes to rest"
+    run.note(EventKind.ARRIVAL, f"{switch.contact} {does} {run.when()}", switch.contact)
+    run.ways = {switch.contact: switch.way} if switch.way else {}
+    run.moving = True
+
+
+def _rest(run: Replay) -> Departure | Arrival | Released | Switched | Outcome:
     """Wait at rest until the formation can start, the goal is near or something gives way."""
     y = run.y
     before = run.stored
@@ -191,7 +204,7 @@ def _advance(run: Replay, stop: float) -> None:
     run.record(still=True)
 
 
-def _collapse(run: Replay, rest: Rest, change: Collapse) -> Released | Outcome:
+def _collapse(run: Replay, rest: Rest, change: Collapse) -> Released | Switched | Outcome:
     """End because nothing balances at rest."""
     _advance(run, max(run.t, run.time(change.x)))
     if change.jammed:
@@ -201,6 +214,8 @@ def _collapse(run: Replay, rest: Rest, change: Collapse) -> Released | Outcome:
         )
     if change.c_t is not None:
         row = run.phase.formation.names.index(change.contact)
+        if row in run.slipping:
+            return Switched(change.contact, -math.copysign(1.0, change.c_t))
         return run.slip(row, change.c_n, change.c_t)
     if change.contact in run.releasable:
         return Released(change.c_n)

@@ -49,6 +49,8 @@ def enter(run: Replay, phase: Phase, following: Phase | None) -> None:
     run.take()
     run.limits = [limit.text for limit in open_limits(phase.formation, until)]
     run.releasable = find_releasable(phase, following)
+    run.resting, run.slipping = find_switching(phase, following)
+    run.has_slid = False
 
 
 def _close(run: Replay, formation: Formation) -> Array:
@@ -88,6 +90,20 @@ def find_releasable(phase: Phase, following: Phase | None) -> tuple[str, ...]:
     return tuple(name for name in phase.formation.names if name not in kept)
 
 
+def find_switching(phase: Phase, following: Phase | None) -> tuple[frozenset[int], frozenset[int]]:
+    """Contacts that come to rest, as they roll in the next phase, and that slip, as they slide.
+
+    A phase without an `until` ends there; if it lets a contact go, then where that happens.
+    """
+    if phase.end is End.REST or following is None or not phase.until.is_release:
+        return frozenset(), frozenset()
+    own, coming = ({c.name for c in p.formation.rolling} for p in (phase, following))
+    names, kept = phase.formation.names, following.formation.names
+    rests = {k for k, name in enumerate(names) if name in coming - own}
+    slips = {k for k, name in enumerate(names) if name in own - coming and name in kept}
+    return frozenset() if set(names) - set(kept) else frozenset(rests), frozenset(slips)
+
+
 def project_velocity(formation: Formation, z: Array, v: Array) -> Array:
     """Velocity nearest to `v` in the metric M5 that keeps every constraint, shape (5,)."""
     P = formation.evaluate(z[None], v[None]).P[0]
@@ -124,6 +140,9 @@ def go_on(run: Replay) -> Ending | None:
     s.inputs[s.at.heading] = v / np.sqrt(mass @ v**2)
     rates = np.concatenate([formation.evaluate(y[None, :5], v[None]).A_t[0] @ v, v[3:]])
     signs = np.where(rates < 0, -1.0, 1.0)
+    for row, name in enumerate(formation.names):
+        signs[row] = run.ways.get(name, signs[row])
+    run.ways = {}
     signs[[row for row in range(len(signs)) if row not in _list_rows(formation)]] = 0.0
     _point(run, signs)
     if s.is_free:

@@ -18,7 +18,7 @@ from ..model import Array
 from .collocation import Scheme
 from .modes import drop, link, merge, mode_of, release_earlier, split
 from .stage import Stage
-from .timenlp import SHORTEST, least_rates
+from .timenlp import least_rates
 
 _STALLED = 1e-6
 """Rate over the largest one at which a direction of friction counts as held back."""
@@ -26,8 +26,9 @@ _SLOW = 1e-2
 """Rate over the largest one below which what is held back stays in all of an interval."""
 _LEANS = 1e-4
 """Margin to the friction cone over mu c_n at which a rolling contact counts as leaning on it."""
-_GONE = 2.0
-"""Duration of a stage over the least one below which it counts as shrunk to nothing."""
+_GONE = 2e-4
+"""Mean duration of an interval, in the scene's unit of time, below which its stage counts as shrunk
+to nothing."""
 
 
 class Run(NamedTuple):
@@ -78,10 +79,10 @@ def list_moves(
             for k, stage in enumerate(stages)
             for run in _find_leaning(stage, scheme, own[k], epsilon)
         ]
-        yield from _apply(stages, scheme, runs)
+        yield from _apply(stages, scheme, own, runs)
         return
     for index, stage in enumerate(stages):
-        if stage.guess.duration < _GONE * SHORTEST * stage.intervals:
+        if stage.guess.duration < _GONE * stage.intervals:
             left = drop(stages, index)
             if left is not None:
                 yield link(merge(left))
@@ -97,11 +98,14 @@ def list_moves(
             *_find_leaning(stage, scheme, own[index], epsilon),
         ]
     ]
-    yield from _apply(stages, scheme, runs)
+    yield from _apply(stages, scheme, own, runs)
 
 
 def _apply(
-    stages: Sequence[Stage], scheme: Scheme, runs: list[tuple[Run, int]]
+    stages: Sequence[Stage],
+    scheme: Scheme,
+    own: Sequence[Formation],
+    runs: list[tuple[Run, int]],
 ) -> Iterator[list[Stage]]:
     """Stages in which what is at its limit over a run moves in another way; whole ones first."""
     wide = [
@@ -114,11 +118,22 @@ def _apply(
     for run, index in [*wide, *runs]:
         stage = stages[index]
         signs = [run.sign] if run.sign else [0.0, -mode_of(stage).signs[run.row]]
+        if _comes_to_rest(stages, index, own, run.row):
+            signs = [sign for sign in signs if sign]
         pieces = [_change(stages, index, run, sign, scheme) for sign in signs]
         # What can roll turns by rolling first.
         found = next((piece for piece in pieces if piece is not None), None)
         if found is not None:
             yield link(merge([*stages[:index], *found, *stages[index + 1 :]]))
+
+
+def _comes_to_rest(stages: Sequence[Stage], index: int, own: Sequence[Formation], row: int) -> bool:
+    """Whether a contact slides until its phase ends, since the next phase lets it roll."""
+    stage = stages[index]
+    last = max(k for k, other in enumerate(stages) if other.phase == stage.phase)
+    if row >= stage.formation.n_contacts or last + 1 == len(stages):
+        return False
+    return stage.formation.contacts[row] in set(own[last + 1].rolling) - set(own[index].rolling)
 
 
 def _is_most(run: Run, stage: Stage) -> bool:

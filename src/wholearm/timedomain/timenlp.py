@@ -55,11 +55,11 @@ from .timelayout import MARGIN, StageLayout, V, Z, lay_out
 from .timelimits import Give, LimitRows, add_limits
 from .timerows import Rows
 
-SLIDING = 3e-4
+SLIDING = 1e-5
 """Least sliding, over the radius of gyration, and least speed of a joint, in the scene's unit of
 time: what does not move at all would have no sense."""
-SHORTEST = 1e-4
-"""Least duration of an interval, in the scene's unit; stages that shrink to it are dropped."""
+SHORTEST = 1e-6
+"""Least duration of an interval, in the scene's unit: next to nothing, and not nothing."""
 EVEN = 0.2
 """Least duration of an interval that chooses its share over that of its neighbour."""
 _HURRY = 3e-4
