@@ -171,7 +171,8 @@ def test_what_the_next_phase_lets_roll_slides_until_then() -> None:
     later = replace(rolling, phase=held.phase + 1)
     for own, rolls in (([formation, rolling.formation], False), ([formation] * 2, True)):
         found = list(list_moves(link([held, later]), SCHEME, own, 0.05))
-        ways = [[mode_of(part).signs[0] for part in stages] for stages in found]
-        sign = mode_of(held).signs[0]
-        assert any(way[0] == sign and way[1] == 0.0 for way in ways) == rolls
-        assert any(way[0] == sign and way[1] == -sign for way in ways) != rolls
+        parts = [part for stages in found for part in stages if part.phase == held.phase]
+        signs = {mode_of(part).signs[0] for part in parts}
+        assert (0.0 in signs) == rolls
+        # Turning is then what is left.
+        assert (-mode_of(held).signs[0] in signs) != rolls
