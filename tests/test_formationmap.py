@@ -79,7 +79,7 @@ def test_closing_many_agrees_with_closing_one(radius: float) -> None:
     # Joints above the palm, so that they get into the object too.
     scene = make_scene(points, base=0.06, depth=0.01, length=0.1, radius=radius)
     rng = np.random.default_rng(1)
-    x, phi = rng.uniform(-0.2, 0.2, 400), rng.uniform(-4.0, 4.0, 400)
+    x, phi = rng.uniform(-0.2, 0.2, 200), rng.uniform(-4.0, 4.0, 200)
     closed = close(scene, x, phi)
     seen = set()
     for row in range(len(x)):
@@ -106,16 +106,19 @@ def test_configurations_of_cells_touch_without_overlap(every: FormationMap) -> N
     scene = every.problem.scene
     rng = np.random.default_rng(2)
     rows, columns = np.nonzero(every.cell >= 0)
-    for k in rng.choice(len(rows), 150, replace=False):
-        x, phi = every.x[columns[k]], every.phi[rows[k]]
-        z = close(scene, np.array([x]), np.array([phi])).z
-        contacts = every.formations[every.cell[rows[k], columns[k]]]
+    chosen = rng.choice(len(rows), 300, replace=False)
+    rows, columns = rows[chosen], columns[chosen]
+    z = close(scene, every.x[columns], every.phi[rows]).z
+    lowest = place_corners(scene, z)[..., 1].min(axis=1)
+    np.testing.assert_allclose(lowest, 0.0, rtol=0, atol=1e-15)
+    for finger in (0, 1):
+        # Distances of polygon and segment in plain geometry; rounding only.
+        assert np.abs(finger_gap(scene, z[:, :3], finger, z[:, 3 + finger])).max() < 1e-10
+    cells = every.cell[rows, columns]
+    for cell in np.unique(cells):
+        contacts = every.formations[cell]
         assert len(contacts) == 3
-        assert np.abs(gaps(scene, contacts, z)).max() < 1e-10
-        assert place_corners(scene, z[0])[:, 1].min() == pytest.approx(0.0, abs=1e-15)
-        for finger in (0, 1):
-            # Distances of polygon and segment in plain geometry; rounding only.
-            assert abs(finger_gap(scene, z[0, :3], finger, z[0, 3 + finger])[0]) < 1e-10
+        assert np.abs(gaps(scene, contacts, z[cells == cell])).max() < 1e-10
 
 
 def test_cells_that_cannot_be_reached_say_why(every: FormationMap) -> None:
@@ -239,7 +242,7 @@ def test_directions_agree_with_a_linear_programme(every: FormationMap) -> None:
     rng = np.random.default_rng(4)
     flush = [b for b in every.borders if b.flush is not None and len(b.z) > 4]
     seen = []
-    for _ in range(150):
+    for _ in range(80):
         border = flush[rng.integers(len(flush))]
         k = int(rng.integers(1, len(border.z) - 1))
         for way, answer in ((1.0, border.forth[k]), (-1.0, border.back[k])):
@@ -248,7 +251,7 @@ def test_directions_agree_with_a_linear_programme(every: FormationMap) -> None:
             if slack is not None and abs(slack) > 1e-6:
                 assert answer == (slack > 0), (border.names, border.points[k], way)
                 seen.append(bool(answer))
-    assert sum(seen) > 40 and len(seen) - sum(seen) > 20
+    assert sum(seen) > 20 and len(seen) - sum(seen) > 10
 
 
 def test_directions_inside_cells_balance(chart: FormationMap) -> None:
@@ -290,8 +293,8 @@ def test_mirrored_problem_has_the_mirrored_map() -> None:
     table["start"] = {"flush": count - 2, "x": -TABLE["start"]["x"]}
     names = ["v5-palm", "v6-palm", "v1-finger1", "v4-finger2"]
     table["phases"] = [{"contacts": names, "until": {"x": 0.0}}]
-    one = build_map(change(), 41, window)
-    two = build_map(build_problem(table), 41, other)
+    one = build_map(change(), 21, window)
+    two = build_map(build_problem(table), 21, other)
 
     def mirror(contact: Any) -> tuple[Any, ...]:
         index = count - 1 - contact.index - (contact.feature == "e")

@@ -99,14 +99,12 @@ def test_rolling_for_a_while_is_found_where_it_is_the_best_of_all_sequences() ->
     assert (mu * (c_n - search.problem.epsilon) - np.abs(c_t)).min() > -1e-6
 
 
-@pytest.mark.parametrize("noise", [2.04e-10, -8e-11])
-def test_rounding_of_masses_decides_nothing(noise: float) -> None:
+def test_rounding_of_masses_decides_nothing() -> None:
     problem = landing()
-    noisy = problem.with_(mass=problem.scene.polygon.mass * (1 + noise))
+    noisy = problem.with_(mass=problem.scene.polygon.mass * (1 + 2.04e-10))
     start = trace_phases(problem)[-1].end
-    options = PlanOptions(time_intervals=10)
-    plans = plan_phases(noisy, noisy.phases[4:], start, options)
-    assert total(plans) == pytest.approx(total(plan_landing(time_intervals=10)), rel=1e-7)
+    plans = plan_phases(noisy, noisy.phases[4:], start, PlanOptions(time_intervals=6))
+    assert total(plans) == pytest.approx(total(plan_landing(time_intervals=6)), rel=1e-7)
 
 
 def test_a_first_phase_lets_go_what_touches_at_the_start() -> None:

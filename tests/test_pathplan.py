@@ -85,21 +85,19 @@ def test_least_time_is_within_its_tolerance_of_a_finer_plan(
 
 @pytest.mark.parametrize("phase", PHASES)
 def test_least_time_agrees_with_the_phase_plane(curves: tuple[Curve, ...], phase: int) -> None:
-    coarse, fine = (PhasePlane(curves[phase], EPSILON, n).least_time() for n in (300, 600))
+    coarse, fine = (PhasePlane(curves[phase], EPSILON, n).least_time() for n in (150, 300))
     # Its own error is of first order; extrapolation leaves some 1e-5.
     assert plan(curves[phase], "time", 320).value == pytest.approx(2 * fine - coarse, rel=2e-4)
-    assert plan(curves[phase]).value == pytest.approx(fine, rel=2e-3)
+    assert plan(curves[phase]).value == pytest.approx(2 * fine - coarse, rel=7e-4)
 
 
-@pytest.mark.parametrize("epsilon", [0.6, 0.8])
-def test_a_phase_that_only_a_quick_motion_carries(
-    curves: tuple[Curve, ...], epsilon: float
-) -> None:
+def test_a_phase_that_only_a_quick_motion_carries(curves: tuple[Curve, ...]) -> None:
     """Slow motions cannot press v1 on the palm so hard in phase 3."""
+    epsilon = 0.8
     slow = with_speed_limit(curves[2], (0.3, 0.3))
     with pytest.raises(InfeasibleError):
-        plan_path(slow, epsilon, PlanOptions(intervals=40), 3)
-    coarse, fine = (PhasePlane(curves[2], epsilon, n).least_time() for n in (300, 600))
+        plan_path(slow, epsilon, PlanOptions(intervals=20), 3)
+    coarse, fine = (PhasePlane(curves[2], epsilon, n).least_time() for n in (150, 300))
     chosen = plan_path(curves[2], epsilon, PlanOptions(intervals=160), 3)
     assert chosen.value == pytest.approx(2 * fine - coarse, rel=2e-4)
 
@@ -344,7 +342,6 @@ def least_shortfall(problem: Problem, phase: int, s: float, row: int) -> float:
     [
         ({"epsilon": 1.0}, 1, "c_n of v1-palm >= epsilon = 1 N"),
         ({"friction": 0.3}, 1, "c_n of v1-palm >= epsilon = 0.05 N"),
-        ({"friction": 0.5}, 1, "c_n of v1-palm >= epsilon = 0.05 N"),
         ({"torque": {"2": 0.05}}, 5, "torque limit of finger 2 = 0.05 N m"),
     ],
 )
@@ -353,7 +350,7 @@ def test_shortfall_is_that_of_a_linear_program(
 ) -> None:
     problem = edited(**changes)
     with pytest.raises(InfeasibleError) as caught:
-        solve(problem, intervals=40)
+        solve(problem, intervals=20)
     message = str(caught.value)
     found = re.match(
         r"phase (\d) is infeasible: (.*?) is (\S+) N( m)? short at t = 0\.0000 s \(x = ", message
@@ -376,7 +373,7 @@ def test_shortfall_is_that_of_a_linear_program(
 )
 def test_infeasible_limits_are_named(changes: dict[str, Any], words: list[str]) -> None:
     with pytest.raises(InfeasibleError, match=r"^phase \d is infeasible: ") as caught:
-        solve(edited(**changes), intervals=20)
+        solve(edited(**changes), intervals=10)
     message = str(caught.value)
     assert all(word in message for word in words), message
     assert re.search(r"at t = \d+\.\d{4} s \(x = -?[\d.]+ mm, phi = -?[\d.]+ deg\)", message)
@@ -385,7 +382,7 @@ def test_infeasible_limits_are_named(changes: dict[str, Any], words: list[str]) 
 
 def test_jamming_friction_is_named() -> None:
     with pytest.raises(JammingError, match=r"phase 1: v0-palm .* jams at x = 16\.68 mm") as caught:
-        solve(edited(friction=1.0))
+        solve(edited(friction=1.0), intervals=20)
     assert caught.value.exit_status == 1
 
 

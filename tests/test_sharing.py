@@ -12,7 +12,6 @@ import sys
 import weakref
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from threading import Thread
 from typing import Any
 
@@ -20,14 +19,13 @@ import numpy as np
 import pytest
 
 import wholearm
+from shipped import FOLDER, LANDING, plan_of, problem_of
 from wholearm import sharing
 from wholearm.formation import Formation
 from wholearm.sharing import Keeper, exclusive, kept_property, retire_with
 from wholearm.simulation.simulate import simulate
 
-PROBLEMS = Path(__file__).parents[1] / "problems"
-SQUARE = str(PROBLEMS / "square.toml")
-LANDING = str(PROBLEMS / "heptagon.toml")
+SQUARE = str(FOLDER / "square.toml")
 
 IN_THREADS = """
 import gc, sys, threading, time
@@ -217,8 +215,7 @@ COPIES = pytest.mark.parametrize("duplicate", [_roundtrip, copy.copy, copy.deepc
 
 @pytest.fixture(scope="module")
 def planned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, ...]:
-    problem = wholearm.load(LANDING)
-    trajectory = wholearm.solve(problem, time_intervals=8)
+    problem, trajectory = problem_of(LANDING), plan_of(LANDING)
     path = tmp_path_factory.mktemp("copies") / "plan.npz"
     trajectory.save(path)
     loaded = wholearm.load_trajectory(path)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from once import once
 from thrown import shove
 from tipping import box
 from wholearm.curve import Curve
@@ -34,6 +35,12 @@ LEAST = 0.35 * 0.2 * 9.81
 
 def plan_all(problem: Problem, **options: Any) -> list[PhasePlan[TimeMotion]]:
     return plan_phases(problem, problem.phases, problem.start, COARSE, **options)
+
+
+@once
+def why_not_shoved(index: int, value: float) -> str:
+    """Why the square is not shoved with another value of a limit, and what is advised."""
+    return why_not(lambda: plan_all(change_limit(shove()[0], index, value)))
 
 
 def why_not(plan: Callable[[], object]) -> str:
@@ -63,7 +70,7 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_force_that_weight_limits_has_its_closed_form() -> None:
-    text = why_not(lambda: plan_all(change_limit(shove()[0], 2, 1.0)))
+    text = why_not_shoved(2, 1.0)
     found = re.fullmatch(
         r"phases 1 and 2 are infeasible: c_n of v1-palm >= epsilon = 1 N is (\S+) N short at "
         r"t = \S+ s, phase 2; feasible with epsilon = (\S+) N instead of 1",
@@ -77,17 +84,14 @@ def test_a_force_that_weight_limits_has_its_closed_form() -> None:
 
 
 @pytest.mark.parametrize(
-    "problem, index, value, name",
-    [
-        (shove()[0], 2, 1.0, "epsilon"),
-        (shove()[0], 0, 0.3, "torque limit of finger 1"),
-    ],
+    "index, value, name",
+    [(2, 1.0, "epsilon"), (0, 0.3, "torque limit of finger 1")],
     ids=["epsilon", "torque limit"],
 )
 def test_there_is_a_plan_with_what_is_advised_and_none_with_less(
-    problem: Problem, index: int, value: float, name: str
+    index: int, value: float, name: str
 ) -> None:
-    text = why_not(lambda: plan_all(change_limit(problem, index, value)))
+    problem, text = shove()[0], why_not_shoved(index, value)
     advised = re.search(rf"; feasible with {name} = (\S+) N( m)? instead of {value:g}$", text)
     assert advised, text
     enough = float(advised[1])

@@ -77,7 +77,7 @@ def thrown(
 ) -> tuple[Problem, Trajectory, float]:
     """A problem of one and two contacts, its plan, and the time that its second phase takes."""
     problem, expected = throw()
-    return problem, solve(problem, objective, time_intervals=COARSE), expected
+    return problem, solve(problem, objective, time_intervals=8), expected
 
 
 def effort(plans: list[PhasePlan[TimeMotion]]) -> float:
@@ -127,7 +127,7 @@ def test_schemes_and_degrees_agree(
     assert error < {3: 1e-4, 4: 1e-5}.get(stage.scheme.order, 1e-6)
 
 
-@pytest.mark.parametrize("name, degree", [("radau", 2), ("legendre", 5)])
+@pytest.mark.parametrize("name, degree", [("legendre", 2), ("radau", 5)])
 def test_landings_of_other_schemes_take_as_long(
     coarse: list[PhasePlan[TimeMotion]], name: str, degree: int
 ) -> None:
@@ -171,13 +171,16 @@ def test_margins_with_rolling_contacts_are_those_along_the_curve() -> None:
     assert within.value < along.meta["phase_values"][1] * (1 + 1e-3)
 
 
-@pytest.mark.parametrize("name", ["radau", "legendre"])
-@pytest.mark.parametrize("throw", [shove, heave, lift])
+@pytest.mark.parametrize(
+    "throw, name",
+    [(shove, "radau"), (heave, "radau"), (heave, "legendre"), (lift, "radau")],
+)
 def test_what_moves_by_itself_takes_its_time(
     throw: Callable[[], tuple[Problem, float]], name: str
 ) -> None:
-    problem, expected = throw()
-    plan = solve(problem, time_intervals=8, scheme=name)
+    problem, plan, expected = thrown(throw)
+    if name != "radau":
+        plan = solve(problem, time_intervals=8, scheme=name)
     # One or two contacts are left, and with them four or three freedoms.
     formation = problem.phases[1].formation
     assert formation.n_constraints == 2 - (throw is lift)
@@ -209,8 +212,10 @@ def test_what_moves_by_itself_takes_its_time(
         assert phi[-1] == pytest.approx(problem.phases[1].until.value, abs=1e-8)
 
 
-@pytest.mark.parametrize("objective", ["effort", "margin"])
-@pytest.mark.parametrize("throw", [shove, heave, lift])
+@pytest.mark.parametrize(
+    "throw, objective",
+    [(shove, "effort"), (shove, "margin"), (heave, "effort"), (lift, "margin")],
+)
 def test_one_and_two_contacts_are_planned_for_every_objective(
     throw: Callable[[], tuple[Problem, float]], objective: str
 ) -> None:
@@ -358,7 +363,8 @@ def test_a_motion_that_limits_forbid_is_no_plan() -> None:
     ]
     feeble = replace(problem, scene=scene, phases=tuple(phases))
     with pytest.raises(InfeasibleError, match=r"phases 1 and 2 are infeasible: .* short"):
-        plan_phases(feeble, phases, feeble.start, PlanOptions(time_intervals=COARSE))
+        options = PlanOptions(time_intervals=COARSE)
+        plan_phases(feeble, phases, feeble.start, options, explained=False)
 
 
 def test_guesses_in_the_time_domain_start_where_curves_end() -> None:

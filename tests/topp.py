@@ -89,8 +89,9 @@ class PhasePlane:
         top = 4.0 * 9.81 * self.h.sum() * 2**6
         for k in range(count - 1, -1, -1):
             low, high = 0.0, top
-            for _ in range(8):
-                b = np.linspace(low, high, 40)
+            # Each time the place is known 64 times as closely.
+            for _ in range(6):
+                b = np.linspace(low, high, 65)
                 least, most = self.accelerations(k, b)
                 most = np.minimum(most, (largest[k + 1] - b) / (2 * self.h[k]))
                 good = np.flatnonzero(least <= most)
