@@ -237,11 +237,23 @@ def _look_around(formation: Formation, ending: Formation, z: Array, slip: Array)
     return best
 
 
-def connect(formation: Formation, start: Array, goal: Array) -> Outline:
-    """A straight line, pulled onto the contacts, with the directions of its middle."""
+def connect(
+    formation: Formation, start: Array, goal: Array, bends: tuple[float, float] = (0.0, 0.0)
+) -> Outline:
+    """A straight line, pulled onto the contacts, with the directions of its middle.
+
+    Parameters
+    ----------
+    formation : Formation
+    start, goal : ndarray, shape (5,)
+    bends : (float, float)
+        How far it bends to one side in one arc and in two, over its length; with two freedoms.
+    """
     points, slip = [start], formation.evaluate_slip(start[None])[0]
+    aside = _find_side(formation, start, goal) if any(bends) else np.zeros(5)
     for x in np.linspace(0.0, 1.0, POINTS)[1:]:
-        point = close(formation, start + x * (goal - start), slip)
+        off = bends[0] * np.sin(np.pi * x) + bends[1] * np.sin(2 * np.pi * x)
+        point = close(formation, start + x * (goal - start) + off * aside, slip)
         points.append(points[-1] if point is None else point)
     z = np.array(points)
     speed = np.gradient(z, axis=0)
@@ -249,3 +261,13 @@ def connect(formation: Formation, start: Array, goal: Array) -> Outline:
     rates = np.hstack([slip, speed[:, 3:]]).sum(axis=0)
     signs = np.where(rates < 0, -1.0, 1.0)
     return Outline(formation, z, Directions(signs[:-2], signs[-2:]))
+
+
+def _find_side(formation: Formation, start: Array, goal: Array) -> Array:
+    """The way aside of a line in the tangent plane at its start, as long as the line."""
+    metric = np.sqrt(metric_weights(formation.scene))
+    line = (goal - start) * metric
+    plane = np.linalg.qr(tangent_basis(formation, start) / metric[:, None])[0]
+    ahead = plane.T @ line
+    aside = plane @ np.array([-ahead[1], ahead[0]]) / max(np.linalg.norm(ahead), 1e-300)
+    return np.asarray(aside * np.linalg.norm(line) / metric)

@@ -39,7 +39,9 @@ LOOSE = 0.01
 ENDS = 16
 """Most places of the end on either side of the nearest one."""
 STEP = 0.08
-"""How far apart these are, over the radius of gyration."""
+"""How far apart the nearest of these are, over the radius of gyration."""
+GROWTH = 1.12
+"""By how much more each is apart from the one before."""
 ENOUGH = 1e-3
 """Margin with which a curve is as good as wanted."""
 
@@ -82,15 +84,15 @@ def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -
     found = [first]
     for way in (1.0, -1.0):
         here, ahead = first, None
-        for _ in range(ENDS):
+        for step in STEP * scene.scales.length * GROWTH ** np.arange(ENDS):
             rows = _end_rows(scene, phase, here)[1] / scale
             tangent = np.linalg.svd(rows)[2][-1] / scale
             if ahead is None:
                 tangent = way * tangent
             elif (tangent * scale) @ (ahead * scale) < 0:
                 tangent = -tangent
-            after = _settle(scene, phase, here + STEP * scene.scales.length * tangent)
-            if after is None or np.linalg.norm((after - here) * scale) > scene.scales.length:
+            after = _settle(scene, phase, here + step * tangent)
+            if after is None or np.linalg.norm((after - here) * scale) > 3 * step:
                 break
             here, ahead = after, tangent
             found.append(here)

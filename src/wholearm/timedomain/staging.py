@@ -16,6 +16,8 @@ from .collocation import Scheme
 from .modes import LEAST_INTERVALS, link
 from .ownunits import in_own_units, scale_state
 from .stage import Stage, StagePoints
+from .wayguess import PacedWay
+from .waypace import Pace
 
 PRESS = 0.5
 """Normal forces that a first guess is near, over the weight of the object."""
@@ -34,18 +36,18 @@ def outline_stages(
     pace: float,
     onwards: bool = False,
     release_at: float = RELEASE_AT,
-    way: Sequence[Outline] | None = None,
+    way: PacedWay | None = None,
 ) -> list[Stage]:
     """Stages of phases that are planned as one, with a first guess, in the scene's own units.
 
     The guessed duration is `pace` times that of a fall over the length of the outlines. With
     `onwards`, phases that go on in motion may end farther away where that takes fewer reversals.
     A phase that ends by a release is guessed to do so at the share `release_at` of its curve.
-    A single phase may be guessed to take the outlines `way` instead of its own.
+    A single phase may be guessed to go a way of its own instead, at the pace of that.
     """
     parts: list[tuple[Phase, Outline, bool]] = []
     for phase in phases:
-        outlines = list(way or outline_phase(problem, phase, z, release_at))
+        outlines = list(way.stretches if way else outline_phase(problem, phase, z, release_at))
         if parts and parts[-1][0].end is End.SMOOTH:
             outlines = [*_turn_first(outlines[0], parts[-1][1]), *outlines[1:]]
             if onwards:
@@ -70,7 +72,12 @@ def outline_stages(
     total = pace * float(np.sqrt(lengths.sum()))
     ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
     # The guess runs as (1 - cos) over all stages, so each has its own share of the time.
-    clock = np.arccos(1 - 2 * np.clip(ends, 0.0, 1.0)) / np.pi
+    own_pace = None if way is None else way.pace
+    if own_pace is not None:
+        total = float(own_pace.t[-1]) / scales.time
+        clock = np.interp(ends, own_pace.s, own_pace.t / own_pace.t[-1])
+    else:
+        clock = np.arccos(1 - 2 * np.clip(ends, 0.0, 1.0)) / np.pi
     longest = {phase.index: lengths[[p is phase for p, _, _ in parts]].sum() for phase in phases}
     stages: list[Stage] = []
     released: tuple[int, ...] = ()
@@ -78,9 +85,8 @@ def outline_stages(
         count = max(LEAST_INTERVALS, round(lengths[k] / longest[phase.index] * intervals))
         following = own.phases[phase.index + 1] if phase is not phases[-1] and last else None
         strikes = following is not None and phase.end is End.IMPACT
-        guess = _guess(
-            outline, scheme, count, (clock[k], clock[k + 1]), (ends[k], ends[k + 1]), total
-        )
+        clocks, spans = (clock[k], clock[k + 1]), (ends[k], ends[k + 1])
+        guess = _guess(outline, scheme, count, clocks, spans, total, own_pace)
         if strikes and following is not None:
             guess = guess._replace(impulses=np.zeros(following.formation.n_constraints))
         opens = k > 0 and parts[k - 1][0] is not phase
@@ -110,6 +116,7 @@ def _guess(
     clock: tuple[float, float],
     ends: tuple[float, float],
     total: float,
+    pace: Pace | None = None,
 ) -> StagePoints:
     """Motion along an outline, without accelerations and with every contact pressed alike.
 
@@ -119,6 +126,8 @@ def _guess(
         Shares of all stages' time and length at the start and the end.
     total : float, [s]
         Duration of all stages.
+    pace : Pace, optional
+        When they are where, if not as (1 - cos).
     """
     knots = np.linspace(0.0, 1.0, len(outline.z))
     slopes = np.gradient(outline.z, knots, axis=0)
@@ -126,11 +135,11 @@ def _guess(
     breaks = np.linspace(0.0, 1.0, count + 1)
 
     def follow(share: Array) -> tuple[Array, Array, Array]:
-        angle = np.pi * (clock[0] + share * (clock[1] - clock[0]))
+        passed = clock[0] + share * (clock[1] - clock[0])
         span = max(ends[1] - ends[0], 1e-12)
-        place = ((1 - np.cos(angle)) / 2 - ends[0]) / span
-        rate = (np.pi * np.sin(angle) / (2 * span * total))[..., None]
-        gain = (np.pi**2 * np.cos(angle) / (2 * span * total**2))[..., None]
+        place, rate, gain = _run(passed) if pace is None else _run_at(pace, passed)
+        place = (place - ends[0]) / span
+        rate, gain = rate[..., None] / (span * total), gain[..., None] / (span * total**2)
         z, slope, bend = (
             np.stack([np.interp(place, knots, column) for column in table.T], axis=-1)
             for table in (outline.z, slopes, bends)
@@ -150,6 +159,23 @@ def _guess(
         tau,
         np.zeros(0),
     )
+
+
+def _run(passed: Array) -> tuple[Array, Array, Array]:
+    """Share of the length at shares of the time, and its derivatives, from rest to rest."""
+    angle = np.pi * passed
+    return (1 - np.cos(angle)) / 2, np.pi / 2 * np.sin(angle), np.pi**2 / 2 * np.cos(angle)
+
+
+def _run_at(pace: Pace, passed: Array) -> tuple[Array, Array, Array]:
+    """The same at a pace of its own."""
+    t = pace.t / pace.t[-1]
+    rates = np.gradient(pace.s, t)
+    rates[[0, -1]] = 0.0
+    place, rate, gain = (
+        np.interp(passed, t, table) for table in (pace.s, rates, np.gradient(rates, t))
+    )
+    return place, rate, gain
 
 
 def _balance(outline: Outline, z: Array, v: Array, a: Array) -> tuple[Array, Array]:

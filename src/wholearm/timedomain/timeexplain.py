@@ -20,9 +20,9 @@ from .stage import Stage
 from .timelimits import Give
 from .timesearch import Search
 
-LONGEST = 3.0
+LONGEST = 1.0
 """Most processor time [s] of one run of the solver that looks for the least shortfalls."""
-ADVICE = 5.0
+ADVICE = 1.0
 """Processor time [s] after which no further change of a limit is tried."""
 SHORT = 1e-4
 """Least shortfall that counts, of forces over the weight, of torques over that times the radius

@@ -27,28 +27,28 @@ from .ending import choose_end, keep_apart
 from .modesearch import adapt, improve
 from .ownunits import to_si, unit_of
 from .revising import halve
-from .slowguess import AMPLE, SlowWay, Way, list_slow_ways
 from .stage import Stage
 from .staging import outline_stages
 from .timemotion import TimeMotion, make_motions
 from .timenlp import LONGEST
 from .timesearch import Search, Solution
+from .wayguess import AMPLE, PacedWay, list_ways
 
 FIRST = 10
 """Most intervals of a phase to start with."""
 CONVINCING = 2
 """Motions that miss limits least, from different guesses, after which there seems to be no plan."""
-BUDGET = 5.0
+BUDGET = 2.5
 """Processor time [s] of this thread after which no further guess is begun: of one block."""
 ATTEMPT = 1.5
 """Most processor time of the first run of the solver from a further guess, in seconds or, if that
 is longer, over the time of the first guess."""
+NEAR = -0.3
+"""Margin of a way from which on a motion beside it may keep its limits."""
 WAYS = 3
-"""Most ways along which a slow motion is guessed."""
+"""Most ways along which a motion is guessed."""
 _PACES = (2.0, 4.0, 1.0)
 """Guessed durations to try, in units of that of a fall."""
-_SLOW_PACES = (4.0, 12.0)
-"""Those of slow motions."""
 
 
 def plan_phases(
@@ -92,7 +92,7 @@ def plan_phases(
     halvings = max(0, math.ceil(math.log2(wanted / FIRST)))
 
     def outline(
-        times: int, pace: float, onwards: bool = False, way: Way | None = None
+        times: int, pace: float, onwards: bool = False, way: PacedWay | None = None
     ) -> list[Stage]:
         count = math.ceil(wanted / 2**times)
         stages = outline_stages(problem, phases, z, search.scheme, count, pace, onwards, way=way)
@@ -116,8 +116,10 @@ def plan_phases(
     refuse(search, problem, phases, first, replan if explained else None)
     spent = time.thread_time() - started
     attempt = max(ATTEMPT, ATTEMPT * spent)
-    ways = list_slow_ways(problem, phases[0], z, WAYS) if patient and len(phases) == 1 else []
+    ways = list_ways(problem, phases[0], z, WAYS) if patient and len(phases) == 1 else []
     sure = any(way.margin > AMPLE for way in ways)
+    # What is far from keeping limits along any way shows at once what is short.
+    far = bool(ways) and all(way.margin <= NEAR for way in ways)
     lost = "" if solution.status.startswith("Ipopt") else f"{solution.status}; "
     short, tried = list[list[Stage]](), dict.fromkeys(["the nearest end"])
     # Each further guess has a share of the budget, however long the first took.
@@ -125,33 +127,32 @@ def plan_phases(
     guesses = _list_guesses(first, halvings, outline if patient else None, ways, len(phases) > 1)
     for name, times, guess in guesses:
         tried[name] = None
-        if guess is not first:
+        if guess is not first and not far:
             solution = _solve(search, guess, times, attempt)
         eased = None if solution.success or sure else ease(search, guess)
+        if eased is not None and not list_shortfalls(problem, eased):
+            solution = _solve(search, eased, times, attempt)
+            # What coarse intervals are not short of, finer ones may be.
+            eased = None if solution.success else ease(search, _halve(search, eased))
         if eased is not None and list_shortfalls(problem, eased):
             short.append(eased)
-        elif eased is not None:
-            solution = _solve(search, eased, times, attempt)
         if solution.success:
             return _summarise(problem, search, phases, solution)
-        if len(short) == CONVINCING or time.thread_time() > stop:
+        if len(short) == (1 if far else CONVINCING) or time.thread_time() > stop:
             break
     reason = f"none was found, also of least shortfalls, from {', '.join(tried)}"
     if sure:
         # What a local least of shortfalls says is then no reason.
         short = []
-        reason = f"none was found, although a slow motion keeps limits, from {', '.join(tried)}"
-
-    reason = lost + reason
-
-    raise explain(search, problem, phases, short, reason, replan if explained else None)
+        reason = f"none was found, although one way has room for it, from {', '.join(tried)}"
+    raise explain(search, problem, phases, short, lost + reason, replan if explained else None)
 
 
 def _list_guesses(
     first: list[Stage],
     halvings: int,
     outline: Callable[..., list[Stage]] | None,
-    ways: Sequence[SlowWay],
+    ways: Sequence[PacedWay],
     onwards: bool,
 ) -> Iterator[tuple[str, int, list[Stage]]]:
     """Guesses by name, with how often their intervals are halved; only the first without others.
@@ -163,16 +164,14 @@ def _list_guesses(
     halvings : int
     outline : callable or None
         Makes guesses.
-    ways : sequence of SlowWay
+    ways : sequence of PacedWay
     onwards : bool
         Whether there are phases that go on in motion.
     """
     if outline is not None:
-        sure = [way for way in ways if way.margin > AMPLE]
-        for pace in _SLOW_PACES if sure else _SLOW_PACES[:1]:
-            for way in sure or ways[:1]:
-                stages = outline(halvings, pace, way=way.stretches)
-                yield f"a straight way at {pace:g} times the duration of a fall", halvings, stages
+        for way in [way for way in ways if way.margin > NEAR] or ways[:1]:
+            stages = outline(halvings, _PACES[0], way=way)
+            yield f"a way with the margin {way.margin:.3g}", halvings, stages
     yield "the nearest end", halvings, first
     if outline is None:
         return
@@ -198,9 +197,14 @@ def _solve(
     search, solution = choose_end(search, adapt(search, improve(search, solution)))
     for _ in range(halvings):
         if solution.success:
-            every = [np.ones(stage.intervals, dtype=bool) for stage in solution.stages]
-            solution = search.solve(halve(solution.stages, search.scheme, every), solution)
+            solution = search.solve(_halve(search, solution.stages), solution)
     return search.hold(solution) if solution.success else solution
+
+
+def _halve(search: Search, stages: list[Stage]) -> list[Stage]:
+    """Stages with all intervals halved."""
+    every = [np.ones(stage.intervals, dtype=bool) for stage in stages]
+    return halve(stages, search.scheme, every)
 
 
 def _summarise(

@@ -34,10 +34,12 @@ DEFECT = 2e-8
 """What collocation may miss z and z' by at the end of an interval, in the scene's own units."""
 DEAR = 1e-5
 """What limits that are raised in an interval may cost, over the cost, without halving it."""
-_ITERATIONS = {Objective.ELASTIC: 300, Objective.RELAX: 300}
+_ITERATIONS = {Objective.ELASTIC: 300, Objective.RELAX: 150}
 """Most iterations of one solve, if not 150."""
 _DEARER = 0.2
 """How much dearer, relatively, a plan may get by tightening before it counts as lost."""
+_COARSE = 0.5
+"""How much dearer, relatively, it may get on finer intervals."""
 
 
 @dataclass
@@ -256,7 +258,7 @@ class Search:
 
     def hold(self, solution: Solution) -> Solution:
         """Go on from a solution until limits hold between points too."""
-        refined = 0
+        refined, first = 0, solution.cost
         limits = [Limits.none(stage) for stage in solution.stages]
         for _ in range(ROUNDS):
             motions = make_motions(solution.stages, self.scheme)
@@ -285,6 +287,9 @@ class Search:
                 refined += 1
                 finer = self.solve(halve(solution.stages, self.scheme, marked), solution)
                 if finer.success:
+                    if finer.cost - first > _COARSE * abs(first):
+                        status = "a plan on finer intervals is much dearer"
+                        return finer._replace(status=status, success=False)
                     solution = finer
                     limits = [Limits.none(stage) for stage in solution.stages]
                     continue

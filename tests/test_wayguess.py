@@ -12,14 +12,14 @@ from wholearm.benchmark.tracing import weights
 from wholearm.options import PlanOptions
 from wholearm.outline import connect, outline_phase
 from wholearm.problem import Problem, build_problem, read_problem
-from wholearm.timedomain.slowguess import (
+from wholearm.timedomain.timeplan import plan_phases
+from wholearm.timedomain.wayguess import (
     AMPLE,
     find_margin,
     list_goals,
-    list_slow_ways,
+    list_ways,
     split_way,
 )
-from wholearm.timedomain.timeplan import plan_phases
 
 
 @cache
@@ -61,7 +61,7 @@ def test_stretches_of_a_way_keep_their_senses() -> None:
 def test_margins_are_those_of_newton_and_euler() -> None:
     problem = tipping()
     (phase,) = problem.phases
-    best, *_ = list_slow_ways(problem, phase, problem.start, 3)
+    best, *_ = list_ways(problem, phase, problem.start, 3)
     assert best.margin > AMPLE
     z = np.concatenate([part.z for part in best.stretches[:1]])
     z_s = np.gradient(z, axis=0)
@@ -83,4 +83,4 @@ def test_a_way_that_slides_while_it_tips_is_planned() -> None:
 
 
 def test_a_release_and_one_freedom_have_no_slow_ways(heptagon: Problem) -> None:
-    assert not list_slow_ways(heptagon, heptagon.phases[0], heptagon.start, 3)
+    assert not list_ways(heptagon, heptagon.phases[0], heptagon.start, 3)
