@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from shipped import HEPTAGON
+from wholearm.benchmark import cellcurves
 from wholearm.benchmark.cellcurves import best_end, find_best, list_ends
 from wholearm.benchmark.lpmotion import slow_margin
 from wholearm.model import Array
@@ -44,7 +45,9 @@ def test_the_best_curve_is_one_that_a_slow_motion_can_take() -> None:
     assert slow_margin(scene, phase, problem.epsilon, best.z, np.gradient(best.z, axis=0))[0] > 0
 
 
-def test_no_curve_takes_a_hand_that_is_too_weak() -> None:
+def test_no_curve_takes_a_hand_that_is_too_weak(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, few in (("DRAWN", 40), ("TRIED", 5), ("BENT", (2, 3))):
+        monkeypatch.setattr(cellcurves, name, few)
     weak = tipping().with_({f"fingers.{k}.torque_limit": 0.01 for k in (1, 2)})
     (phase,), ends = weak.phases, _ends()[:3]
     best = find_best(weak.scene, phase, weak.epsilon, weak.start, ends)

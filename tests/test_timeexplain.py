@@ -118,7 +118,7 @@ def test_advice_is_that_along_the_curve(heptagon: Problem, curves: tuple[Curve, 
         why_not(lambda: plan_phases(problem, (problem.phases[1],), start, options)),
         why_not(lambda: plan_path(curves[1], problem.epsilon, PlanOptions(), phase.number)),
     ]
-    shape = r"phase 2 is infeasible: c_n of v1-palm >= epsilon = 1 N is \S+ N short at t = 0\.\d+ s"
+    shape = r"phase 2 is infeasible: .*c_n of v1-palm >= epsilon = 1 N is \S+ N short at "
     assert all(re.match(shape, text) for text in texts), texts
     within, along = (float(text.split("epsilon = ")[-1].split()[0]) for text in texts)
     assert within == pytest.approx(along, rel=0.02)

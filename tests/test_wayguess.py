@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from shipped import HEPTAGON
-from wholearm.benchmark.lpmotion import slow_margin
+from wholearm.benchmark.lpmotion import fast_margin
 from wholearm.benchmark.tracing import weights
 from wholearm.options import PlanOptions
 from wholearm.outline import connect, outline_phase
@@ -15,11 +15,11 @@ from wholearm.problem import Problem, build_problem, read_problem
 from wholearm.timedomain.timeplan import plan_phases
 from wholearm.timedomain.wayguess import (
     AMPLE,
-    find_margin,
     list_goals,
     list_ways,
     split_way,
 )
+from wholearm.timedomain.waypace import WayForces
 
 
 @cache
@@ -63,12 +63,43 @@ def test_margins_are_those_of_newton_and_euler() -> None:
     (phase,) = problem.phases
     best, *_ = list_ways(problem, phase, problem.start, 3)
     assert best.margin > AMPLE
-    z = np.concatenate([part.z for part in best.stretches[:1]])
-    z_s = np.gradient(z, axis=0)
-    z_s /= np.sqrt(z_s**2 @ weights(problem.scene))[:, None]
-    own = find_margin(best.stretches[:1], problem.epsilon)
-    margin, _ = slow_margin(problem.scene, phase, problem.epsilon, z, z_s)
-    assert own == pytest.approx(margin, abs=0.02)
+    part = best.stretches[0]
+    s = np.append(0.0, np.cumsum(np.sqrt(np.diff(part.z, axis=0) ** 2 @ weights(problem.scene))))
+    course = s, part.z, np.gradient(part.z, s, axis=0, edge_order=2)
+    own = WayForces([part], problem.epsilon).find_margin()
+    other = fast_margin(problem.scene, phase, problem.epsilon, course)
+    # One looks at the middles of the intervals, the other one at their ends.
+    assert other - 0.02 < own < other + 0.1
+    # What epsilon takes of all normal forces, it takes of the margin at most.
+    more = problem.epsilon + 0.05 * problem.scene.scales.force
+    assert own - 0.05 - 1e-9 <= WayForces([part], more).find_margin() <= own + 1e-9
+
+
+def test_a_brisk_motion_keeps_half_the_margin_and_ends_at_rest() -> None:
+    problem = tipping()
+    best, *_ = list_ways(problem, problem.phases[0], problem.start, 1)
+    pace = best.pace
+    assert pace is not None and pace.t[0] == 0.0 and pace.s[-1] == pytest.approx(1.0)
+    assert (np.diff(pace.t) > 0).all() and (np.diff(pace.s) > 0).all()
+    speeds = np.diff(pace.s) / np.diff(pace.t)
+    assert speeds[[0, -1]].max() < speeds.max()
+    # No faster than gravity and the torques allow; no slower than a few falls over its length.
+    length = sum(part.length for part in best.stretches)
+    assert 0.1 < pace.t[-1] / np.sqrt(length / problem.scene.gravity) < 20.0
+
+
+def test_ways_bend_to_one_side_and_to_the_other() -> None:
+    problem = tipping()
+    (phase,) = problem.phases
+    start, formation = problem.start, phase.formation
+    (nearest,) = outline_phase(problem, phase, start)
+    goal, straight = nearest.z[-1], connect(formation, start, nearest.z[-1]).z
+    sides = [connect(formation, start, goal, (bend, 0.0)).z for bend in (0.3, -0.3)]
+    for z in sides:
+        assert (z[0] == start).all() and np.abs(z[-1] - goal).max() < 1e-9
+        assert np.abs(formation.evaluate(z, z).C).max() < 1e-9
+    off = [(z - straight)[len(z) // 2] * np.sqrt(weights(problem.scene)) for z in sides]
+    assert off[0] @ off[1] < 0 and np.linalg.norm(off[0]) > 0.1 * nearest.length
 
 
 def test_a_way_that_slides_while_it_tips_is_planned() -> None:
@@ -82,5 +113,5 @@ def test_a_way_that_slides_while_it_tips_is_planned() -> None:
     assert samples.c_n.min() > problem.epsilon - 1e-6
 
 
-def test_a_release_and_one_freedom_have_no_slow_ways(heptagon: Problem) -> None:
+def test_a_release_and_one_freedom_have_no_ways(heptagon: Problem) -> None:
     assert not list_ways(heptagon, heptagon.phases[0], heptagon.start, 3)

@@ -24,6 +24,8 @@ from .phaseplan import PhasePlan
 from .problem import End, Phase, Problem
 from .trajectory import Motion
 
+PLAIN = -1
+"""In place of how often intervals are doubled: as many as at first, and no search for modes."""
 FINEST = 64
 """Most intervals of a phase in the time domain that refining asks for."""
 MOVED = 1e-9
@@ -44,7 +46,7 @@ class BlockPlan:
     start : ndarray, shape (5,)
         Where it starts.
     finer : int
-        How often its intervals are doubled.
+        How often its intervals are doubled, or `PLAIN`.
     duration : float or None, [s]
         Its longest duration, for the objective `margin`.
     fastest : list of PhasePlan
@@ -146,9 +148,15 @@ def plan_blocks(problem: Problem, options: PlanOptions, report: Callable[[str], 
     return _require_margin(_plan_each(planning, [0] * count, report))
 
 
-def refine_block(planning: Planning, index: int, report: Callable[[str], None]) -> Planning:
-    """Plan one block with twice the intervals, and those after it that then start elsewhere."""
-    finer = [block.finer + (k == index) for k, block in enumerate(planning.blocks)]
+def refine_block(
+    planning: Planning, index: int, report: Callable[[str], None], plain: bool = False
+) -> Planning:
+    """Plan one block anew, and those after it that then start elsewhere.
+
+    It has twice the intervals, or if it is to be `plain`, no search for modes.
+    """
+    finer = [block.finer for block in planning.blocks]
+    finer[index] = PLAIN if plain else finer[index] + 1
     return _require_margin(_plan_each(planning, finer, report))
 
 
@@ -195,6 +203,8 @@ def _refine(options: PlanOptions, known: BlockPlan | None, finer: int) -> PlanOp
     """Options for a block whose intervals are doubled `finer` times."""
     if finer == 0:
         return options
+    if finer == PLAIN:
+        return replace(options, mode_search=False)
     wanted = options.time_intervals
     if known is not None and known.chain is None:
         wanted = min(known.intervals * 2 ** (finer - known.finer), FINEST)

@@ -102,6 +102,8 @@ def build_parser() -> argparse.ArgumentParser:
     solve.add_argument("--time-intervals", type=int, help="intervals of a phase in the time domain")
     solve.add_argument("--degree", type=int, help="collocation points of an interval there")
     solve.add_argument("--scheme", help="radau (the default) or legendre points")
+    text = "keep the contact modes of the first plan that is found"
+    solve.add_argument("--no-mode-search", dest="mode_search", action="store_false", help=text)
     text = "return the plan without replaying it"
     solve.add_argument("--no-replay", dest="replay", action="store_false", help=text)
     solve.add_argument("--json", action="store_true", help="print the summary as JSON")

@@ -69,6 +69,9 @@ class PlanOptions:
         Which points: ``"radau"`` or ``"legendre"``.
     replay : bool
         Whether to replay the plan, to refine what does not hold and to return only what does.
+    mode_search : bool
+        Whether contact modes are changed, in the time domain, for as long as that makes a plan
+        better.
 
     Raises
     ------
@@ -88,6 +91,7 @@ class PlanOptions:
     degree: int = 3
     scheme: str = "radau"
     replay: bool = True
+    mode_search: bool = True
 
     def __post_init__(self) -> None:
         given = self.objective
@@ -108,8 +112,9 @@ class PlanOptions:
         if self.transcription not in ("auto", "time"):
             given = self.transcription
             raise InputError("", "transcription", f"{given!r} given; allowed are auto and time")
-        if not isinstance(self.replay, bool):
-            raise InputError("", "replay", f"{self.replay!r} given; allowed are true and false")
+        for key in ("replay", "mode_search"):
+            if not isinstance(value := getattr(self, key), bool):
+                raise InputError("", key, f"{value!r} given; allowed are true and false")
         for key in ("opening", "clearance"):
             value = require_number(getattr(self, key), key, nonnegative=True)
             object.__setattr__(self, key, value)

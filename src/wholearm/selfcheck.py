@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .blocks import BlockPlan, Planning, refine_block
+from .blocks import PLAIN, BlockPlan, Planning, refine_block
 from .errors import InfeasibleError, ReplayError, SolverError
 from .model import Array, Scales
 from .newton_euler import balance
@@ -25,6 +25,9 @@ from .verify import choose_times, inspect
 
 REFINEMENTS = 3
 """How often the intervals of a block may be doubled."""
+ROUGH = 2
+"""How often those in the time domain may be, before contact modes are left as they come: a plan
+that hangs on a contact that comes to rest need not hold, however fine it is."""
 STRICT = 0.5
 """Share of what `verify` allows that a plan may use: `verify` looks at more instants."""
 RESIDUAL = 1e-8
@@ -128,10 +131,13 @@ def replay_plan(
             for k, block in enumerate(planning.blocks)
             if number in [phase.number for phase in block.phases]
         )
-        most = REFINEMENTS if accepted.failure is not None else 1
         block = planning.blocks[index]
-        finer = block.finer < most and not block.is_finest
-        refined = _refine(planning, index, report) if finer else None
+        most = 1 if accepted.failure is None else REFINEMENTS if block.chain else ROUGH
+        refined = None
+        if PLAIN != block.finer < most and not block.is_finest:
+            refined = _refine(planning, index, report)
+        if refined is None and accepted.failure and not block.chain and block.finer != PLAIN:
+            refined = _refine(planning, index, report, plain=True)
         if refined is None and accepted.failure is None:
             check = accepted
             break
@@ -213,10 +219,12 @@ def find_residual(problem: Problem, trajectory: Trajectory) -> Residual:
     return worst
 
 
-def _refine(planning: Planning, index: int, report: Callable[[str], None]) -> Planning | None:
-    """The planning with a block of twice the intervals; None if there is no plan for it."""
+def _refine(
+    planning: Planning, index: int, report: Callable[[str], None], plain: bool = False
+) -> Planning | None:
+    """The planning with another plan of a block; None if there is none."""
     try:
-        return refine_block(planning, index, report)
+        return refine_block(planning, index, report, plain)
     except (InfeasibleError, SolverError):
         return None
 
@@ -224,8 +232,8 @@ def _refine(planning: Planning, index: int, report: Callable[[str], None]) -> Pl
 def _describe(block: BlockPlan, number: int, check: Check) -> str:
     """The error for a plan that does not hold, from phase `number` of a block on."""
     assert check.failure is not None
-    reason, times = check.failure[1], 2**block.finer
-    finer = f", with {times} times the intervals" if times > 1 else ""
+    reason = check.failure[1]
+    finer = f", with {2**block.finer} times the intervals" if block.finer > 0 else ""
     return (
         f"the plan of phase {number} does not hold in its replay{finer}: {reason}; other intervals "
         "or another objective may do, and --no-replay (replay=False) leaves the check out"

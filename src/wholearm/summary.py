@@ -49,7 +49,7 @@ def _list_replay(replay: Mapping[str, Any] | None) -> list[str]:
         f"replayed: least c_n {least['value']:.6f} N on {least['contact']}, off by at most "
         f"{far[0]:.1e} m and {far[1]:.1e} rad at the ends of phases"
     )
-    return [text + (f", with up to {2**finer} times the intervals" if finer else "")]
+    return [text + (f", with up to {2**finer} times the intervals" if finer > 0 else "")]
 
 
 def _list_table(table: Mapping[str, Any]) -> list[str]:

@@ -50,14 +50,16 @@ def rest_margin(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: bool
         return np.nan
     slip = np.array([t.tangent[0] for t in touches] + list(np.eye(5)[3:])) @ N
     slip[list(rolling)] = 0.0
-    apart = [t.normal[0] @ N for t in list_others(scene, phase, z)]
-    margins = []
-    for way in _ways(slip):
+    apart = np.array([t.normal[0] @ N for t in list_others(scene, phase, z)]).reshape(
+        -1, N.shape[1]
+    )
+    largest = np.abs(slip).max()
+    margins = [-np.inf]
+    for way in _ways(np.vstack([slip, apart])):
         rate = slip @ way
-        signs = np.where(
-            np.abs(rate) > STILL * np.abs(slip * scene.scales.length).max(), np.sign(rate), 0.0
-        )
-        margins.append(_solve(scene, epsilon, touches, N, (slip, signs, np.array(apart)), ends))
+        signs = np.where(np.abs(rate) > STILL * largest, np.sign(rate), 0.0)
+        if (apart @ way >= -STILL * largest).all():
+            margins.append(_solve(scene, epsilon, touches, N, (slip, signs, apart), ends))
     return max(margins)
 
 

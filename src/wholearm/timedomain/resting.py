@@ -4,11 +4,12 @@ At rest nothing is left of the equations of motion that is not linear,
 
     A a = 0,  M5 a = g - D sigma + S tau + A^T c_n + A_t^T c_t,  c_n >= epsilon,  |tau| <= limit,
 
-and friction is that of the way in which the acceleration a sets things in motion: c_t = -mu Xi c_n
-with Xi A_t a > 0 where a contact will slide, |c_t| <= mu (c_n - epsilon) with A_t a = 0 where it
-will not. With two freedoms the ways are the sectors and rays between a handful of lines. If none of
-them admits an acceleration other than zero, no plan exists, whatever the solver says. Where a
-motion comes to rest the same holds with the acceleration against the way that things move.
+and gaps that are closed beside the contacts can only open. Friction is that of the way in which the
+acceleration a sets things in motion: c_t = -mu Xi c_n with Xi A_t a > 0 where a contact will slide,
+|c_t| <= mu (c_n - epsilon) with A_t a = 0 where it will not. With two freedoms the ways are the
+sectors and rays between a handful of lines. If none of them admits an acceleration other than zero,
+no plan exists, whatever the solver says. Where a motion comes to rest the same holds with the
+acceleration against the way that things move.
 """
 
 from __future__ import annotations
@@ -25,6 +26,10 @@ MOVES = 1e-5
 """Least sum of accelerations, over the scene's own, that counts as a motion."""
 _STILL = 1e-9
 """Rate over the largest one below which something does not move."""
+_PROBE = 1e-6
+"""Steps that slopes of limits are taken over, in radii of gyration and rad."""
+_LEVEL = 1e-6
+"""Slope of a limit, in radii of gyration, below which no motion changes it."""
 
 
 EPSILON = 2
@@ -116,12 +121,23 @@ def _list_modes(formation: Formation, z: Array, epsilon: float, ends: bool) -> l
     A, A_t = kinematics.A[0], kinematics.A_t[0]
     rates = np.vstack([A_t, np.eye(5)[3:]]) @ N
     least = _STILL * np.abs(rates).max()
+    opens = _list_opening(formation, z) @ N
     modes = []
     for way in list_ways(rates):
         signs = np.sign(np.where(np.abs(rates @ way) > least, rates @ way, 0))
         signs[list(formation.rolling_rows)] = 0.0
-        modes.append(_Programme(formation, epsilon, -N if ends else N, A, A_t, rates, signs))
+        side = -1.0 if ends else 1.0
+        modes.append(_Programme(formation, epsilon, side * N, A, A_t, rates, signs, side * opens))
     return modes
+
+
+def _list_opening(formation: Formation, z: Array) -> Array:
+    """Slopes of the limits that are met at `z`, shape (n, 5): from rest these may only grow."""
+    met = np.abs(formation.evaluate_limits(z[None])[0]) < formation.scene.touching
+    steps = _PROBE * np.diag([*[formation.scene.scales.length] * 2, 1.0, 1.0, 1.0])
+    around = formation.evaluate_limits(z + np.vstack([steps, -steps]))[:, met]
+    ahead, behind = np.split(around, 2)
+    return np.asarray((ahead - behind).T / (2 * steps.diagonal()))
 
 
 class _Programme:
@@ -136,6 +152,7 @@ class _Programme:
         A_t: Array,
         rates: Array,
         signs: Array,
+        opens: Array,
     ) -> None:
         scene, n_c, f = formation.scene, formation.n_contacts, N.shape[1]
         self.names, self.epsilon = formation.names, epsilon
@@ -170,6 +187,9 @@ class _Programme:
         self.speed = np.zeros(self.size)
         self.speed[:f] = (signs[moving, None] * rates[moving]).sum(axis=0)
         for row in signs[moving, None] * rates[moving]:
+            rows.append(np.concatenate([-row, np.zeros(self.size - f)]))
+            most.append(0.0)
+        for row in opens[np.abs(opens).max(axis=1, initial=0.0) > _LEVEL]:
             rows.append(np.concatenate([-row, np.zeros(self.size - f)]))
             most.append(0.0)
         self.rows, self.most = np.array(rows), np.array(most)

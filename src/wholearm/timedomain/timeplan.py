@@ -32,13 +32,13 @@ from .staging import outline_stages
 from .timemotion import TimeMotion, make_motions
 from .timenlp import LONGEST
 from .timesearch import Search, Solution
-from .wayguess import AMPLE, PacedWay, list_ways
+from .wayguess import PacedWay, list_ways
 
 FIRST = 10
 """Most intervals of a phase to start with."""
 CONVINCING = 2
 """Motions that miss limits least, from different guesses, after which there seems to be no plan."""
-BUDGET = 2.5
+BUDGET = 3.0
 """Processor time [s] of this thread after which no further guess is begun: of one block."""
 ATTEMPT = 1.5
 """Most processor time of the first run of the solver from a further guess, in seconds or, if that
@@ -117,10 +117,9 @@ def plan_phases(
     spent = time.thread_time() - started
     attempt = max(ATTEMPT, ATTEMPT * spent)
     ways = list_ways(problem, phases[0], z, WAYS) if patient and len(phases) == 1 else []
-    sure = any(way.margin > AMPLE for way in ways)
     # What is far from keeping limits along any way shows at once what is short.
     far = bool(ways) and all(way.margin <= NEAR for way in ways)
-    lost = "" if solution.status.startswith("Ipopt") else f"{solution.status}; "
+    lost = f"{solution.status}; " if solution.is_lost else ""
     short, tried = list[list[Stage]](), dict.fromkeys(["the nearest end"])
     # Each further guess has a share of the budget, however long the first took.
     stop = started + spent + max(BUDGET - spent, BUDGET / 2, spent)
@@ -129,7 +128,7 @@ def plan_phases(
         tried[name] = None
         if guess is not first and not far:
             solution = _solve(search, guess, times, attempt)
-        eased = None if solution.success or sure else ease(search, guess)
+        eased = None if solution.success or solution.is_lost else ease(search, guess)
         if eased is not None and not list_shortfalls(problem, eased):
             solution = _solve(search, eased, times, attempt)
             # What coarse intervals are not short of, finer ones may be.
@@ -140,12 +139,8 @@ def plan_phases(
             return _summarise(problem, search, phases, solution)
         if len(short) == (1 if far else CONVINCING) or time.thread_time() > stop:
             break
-    reason = f"none was found, also of least shortfalls, from {', '.join(tried)}"
-    if sure:
-        # What a local least of shortfalls says is then no reason.
-        short = []
-        reason = f"none was found, although one way has room for it, from {', '.join(tried)}"
-    raise explain(search, problem, phases, short, lost + reason, replan if explained else None)
+    reason = f"{lost}none was found, also of least shortfalls, from {', '.join(tried)}"
+    raise explain(search, problem, phases, short, reason, replan if explained else None)
 
 
 def _list_guesses(
@@ -194,7 +189,8 @@ def _solve(
     solution = search.solve(stages, seconds=seconds)
     if not solution.success:
         return solution
-    search, solution = choose_end(search, adapt(search, improve(search, solution)))
+    better = improve(search, solution) if search.options.mode_search else solution
+    search, solution = choose_end(search, adapt(search, better))
     for _ in range(halvings):
         if solution.success:
             solution = search.solve(_halve(search, solution.stages), solution)

@@ -38,7 +38,7 @@ _ITERATIONS = {Objective.ELASTIC: 300, Objective.RELAX: 150}
 """Most iterations of one solve, if not 150."""
 _DEARER = 0.2
 """How much dearer, relatively, a plan may get by tightening before it counts as lost."""
-_COARSE = 0.5
+_COARSE = 0.1
 """How much dearer, relatively, it may get on finer intervals."""
 
 
@@ -91,6 +91,11 @@ class Solution(NamedTuple):
     def end(self) -> Array:
         """Where the stages end, shape (5,)."""
         return np.asarray(self.stages[-1].guess.nodes[-1, 0])
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether it was one on coarse intervals, and did not hold on finer ones."""
+        return not self.success and not self.status.startswith("Ipopt")
 
     @property
     def watched(self) -> list[tuple[int, ...]]:
