@@ -1,20 +1,23 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from plane import make_formation, measure_gaps, measure_slip
+from tipping import roll, tilting
 from wholearm.contact import parse_contact
 from wholearm.errors import InputError
 from wholearm.explore import close
 from wholearm.formation import Formation
+from wholearm.model import Array
 from wholearm.options import PlanOptions
 from wholearm.outline import load, outline_curve, outline_onwards, outline_phase
 from wholearm.path import trace_phases
 from wholearm.pathdomain.pathplan import plan_path
-from wholearm.problem import Phase, Problem, Until
+from wholearm.problem import End, Phase, Problem, Until
 from wholearm.timedomain.timeplan import plan_phases
 
 CLOSED = 1e-9
@@ -101,3 +104,33 @@ def test_a_flush_edge_that_turns_is_planned_in_the_time_domain_too(square: Probl
     (plan,) = plan_phases(square, square.phases[2:3], curves[1].end, options)
     # Torques that are linear in each interval come a little behind the true least time.
     assert exact * (1 - 1e-4) < plan.motion.duration < 1.02 * exact
+
+
+def test_phases_without_ends_of_their_own_go_towards_the_next_end() -> None:
+    """However many of them there are: each is guessed to go half of the way that is left."""
+    sliding = tilting()
+    (phase,) = sliding.phases
+    rolling = roll(phase.formation, "v1-palm")
+    first, second = (
+        replace(phase, index=k, formation=formation, until=Until(), end=End.SMOOTH)
+        for k, formation in enumerate((phase.formation, rolling))
+    )
+    ways = []
+    for phases in ((first, second), (first,)):
+        problem = replace(sliding, phases=(*phases, replace(phase, index=len(phases))))
+        z = problem.start
+        for own in problem.phases:
+            ways.append(outline_phase(problem, own, z)[-1].z)
+            z = ways[-1][-1]
+    np.testing.assert_allclose(ways[0], ways[3], atol=1e-12)
+    gaps = [evaluate_gap(sliding, way[-1]) for way in ways]
+    start = evaluate_gap(sliding, sliding.start)
+    assert start > gaps[0] > gaps[1] > 0.1 * start
+    np.testing.assert_allclose([gaps[2], gaps[4]], 0.0, atol=1e-9)
+
+
+def evaluate_gap(problem: Problem, z: Array) -> float:
+    """Gap of what ends the only phase of a problem [m]."""
+    contact = problem.phases[0].until.contact
+    assert contact is not None
+    return float(measure_gaps(make_formation(problem.scene, contact.name), z)[0])

@@ -135,16 +135,17 @@ def _find_goal(problem: Problem, phase: Phase, z: Array) -> Array:
     """Nearest configuration at which the phase ends."""
     key = f"phases[{phase.number}].until"
     if phase.until.is_release:
-        if phase.index + 1 == len(problem.phases):
+        ends = [later.until for later in problem.phases[phase.index + 1 :]]
+        ends = [until for until in ends if not until.is_release]
+        if not ends:
             raise InputError(problem.source, key, "is missing; only one freedom needs none")
-        # On the way to where the next phase ends, as far as this one's contacts lead there.
-        coming = replace(phase, until=problem.phases[phase.index + 1].until)
-        ahead = _find_goal(problem, coming, z)
+        # On the way to where a phase ends next, as far as this one's contacts lead there.
+        ahead = _find_goal(problem, replace(phase, until=ends[0]), z)
         middle = close(phase.formation, (z + ahead) / 2, phase.formation.evaluate_slip(z[None])[0])
         return ahead if middle is None else middle
     slip, reasons, goals = phase.formation.evaluate_slip(z[None])[0], [], []
-    ends = list_ends(phase)
-    for end in ends:
+    endings = list_ends(phase)
+    for end in endings:
         goal, reason = _settle(end, z, slip)
         reasons.append(reason)
         goals += [goal] if goal is not None else []
@@ -152,7 +153,7 @@ def _find_goal(problem: Problem, phase: Phase, z: Array) -> Array:
         found = _look_around(phase.formation, _end_formation(phase), z, slip)
         goals = [found] if found is not None else []
     if not goals:
-        found = explore(phase.formation, z, slip, ends)
+        found = explore(phase.formation, z, slip, endings)
         goals = [found] if found is not None else []
     if goals:
         metric = metric_weights(problem.scene)
