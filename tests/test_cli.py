@@ -175,7 +175,7 @@ def test_solve_names_its_output_after_the_problem(folder: Path) -> None:
 
 def test_solve_lists_the_impacts(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     impacts = str(IMPACTS)
-    assert main(["solve", impacts, "-o", "a.npz", "--intervals", "40"]) == 0
+    assert main(["solve", impacts, "-o", "a.npz", "--intervals", "20"]) == 0
     out, err = capsys.readouterr()
     lines = out.splitlines()
     assert err == "" and lines[6] == lines[12] == ""
@@ -491,9 +491,7 @@ def test_bad_trajectory_files(
     assert not Path("a.png").exists()
 
 
-@pytest.mark.parametrize(
-    "name, start", [("a.png", b"\x89PNG"), ("a.pdf", b"%PDF"), ("a.svg", b"<?xml")]
-)
+@pytest.mark.parametrize("name, start", [("a.png", b"\x89PNG"), ("a.svg", b"<?xml")])
 def test_plot(
     folder: Path, planned: Path, capsys: pytest.CaptureFixture[str], name: str, start: bytes
 ) -> None:

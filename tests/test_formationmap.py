@@ -283,8 +283,8 @@ def test_directions_inside_cells_balance(chart: FormationMap) -> None:
 
 
 def test_mirrored_problem_has_the_mirrored_map() -> None:
-    window = Window((-0.16, 0.16), (np.radians(-70.0), np.radians(50.0)))
-    other = Window((-0.16, 0.16), (np.radians(-50.0), np.radians(70.0)))
+    window = Window((-0.16, 0.16), (np.radians(-40.0), np.radians(20.0)))
+    other = Window((-0.16, 0.16), (np.radians(-20.0), np.radians(40.0)))
     corners = TABLE["object"]["vertices"]
     count = len(corners)
     table = copy.deepcopy(TABLE)

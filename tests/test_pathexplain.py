@@ -220,10 +220,10 @@ def test_whole_problems_are_advised() -> None:
     with pytest.raises(
         InfeasibleError, match=r"^phase 4 is infeasible: .*; feasible with "
     ) as caught:
-        solve(edited({"torque limit of finger 2": 0.05}))
+        solve(edited({"torque limit of finger 2": 0.05}), intervals=20)
     (name, value), *others = read_advice(str(caught.value)).items()
     assert name == "torque limit of finger 2" and not others
-    assert solve(edited({name: value})).meta["status"] == "solved"
+    assert solve(edited({name: value}), intervals=20).meta["status"] == "solved"
 
 
 def test_phases_that_impacts_join_are_advised_together() -> None:
@@ -256,9 +256,10 @@ def test_too_short_a_duration_is_named(curves: tuple[Curve, ...], duration: floa
 def test_a_duration_for_all_phases_is_advised() -> None:
     problem = edited({})
     with pytest.raises(InfeasibleError, match=r"^duration = 0\.3 s is not longer") as caught:
-        solve(problem, objective="margin", duration=0.3)
+        solve(problem, objective="margin", duration=0.3, intervals=20)
     value = read_advice(str(caught.value))["duration"]
-    assert solve(problem, objective="margin", duration=value).duration <= value * (1 + 1e-6)
+    longer = solve(problem, objective="margin", duration=value, intervals=20)
+    assert longer.duration <= value * (1 + 1e-6)
 
 
 def test_changing_one_limit_leaves_everything_else(curves: tuple[Curve, ...]) -> None:

@@ -190,7 +190,7 @@ def test_more_time_never_lowers_the_margin(heptagon: Problem, trajectory: Trajec
 
 def test_a_heavier_weight_on_time_makes_it_faster(heptagon: Problem) -> None:
     plans = [
-        solve(heptagon, "effort", time_weight=weight, intervals=40) for weight in (0.1, 1.0, 10.0)
+        solve(heptagon, "effort", time_weight=weight, intervals=20) for weight in (0.1, 1.0, 10.0)
     ]
     durations = [plan.duration for plan in plans]
     assert durations[0] > durations[1] > durations[2]
@@ -200,9 +200,9 @@ def test_a_heavier_weight_on_time_makes_it_faster(heptagon: Problem) -> None:
 def test_default_margin_takes_twice_the_least_time(
     heptagon: Problem, trajectory: Trajectory
 ) -> None:
-    default = solve(heptagon, "margin", intervals=40)
-    least = solve(heptagon, intervals=40).duration
-    given = solve(heptagon, "margin", intervals=40, duration=2 * least)
+    default = solve(heptagon, "margin", intervals=20)
+    least = solve(heptagon, intervals=20).duration
+    given = solve(heptagon, "margin", intervals=20, duration=2 * least)
     assert default.meta["value"] == pytest.approx(given.meta["value"], rel=1e-9)
 
 
