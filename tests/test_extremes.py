@@ -56,27 +56,27 @@ def test_strong_drag_bounds_the_speed() -> None:
 
 def test_dry_friction_above_the_torque_limit_is_named() -> None:
     with pytest.raises(InfeasibleError, match=r"torque limit of finger \d = 2 N m is .* short"):
-        solve(edited(dry=3.0), intervals=20)
+        solve(edited(dry=3.0), intervals=10)
 
 
 def test_friction_is_advised_where_it_is_the_cause() -> None:
     """Each advised value does, and one halfway back to what is given does not."""
     rough = {"palm": 0.35, "finger1": 0.35, "finger2": 0.35}
     with pytest.raises(InfeasibleError, match="feasible with friction of palm = ") as caught:
-        solve(edited(rough), intervals=20)
+        solve(edited(rough), intervals=10)
     advised = re.findall(r"friction of (\w+)( \d)? = ([\d.]+) instead of 0.35", str(caught.value))
     assert advised
     for part, number, value in advised:
         key = part + number.strip()
-        solve(edited(rough | {key: float(value)}), intervals=20)
+        solve(edited(rough | {key: float(value)}), intervals=10)
         with pytest.raises(InfeasibleError):
-            solve(edited(rough | {key: (float(value) + 0.35) / 2}), intervals=20)
+            solve(edited(rough | {key: (float(value) + 0.35) / 2}), intervals=10)
 
 
 def test_jamming_says_which_friction_to_lower() -> None:
     rough = {"palm": 3.0, "finger1": 0.3, "finger2": 0.3}
     with pytest.raises(JammingError, match=r"jams at .*; feasible with friction of palm = ") as jam:
-        solve(edited(rough), intervals=20)
+        solve(edited(rough), intervals=10)
     found = re.search(r"friction of palm = ([\d.]+) instead of 3", str(jam.value))
     assert found is not None
-    solve(edited(rough | {"palm": float(found[1])}), intervals=20)
+    solve(edited(rough | {"palm": float(found[1])}), intervals=10)
