@@ -15,6 +15,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,6 +44,8 @@ BUDGET = 3.0
 ATTEMPT = 1.5
 """Most processor time of the first run of the solver from a further guess, in seconds or, if that
 is longer, over the time of the first guess."""
+NEAREST = "the nearest end"
+"""Name of the first guess."""
 NEAR = -0.3
 """Margin of a way from which on a motion beside it may keep its limits."""
 WAYS = 3
@@ -107,7 +110,7 @@ def plan_phases(
     solution = _solve(search, first, halvings)
     if solution.success:
         return _summarise(problem, search, phases, solution)
-    from .timeexplain import ease, explain, list_shortfalls, refuse
+    from .timeexplain import explain, refuse
 
     def replan(other: Problem) -> object:
         own = [other.phases[phase.index] for phase in phases]
@@ -115,32 +118,70 @@ def plan_phases(
 
     refuse(search, problem, phases, first, replan if explained else None)
     spent = time.thread_time() - started
-    attempt = max(ATTEMPT, ATTEMPT * spent)
     ways = list_ways(problem, phases[0], z, WAYS) if patient and len(phases) == 1 else []
-    # What is far from keeping limits along any way shows at once what is short.
-    far = bool(ways) and all(way.margin <= NEAR for way in ways)
-    lost = f"{solution.status}; " if solution.is_lost else ""
-    short, tried = list[list[Stage]](), dict.fromkeys(["the nearest end"])
     # Each further guess has a share of the budget, however long the first took.
     stop = started + spent + max(BUDGET - spent, BUDGET / 2, spent)
     guesses = _list_guesses(first, halvings, outline if patient else None, ways, len(phases) > 1)
-    for name, times, guess in guesses:
+    attempt = ATTEMPT * max(1.0, spent)
+    found = _try_guesses(search, problem, (first, solution), guesses, ways, (attempt, stop))
+    if found.solution.success:
+        return _summarise(problem, search, phases, found.solution)
+    reason = f"none was found, also of least shortfalls, from {', '.join(found.tried)}"
+    raise explain(search, problem, phases, found.short, reason, replan if explained else None)
+
+
+class _Found(NamedTuple):
+    """What has come of guesses: a solution, or motions that are short of something."""
+
+    solution: Solution
+    short: list[list[Stage]]
+    tried: list[str]
+
+
+def _try_guesses(
+    search: Search,
+    problem: Problem,
+    begun: tuple[list[Stage], Solution],
+    guesses: Iterator[tuple[str, int, list[Stage]]],
+    ways: Sequence[PacedWay],
+    times: tuple[float, float],
+) -> _Found:
+    """Solve from one guess after the other, and for least shortfalls where that leads nowhere.
+
+    Parameters
+    ----------
+    begun : (list of Stage, Solution)
+        The first guess, which is one of them, and what it has led to.
+    ways : sequence of PacedWay
+    times : (float, float), [s]
+        Most processor time of the first run from a guess, and when to begin no other one.
+    """
+    from .timeexplain import ease, list_shortfalls
+
+    attempt, stop = times
+    # What is far from keeping limits along any way shows at once what is short.
+    far = bool(ways) and all(way.margin <= NEAR for way in ways)
+    first, solution = begun
+    short, tried = list[list[Stage]](), dict.fromkeys([NEAREST])
+    for name, halvings, guess in guesses:
         tried[name] = None
         if guess is not first and not far:
-            solution = _solve(search, guess, times, attempt)
-        eased = None if solution.success or solution.is_lost else ease(search, guess)
-        if eased is not None and not list_shortfalls(problem, eased):
-            solution = _solve(search, eased, times, attempt)
+            solution = _solve(search, guess, halvings, attempt)
+        eased = None
+        if not solution.success:
             # What coarse intervals are not short of, finer ones may be.
+            eased = ease(search, _halve(search, solution.stages) if solution.is_lost else guess)
+        if not solution.is_lost and eased is not None and not list_shortfalls(problem, eased):
+            solution = _solve(search, eased, halvings, attempt)
             eased = None if solution.success else ease(search, _halve(search, eased))
         if eased is not None and list_shortfalls(problem, eased):
             short.append(eased)
-        if solution.success:
-            return _summarise(problem, search, phases, solution)
-        if len(short) == (1 if far else CONVINCING) or time.thread_time() > stop:
+        late = time.thread_time() > stop
+        if solution.success or late or len(short) == (1 if far else CONVINCING):
             break
-    reason = f"{lost}none was found, also of least shortfalls, from {', '.join(tried)}"
-    raise explain(search, problem, phases, short, reason, replan if explained else None)
+    if not solution.success and not short and (eased := ease(search, first)) is not None:
+        short = [eased] if list_shortfalls(problem, eased) else []
+    return _Found(solution, short, list(tried))
 
 
 def _list_guesses(
@@ -167,13 +208,13 @@ def _list_guesses(
         for way in [way for way in ways if way.margin > NEAR] or ways[:1]:
             stages = outline(halvings, _PACES[0], way=way)
             yield f"a way with the margin {way.margin:.3g}", halvings, stages
-    yield "the nearest end", halvings, first
+    yield NEAREST, halvings, first
     if outline is None:
         return
     for times in dict.fromkeys((halvings, 0)):
         for pace in _PACES:
             if onwards or times != halvings or pace != _PACES[0]:
-                name = f"{'an end ahead' if onwards else 'the nearest end'} at {pace:g}"
+                name = f"{'an end ahead' if onwards else NEAREST} at {pace:g}"
                 yield f"{name} times the duration of a fall", times, outline(times, pace, onwards)
 
 

@@ -28,8 +28,10 @@ ROUNDS = 24
 """Most times that limits are tightened."""
 REFINEMENTS = 8
 """Most times that intervals are halved because of misses."""
-MOST = 256
-"""Intervals of all stages from which on none is halved."""
+MOST = 64
+"""Intervals of each phase from which on none is halved."""
+_PATIENCE = 80
+"""Most iterations of one solve on finer intervals, that starts from a solution."""
 DEFECT = 2e-8
 """What collocation may miss z and z' by at the end of an interval, in the scene's own units."""
 DEAR = 1e-5
@@ -287,10 +289,13 @@ class Search:
                 dear | (np.abs(motion.defects).max(axis=(1, 2)) > DEFECT)
                 for dear, motion in zip(self.find_dear(solution, misses), motions, strict=True)
             ]
-            few = sum(stage.intervals for stage in solution.stages) < MOST
+            phases = len({stage.phase for stage in solution.stages})
+            few = sum(stage.intervals for stage in solution.stages) < MOST * phases
             if few and refined < REFINEMENTS and any(mine.any() for mine in marked):
                 refined += 1
-                finer = self.solve(halve(solution.stages, self.scheme, marked), solution)
+                finer = self.solve(
+                    halve(solution.stages, self.scheme, marked), solution, most=_PATIENCE
+                )
                 if finer.success:
                     if finer.cost - first > _COARSE * abs(first):
                         status = "a plan on finer intervals is much dearer"
