@@ -85,13 +85,15 @@ def test_halved_intervals_hold_the_same_motion(name: str, degree: int) -> None:
     part = Course(degree).sample(scheme, breaks)
     # Torques and motions that step or bend from interval to interval, unlike one polynomial.
     part = part._replace(tau=rng.normal(size=(4, 2, 2)), forces=rng.normal(size=part.forces.shape))
-    finer = bisect(part, scheme, np.array([True, False, True, False]))
+    finer = bisect(part, scheme, np.array([1, 0, 2, 0]))
     widths = np.diff(breaks)
-    halves = [widths[0] / 2, widths[0] / 2, widths[1], widths[2] / 2, widths[2] / 2, widths[3]]
+    halves = [*[widths[0] / 2] * 2, widths[1], *[widths[2] / 4] * 4, widths[3]]
     np.testing.assert_allclose(finer.fractions, halves, atol=1e-15)
     assert finer.duration == part.duration
-    for k, (parent, inside) in enumerate([(0, 0), (0, 1), (1, None), (2, 0), (2, 1), (3, None)]):
-        start, width = (0.0, 1.0) if inside is None else (inside / 2, 0.5)
+    owners = [(0, 0), (0, 1), (1, 0), *[(2, k) for k in range(4)], (3, 0)]
+    for k, (parent, inside) in enumerate(owners):
+        width = finer.fractions[k] / widths[parent]
+        start = inside * width
         table = scheme.interpolate(start + width * scheme.points)
         np.testing.assert_allclose(finer.forces[k], table @ part.forces[parent], atol=1e-11)
         ends = np.array([[1 - start, start], [1 - start - width, start + width]])
@@ -102,4 +104,4 @@ def test_halved_intervals_hold_the_same_motion(name: str, degree: int) -> None:
 def test_nothing_changes_where_no_interval_is_marked(name: str, degree: int) -> None:
     scheme = make_scheme(name, degree)
     part = Course(degree).sample(scheme, np.linspace(0.0, 1.0, 6))
-    check(bisect(part, scheme, np.zeros(5, dtype=bool)), part)
+    check(bisect(part, scheme, np.zeros(5, dtype=int)), part)

@@ -36,7 +36,7 @@ def coarse(objective: str) -> Solution:
 @pytest.mark.parametrize("objective", ["time", "effort"])
 def test_halved_intervals_start_from_the_multipliers_before(objective: str) -> None:
     solution = coarse(objective)
-    every = [np.ones(stage.intervals, dtype=bool) for stage in solution.stages]
+    every = [np.ones(stage.intervals, dtype=int) for stage in solution.stages]
     finer = halve(solution.stages, SCHEME, every)
     costs = []
     for before in (solution, None):
@@ -58,7 +58,7 @@ def test_first_multipliers_push_away_from_the_bounds_there_are() -> None:
 
 def test_multipliers_are_shared_among_the_intervals_that_replace_one() -> None:
     solution = coarse("time")
-    marked = [np.arange(stage.intervals) % 2 == 0 for stage in solution.stages]
+    marked = [(np.arange(stage.intervals) + 1) % 2 for stage in solution.stages]
     stages = halve(solution.stages, SCHEME, marked)
     search = search_for("time")
     nlp = search.build(stages)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from ..contact import Contact
 from ..errors import WholearmError
+from .revising import settle
 from .stage import Stage
 from .timesearch import Price, Search, Solution
 
@@ -33,7 +34,7 @@ def choose_end(search: Search, solution: Solution) -> tuple[Search, Solution]:
             break
         least, best = total, (search, solution)
         search = replace(search, price=Price(gradient, solution.end))
-        solution = search.solve(solution.stages, solution)
+        solution = search.solve(settle(solution.stages), solution)
         if not solution.success:
             break
     return best

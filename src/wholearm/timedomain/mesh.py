@@ -47,10 +47,11 @@ def resample(
     )
 
 
-def bisect(part: StagePoints, scheme: Scheme, marked: NDArray[np.bool_]) -> StagePoints:
-    """Halve the intervals that are marked, shape (K,)."""
-    middles = part.breaks[:-1] + part.fractions / 2
-    return resample(part, scheme, np.sort(np.append(part.breaks, middles[marked])))
+def bisect(part: StagePoints, scheme: Scheme, times: NDArray[np.int64]) -> StagePoints:
+    """Halve each interval and its parts so many times, shape (K,)."""
+    pairs = zip(part.breaks[:-1], part.breaks[1:], 2**times, strict=True)
+    pieces = [np.linspace(start, stop, count, endpoint=False) for start, stop, count in pairs]
+    return resample(part, scheme, np.append(np.concatenate(pieces), part.breaks[-1]))
 
 
 def _interpolate(part: StagePoints, scheme: Scheme, places: Array) -> tuple[Array, ...]:

@@ -45,13 +45,15 @@ def improve(search: Search, solution: Solution) -> Solution:
 
 
 def adapt(search: Search, solution: Solution) -> Solution:
-    """Let the intervals choose their shares of the duration: torques then switch between them."""
+    """Let the intervals choose their shares of the duration: torques then switch between them.
+
+    The stages returned still choose, at a price that solving for finer ones leaves out.
+    """
     count = sum(stage.intervals for stage in solution.stages)
     price = STRETCH * abs(solution.cost) / count
     loose = [replace(stage, adapts=price) for stage in solution.stages]
     moved = search.solve(loose, solution, most=PATIENCE)
-    fixed = search.solve([replace(stage, adapts=0.0) for stage in moved.stages], moved)
-    return fixed if fixed.success and fixed.cost < solution.cost else solution
+    return moved if moved.success and moved.cost < solution.cost else solution
 
 
 def _list(search: Search, solution: Solution, leaning: bool = False) -> list[list[Stage]]:

@@ -240,7 +240,7 @@ def _solve(
 
 def _halve(search: Search, stages: list[Stage]) -> list[Stage]:
     """Stages with all intervals halved."""
-    every = [np.ones(stage.intervals, dtype=bool) for stage in stages]
+    every = [np.ones(stage.intervals, dtype=int) for stage in stages]
     return halve(stages, search.scheme, every)
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..costtogo import CostToGo
 from ..model import Array
@@ -16,7 +15,7 @@ from ..problem import Problem
 from .between import Limits, find_misses, look_between, raise_bounds, watch_missed
 from .collocation import Scheme, make_scheme
 from .ownunits import in_own_units, scale_options, unit_lengths, unit_of
-from .revising import adopt, halve, watch_broken
+from .revising import adopt, count_halvings, halve, settle, watch_broken
 from .stage import Stage
 from .timelayout import pack, unpack
 from .timelimits import Give
@@ -32,10 +31,6 @@ MOST = 64
 """Intervals of each phase from which on none is halved."""
 _PATIENCE = 80
 """Most iterations of one solve on finer intervals, that starts from a solution."""
-DEFECT = 2e-8
-"""What collocation may miss z and z' by at the end of an interval, in the scene's own units."""
-DEAR = 1e-5
-"""What limits that are raised in an interval may cost, over the cost, without halving it."""
 _ITERATIONS = {Objective.ELASTIC: 300, Objective.RELAX: 150}
 """Most iterations of one solve, if not 150."""
 _DEARER = 0.2
@@ -249,10 +244,10 @@ class Search:
             {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")},
         )
 
-    def find_dear(self, solution: Solution, misses: Sequence[Limits]) -> list[NDArray[np.bool_]]:
-        """Intervals in which raising limits by their misses would cost much, each of shape (K,)."""
+    def price_misses(self, solution: Solution, misses: Sequence[Limits]) -> list[Array]:
+        """What raising limits by their misses would cost in each interval, over the cost, (K,)."""
         on_x, on_g = (np.abs(solution.multipliers[key]) for key in ("lam_x0", "lam_g0"))
-        marked = []
+        prices = []
         for k, (stage, miss) in enumerate(zip(solution.stages, misses, strict=True)):
             layout, rows = solution.nlp.layouts[k], solution.nlp.rows_of[k].limits
             n_c, R = stage.formation.n_contacts, stage.formation.n_rolling
@@ -260,8 +255,8 @@ class Search:
             both = on_g[rows.cones].sum(axis=1)
             grip = both[:, :R] + both[:, R:]
             cost = (price * miss.c_n).sum(axis=1) + (grip * miss.cone).sum(axis=1)
-            marked.append(np.asarray(cost > DEAR * abs(solution.cost)))
-        return marked
+            prices.append(np.asarray(cost / max(abs(solution.cost), 1e-300)))
+        return prices
 
     def hold(self, solution: Solution) -> Solution:
         """Go on from a solution until limits hold between points too."""
@@ -285,16 +280,17 @@ class Search:
                 for stage, look in zip(solution.stages, looks, strict=True)
             ]
             worst = max(miss.worst for miss in misses)
-            marked = [
-                dear | (np.abs(motion.defects).max(axis=(1, 2)) > DEFECT)
-                for dear, motion in zip(self.find_dear(solution, misses), motions, strict=True)
+            prices = self.price_misses(solution, misses)
+            times = [
+                count_halvings(price, motion.defects, self.scheme)
+                for price, motion in zip(prices, motions, strict=True)
             ]
             phases = len({stage.phase for stage in solution.stages})
             few = sum(stage.intervals for stage in solution.stages) < MOST * phases
-            if few and refined < REFINEMENTS and any(mine.any() for mine in marked):
+            if few and refined < REFINEMENTS and any(mine.any() for mine in times):
                 refined += 1
                 finer = self.solve(
-                    halve(solution.stages, self.scheme, marked), solution, most=_PATIENCE
+                    halve(solution.stages, self.scheme, times), solution, most=_PATIENCE
                 )
                 if finer.success:
                     if finer.cost - first > _COARSE * abs(first):
@@ -303,6 +299,11 @@ class Search:
                     solution = finer
                     limits = [Limits.none(stage) for stage in solution.stages]
                     continue
+            if any(stage.adapts for stage in solution.stages):
+                solution = self.solve(settle(solution.stages), solution)
+                if not solution.success:
+                    return solution
+                continue
             if worst <= 1:
                 return solution
             limits = [raised.raised(miss) for raised, miss in zip(limits, misses, strict=True)]
