@@ -23,6 +23,7 @@ from wholearm.timedomain.staging import outline_stages
 from wholearm.timedomain.timemotion import TimeMotion
 from wholearm.timedomain.timeplan import plan_phases
 from wholearm.timedomain.timesearch import MOST, Search
+from wholearm.verdict import DEPARTURE
 from wholearm.verify import verify
 
 OPTIONS = PlanOptions(time_intervals=10)
@@ -137,8 +138,9 @@ def test_a_contact_rolls_in_one_phase_and_slides_in_the_other(rolls_first: bool)
     assert report.ok, report.to_text()
     assert report.phases[0].until == "change of v1-palm"
     ends = np.cumsum([motion.duration for motion in plan.motions])
-    # How late a contact comes to rest is an error of its speed over what slows it down.
-    assert report.phases[0].arrival == pytest.approx(ends[0], abs=1e-4 * ends[1])
+    # How late a contact comes to rest, or slips, is an error of its speed over what slows it down,
+    # or of its force over how fast that grows: no more than a replay may depart.
+    assert report.phases[0].arrival == pytest.approx(ends[0], abs=DEPARTURE * ends[1])
     # No interval is halved for ever, and neither phase shrinks to nothing.
     motions = [motion for motion in plan.motions if isinstance(motion, TimeMotion)]
     stages = [stage for motion in motions for stage in motion.stages]
