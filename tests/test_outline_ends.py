@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from plane import make_formation, measure_gaps, measure_slip
+from timed import landing
 from tipping import roll, tilting
 from wholearm.contact import parse_contact
 from wholearm.errors import InputError
@@ -129,8 +130,26 @@ def test_phases_without_ends_of_their_own_go_towards_the_next_end() -> None:
     np.testing.assert_allclose([gaps[2], gaps[4]], 0.0, atol=1e-9)
 
 
+def test_a_phase_that_rolls_between_others_does_not_go_back() -> None:
+    """Though the way back is longer; only a contact that is let go may take that."""
+    problem = landing()
+    *before, last = problem.phases
+    rolling = roll(last.formation, "v1-palm")
+    opened = [
+        replace(last, index=last.index + k, formation=one, until=Until(), end=End.SMOOTH)
+        for k, one in enumerate((last.formation, rolling))
+    ]
+    parts = replace(problem, phases=(*before, *opened, replace(last, index=last.index + 2)))
+    z = outline_phase(parts, parts.phases[4], trace_phases(parts)[-1].end)[-1].z[-1]
+    gaps = [evaluate_gap(problem, z)]
+    for phase in parts.phases[5:]:
+        z = outline_phase(parts, phase, z)[-1].z[-1]
+        gaps.append(evaluate_gap(problem, z))
+    assert (np.diff(gaps) < 0).all() and gaps[-1] == pytest.approx(0.0, abs=CLOSED)
+
+
 def evaluate_gap(problem: Problem, z: Array) -> float:
-    """Gap of what ends the only phase of a problem [m]."""
-    contact = problem.phases[0].until.contact
+    """Gap of what ends the last phase of a problem [m]."""
+    contact = problem.phases[-1].until.contact
     assert contact is not None
     return float(measure_gaps(make_formation(problem.scene, contact.name), z)[0])

@@ -73,9 +73,15 @@ def trace_phase(problem: Problem, phase: Phase, z: Array) -> Curve:
     if not phase.until.is_release:
         return _trace_phase(problem, phase, z)
     formation, until = phase.formation, phase.until
-    ways = [trace_curve(formation, z, way, until) for way in _headings(formation, z, until)]
-    curve = max(ways, key=lambda curve: curve.length)
-    if curve.length < HELD * problem.scene.scales.length:
+    later = problem.phases[phase.index + 1 :]
+    ends = [*(p.until for p in later if not p.until.is_release), until]
+    ways = [trace_curve(formation, z, way, until) for way in _headings(formation, z, ends[0])]
+    curve, least = max(ways, key=lambda curve: curve.length), HELD * problem.scene.scales.length
+    same = later and set(later[0].formation.contacts) == set(formation.contacts)
+    if same and ways[0].length >= least:
+        # Only modes change, which can be anywhere on the way to where a phase ends next.
+        curve = ways[0]
+    if curve.length < least:
         key = f"phases[{phase.number}].contacts"
         raise InputError(problem.source, key, f"cannot move: {curve.ending}")
     return curve
