@@ -110,7 +110,7 @@ def test_solve_writes_the_plan(folder: Path, capsys: pytest.CaptureFixture[str])
     assert sorted(path.name for path in folder.iterdir()) == ["a.csv", "a.npz"]
 
 
-@pytest.mark.parametrize("more", [["linear"], ["hold"], []])
+@pytest.mark.parametrize("more", [["hold"], []])
 def test_solve_writes_samples_and_what_becomes_of_them(
     folder: Path, capsys: pytest.CaptureFixture[str], more: list[str]
 ) -> None:

@@ -30,7 +30,7 @@ from wholearm.model import Array, Scene
 from wholearm.problem import Problem, build_problem
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
-WINDOW = Window((-0.16, 0.16), (np.radians(-110.0), np.radians(60.0)))
+WINDOW = Window((-0.16, 0.16), (np.radians(-75.0), np.radians(30.0)))
 
 
 def change(**edits: Any) -> Problem:
@@ -45,14 +45,14 @@ def change(**edits: Any) -> Problem:
 
 @pytest.fixture(scope="module")
 def chart(heptagon: Problem) -> FormationMap:
-    return build_map(heptagon, resolution=60, window=WINDOW)
+    return build_map(heptagon, resolution=40, window=WINDOW)
 
 
 @pytest.fixture(scope="module")
 def pointed() -> FormationMap:
     """Short pointed fingers: tips reach edges, and much of the plane is out of reach."""
     problem = change(radius=0.0, length=0.12)
-    return build_map(problem, resolution=60, window=WINDOW)
+    return build_map(problem, resolution=40, window=WINDOW)
 
 
 @pytest.fixture(scope="module", params=["chart", "pointed"])
@@ -160,7 +160,7 @@ def test_flush_edges_lie_on_palm_or_link(every: FormationMap) -> None:
 
 
 def test_crossings_have_five_closed_contacts(every: FormationMap) -> None:
-    assert sum(len(crossing.flush) >= 2 for crossing in every.crossings) > 8
+    assert sum(len(crossing.flush) >= 2 for crossing in every.crossings) > 5
     for crossing in every.crossings:
         assert len(crossing.contacts) >= 5
         worst = np.abs(gaps(every.problem.scene, crossing.contacts, crossing.z[None])).max()
@@ -176,7 +176,7 @@ def test_every_change_of_cell_is_a_border(every: FormationMap) -> None:
     stops = starts + rng.uniform(-0.02, 0.02, (1500, 2)) * size
     first, last = (label_cells(scene, *points.T) for points in (starts, stops))
     both = (first[:, 0] != NOWHERE) & (last[:, 0] != NOWHERE) & (first != last).any(axis=1)
-    assert both.sum() > 100
+    assert both.sum() > 60
     low, high, first = starts[both], stops[both], first[both]
     for _ in range(50):
         middle = (low + high) / 2

@@ -290,17 +290,17 @@ def test_a_block_that_starts_elsewhere_gets_another_share() -> None:
     whole = problem_of(TWICE)
     phases = tuple(replace(phase, index=k) for k, phase in enumerate(whole.phases[4:8]))
     problem = replace(whole, start=trace_phases(whole)[-1].end, phases=phases)
-    fastest = solve(problem, time_intervals=4, intervals=20)
-    times = np.array(fastest.meta["phase_durations"])
+    times = np.array(plan_of(TWICE).meta["phase_durations"][4:8])
     plan = solve(problem, "margin", duration=1.5 * times.sum(), time_intervals=4, intervals=20)
     got = plan.meta["phase_durations"]
-    starts = [each.motions[2].evaluate(np.zeros(1)).z[0] for each in (plan, fastest)]
+    slides = plan.motions[2], plan_of(TWICE).motions[6]
+    starts = [motion.evaluate(np.zeros(1)).z[0] for motion in slides]
     assert np.abs(starts[0] - starts[1]).max() > 1e-5
     # Such a slide may take its time in proportion to its own least time, and the next one the rest.
     slide = replace(problem, start=starts[0], phases=(replace(phases[2], index=0),))
     own = solve(slide, intervals=20).duration
-    assert got[0] + got[1] < 1.5 * (times[0] + times[1]) * (1 + 1e-6)
-    assert got[2] == pytest.approx(1.5 * own, rel=2e-3)
+    assert got[0] + got[1] < 1.5 * (times[0] + times[1]) * (1 + 2e-3)
+    assert got[2] == pytest.approx(1.5 * own, rel=4e-3)
     assert got[3] == pytest.approx(1.5 * (times[2] + times[3] - own), rel=1e-2)
     assert min(plan.meta["phase_values"]) >= problem.epsilon
     report = verify(problem, plan)

@@ -389,7 +389,7 @@ def test_trajectory_without_its_problem_is_refused(planned: Trajectory) -> None:
 
 
 def test_odd_names_are_drawn_as_they_are(planned: Trajectory) -> None:
-    for name in ("cost $5 and \\frac{", "a long name " * 20, ""):
+    for name in ("cost $5 and \\frac{" + 20 * " a long name", ""):
         meta = {**planned.meta, "name": name}
         check_layout(plots.force_margins(dataclasses.replace(planned, meta=meta)))
 
