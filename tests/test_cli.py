@@ -480,7 +480,7 @@ def test_bad_torque_files(folder: Path, capsys: pytest.CaptureFixture[str], case
         ("a.npz", None, "cannot be read: No such file"),
         ("a.npz", b"", "is not a trajectory file"),
         ("a.npz", b"nothing like it", "is not a trajectory file"),
-        ("a.txt", b"", "ending '.txt' given; allowed are .npz and .csv"),
+        ("a.txt", b"", "ending '.txt' given; allowed: .npz, .csv"),
     ],
 )
 def test_bad_trajectory_files(

@@ -382,7 +382,7 @@ def test_command_lists_phases(capsys: pytest.CaptureFixture[str]) -> None:
         (["--list", "nan,0", "0,0"], "--list"),
         (["--list", "0,0"], "route: 1 pose"),
         (["--phi", "3,2"], "--phi: '3,2' given"),
-        (["-o", "map.txt"], "allowed are .png, .pdf, .svg"),
+        (["-o", "map.txt"], "allowed: .png, .pdf, .svg"),
         (["--plan", "missing.npz"], "missing.npz: cannot be read"),
     ],
 )

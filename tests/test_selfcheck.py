@@ -42,7 +42,22 @@ def test_torques_that_do_not_carry_the_motion_are_found() -> None:
     check = check_plan(problem, weak, Allowance())
     assert check.failure is not None and check.failure == (2, verify(problem, weak).reason)
     # The first phase departs by the braking that it lacks.
-    assert check.find_culprit(problem.scene.scales, Allowance(departure=1e-5)) == 1
+    assert check.find_culprit(problem.scene.scales, Allowance(departure=1e-5), np.zeros(1)) == 1
+
+
+def test_a_phase_that_hardly_stops_is_found_by_where_the_next_one_ends() -> None:
+    """What departs is the second phase, by the speed that the first one leaves."""
+    problem, trajectory = plan()
+    check = check_plan(
+        problem, replace(trajectory, torque=change(trajectory.torque, brake_less)), Allowance()
+    )
+    first, *others = check.report.phases
+    speed, least = 1e-3, Allowance(departure=1.0, rest_speed=1.0)
+    report = replace(check.report, phases=(replace(first, end_speed=speed), *others))
+    left = check._replace(report=report)
+    lasts = np.array([1.0, 2.0 * least.departure * problem.scene.scales.length / speed])
+    assert left.find_culprit(problem.scene.scales, least, lasts) == 1
+    assert left.find_culprit(problem.scene.scales, least, lasts / 4) == 2
 
 
 def test_friction_the_wrong_way_is_found_by_the_residual() -> None:

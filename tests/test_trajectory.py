@@ -89,9 +89,39 @@ def test_assemble_lays_phases_end_to_end(trajectory: Trajectory) -> None:
 def test_at_asks_the_right_phase(
     trajectory: Trajectory, t: float, phase: int, local: float
 ) -> None:
-    expected = MOTIONS[phase].evaluate(np.array([local]))
-    for found, wanted in zip(trajectory.at(t), expected, strict=True):
-        np.testing.assert_allclose(found, wanted, atol=1e-15)
+    check_samples(trajectory, trajectory.at(t), phase, np.array([local]))
+
+
+def check_samples(trajectory: Trajectory, found: Samples, phase: int, local: Array) -> None:
+    """Samples against those of a phase; forces of other contacts are NaN."""
+    motion = MOTIONS[phase]
+    own = [trajectory.contacts.index(name) for name in motion.contacts]
+    expected = motion.evaluate(local)
+    for k, (whole, wanted) in enumerate(zip(found, expected, strict=True)):
+        columns = np.arange(whole.shape[1]) if k < 4 else np.array(own)
+        np.testing.assert_allclose(whole[:, columns], wanted, atol=1e-15)
+        assert np.isnan(np.delete(whole, columns, axis=1)).all()
+
+
+def test_at_takes_many_times_in_any_order(trajectory: Trajectory) -> None:
+    times = np.array([0.8, 0.1, 0.7, 0.3])
+    many = trajectory.at(times)
+    for row, (phase, local) in enumerate([(1, 0.1), (0, 0.1), (1, 0.0), (0, 0.3)]):
+        one = Samples(*(table[row : row + 1] for table in many))
+        check_samples(trajectory, one, phase, np.array([local]))
+
+
+def test_representations_are_one_line(trajectory: Trajectory) -> None:
+    assert repr(trajectory) == "Trajectory(2 phases, 0.9 s)"
+    assert "\n" not in repr(trajectory.torque)
+
+
+def test_files_have_their_endings(trajectory: Trajectory, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"ending '.mat' given; allowed: .npz"):
+        trajectory.save(tmp_path / "plan.mat")
+    with pytest.raises(InputError, match=r"ending '' given; allowed: .csv"):
+        trajectory.save_torques(tmp_path / "torques")
+    assert not list(tmp_path.iterdir())
 
 
 def test_at_reaches_the_end_and_no_farther(trajectory: Trajectory) -> None:

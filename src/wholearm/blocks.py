@@ -98,6 +98,9 @@ class Planning:
         least duration, and as used, where a block turned out to start from somewhere else.
     least : list of PhasePlan
         Those plans of least duration; empty for other objectives.
+    ahead : bool
+        Whether blocks end with regard to what follows them. Plans that durations are shared out
+        by do not, as blocks for the objective `margin` cannot.
     """
 
     problem: Problem
@@ -106,6 +109,7 @@ class Planning:
     shares: list[float | None]
     allowed: list[float | None]
     least: Plans = field(default_factory=list)
+    ahead: bool = True
 
     @property
     def plans(self) -> Plans:
@@ -142,7 +146,7 @@ def plan_blocks(problem: Problem, options: PlanOptions, report: Callable[[str], 
     none: list[float | None] = [None] * len(problem.phases)
     planning = Planning(problem, options, (), none, none)
     if options.goal is Objective.MARGIN:
-        first = replace(planning, options=_for_time(options))
+        first = replace(planning, options=_for_time(options), ahead=False)
         least = _plan_each(first, [0] * count, report).plans
         planning = replace(planning, shares=_share_duration(least, options.duration), least=least)
     return _require_margin(_plan_each(planning, [0] * count, report))
@@ -191,7 +195,7 @@ def _plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str],
             numbers = "-".join(str(phase.number) for phase in phases)
             report(f"phase {numbers} of {len(problem.phases)}: {options.goal.value}")
             own = _refine(options, known, finer[index])
-            to_go = _look_ahead(problem, phases, own)
+            to_go = _look_ahead(problem, phases, own) if planning.ahead else None
             made = _plan_block(problem, phases, z, own, allowed, to_go)
             known = BlockPlan(phases, z, *wanted, fastest, *made)
         blocks.append(known)

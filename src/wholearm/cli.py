@@ -166,7 +166,7 @@ class _Version(argparse.Action):
 def _solve(options: argparse.Namespace) -> int:
     from dataclasses import fields
 
-    from .files import require_writable, together, write_text
+    from .files import require_ending, require_writable, together, write_text
     from .options import PlanOptions
     from .outline import load
     from .plan import solve_with
@@ -180,9 +180,10 @@ def _solve(options: argparse.Namespace) -> int:
         if getattr(options, key) is not None
     }
     plan_options = PlanOptions(**given)
-    for path in (output, options.torques):
+    for path, ending in ((output, ".npz"), (options.torques, ".csv")):
         if path is not None:
             require_writable(path)
+            require_ending(path, ending)
     _check_sampling(options)
     problem = load(options.problem)
     trajectory = solve_with(problem, plan_options, _progress())
@@ -246,15 +247,12 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _read_torques(path: str) -> Trajectory | TorqueProfile:
+    from .files import require_ending
     from .torque import read_torque_csv
     from .trajectory import load_trajectory
 
-    ending = os.path.splitext(path)[1].lower()
-    if ending == ".csv":
-        return read_torque_csv(path)
-    if ending == ".npz":
-        return load_trajectory(path)
-    raise InputError(path, "", f"ending {ending!r} given; allowed are .npz and .csv")
+    csv = require_ending(path, ".npz", ".csv") == ".csv"
+    return read_torque_csv(path) if csv else load_trajectory(path)
 
 
 def _plot(options: argparse.Namespace) -> int:

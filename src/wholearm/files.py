@@ -31,6 +31,21 @@ def require_writable(path: str | os.PathLike[str]) -> None:
         raise InputError(target, "", f"cannot be written: no permission in {folder}")
 
 
+def require_ending(path: str | os.PathLike[str], *allowed: str) -> str:
+    """Return the ending of a file's name, in small letters; a device or a pipe needs none.
+
+    Raises
+    ------
+    InputError
+        If it is none of those that are allowed.
+    """
+    ending = os.path.splitext(path)[1].lower()
+    if ending not in allowed and not _is_special(os.fspath(path)):
+        text = f"ending {ending!r} given; allowed: {', '.join(allowed)}"
+        raise InputError(os.fspath(path), "", text)
+    return ending
+
+
 def write_whole(path: str | os.PathLike[str], write: Callable[[BinaryIO], object]) -> None:
     """Write a file through a temporary one beside it, renamed when complete.
 

@@ -87,6 +87,10 @@ class Formation(Keeper):
         if not set(self.rolling) <= set(self.contacts):
             raise ValueError(f"{describe(self.rolling)} roll, which are no contacts")
 
+    def __repr__(self) -> str:
+        rolls = [" rolling" if contact in self.rolling else "" for contact in self.contacts]
+        return f"Formation({', '.join(map(str.__add__, self.names, rolls))})"
+
     @property
     def n_contacts(self) -> int:
         """Number of contacts n_c."""

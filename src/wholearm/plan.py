@@ -23,6 +23,11 @@ from .torque import TorqueProfile
 from .trajectory import Motion, Trajectory, assemble
 from .transition import Transition
 
+_SETTINGS = (
+    "intervals", "transcription", "time_weight", "duration", "time_intervals", "degree", "scheme",
+    "opening", "clearance",
+)  # fmt: skip
+"""Options that `meta` says what a plan was made with."""
 UNITS = {Objective.TIME: "s", Objective.EFFORT: "(N m)^2 s", Objective.MARGIN: "N"}
 
 
@@ -143,9 +148,7 @@ def _describe(planning: Planning) -> dict[str, Any]:
         "modes": _list_modes(plans),
         "sequences": [plan.sequences for plan in plans],
         "phase_durations": [plan.motion.duration for plan in plans],
-        "intervals": options.intervals,
-        "transcription": options.transcription,
-        "time_weight": options.time_weight,
+        **{name: getattr(options, name) for name in _SETTINGS},
         "iterations": [plan.iterations for plan in plans],
         "solves": [plan.solves for plan in plans],
         "versions": {

@@ -154,7 +154,7 @@ def require_format(path: str | os.PathLike[str]) -> str:
     """Return the ending of `path`, or raise `InputError` if it is none of .png, .pdf and .svg."""
     ending = os.path.splitext(path)[1].lower()
     if ending not in _FORMATS:
-        raise InputError(str(path), "", f"ending {ending!r} given; allowed are .png, .pdf, .svg")
+        raise InputError(str(path), "", f"ending {ending!r} given; allowed: {', '.join(_FORMATS)}")
     return ending
 
 

@@ -163,6 +163,9 @@ class Problem:
         object.__setattr__(self, "phases", phases)
         object.__setattr__(self, "table", match_table(self))
 
+    def __repr__(self) -> str:
+        return f"Problem({self.name!r}, {len(self.phases)} phases)"
+
     def with_(self, changes: Mapping[str, Any] | None = None, /, **named: Any) -> Problem:
         """Return the problem with other values, checked like those of a file.
 

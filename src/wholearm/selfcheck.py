@@ -75,16 +75,28 @@ class Check(NamedTuple):
         assert self.report.failed_phase is not None
         return self.report.failed_phase, self.report.reason
 
-    def find_culprit(self, scales: Scales, allowance: Allowance) -> int:
-        """Number of the phase to refine: the first that departs or does not stop, or that fails."""
+    def find_culprit(self, scales: Scales, allowance: Allowance, durations: Array) -> int:
+        """Number of the phase to refine: the first that departs or does not stop, or that fails.
+
+        What is left of the speed at a stop must not carry the phase that follows away, either.
+
+        Parameters
+        ----------
+        scales : Scales
+        allowance : Allowance
+        durations : ndarray, shape (n_phases,), [s]
+        """
         assert self.failure is not None
+        following = dict(enumerate(durations[1:].tolist(), start=1))
         for phase in self.report.phases:
             departs = (
                 phase.deviation is not None
                 and measure_departure(phase.deviation, scales.length) > allowance.departure
             )
-            fast = (phase.end_speed or 0.0) > allowance.rest_speed * scales.speed
-            if departs or fast:
+            speed = phase.end_speed or 0.0
+            carried = speed * following.get(phase.number, 0.0)
+            fast = speed > allowance.rest_speed * scales.speed
+            if departs or fast or carried > allowance.departure * scales.length:
                 return min(phase.number, self.failure[0])
         return self.failure[0]
 
@@ -125,7 +137,8 @@ def replay_plan(
         if check.failure is None:
             break
         accepted = check_plan(problem, trajectory, usual, closely=True)
-        number = check.find_culprit(problem.scene.scales, strict)
+        durations = np.diff(trajectory.phase_starts)
+        number = check.find_culprit(problem.scene.scales, strict, durations)
         index = next(
             k
             for k, block in enumerate(planning.blocks)

@@ -32,6 +32,9 @@ class TorqueProfile:
     breaks: Array
     coefficients: Array
 
+    def __repr__(self) -> str:
+        return f"TorqueProfile({len(self.coefficients)} pieces, {self.duration:.6g} s)"
+
     @property
     def duration(self) -> float:
         """From the first break to the last [s]."""

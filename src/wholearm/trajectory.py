@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .archive import read_arrays
 from .errors import InputError
-from .files import write_text, write_whole
+from .files import require_ending, write_text, write_whole
 from .model import Array
 from .torque import MOST, TorqueProfile
 
@@ -96,6 +96,9 @@ class Trajectory:
     motions: tuple[Motion, ...]
     meta: Mapping[str, Any]
 
+    def __repr__(self) -> str:
+        return f"Trajectory({len(self.motions)} phases, {self.duration:.6g} s)"
+
     @property
     def duration(self) -> float:
         """How long the motion lasts [s]."""
@@ -137,22 +140,34 @@ class Trajectory:
         """Accelerations (q'', theta''), shape (n, 5)."""
         return np.hstack([self.q_ddot, self.theta_ddot])
 
-    def at(self, t: float) -> Samples:
-        """The motion at one instant, each field of shape (1, ...).
+    def at(self, t: ArrayLike) -> Samples:
+        """The motion at some times, shape (n,) or a number [s], each field of shape (n, ...).
 
-        At a phase boundary the later phase answers. The contacts are those of that phase,
-        ``motions[k].contacts``.
+        At a phase boundary the later phase answers. The contacts are all of the trajectory's;
+        forces are NaN where a contact is not in the formation.
 
         Raises
         ------
         ValueError
-            If `t` is outside the trajectory.
+            If one of the times is outside the trajectory.
         """
-        starts = self.phase_starts
-        if not starts[0] <= t <= starts[-1]:
-            raise ValueError(f"t = {t} s is outside the trajectory, 0 to {starts[-1]} s")
-        index = min(int(np.searchsorted(starts, t, side="right")) - 1, len(self.motions) - 1)
-        return self.motions[index].evaluate(np.array([t - starts[index]]))
+        times, starts = np.atleast_1d(np.asarray(t, dtype=float)), self.phase_starts
+        inside = (times >= starts[0]) & (times <= starts[-1])
+        if not inside.all():
+            wrong = times[~inside][0]
+            raise ValueError(f"t = {wrong} s is outside the trajectory, 0 to {starts[-1]} s")
+        owner = np.searchsorted(starts, times, side="right") - 1
+        owner = np.minimum(owner, len(self.motions) - 1)
+        n, m = len(times), len(self.contacts)
+        fields = Samples(*(np.full((n, width), np.nan) for width in (5, 5, 5, 2, m, m)))
+        for index in np.unique(owner).tolist():
+            motion, rows = self.motions[index], np.flatnonzero(owner == index)
+            part = motion.evaluate(times[rows] - starts[index])
+            own = [self.contacts.index(name) for name in motion.contacts]
+            for k, (whole, values) in enumerate(zip(fields, part, strict=True)):
+                columns = slice(None) if k < 4 else own
+                whole[rows[:, None], np.arange(whole.shape[1])[columns]] = values
+        return fields
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the trajectory to a ``.npz`` file.
@@ -162,6 +177,7 @@ class Trajectory:
         InputError
             If the file cannot be written.
         """
+        require_ending(path, ".npz")
         arrays: dict[str, Any] = {name: getattr(self, name) for name in _ARRAYS}
         arrays["contacts"] = np.array(self.contacts)
         arrays["torque_breaks"] = self.torque.breaks
@@ -181,6 +197,7 @@ class Trajectory:
         """
         from .torquetable import format_rows, place_rows
 
+        require_ending(path, ".csv")
         write_text(path, format_rows(place_rows(self.torque)))
 
 
