@@ -8,9 +8,11 @@ from wholearm.benchmark.legs import (
     KINDS,
     Leg,
     Outcome,
+    Task,
     draw_leg,
     name_argument,
     run_leg,
+    run_legs,
     summarise,
 )
 from wholearm.problem import build_problem, read_problem
@@ -44,6 +46,13 @@ def test_what_kind_of_argument_refuses() -> None:
     assert name_argument("from rest at its start, no motion begins") == "rest at the start"
     assert name_argument("at its end, no motion comes to rest") == "rest at the end"
     assert name_argument("c_n of v1-palm is 0.3 N short at t = 0") == "least shortfalls"
+
+
+def test_legs_are_run_in_worker_processes() -> None:
+    lines: list[str] = []
+    (outcome,) = run_legs([Task(0, 12, "time", PROBLEMS)], 1, lines.append)
+    assert outcome.kind in KINDS and outcome.kind != "traceback", outcome.text
+    assert len(lines) == 1 and lines[0].startswith("12 time heptagon ")
 
 
 def test_the_table_counts_every_kind() -> None:

@@ -241,3 +241,17 @@ def test_what_is_broken_between_points_is_watched() -> None:
         found = watch_missed(stages, looks)
         assert {k for stage in found or stages for k in stage.watched} == set(watched)
         assert (found is None) == (watched == ())
+
+
+def test_what_is_short_where_a_stage_starts_is_no_miss_of_its_own() -> None:
+    solution = solve_at_points()
+    stage, motion = solution.stages[0], make_motions(solution.stages, SCHEME)[0]
+    seen = look_between(stage, motion)
+    deep = 10 * GRAZE * stage.formation.scene.scales.length
+    lower = np.full_like(seen.limits, deep)
+    lower[0] = -deep
+    row = (0, *stage.watched)[-1]
+    watching = replace(stage, watched=(row,), released=())
+    assert find_misses(watching, seen._replace(limits=lower), EPSILON).gap.max() == 0.0
+    lower[5] = -4 * deep
+    assert find_misses(watching, seen._replace(limits=lower), EPSILON).gap.max() > 2 * deep

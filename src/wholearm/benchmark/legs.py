@@ -1,9 +1,9 @@
 """Random straight legs through cells of the map, planned or refused, and how long that takes.
 
-``python -m wholearm.benchmark.legs [--legs 200] [--seed 0] [--objective time]`` prints a line for
-each leg and a table. A leg slides along the palm and then goes through one to three cells, from
-rest to rest; the map lists its phases. Plans are verified by replay and an independent residual,
-refusals are looked at by linear programmes of their own.
+``python -m wholearm.benchmark.legs [--legs 200] [--seed 0] [--objective all] [--jobs 2]`` prints a
+line for each leg and a table. A leg slides along the palm and then goes through one to three cells,
+from rest to rest; the map lists its phases. Plans are verified by replay and an independent
+residual, refusals are looked at by linear programmes of their own (`wholearm.benchmark.refusals`).
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from ..verify import verify
 from .plancheck import check_plan
 from .refusals import judge
 from .scenes import Table
+from .workers import run_tasks
 
 PROBLEMS = ("heptagon", "hexagon", "square", "triangle")
 """Shipped problems whose scenes and starts are taken in turn."""
@@ -39,6 +40,8 @@ CELL = ((-0.6, 1.0), (0.05, 0.5))
 """What one cell adds to x, over the radius of gyration, and takes from phi [rad]."""
 SLOW = 5.0
 """Processor time [s] from which on an answer counts as slow."""
+BOUND = 300.0
+"""Most processor time [s] of one leg with the second look at it."""
 ITERATIONS = "Maximum_Iterations_Exceeded"
 """What no answer may say: a limit of iterations is no reason."""
 
@@ -157,25 +160,39 @@ def name_argument(text: str) -> str:
     return "least shortfalls" if " short at " in text else "other"
 
 
-def run_legs(
-    count: int,
-    seed: int,
-    objective: str,
-    folder: Path,
-    say: Callable[[str], object],
-    first: int = 0,
-) -> list[Outcome]:
-    """Run legs one after the other, with a line for each to `say`."""
+class Task(NamedTuple):
+    """A leg to be drawn and run."""
+
+    seed: int
+    number: int
+    objective: str
+    folder: Path
+
+
+def run_task(task: Task) -> tuple[str, Outcome] | None:
+    """Draw a leg and run it: the name of its scene and what came of it; None without a route."""
+    leg = draw_leg(task.seed, task.number, task.folder)
+    return None if leg is None else (leg.name, run_leg(leg, task.objective))
+
+
+def run_legs(tasks: Sequence[Task], jobs: int, say: Callable[[str], object]) -> list[Outcome]:
+    """Run legs in worker processes, with a line for each to `say`."""
     outcomes = []
-    for number in range(first, first + count):
-        leg = draw_leg(seed, number, folder)
-        if leg is None:
-            say(f"{number} no route")
+    for answer in run_tasks(run_task, tasks, jobs, BOUND):
+        task: Task = answer.task
+        at = f"{task.number} {task.objective}"
+        if answer.ended != "done":
+            kind = "traceback" if answer.ended == "raised" else "no answer"
+            found = "", Outcome(kind, answer.ended, str(answer.result), answer.seconds)
+        elif answer.result is None:
+            say(f"{at} no route")
             continue
-        outcome = run_leg(leg, objective)
+        else:
+            found = answer.result
+        name, outcome = found
         outcomes.append(outcome)
         kind = f"{outcome.kind}, {outcome.reason}" if outcome.reason else outcome.kind
-        say(f"{number} {leg.name} {outcome.seconds:.1f} s {kind}: {outcome.text}")
+        say(f"{at} {name} {outcome.seconds:.1f} s {kind}: {outcome.text}")
     return outcomes
 
 
@@ -203,16 +220,18 @@ def main() -> int:
     parser.add_argument("--legs", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0, help="number of the first leg")
-    parser.add_argument("--objective", choices=CHOICES, default="time")
+    parser.add_argument("--objective", choices=(*CHOICES, "all"), default="time")
     parser.add_argument("--problems", type=Path, default=Path("problems"), help="folder of scenes")
+    parser.add_argument("--jobs", type=int, default=1, help="worker processes")
     options = parser.parse_args()
 
     def say(line: str) -> None:
         print(line, flush=True)
 
-    outcomes = run_legs(
-        options.legs, options.seed, options.objective, options.problems, say, options.first
-    )
+    every = CHOICES if options.objective == "all" else (options.objective,)
+    numbers = range(options.first, options.first + options.legs)
+    tasks = [Task(options.seed, n, goal, options.problems) for n in numbers for goal in every]
+    outcomes = run_legs(tasks, options.jobs, say)
     print(summarise(outcomes))
     return int(any(outcome.kind in KINDS[4:] for outcome in outcomes))
 

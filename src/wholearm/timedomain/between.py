@@ -101,10 +101,13 @@ def find_misses(stage: Stage, look: Look, epsilon: float, margin: float = 0.0) -
     samples = look.samples
     grip = slip_margins(stage.formation, samples.c_n - epsilon, samples.c_t)
     clear = stage.list_clearances(look.places, after=1 / 2) / 2
+    # What a stage is short of where it starts, no bound within it can mend.
+    values = look.limits[:, list(stage.watched)]
+    values = values - np.minimum(values[:1], 0.0)
     tables = (
         samples.c_n - (epsilon + margin),
         grip,
-        look.limits[:, list(stage.watched)] - clear,
+        values - clear,
         _measure_senses(stage, samples) - 0.5 * least_rates(stage, look.places)[:, None],
     )
     shape = (stage.intervals, LOOKS)
