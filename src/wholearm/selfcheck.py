@@ -37,6 +37,8 @@ ROWS = 8
 """Parts of a phase at whose ends replay and plan are compared."""
 PIECES = 40
 """Parts of a phase at whose ends normal forces are looked at."""
+_CLOSER = 4
+"""How many times as many parts are looked at, if a parabola through few instants dips too low."""
 DENSE = 201
 """Rows per phase for the equations of motion, if the trajectory has not half as many."""
 
@@ -130,13 +132,14 @@ def replay_plan(
     usual, strict = Allowance(), Allowance().scale(STRICT)
     while True:
         report("replaying the plan")
-        check = check_plan(problem, trajectory, strict)
-        if check.failure is not None:
-            # Parabolas through few instants may dip too low; then `verify` looks closely.
-            check = check_plan(problem, trajectory, strict, closely=True)
+        every = choose_times(trajectory.torque, trajectory)
+        for times in (None, pick_times(trajectory, _CLOSER * PIECES), every):
+            check = check_plan(problem, trajectory, strict, times)
+            if check.failure is None:
+                break
         if check.failure is None:
             break
-        accepted = check_plan(problem, trajectory, usual, closely=True)
+        accepted = check_plan(problem, trajectory, usual, every)
         durations = np.diff(trajectory.phase_starts)
         number = check.find_culprit(problem.scene.scales, strict, durations)
         index = next(
@@ -161,26 +164,33 @@ def replay_plan(
 
 
 def check_plan(
-    problem: Problem, trajectory: Trajectory, allowance: Allowance, closely: bool = False
+    problem: Problem, trajectory: Trajectory, allowance: Allowance, times: Array | None = None
 ) -> Check:
     """Replay a plan, and see what its samples leave of the equations of motion.
 
-    It is looked at in few instants, or `closely`, in those of `verify`.
+    It is looked at in few instants, or at `times`, shape (n,) [s].
     """
-    times = choose_times(trajectory.torque, trajectory) if closely else pick_times(trajectory)
+    times = pick_times(trajectory) if times is None else times
     replayed = inspect(problem, trajectory.torque, trajectory, times, allowance, 1e-9)
     return Check(replayed, find_residual(problem, trajectory))
 
 
-def pick_times(trajectory: Trajectory) -> Array:
-    """Few instants to look at: some rows of each phase, and some in long pieces of the torques."""
+def pick_times(trajectory: Trajectory, pieces: int = PIECES) -> Array:
+    """Few instants to look at: some rows of each phase, and some in long pieces of the torques.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+    pieces : int
+        Into how many parts of a phase its torques are divided at least.
+    """
     times: list[Array] = []
     for index in range(len(trajectory.motions)):
         rows = np.flatnonzero(trajectory.phase == index)
         picked = np.linspace(0, len(rows) - 1, ROWS + 1).round().astype(int)
         times.append(trajectory.t[rows[picked]])
     starts = trajectory.phase_starts
-    times.append(divide_pieces(trajectory.torque, starts, np.diff(starts) / PIECES))
+    times.append(divide_pieces(trajectory.torque, starts, np.diff(starts) / pieces))
     return np.concatenate(times)
 
 
