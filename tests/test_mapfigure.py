@@ -124,11 +124,11 @@ def test_command_writes_the_figure(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     trajectory.save("plan.npz")
-    assert main(["map", str(HEPTAGON), "--plan", "plan.npz", "--phi", "-6,2"]) == 0
+    assert main(["map", str(HEPTAGON), "--plan", "plan.npz", "--phi", "-4,0"]) == 0
     assert capsys.readouterr().out == "wrote map_heptagon_four_contacts.png\n"
     data = (tmp_path / "map_heptagon_four_contacts.png").read_bytes()
     assert data[:4] == b"\x89PNG"
-    arguments = ["map", str(HEPTAGON), "--phi", "-6,2", "-o", "m.pdf"]
+    arguments = ["map", str(HEPTAGON), "--phi", "-4,0", "-o", "m.pdf"]
     assert main([*arguments, "--list", "0.045,-2", "0,-2"]) == 0
     captured = capsys.readouterr()
     assert captured.out.startswith("# from x = 45 mm") and captured.err == "wrote m.pdf\n"

@@ -184,7 +184,6 @@ def relax_by_linear_program(curve: Curve, epsilon: float, name: str) -> float | 
     "phase, limits",
     [
         (1, {"epsilon": 1.0}),
-        (3, {"epsilon": 1.4}),
         (4, {"torque limit of finger 1": 0.3}),
         (4, {"torque limit of finger 2": 0.05}),
         (4, {"torque limit of finger 1": 0.7, "epsilon": 0.4}),

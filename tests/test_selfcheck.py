@@ -120,7 +120,7 @@ def slide(heptagon: Problem) -> Problem:
     return replace(heptagon, phases=heptagon.phases[:3])
 
 
-@pytest.mark.parametrize("cured", [0, 1, 2])
+@pytest.mark.parametrize("cured", [0, 2])
 def test_only_what_does_not_hold_is_refined(slide: Problem, cured: int) -> None:
     spoiled = Spoiled(slide, 1, cured)
     planning, trajectory, figures = spoiled.run()

@@ -113,10 +113,10 @@ def test_advice_is_that_along_the_curve(heptagon: Problem, curves: tuple[Curve, 
     """Two formulations with different unknowns, one of them convex but for viscous friction."""
     problem, phase = change_limit(heptagon, 2, 1.0), heptagon.phases[1]
     start = curves[0].end
-    options = PlanOptions(time_intervals=6)
+    options, coarse = PlanOptions(time_intervals=6), PlanOptions(intervals=40)
     texts = [
         why_not(lambda: plan_phases(problem, (problem.phases[1],), start, options)),
-        why_not(lambda: plan_path(curves[1], problem.epsilon, PlanOptions(), phase.number)),
+        why_not(lambda: plan_path(curves[1], problem.epsilon, coarse, phase.number)),
     ]
     shape = r"phase 2 is infeasible: .*c_n of v1-palm >= epsilon = 1 N is \S+ N short at "
     assert all(re.match(shape, text) for text in texts), texts

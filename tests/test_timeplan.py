@@ -40,7 +40,7 @@ SLACK = 1e-6
 """What a limit may be missed by between the places that the planner looks at [N or N m]."""
 COARSE = 6
 """Intervals where only what a plan is for is looked at, not how good it is."""
-SCHEMES = [(name, degree) for name in ("radau", "legendre") for degree in (2, 3, 5)]
+SCHEMES = [("radau", 2), ("radau", 5), ("legendre", 2), ("legendre", 3)]
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +65,15 @@ def gentle() -> Trajectory:
 
 @once
 def in_time() -> Trajectory:
-    """The heptagon's slide and flip, which curves are for, in the time domain."""
-    return solve(problem_of(HEPTAGON), transcription="time", time_intervals=16, replay=False)
+    """The heptagon's last slide and its flip, which curves are for, in the time domain."""
+    return solve(turning(), transcription="time", time_intervals=16, replay=False)
+
+
+@cache
+def turning() -> Problem:
+    whole = problem_of(HEPTAGON)
+    phases = tuple(replace(phase, index=k) for k, phase in enumerate(whole.phases[2:]))
+    return replace(whole, start=trace_phases(whole)[1].end, phases=phases)
 
 
 @cache
@@ -93,12 +100,12 @@ def landing_of(plan: Trajectory) -> list[StageMotion]:
     return [stage for motion in motions for stage in motion.stages]
 
 
-@pytest.mark.parametrize("phase", range(5))
+@pytest.mark.parametrize("phase", range(2, 5))
 def test_least_times_agree_with_those_along_the_curve(
     curves: tuple[Curve, ...], trajectory: Trajectory, phase: int
 ) -> None:
     plan = in_time()
-    motion, expected = plan.motions[phase], trajectory.meta["phase_durations"][phase]
+    motion, expected = plan.motions[phase - 2], trajectory.meta["phase_durations"][phase]
     assert isinstance(motion, TimeMotion)
     # Two discretisations of one problem: torques are linear over a 16th of the phase here, or half
     # of that where they switch, so that it takes longer.
@@ -111,12 +118,12 @@ def test_least_times_agree_with_those_along_the_curve(
         np.testing.assert_array_equal(stage.directions.sigma, segment.sigma)
 
 
-def test_the_whole_problem_planned_in_the_time_domain_is_carried_out(heptagon: Problem) -> None:
+def test_a_problem_planned_in_the_time_domain_is_carried_out() -> None:
     plan = in_time()
     assert plan.meta["transcription"] == "time"
-    report = verify(heptagon, plan)
+    report = verify(turning(), plan)
     assert report.ok, report.to_text()
-    assert np.nanmin(plan.c_n) > heptagon.epsilon - SLACK
+    assert np.nanmin(plan.c_n) > turning().epsilon - SLACK
     assert np.abs(plan.tau).max() < 2.0 + SLACK
 
 
@@ -219,7 +226,7 @@ def test_what_moves_by_itself_takes_its_time(
 
 @pytest.mark.parametrize(
     "throw, objective",
-    [(shove, "effort"), (shove, "margin"), (heave, "effort"), (lift, "margin")],
+    [(shove, "margin"), (heave, "effort")],
 )
 def test_one_and_two_contacts_are_planned_for_every_objective(
     throw: Callable[[], tuple[Problem, float]], objective: str
