@@ -370,7 +370,7 @@ def test_png_has_at_least_150_dots_per_inch(figure: Figure, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("name", ["a.jpg", "a", "png", "a.png.txt"])
 def test_save_refuses_other_endings(figure: Figure, tmp_path: Path, name: str) -> None:
-    with pytest.raises(InputError, match=r"allowed are \.png, \.pdf, \.svg") as caught:
+    with pytest.raises(InputError, match=r"allowed: \.png, \.pdf, \.svg") as caught:
         plots.save(figure, tmp_path / name)
     assert name in str(caught.value)
     assert not list(tmp_path.iterdir())
