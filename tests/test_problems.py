@@ -17,7 +17,6 @@ import pytest
 from crossing import measure_fingers
 from plane import finger_gap
 from shipped import FOLDER, plan_of, problem_of
-from wholearm.problem import End
 from wholearm.verify import verify
 
 FILES = sorted(FOLDER.glob("*.toml"))
@@ -69,13 +68,11 @@ def test_plans_have_their_reference_figures(path: Path) -> None:
     assert tuple(expected) == FIGURES
     got = measure(path)
     assert (got["status"], got["objective"]) == (expected["status"], expected["objective"])
-    # Another machine or solver version may stop elsewhere on a flat optimum, not 0.2 % slower, and
-    # phases that are passed at speed are planned as one.
-    rests = [phase.end is End.REST for phase in problem_of(path).phases]
-    starts = [0, *(k + 1 for k, rest in enumerate(rests[:-1]) if rest)]
-    np.testing.assert_allclose(
-        *(np.add.reduceat(each["phase_durations"], starts) for each in (got, expected)), rtol=2e-3
-    )
+    # Another machine or solver version may stop elsewhere on a flat optimum: a landing ends where
+    # the phases after it can go on fast, and time that it takes longer they take less.
+    given, found = (np.array(each["phase_durations"]) for each in (expected, got))
+    np.testing.assert_allclose(found, given, rtol=1e-2)
+    assert found.sum() == pytest.approx(given.sum(), rel=5e-4)
     # Least time presses no harder than it has to, so the margin is zero but for discretisation.
     assert got["least_margin"] == pytest.approx(expected["least_margin"], abs=1e-3)
     assert got["least_margin"] > -2e-6
