@@ -11,7 +11,9 @@ from .newton import Touch, balance, locate
 from .overlap import clearances
 
 INSTANTS = 401
-"""Instants of a phase that are looked at."""
+"""Instants of a phase that are looked at, besides some in short pieces of its torques."""
+BRIEF = 1e-6
+"""Share of a phase below which a piece of its torques has no length."""
 ROUNDING = 1e-6
 """What may be left of an equation, over the largest of its terms."""
 OVERLAP = 1e-6
@@ -27,7 +29,7 @@ def check_plan(problem: Problem, plan: Trajectory) -> list[str]:
     found: list[str] = []
     before: Array | None = None
     for phase, motion, start in zip(problem.phases, plan.motions, plan.phase_starts, strict=False):
-        t = np.linspace(0.0, motion.duration, INSTANTS)
+        t = _choose_times(plan, start, motion.duration)
         rows = motion.evaluate(t)
         texts = _check_phase(problem, phase, rows)
         texts += _check_rates(problem.scene, t, rows)
@@ -38,6 +40,16 @@ def check_plan(problem: Problem, plan: Trajectory) -> list[str]:
         before = np.array([rows.z[-1], rows.z_dot[-1]])
         found += [f"phase {phase.number}: {text}" for text in texts]
     return found
+
+
+def _choose_times(plan: Trajectory, start: float, duration: float) -> Array:
+    """Instants of a phase, some of them in pieces of its torques that are short [s]."""
+    breaks = plan.torque.breaks - start
+    ends = np.concatenate([[0.0], breaks[(breaks > 0.0) & (breaks < duration)], [duration]])
+    runs = np.diff(ends)
+    short = (runs > BRIEF * duration) & (runs < 2 * duration / INSTANTS)
+    inside = ends[:-1][short, None] + runs[short, None] * np.array([0.1, 0.5, 0.9])
+    return np.unique(np.concatenate([np.linspace(0.0, duration, INSTANTS), inside.ravel()]))
 
 
 def _check_phase(problem: Problem, phase: Phase, rows: Samples) -> list[str]:
