@@ -6,10 +6,10 @@ import pytest
 
 from once import STORE
 from shipped import HEPTAGON, plan_of, problem_of
-from wholearm.curve import Curve
-from wholearm.path import trace_phases
-from wholearm.problem import Problem
-from wholearm.trajectory import Trajectory
+from wholearm.geometry.curve import Curve
+from wholearm.geometry.tracing import trace_phases
+from wholearm.problem.definition import Problem
+from wholearm.results.trajectory import Trajectory
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from plane import cross, point_to_segment
 from shipped import HEXAGON
-from wholearm.model import Array, Scene
-from wholearm.problem import Problem, build_problem
+from wholearm.common.arrays import Array
+from wholearm.problem.definition import Problem, build_problem
+from wholearm.scene.model import Scene
 
 
 def hexagon(

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from plane import stack_rows
-from wholearm.formation import Formation
-from wholearm.model import Array
+from wholearm.common.arrays import Array
+from wholearm.contacts.formation import Formation
 
 
 class Collision(NamedTuple):

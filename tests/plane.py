@@ -12,11 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wholearm.contact import parse_contact
-from wholearm.curve import Curve
-from wholearm.formation import Formation
-from wholearm.model import Array, Finger, Friction, Polygon, Scene
-from wholearm.trajectory import Samples
+from wholearm.common.arrays import Array
+from wholearm.contacts.elemental import parse_contact
+from wholearm.contacts.formation import Formation
+from wholearm.geometry.curve import Curve
+from wholearm.results.trajectory import Samples
+from wholearm.scene.model import Finger, Friction, Scene
+from wholearm.scene.polygon import Polygon
 
 SQUARE = [[-0.03, -0.03], [0.03, -0.03], [0.03, 0.03], [-0.03, 0.03]]
 

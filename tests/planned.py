@@ -12,15 +12,15 @@ import numpy as np
 from scipy.optimize import brentq
 
 from shipped import HEPTAGON, problem_of
-from wholearm.contact import parse_contact
-from wholearm.curve import Curve
-from wholearm.dynamics import Directions, inverse
-from wholearm.formation import Formation
-from wholearm.model import Array
-from wholearm.path import trace_phases
-from wholearm.problem import End, Phase, Problem, Until
-from wholearm.torque import TorqueProfile
-from wholearm.trajectory import Motion, Samples, Trajectory, assemble
+from wholearm.common.arrays import Array
+from wholearm.contacts.elemental import parse_contact
+from wholearm.contacts.formation import Formation
+from wholearm.geometry.curve import Curve
+from wholearm.geometry.tracing import trace_phases
+from wholearm.mechanics.dynamics import Directions, inverse
+from wholearm.problem.definition import End, Phase, Problem, Until
+from wholearm.results.torque import TorqueProfile
+from wholearm.results.trajectory import Motion, Samples, Trajectory, assemble
 
 DEPENDENT = [1, 3, 4]
 """Coordinates y, theta_1 and theta_2, which follow from x and phi."""

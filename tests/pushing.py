@@ -10,10 +10,11 @@ from itertools import pairwise
 import numpy as np
 
 from plane import accelerate, make_formation, make_scene, rotate, stack_rows
-from wholearm.formation import Formation, close_finger, place_flush
-from wholearm.model import Array, Friction, Scene
-from wholearm.problem import Phase, Problem, Until
-from wholearm.torque import TorqueProfile
+from wholearm.common.arrays import Array
+from wholearm.contacts.formation import Formation, close_finger, place_flush
+from wholearm.problem.definition import Phase, Problem, Until
+from wholearm.results.torque import TorqueProfile
+from wholearm.scene.model import Friction, Scene
 
 FAR = Until(coordinate="x", value=-0.3)
 """An end that is never reached."""

@@ -11,11 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wholearm.contact import parse_contact
-from wholearm.formation import Formation
-from wholearm.model import Array, Friction, Scene
-from wholearm.problem import Problem, Until
-from wholearm.torque import TorqueProfile
+from wholearm.common.arrays import Array
+from wholearm.contacts.elemental import parse_contact
+from wholearm.contacts.formation import Formation
+from wholearm.problem.definition import Problem, Until
+from wholearm.results.torque import TorqueProfile
+from wholearm.scene.model import Friction, Scene
 
 
 class Retold(NamedTuple):

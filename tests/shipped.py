@@ -6,10 +6,10 @@ from functools import cache
 from pathlib import Path
 
 from once import once
-from wholearm.outline import load
-from wholearm.plan import solve
-from wholearm.problem import Problem
-from wholearm.trajectory import Trajectory
+from wholearm.geometry.path_guess import load
+from wholearm.planning.plan import solve
+from wholearm.problem.definition import Problem
+from wholearm.results.trajectory import Trajectory
 
 FOLDER = Path(__file__).parents[1] / "problems"
 HEPTAGON = FOLDER / "heptagon_four_contacts.toml"

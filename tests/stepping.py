@@ -11,8 +11,8 @@ from collections.abc import Callable
 import numpy as np
 
 from plane import stack_rows
-from wholearm.formation import Formation
-from wholearm.model import Array
+from wholearm.common.arrays import Array
+from wholearm.contacts.formation import Formation
 
 
 def march(

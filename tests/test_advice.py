@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from wholearm.advice import (
+from wholearm.planning.advice import (
     Change,
     Limit,
     Shortfall,

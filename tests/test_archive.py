@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from wholearm.archive import read_arrays
-from wholearm.errors import InputError
+from wholearm.common.archive import read_arrays
+from wholearm.common.errors import InputError
 
 
 def _write(path: Path, members: dict[str, bytes]) -> str:

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from wholearm.batch import SIZE, Batch
+from wholearm.common.batch import SIZE, Batch
 
 
 def build_function() -> ca.Function:

@@ -10,11 +10,11 @@ from crossing import make_way, measure_fingers
 from plane import finger_gap, make_formation, measure_gaps
 from thrown import heave
 from timed import instants, landing, plan_landing, stages_of
-from wholearm.dynamics import Directions
-from wholearm.links import FINGERS_TOUCH
-from wholearm.options import CLEARANCE, PlanOptions
-from wholearm.plan import solve
-from wholearm.timedomain.between import (
+from wholearm.contacts.links import FINGERS_TOUCH
+from wholearm.mechanics.dynamics import Directions
+from wholearm.planning.options import CLEARANCE, PlanOptions
+from wholearm.planning.plan import solve
+from wholearm.planning.time_domain.between import (
     GRAZE,
     MISS,
     Limits,
@@ -23,15 +23,15 @@ from wholearm.timedomain.between import (
     raise_bounds,
     watch_missed,
 )
-from wholearm.timedomain.collocation import make_scheme
-from wholearm.timedomain.ownunits import to_si
-from wholearm.timedomain.stage import Stage
-from wholearm.timedomain.staging import outline_stages
-from wholearm.timedomain.timemotion import StageMotion, TimeMotion, make_motions
-from wholearm.timedomain.timenlp import bound_unknowns
-from wholearm.timedomain.timeplan import plan_phases
-from wholearm.timedomain.timesearch import Search, Solution
-from wholearm.trajectory import Trajectory
+from wholearm.planning.time_domain.collocation import make_scheme
+from wholearm.planning.time_domain.motion import StageMotion, TimeMotion, make_motions
+from wholearm.planning.time_domain.nlp import bound_unknowns
+from wholearm.planning.time_domain.own_units import to_si
+from wholearm.planning.time_domain.plan import plan_phases
+from wholearm.planning.time_domain.search import Search, Solution
+from wholearm.planning.time_domain.stage import Stage
+from wholearm.planning.time_domain.staging import outline_stages
+from wholearm.results.trajectory import Trajectory
 
 EPSILON = 0.05
 SCHEME = make_scheme("radau", 3)

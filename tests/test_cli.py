@@ -17,9 +17,9 @@ import pytest
 import wholearm
 from shipped import BOX, HEPTAGON, IMPACTS, plan_of
 from tipping import scale, tipped
-from wholearm.cli import build_parser, main
-from wholearm.torquetable import format_rows, place_rows
-from wholearm.trajectory import Trajectory, load_trajectory
+from wholearm.cli.command import build_parser, main
+from wholearm.results.torque_table import format_rows, place_rows
+from wholearm.results.trajectory import Trajectory, load_trajectory
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
 Edit = Callable[[dict[str, Any]], object]
@@ -521,7 +521,7 @@ def test_interrupting_leaves_nothing(
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("wholearm.blocks.plan_chain", interrupt)
+    monkeypatch.setattr("wholearm.planning.blocks.plan_chain", interrupt)
     assert main(["solve", str(HEPTAGON)]) == 130
     assert capsys.readouterr().err == "wholearm: interrupted\n"
     assert list(folder.iterdir()) == []
@@ -551,9 +551,9 @@ def test_version() -> None:
 def test_solve_imports_only_what_it_needs(folder: Path, more: list[str]) -> None:
     """What the process costs over importing casadi and numpy is its own work."""
     code = (
-        "import sys\nfrom wholearm.cli import main\n"
+        "import sys\nfrom wholearm.cli.command import main\n"
         f"assert main(['solve', {str(HEPTAGON)!r}, '-o', 'a.npz', *{more!r}]) == 0\n"
-        "unwanted = ['scipy', 'matplotlib', 'wholearm.plots']\n"
+        "unwanted = ['scipy', 'matplotlib', 'wholearm.figures.plots']\n"
         f"unwanted += ['wholearm.simulation.simulate'] if {more!r} else []\n"
         "print([name for name in unwanted if name in sys.modules])"
     )
@@ -564,7 +564,7 @@ def test_solve_imports_only_what_it_needs(folder: Path, more: list[str]) -> None
 
 def test_bad_input_is_told_before_anything_heavy_is_imported() -> None:
     code = (
-        "import sys\nfrom wholearm.cli import main\n"
+        "import sys\nfrom wholearm.cli.command import main\n"
         "status = main(['solve'])\n"
         "print(status, [name for name in ('casadi', 'numpy') if name in sys.modules])"
     )

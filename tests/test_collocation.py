@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from wholearm.timedomain.collocation import make_scheme
+from wholearm.planning.time_domain.collocation import make_scheme
 
 NAMES = ["radau", "legendre"]
 DEGREES = [1, 2, 3, 4, 5, 6]

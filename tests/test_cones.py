@@ -7,9 +7,9 @@ import pytest
 
 from plane import SQUARE, make_formation, make_scene
 from tipping import roll
-from wholearm.cones import find_weakest, hold_least, hold_rows, name_holds, slip_margins
-from wholearm.formation import Formation
-from wholearm.model import Friction
+from wholearm.contacts.cones import find_weakest, hold_least, hold_rows, name_holds, slip_margins
+from wholearm.contacts.formation import Formation
+from wholearm.scene.model import Friction
 
 
 @pytest.fixture

@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 
 from plane import SQUARE, cross, make_formation, make_scene, rotate
-from wholearm.contact import Contact, build_features, build_geometry
-from wholearm.curve import Curve
-from wholearm.dynamics import (
+from wholearm.common.arrays import Array
+from wholearm.common.errors import JammingError
+from wholearm.contacts.elemental import Contact, build_features, build_geometry
+from wholearm.contacts.formation import Formation, close_finger
+from wholearm.geometry.curve import Curve
+from wholearm.geometry.tracing import trace_phases
+from wholearm.mechanics.dynamics import (
     Directions,
     build_forward,
     energy,
@@ -20,11 +24,8 @@ from wholearm.dynamics import (
     reduced_inertia,
     split_forces,
 )
-from wholearm.errors import JammingError
-from wholearm.formation import Formation, close_finger
-from wholearm.model import Array, Friction, Scene
-from wholearm.path import trace_phases
-from wholearm.problem import build_problem
+from wholearm.problem.definition import build_problem
+from wholearm.scene.model import Friction, Scene
 
 FRICTIONLESS = Friction(0.0, 0.0, 0.0)
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from timed import landing
-from wholearm.errors import InfeasibleError
-from wholearm.model import Array
-from wholearm.options import PlanOptions
-from wholearm.path import trace_phases
-from wholearm.timedomain.ending import GAIN, choose_end, keep_apart
-from wholearm.timedomain.staging import outline_stages
-from wholearm.timedomain.timesearch import Search, Solution
+from wholearm.common.arrays import Array
+from wholearm.common.errors import InfeasibleError
+from wholearm.geometry.tracing import trace_phases
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.time_domain.ending import GAIN, choose_end, keep_apart
+from wholearm.planning.time_domain.search import Search, Solution
+from wholearm.planning.time_domain.staging import outline_stages
 
 
 @lru_cache(maxsize=1)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from wholearm.errors import LONGEST, InputError, name_source
+from wholearm.common.errors import LONGEST, InputError, name_source
 
 
 @pytest.mark.parametrize("given", ["\n" * 3, "\x00" * 5000, "x" * 5000, "\u2028", "\x1b[2J"])

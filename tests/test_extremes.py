@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 
 from shipped import HEPTAGON
-from wholearm.errors import InfeasibleError, JammingError
-from wholearm.outline import load
-from wholearm.plan import solve
-from wholearm.problem import Problem, build_problem
-from wholearm.verify import verify
+from wholearm.common.errors import InfeasibleError, JammingError
+from wholearm.geometry.path_guess import load
+from wholearm.planning.plan import solve
+from wholearm.problem.definition import Problem, build_problem
+from wholearm.verification.verify import verify
 
 TABLE = dict(load(str(HEPTAGON)).table)
 

@@ -7,8 +7,8 @@ from typing import BinaryIO
 
 import pytest
 
-from wholearm.errors import InputError
-from wholearm.files import require_writable, write_whole
+from wholearm.common.errors import InputError
+from wholearm.common.files import require_writable, write_whole
 
 
 def fail_halfway(stream: BinaryIO) -> None:

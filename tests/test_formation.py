@@ -15,9 +15,10 @@ from plane import (
     place_tips,
     rotate,
 )
-from wholearm.contact import parse_contact
-from wholearm.errors import InputError
-from wholearm.formation import (
+from wholearm.common.arrays import Array
+from wholearm.common.errors import InputError
+from wholearm.contacts.elemental import parse_contact
+from wholearm.contacts.formation import (
     Formation,
     close_finger,
     describe,
@@ -25,8 +26,8 @@ from wholearm.formation import (
     place_flush,
     split_by_first_joint,
 )
-from wholearm.model import Array, Friction, Scene
-from wholearm.problem import Problem
+from wholearm.problem.definition import Problem
+from wholearm.scene.model import Friction, Scene
 
 # Distances of metres-sized coordinates in double precision.
 ROUNDING = 1e-14

@@ -10,12 +10,13 @@ import pytest
 from moreau import collide
 from plane import SQUARE, cross, make_formation, make_scene, measure_gaps, measure_slip, touch
 from shipped import HEPTAGON, IMPACTS
-from wholearm.formation import Formation
-from wholearm.impact import Impact, Obstacle, strike, transfer
-from wholearm.model import Array, Friction, Scene
-from wholearm.outline import load
-from wholearm.path import trace_phases
-from wholearm.pathdomain.chain import Chain, make_chain
+from wholearm.common.arrays import Array
+from wholearm.contacts.formation import Formation
+from wholearm.geometry.path_guess import load
+from wholearm.geometry.tracing import trace_phases
+from wholearm.mechanics.impact import Impact, Obstacle, strike, transfer
+from wholearm.planning.path_domain.impact_sequence import Chain, make_chain
+from wholearm.scene.model import Friction, Scene
 
 MASS = 0.2
 

@@ -26,9 +26,9 @@ def test_every_name_is_there(name: str) -> None:
 
 
 def test_names_come_from_their_modules() -> None:
-    from wholearm.outline import load
-    from wholearm.plan import solve
-    from wholearm.trajectory import Trajectory
+    from wholearm.geometry.path_guess import load
+    from wholearm.planning.plan import solve
+    from wholearm.results.trajectory import Trajectory
 
     assert wholearm.load is load and wholearm.solve is solve
     assert wholearm.Trajectory is Trajectory
@@ -51,7 +51,7 @@ def test_a_function_is_not_shadowed_by_its_module() -> None:
     """Importing a submodule must not replace the function of the same name."""
     code = (
         "import importlib, wholearm\n"
-        "for m in ('verify', 'simulation.simulate', 'plots', 'plan'):\n"
+        "for m in ('verification.verify', 'simulation.simulate', 'planning.plan'):\n"
         "    importlib.import_module('wholearm.' + m)\n"
         "for name in ('verify', 'simulate', 'plots', 'solve'):\n"
         "    print(type(getattr(wholearm, name)).__name__)\n"

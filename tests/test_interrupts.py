@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 
 from shipped import HEPTAGON
-from wholearm import interrupts
-from wholearm.benchmark.benchinterrupts import STARTED, interrupt
-from wholearm.files import together, write_whole
-from wholearm.interrupts import check, guard, held
-from wholearm.ipopt import STOPPED, Solver
+from wholearm.benchmark.interrupts import STARTED, interrupt
+from wholearm.common import interrupts
+from wholearm.common.files import together, write_whole
+from wholearm.common.interrupts import check, guard, held
+from wholearm.solvers.ipopt import STOPPED, Solver
 
 BOTH = pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda n: n.name)
 

@@ -17,9 +17,9 @@ from wholearm.benchmark.invariance import (
     mirrored,
     renumbered,
 )
-from wholearm.outline import load
-from wholearm.path import trace_phases
-from wholearm.problem import Problem, build_problem
+from wholearm.geometry.path_guess import load
+from wholearm.geometry.tracing import trace_phases
+from wholearm.problem.definition import Problem, build_problem
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
 CASES = [("heptagon_impact", 2, 20), ("box_rolling", 1, 80)]

@@ -3,8 +3,8 @@ from __future__ import annotations
 import casadi as ca
 import pytest
 
-from wholearm.contact import Expression
-from wholearm.ipopt import build_solver
+from wholearm.common.arrays import Expression
+from wholearm.solvers.ipopt import build_solver
 
 
 def build(max_iter: int) -> Expression:

@@ -5,14 +5,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from wholearm.errors import InputError
-from wholearm.formation import Formation
+from wholearm.common.arrays import Array
+from wholearm.common.errors import InputError
+from wholearm.contacts.formation import Formation
+from wholearm.geometry.closing import close, contact_table
 from wholearm.mapping.borders import NOWHERE, flush_track, label_cells
-from wholearm.mapping.closing import close, contact_table
 from wholearm.mapping.legs import split_leg
 from wholearm.mapping.nearby import tolerance
-from wholearm.model import Array
-from wholearm.problem import Problem
+from wholearm.problem.definition import Problem
 
 PHI = np.radians(-35.0)
 

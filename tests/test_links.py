@@ -8,9 +8,10 @@ import pytest
 
 from crossing import measure_centres, place_links
 from plane import SQUARE, make_finger, make_formation, make_scene
-from wholearm.contact import build_features
-from wholearm.links import FINGERS_TOUCH, build_finger_gap, evaluate_finger_gap
-from wholearm.model import Array, Scene
+from wholearm.common.arrays import Array
+from wholearm.contacts.elemental import build_features
+from wholearm.contacts.links import FINGERS_TOUCH, build_finger_gap, evaluate_finger_gap
+from wholearm.scene.model import Scene
 
 ROUNDING = 1e-15
 COUNT = 400

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from wholearm.margins import find_least
+from wholearm.verification.margins import find_least
 
 
 def test_least_of_a_parabola_is_exact() -> None:

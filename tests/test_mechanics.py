@@ -5,7 +5,7 @@ import pytest
 
 import wholearm
 from wholearm.simulation.layout import STATE
-from wholearm.simulation.mechanics import share_mechanics
+from wholearm.simulation.mode_equations import share_mechanics
 from wholearm.simulation.modes import Grips, Mode, Rows, respond
 
 

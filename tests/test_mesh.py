@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from timed import tables
-from wholearm.model import Array
-from wholearm.timedomain.collocation import Scheme, make_scheme
-from wholearm.timedomain.mesh import bisect, resample
-from wholearm.timedomain.stage import StagePoints
+from wholearm.common.arrays import Array
+from wholearm.planning.time_domain.collocation import Scheme, make_scheme
+from wholearm.planning.time_domain.mesh import bisect, resample
+from wholearm.planning.time_domain.stage import StagePoints
 
 SCHEMES = [("radau", 2), ("radau", 4), ("legendre", 3)]
 

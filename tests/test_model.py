@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 
 from plane import SQUARE, make_finger, make_scene
-from wholearm.errors import InputError
-from wholearm.model import Friction, Polygon, Scene
+from wholearm.common.errors import InputError
+from wholearm.scene.model import Friction, Scene
+from wholearm.scene.polygon import Polygon
 
 
 @pytest.mark.parametrize("value", [-1.0, math.nan, True, "1"])

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from plane import make_formation
-from test_timelayout import random_points
+from test_time_layout import random_points
 from timed import landing
-from wholearm.dynamics import Directions, split_forces
-from wholearm.formation import Formation
-from wholearm.problem import Until
-from wholearm.timedomain.collocation import make_scheme
-from wholearm.timedomain.modes import (
+from wholearm.contacts.formation import Formation
+from wholearm.mechanics.dynamics import Directions, split_forces
+from wholearm.planning.time_domain.collocation import make_scheme
+from wholearm.planning.time_domain.modes import (
     LEAST_INTERVALS,
     Mode,
     drop,
@@ -24,7 +23,8 @@ from wholearm.timedomain.modes import (
     sign_sequence,
     split,
 )
-from wholearm.timedomain.stage import Stage
+from wholearm.planning.time_domain.stage import Stage
+from wholearm.problem.definition import Until
 
 SCHEME = make_scheme("radau", 3)
 

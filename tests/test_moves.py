@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from test_modes import SCHEME, make_stage, turned
-from wholearm.formation import Formation
-from wholearm.model import Array
-from wholearm.timedomain.mesh import resample
-from wholearm.timedomain.modes import drop, in_mode, link, merge, mode_of, split
-from wholearm.timedomain.moves import list_moves
-from wholearm.timedomain.stage import Stage, StagePoints
+from wholearm.common.arrays import Array
+from wholearm.contacts.formation import Formation
+from wholearm.planning.time_domain.mesh import resample
+from wholearm.planning.time_domain.modes import drop, in_mode, link, merge, mode_of, split
+from wholearm.planning.time_domain.moves import list_moves
+from wholearm.planning.time_domain.stage import Stage, StagePoints
 
 THREE = "v1-palm v4-finger1 v6-finger2"
 

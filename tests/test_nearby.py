@@ -4,7 +4,7 @@ import numpy as np
 
 from test_legs import PHI, on_border
 from wholearm.mapping.nearby import choose_leg, describe_miss, find_miss, tolerance
-from wholearm.problem import Problem
+from wholearm.problem.definition import Problem
 
 
 def test_near_miss_names_the_border_and_its_distance(heptagon: Problem) -> None:

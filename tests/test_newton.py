@@ -2,11 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from wholearm.benchmark.newton import balance, locate
-from wholearm.contact import candidate_contacts
-from wholearm.formation import Formation
-from wholearm.problem import Problem
-from wholearm.trajectory import Trajectory
+from wholearm.benchmark.stress.newton import balance, locate
+from wholearm.contacts.elemental import candidate_contacts
+from wholearm.contacts.formation import Formation
+from wholearm.problem.definition import Problem
+from wholearm.results.trajectory import Trajectory
 
 
 def test_contacts_are_those_of_the_planner(heptagon: Problem) -> None:

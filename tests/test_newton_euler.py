@@ -8,11 +8,12 @@ import pytest
 from plane import make_formation, make_scene
 from planned import plan, plan_landing
 from tipping import box, tipped
-from wholearm.formation import Formation
-from wholearm.model import Array, Friction, Scene
-from wholearm.newton_euler import BODIES, Balance, balance
-from wholearm.problem import Problem
-from wholearm.trajectory import Samples, Trajectory
+from wholearm.common.arrays import Array
+from wholearm.contacts.formation import Formation
+from wholearm.problem.definition import Problem
+from wholearm.results.trajectory import Samples, Trajectory
+from wholearm.scene.model import Friction, Scene
+from wholearm.verification.newton_euler import BODIES, Balance, balance
 
 CONTACTS = "v0-palm v1-finger1 v3-finger2 e2-tip1 v2-tip2"
 

@@ -13,10 +13,11 @@ from plane import (
     make_scene,
     rotate,
 )
-from wholearm.contact import build_features, parse_contact
-from wholearm.formation import Formation
-from wholearm.model import Array, Scene
-from wholearm.obstacles import build_apart
+from wholearm.common.arrays import Array
+from wholearm.contacts.elemental import build_features, parse_contact
+from wholearm.contacts.formation import Formation
+from wholearm.contacts.obstacles import build_apart
+from wholearm.scene.model import Scene
 
 ROUNDING = 1e-15
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from wholearm.errors import InputError
-from wholearm.options import CHOICES, Objective, PlanOptions
+from wholearm.common.errors import InputError
+from wholearm.planning.options import CHOICES, Objective, PlanOptions
 
 
 @pytest.mark.parametrize("choice", ["time", "effort", "margin"])

@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wholearm.benchmark.overlap import clearances, separate
-from wholearm.problem import Problem
-from wholearm.trajectory import Trajectory
+from wholearm.benchmark.stress.overlap import clearances, separate
+from wholearm.problem.definition import Problem
+from wholearm.results.trajectory import Trajectory
 
 SQUARE = np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]])
 

@@ -12,17 +12,18 @@ from plane import measure_gaps, measure_slip, unbalance
 from shipped import HEPTAGON, TWICE, plan_of, problem_of
 from thrown import shove
 from tipping import tipped
-from wholearm.blocks import plan_blocks
-from wholearm.errors import InfeasibleError, InputError
-from wholearm.model import Array
-from wholearm.options import Objective, PlanOptions
-from wholearm.path import trace_phases
-from wholearm.phaseplan import PhasePlan
-from wholearm.plan import solve
-from wholearm.problem import Problem
-from wholearm.timedomain import timeimpacts, timeplan
-from wholearm.timedomain.timemotion import TimeMotion
-from wholearm.trajectory import Samples, Trajectory, load_trajectory
+from wholearm.common.arrays import Array
+from wholearm.common.errors import InfeasibleError, InputError
+from wholearm.geometry.tracing import trace_phases
+from wholearm.planning.blocks import plan_blocks
+from wholearm.planning.options import Objective, PlanOptions
+from wholearm.planning.phase_plan import PhasePlan
+from wholearm.planning.plan import solve
+from wholearm.planning.time_domain import impacts as timeimpacts
+from wholearm.planning.time_domain import plan as timeplan
+from wholearm.planning.time_domain.motion import TimeMotion
+from wholearm.problem.definition import Problem
+from wholearm.results.trajectory import Samples, Trajectory, load_trajectory
 
 OBJECTIVES = ["time", "effort", "margin"]
 LIMIT = 2.0

@@ -21,12 +21,12 @@ from matplotlib.text import Text
 import tipping
 import wholearm
 from wholearm import plots
-from wholearm.errors import InputError
-from wholearm.model import Array
-from wholearm.plotdata import choose_snapshots, find_steps
-from wholearm.problem import Problem
-from wholearm.torque import TorqueProfile
-from wholearm.trajectory import Trajectory, assemble
+from wholearm.common.arrays import Array
+from wholearm.common.errors import InputError
+from wholearm.figures.data import choose_snapshots, find_steps
+from wholearm.problem.definition import Problem
+from wholearm.results.torque import TorqueProfile
+from wholearm.results.trajectory import Trajectory, assemble
 
 
 @dataclasses.dataclass

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from plane import SQUARE, convex_polygon, cross, rotate
-from wholearm.errors import InputError
-from wholearm.model import Array, Polygon
+from wholearm.common.arrays import Array
+from wholearm.common.errors import InputError
+from wholearm.scene.polygon import Polygon
 
 PENTAGRAM = [[math.cos(a), math.sin(a)] for a in 2 * np.pi * np.arange(5) * 2 / 5]
 

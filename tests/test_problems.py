@@ -17,7 +17,7 @@ import pytest
 from crossing import measure_fingers
 from plane import finger_gap
 from shipped import FOLDER, plan_of, problem_of
-from wholearm.verify import verify
+from wholearm.verification.verify import verify
 
 FILES = sorted(FOLDER.glob("*.toml"))
 OBJECTIVES = ("time", "effort", "margin")

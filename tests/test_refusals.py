@@ -3,9 +3,9 @@ from __future__ import annotations
 import pytest
 
 from shipped import HEPTAGON
-from wholearm.benchmark.refusals import judge
-from wholearm.errors import InfeasibleError, InputError, JammingError
-from wholearm.problem import Problem, build_problem, read_problem
+from wholearm.benchmark.stress.refusals import judge
+from wholearm.common.errors import InfeasibleError, InputError, JammingError
+from wholearm.problem.definition import Problem, build_problem, read_problem
 
 WEAK = {f"fingers.{k}.torque_limit": 0.05 for k in (1, 2)}
 

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wholearm.errors import InputError
-from wholearm.require import require_number, require_vector
+from wholearm.common.errors import InputError
+from wholearm.common.require import require_number, require_vector
 
 
 @pytest.mark.parametrize("value", [3, 3.0, np.float32(3), np.int64(3)])

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from timed import landing, plan_landing
-from wholearm.errors import InfeasibleError
-from wholearm.options import PlanOptions
-from wholearm.path import trace_phases
-from wholearm.timedomain.ownunits import in_own_units, scale_state
-from wholearm.timedomain.resting import find_block, list_ways
-from wholearm.timedomain.timeplan import plan_phases
+from wholearm.common.errors import InfeasibleError
+from wholearm.geometry.tracing import trace_phases
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.time_domain.own_units import in_own_units, scale_state
+from wholearm.planning.time_domain.plan import plan_phases
+from wholearm.planning.time_domain.resting import find_block, list_ways
 
 COARSE = PlanOptions(time_intervals=4)
 

@@ -11,12 +11,12 @@ import pytest
 
 import wholearm
 from shipped import HEPTAGON
-from wholearm.benchmark.scenes import random_route, random_scene
-from wholearm.curve import Curve
-from wholearm.errors import InputError
+from wholearm.benchmark.stress.scenes import random_route, random_scene
+from wholearm.common.errors import InputError
+from wholearm.geometry.curve import Curve
+from wholearm.geometry.path_guess import outline_phase
 from wholearm.mapping.route import Route, format_route, list_formations
-from wholearm.outline import outline_phase
-from wholearm.problem import Problem, build_problem
+from wholearm.problem.definition import Problem, build_problem
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
 FLAT = -1.984

@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wholearm.benchmark.scenes import random_route, random_scene
-from wholearm.formation import find_touching
-from wholearm.problem import build_problem
+from wholearm.benchmark.stress.scenes import random_route, random_scene
+from wholearm.contacts.formation import find_touching
+from wholearm.problem.definition import build_problem
 
 
 @pytest.mark.parametrize("seed", range(4))

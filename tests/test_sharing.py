@@ -20,9 +20,9 @@ import pytest
 
 import wholearm
 from shipped import FOLDER, LANDING, plan_of, problem_of
-from wholearm import sharing
-from wholearm.formation import Formation
-from wholearm.sharing import Keeper, exclusive, kept_property, retire_with
+from wholearm.common import sharing
+from wholearm.common.sharing import Keeper, exclusive, kept_property, retire_with
+from wholearm.contacts.formation import Formation
 from wholearm.simulation.simulate import simulate
 
 SQUARE = str(FOLDER / "square.toml")

@@ -12,17 +12,18 @@ from crossing import hexagon, measure_fingers
 from planned import CosineMotion, change, plan
 from shipped import HEXAGON, plan_of
 from wholearm.benchmark.baseline_simulation import simulate_with_scipy, solve_motion
-from wholearm.contact import parse_contact
-from wholearm.dynamics import Directions, forward
-from wholearm.errors import InputError, JammingError, SimulationError
-from wholearm.formation import Formation
-from wholearm.model import Array, Finger, Friction, Scene
-from wholearm.problem import Phase, Problem, Until
+from wholearm.common.arrays import Array
+from wholearm.common.errors import InputError, JammingError, SimulationError
+from wholearm.contacts.elemental import parse_contact
+from wholearm.contacts.formation import Formation
+from wholearm.mechanics.dynamics import Directions, forward
+from wholearm.problem.definition import Phase, Problem, Until
+from wholearm.results.torque import TorqueProfile
+from wholearm.scene.model import Finger, Friction, Scene
 from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.simulation.simulate import simulate
 from wholearm.simulation.statics import balances
 from wholearm.simulation.sticking import find_rest
-from wholearm.torque import TorqueProfile
 
 
 def pick(index: int) -> tuple[Problem, CosineMotion]:
@@ -56,9 +57,8 @@ def test_imports_nothing_of_the_planner() -> None:
     code = "import sys, wholearm.simulation.simulate; print(*sys.modules)"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = set(run.stdout.split())
-    planning = tuple(f"wholearm.{name}domain" for name in ("path", "time"))
-    assert not [name for name in loaded if name.startswith(planning)]
-    assert not loaded & {f"wholearm.{name}" for name in ("path", "curve", "plan", "outline")}
+    assert not [name for name in loaded if name.startswith("wholearm.planning")]
+    assert not [name for name in loaded if name.startswith("wholearm.geometry")]
     assert not loaded & {"scipy", "matplotlib"}
 
 

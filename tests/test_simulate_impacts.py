@@ -14,18 +14,18 @@ import pytest
 from plane import stack_rows
 from planned import SQUEEZES, DepartingMotion, change
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
-from wholearm.contact import parse_contact
-from wholearm.dynamics import energy
-from wholearm.formation import Formation
-from wholearm.impact import strike
-from wholearm.model import Array
-from wholearm.path import trace_phases
-from wholearm.problem import End, Phase, Problem, build_problem
+from wholearm.common.arrays import Array
+from wholearm.contacts.elemental import parse_contact
+from wholearm.contacts.formation import Formation
+from wholearm.geometry.tracing import trace_phases
+from wholearm.mechanics.dynamics import energy
+from wholearm.mechanics.impact import strike
+from wholearm.problem.definition import End, Phase, Problem, build_problem
+from wholearm.results.torque import TorqueProfile
+from wholearm.results.trajectory import Trajectory
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
 from wholearm.simulation.simulate import simulate
-from wholearm.torque import TorqueProfile
-from wholearm.trajectory import Trajectory
-from wholearm.verify import verify
+from wholearm.verification.verify import verify
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,10 @@ import pytest
 from planned import plan, plan_landing
 from pushing import pushed, rocking
 from retold import Retold, in_units, mirror, renumber
-from wholearm.problem import Problem
+from wholearm.problem.definition import Problem
+from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.events import Event
 from wholearm.simulation.simulate import simulate
-from wholearm.torque import TorqueProfile
 
 TELLINGS = {
     "7 lengths, 3 masses": partial(in_units, length=7.0, mass=3.0),

@@ -10,11 +10,11 @@ import pytest
 from plane import convex_polygon, make_scene
 from pushing import evaluate, linear
 from stepping import march
-from wholearm.formation import Formation, close_finger, find_touching
-from wholearm.model import Friction
-from wholearm.problem import Phase, Problem, Until
+from wholearm.contacts.formation import Formation, close_finger, find_touching
+from wholearm.problem.definition import Phase, Problem, Until
+from wholearm.results.torque import TorqueProfile
+from wholearm.scene.model import Friction
 from wholearm.simulation.simulate import simulate
-from wholearm.torque import TorqueProfile
 
 
 def draw(rng: np.random.Generator) -> tuple[Problem, TorqueProfile] | None:

@@ -9,14 +9,15 @@ from scipy.optimize import brentq
 
 from plane import make_formation, make_scene, measure_slip, place_corners, unbalance
 from tipping import POINTS, box, constant, falling, ramp, roll, tip, tipped
-from wholearm.dynamics import energy
-from wholearm.formation import close_finger, place_flush
-from wholearm.model import Array, Friction, Scene
-from wholearm.problem import End, Phase, Problem, Until
+from wholearm.common.arrays import Array
+from wholearm.contacts.formation import close_finger, place_flush
+from wholearm.mechanics.dynamics import energy
+from wholearm.problem.definition import End, Phase, Problem, Until
+from wholearm.results.trajectory import Samples
+from wholearm.scene.model import Friction, Scene
 from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.simulation.simulate import simulate
 from wholearm.simulation.transitions import project_velocity
-from wholearm.trajectory import Samples
 
 
 def test_replay_keeps_the_vertex_where_it_is() -> None:

@@ -13,11 +13,11 @@ from pushing import Push, Roll, evaluate, linear, pushed, rocking
 from stepping import march
 from test_simulate_rolling import fall
 from tipping import constant, falling
-from wholearm.problem import Problem
+from wholearm.problem.definition import Problem
+from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation
 from wholearm.simulation.simulate import simulate
 from wholearm.simulation.statics import balances
-from wholearm.torque import TorqueProfile
 
 CHANGES = (EventKind.STICK, EventKind.SLIP, EventKind.REVERSAL)
 

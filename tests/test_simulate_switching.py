@@ -12,12 +12,12 @@ from planned import plan_landing
 from pushing import Roll
 from test_simulate_rolling import fall
 from tipping import constant, falling, roll
-from wholearm.formation import Formation
-from wholearm.problem import End, Phase, Problem, Until
+from wholearm.contacts.formation import Formation
+from wholearm.problem.definition import End, Phase, Problem, Until
+from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.simulation.simulate import simulate
-from wholearm.torque import TorqueProfile
-from wholearm.verify import verify
+from wholearm.verification.verify import verify
 
 
 def divide(problem: Problem, formations: Sequence[Formation]) -> Problem:

@@ -11,8 +11,8 @@ from crossing import make_way
 from plane import make_formation
 from planned import CosineMotion, choose_squeeze, join
 from shipped import HEXAGON
-from wholearm.path import trace_phases
-from wholearm.problem import Problem, build_problem
+from wholearm.geometry.tracing import trace_phases
+from wholearm.problem.definition import Problem, build_problem
 from wholearm.simulation.simulate import simulate
 from wholearm.simulation.starting import Departure, Touching
 from wholearm.simulation.sticking import find_rest

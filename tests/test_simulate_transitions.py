@@ -10,19 +10,19 @@ import pytest
 from planned import LandingMotion, change, plan_landing
 from stepping import march
 from wholearm.benchmark.baseline_simulation import simulate_with_scipy
-from wholearm.contact import parse_contact
-from wholearm.dynamics import Directions, forward
-from wholearm.errors import SimulationError
-from wholearm.formation import Formation
-from wholearm.model import Array
-from wholearm.problem import End, Phase, Problem, Until
+from wholearm.common.arrays import Array
+from wholearm.common.errors import SimulationError
+from wholearm.contacts.elemental import parse_contact
+from wholearm.contacts.formation import Formation
+from wholearm.mechanics.dynamics import Directions, forward
+from wholearm.problem.definition import End, Phase, Problem, Until
+from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.simulation.simulate import simulate
 from wholearm.simulation.starting import Departure
 from wholearm.simulation.sticking import find_rest
 from wholearm.simulation.transitions import project_velocity
-from wholearm.torque import TorqueProfile
-from wholearm.verify import verify
+from wholearm.verification.verify import verify
 
 RELEASE = 0.5
 """When `plan_landing` lets vertex 3 go [s]."""

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from plane import make_formation, make_scene
-from test_contact import KITE, NAMES, STEP, configurations, measure_gap
-from wholearm.contact import build_features
-from wholearm.model import Scene
-from wholearm.slip import build_slip
+from test_elemental import KITE, NAMES, STEP, configurations, measure_gap
+from wholearm.contacts.elemental import build_features
+from wholearm.contacts.slip import build_slip
+from wholearm.scene.model import Scene
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from test_timelayout import random_points
+from test_time_layout import random_points
 
 
 def test_breaks_and_places_follow_the_shares_of_the_intervals() -> None:

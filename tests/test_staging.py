@@ -10,14 +10,14 @@ from plane import measure_gaps
 from thrown import lift
 from timed import landing
 from tipping import roll, tilting
-from wholearm.outline import outline_phase
-from wholearm.path import trace_phases
-from wholearm.problem import End, Until
-from wholearm.timedomain.collocation import make_scheme
-from wholearm.timedomain.modes import LEAST_INTERVALS
-from wholearm.timedomain.ownunits import in_own_units
-from wholearm.timedomain.stage import Stage
-from wholearm.timedomain.staging import outline_stages
+from wholearm.geometry.path_guess import outline_phase
+from wholearm.geometry.tracing import trace_phases
+from wholearm.planning.time_domain.collocation import make_scheme
+from wholearm.planning.time_domain.modes import LEAST_INTERVALS
+from wholearm.planning.time_domain.own_units import in_own_units
+from wholearm.planning.time_domain.stage import Stage
+from wholearm.planning.time_domain.staging import outline_stages
+from wholearm.problem.definition import End, Until
 
 SCHEME = make_scheme("radau", 3)
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from wholearm.errors import InputError
-from wholearm.model import Array
-from wholearm.torque import TorqueProfile, read_torque_csv
+from wholearm.common.arrays import Array
+from wholearm.common.errors import InputError
+from wholearm.results.torque import TorqueProfile, read_torque_csv
 
 GOOD = "t,tau1,tau2\n0,1,-1\n0.5,2,-2\n0.5,4,0\n2,1,3\n"
 

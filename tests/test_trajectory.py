@@ -9,10 +9,16 @@ import numpy as np
 import pytest
 
 from tipping import tipped
-from wholearm.errors import InputError
-from wholearm.model import Array
-from wholearm.torque import TorqueProfile
-from wholearm.trajectory import SampledMotion, Samples, Trajectory, assemble, load_trajectory
+from wholearm.common.arrays import Array
+from wholearm.common.errors import InputError
+from wholearm.results.torque import TorqueProfile
+from wholearm.results.trajectory import (
+    SampledMotion,
+    Samples,
+    Trajectory,
+    assemble,
+    load_trajectory,
+)
 
 ARRAYS = ["t", "q", "theta", "q_dot", "theta_dot", "q_ddot", "theta_ddot", "tau", "c_n", "c_t"]
 TEXT = ["contacts", "meta"]

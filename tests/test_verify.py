@@ -12,11 +12,11 @@ from crossing import hexagon, measure_fingers
 from planned import change, plan
 from shipped import HEXAGON, plan_of, problem_of
 from tipping import box, scale, tipped
-from wholearm.errors import InputError
-from wholearm.model import Array
+from wholearm.common.arrays import Array
+from wholearm.common.errors import InputError
+from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.simulate import simulate
-from wholearm.torque import TorqueProfile
-from wholearm.verify import verify
+from wholearm.verification.verify import verify
 
 
 def brake_less(starts: Array, c: Array) -> Array:

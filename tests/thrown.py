@@ -9,10 +9,11 @@ import numpy as np
 from scipy.integrate import quad
 
 from plane import make_scene, rotate
-from wholearm.contact import parse_contact
-from wholearm.formation import Formation, close_finger, find_touching, place_flush
-from wholearm.model import Array, Friction, Scene
-from wholearm.problem import End, Phase, Problem, Until
+from wholearm.common.arrays import Array
+from wholearm.contacts.elemental import parse_contact
+from wholearm.contacts.formation import Formation, close_finger, find_touching, place_flush
+from wholearm.problem.definition import End, Phase, Problem, Until
+from wholearm.scene.model import Friction, Scene
 
 HALF = 0.03
 """Half a side of the square [m]."""

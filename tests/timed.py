@@ -14,17 +14,17 @@ from scipy.integrate import solve_ivp
 from once import once
 from plane import accelerate
 from shipped import LANDING, plan_of, problem_of
-from wholearm.dynamics import Directions
-from wholearm.formation import Formation
-from wholearm.model import Array
-from wholearm.options import PlanOptions
-from wholearm.path import trace_phases
-from wholearm.phaseplan import PhasePlan
-from wholearm.problem import Problem
-from wholearm.timedomain.collocation import Scheme
-from wholearm.timedomain.stage import StagePoints
-from wholearm.timedomain.timemotion import StageMotion, TimeMotion
-from wholearm.timedomain.timeplan import plan_phases
+from wholearm.common.arrays import Array
+from wholearm.contacts.formation import Formation
+from wholearm.geometry.tracing import trace_phases
+from wholearm.mechanics.dynamics import Directions
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.phase_plan import PhasePlan
+from wholearm.planning.time_domain.collocation import Scheme
+from wholearm.planning.time_domain.motion import StageMotion, TimeMotion
+from wholearm.planning.time_domain.plan import plan_phases
+from wholearm.planning.time_domain.stage import StagePoints
+from wholearm.problem.definition import Problem
 
 
 def landing() -> Problem:

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from wholearm.curve import Curve
-from wholearm.dynamics import PathForces, inverse
-from wholearm.model import Array
-from wholearm.pathdomain.pathmotion import directions_of
+from wholearm.common.arrays import Array
+from wholearm.geometry.curve import Curve
+from wholearm.mechanics.dynamics import PathForces, inverse
+from wholearm.planning.path_domain.motion import directions_of
 
 
 def _look(curve: Curve, steps: int) -> tuple[Array, PathForces]:

@@ -13,14 +13,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from wholearm.curve import Curve, Segment
-from wholearm.dynamics import Directions, PathForces
-from wholearm.model import Array, Scales
-from wholearm.options import PlanOptions
-from wholearm.pathdomain import pathdata
-from wholearm.pathdomain.pathmotion import PathMotion
-from wholearm.pathdomain.pathplan import plan_path
-from wholearm.phaseplan import PhasePlan
+from wholearm.common.arrays import Array
+from wholearm.geometry.curve import Curve, Segment
+from wholearm.mechanics.dynamics import Directions, PathForces
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.path_domain import data as pathdata
+from wholearm.planning.path_domain.motion import PathMotion
+from wholearm.planning.path_domain.plan import plan_path
+from wholearm.planning.phase_plan import PhasePlan
+from wholearm.scene.model import Scales
 
 Law = Callable[[Array, NDArray[np.bool_]], tuple[Array, ...]]
 """Coefficients (Ta, Tl, Tv), each (n, 2), at n arc lengths, before or after the break."""

@@ -10,14 +10,11 @@ Everything is imported when it is first used, so that a program pays only for wh
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from . import plots
-    from .errors import (
+    from .common.errors import (
         InfeasibleError,
         InputError,
         JammingError,
@@ -25,30 +22,31 @@ if TYPE_CHECKING:
         SolverError,
         WholearmError,
     )
-    from .outline import load
-    from .plan import solve
+    from .figures import plots
+    from .geometry.path_guess import load
+    from .planning.plan import solve
+    from .results.torque import TorqueProfile, read_torque_csv
+    from .results.trajectory import Trajectory, load_trajectory
     from .simulation.simulate import simulate
-    from .torque import TorqueProfile, read_torque_csv
-    from .trajectory import Trajectory, load_trajectory
-    from .verify import verify
+    from .verification.verify import verify
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "InfeasibleError": "errors",
-    "InputError": "errors",
-    "JammingError": "errors",
-    "SimulationError": "errors",
-    "SolverError": "errors",
-    "TorqueProfile": "torque",
-    "Trajectory": "trajectory",
-    "WholearmError": "errors",
-    "load": "outline",
-    "load_trajectory": "trajectory",
-    "read_torque_csv": "torque",
+    "InfeasibleError": "common.errors",
+    "InputError": "common.errors",
+    "JammingError": "common.errors",
+    "SimulationError": "common.errors",
+    "SolverError": "common.errors",
+    "TorqueProfile": "results.torque",
+    "Trajectory": "results.trajectory",
+    "WholearmError": "common.errors",
+    "load": "geometry.path_guess",
+    "load_trajectory": "results.trajectory",
+    "read_torque_csv": "results.torque",
     "simulate": "simulation.simulate",
-    "solve": "plan",
-    "verify": "verify",
+    "solve": "planning.plan",
+    "verify": "verification.verify",
 }
 
 __all__ = [
@@ -73,7 +71,7 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name == "plots":
-        return import_module(".plots", __name__)
+        return import_module(".figures.plots", __name__)
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f".{_HOMES[name]}", __name__), name)
@@ -83,15 +81,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
-
-
-class _Package(ModuleType):
-    """Keeps `simulate` and `verify` functions when the modules of the same name are imported."""
-
-    def __setattr__(self, name: str, value: object) -> None:
-        if name in _HOMES and isinstance(value, ModuleType):
-            value = getattr(value, name)
-        super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package

@@ -5,14 +5,16 @@ import contextlib
 import os
 import signal
 import sys
+from collections.abc import Sequence
 
-from .interrupts import ENDED, guard
+from .common.interrupts import ENDED, guard
 
 
-def _run() -> int:
-    from .cli import main
+def start(arguments: Sequence[str] | None = None) -> int:
+    """Run the command of the given arguments, or of the process's, and return its exit status."""
+    from .cli.command import main
 
-    return main()
+    return main(arguments)
 
 
 def run() -> None:
@@ -21,7 +23,7 @@ def run() -> None:
         sys.stdout = open(os.devnull, "w", encoding="utf-8")
     if sys.stderr is None:
         sys.stderr = open(os.devnull, "w", encoding="utf-8")
-    status = guard(_run)
+    status = guard(start)
     # What the command had to do is done; exiting takes a moment, and would be a traceback.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)

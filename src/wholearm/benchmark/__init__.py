@@ -1,1 +1,1 @@
-"""Run time against error, beside plain baselines."""
+"""Run time against error, and other studies."""

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from ..curve import Curve
-from ..ipopt import STOPPED
-from ..torque import TorqueProfile
+from ..geometry.curve import Curve
+from ..results.torque import TorqueProfile
+from ..solvers.ipopt import STOPPED
 
 
 class BaselineResult(NamedTuple):

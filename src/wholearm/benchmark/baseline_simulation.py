@@ -1,4 +1,4 @@
-"""The simulation an ordinary user would write, to measure `wholearm.simulation.simulate` against.
+"""The simulation an ordinary user would write, to measure `simulation.simulate` against.
 
 The Newton-Euler equations of object and fingers are written out in NumPy, contact by contact, and
 solved together with the contact conditions as one linear system in every call of
@@ -15,10 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..contact import Contact
-from ..model import Array, Scene
-from ..problem import Problem
-from ..torque import TorqueProfile
+from ..common.arrays import Array
+from ..contacts.elemental import Contact
+from ..problem.definition import Problem
+from ..results.torque import TorqueProfile
+from ..scene.model import Scene
 
 
 class BaselineRun(NamedTuple):

@@ -15,10 +15,10 @@ import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from ..errors import InfeasibleError, ReplayError, SolverError
-from ..options import CHOICES
-from ..plan import solve
-from ..problem import Problem, read_problem
+from ..common.errors import InfeasibleError, ReplayError, SolverError
+from ..planning.options import CHOICES
+from ..planning.plan import solve
+from ..problem.definition import Problem, read_problem
 
 INTERVALS = (8, 10, 12, 16, 20, 30, 40)
 DEGREES = (3, 4)

@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..contact import Contact
-from ..model import Array
-from ..options import Objective
-from ..plan import solve
-from ..problem import ROLLING, Problem, build_problem
-from ..trajectory import Trajectory
+from ..common.arrays import Array
+from ..contacts.elemental import Contact
+from ..planning.options import Objective
+from ..planning.plan import solve
+from ..problem.definition import ROLLING, Problem, build_problem
+from ..results.trajectory import Trajectory
 
 Table = Mapping[str, Any]
 _NAME = re.compile(r"([ve])(\d+)-(palm|finger|tip)([12]?)")

@@ -3,7 +3,7 @@
 ``python -m wholearm.benchmark.legs [--legs 200] [--seed 0] [--objective all] [--jobs 2]`` prints a
 line for each leg and a table. A leg slides along the palm and then goes through one to three cells,
 from rest to rest; the map lists its phases. Plans are verified by replay and an independent
-residual, refusals are looked at by linear programmes of their own (`wholearm.benchmark.refusals`).
+residual, refusals are looked at by linear programmes of their own (`benchmark.stress.refusals`).
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import InfeasibleError, InputError, SolverError, WholearmError
+from ..common.errors import InfeasibleError, InputError, SolverError, WholearmError
 from ..mapping.route import format_route, list_formations
-from ..options import CHOICES
-from ..plan import solve
-from ..problem import Problem, build_problem, read_problem
-from ..verify import verify
-from .plancheck import check_plan
-from .refusals import judge
-from .scenes import Table
-from .workers import run_tasks
+from ..planning.options import CHOICES
+from ..planning.plan import solve
+from ..problem.definition import Problem, build_problem, read_problem
+from ..verification.verify import verify
+from .stress.plan_check import check_plan
+from .stress.refusals import judge
+from .stress.scenes import Table
+from .stress.workers import run_tasks
 
 PROBLEMS = ("heptagon", "hexagon", "square", "triangle")
 """Shipped problems whose scenes and starts are taken in turn."""

@@ -11,12 +11,12 @@ from collections import Counter
 
 import numpy as np
 
-from ..errors import InputError
+from ..common.errors import InputError
+from ..geometry.path_guess import load
 from ..mapping.route import Route, format_route, list_formations
-from ..outline import load
-from ..problem import build_problem
-from .scenes import Table, random_route, random_scene
-from .tomltext import to_toml
+from ..problem.definition import build_problem
+from .stress.scenes import Table, random_route, random_scene
+from .stress.toml import to_toml
 
 TRIES = 8
 """Most routes that are drawn in one scene until one can be followed."""

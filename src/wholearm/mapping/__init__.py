@@ -1,1 +1,1 @@
-"""The contact-formation map: closed configurations over the plane of x and phi."""
+"""The map of contact formations over x and phi, and routes through it."""

@@ -20,9 +20,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..contact import Contact
-from ..model import Array, Scene
-from .closing import Closed, Flags, Numbers, close, first_contact, lower, place_corners
+from ..common.arrays import Array
+from ..contacts.elemental import Contact
+from ..geometry.closing import Closed, Flags, Numbers, close, first_contact, lower, place_corners
+from ..scene.model import Scene
 
 SAME_ANGLE, ROUNDING = 1e-7, 1e-11
 """Differences [rad] below which a closed finger that touches one of a border's contacts, and one

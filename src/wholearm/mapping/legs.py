@@ -6,13 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..contact import Contact
-from ..curve import describe_pose
-from ..errors import InputError
-from ..formation import find_touching
-from ..model import Array, Scene
+from ..common.arrays import Array
+from ..common.errors import InputError
+from ..contacts.elemental import Contact
+from ..contacts.formation import find_touching
+from ..geometry.closing import Numbers, close, contact_table, describe_obstacle
+from ..geometry.curve import describe_pose
+from ..scene.model import Scene
 from .borders import Piece, label_cells, name_contacts
-from .closing import Numbers, close, contact_table, describe_obstacle
 from .nearby import Leg, choose_leg, tolerance
 from .pieces import cut
 

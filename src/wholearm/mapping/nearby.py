@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..model import Array, Scene
+from ..common.arrays import Array
+from ..scene.model import Scene
 from .borders import Piece, Track, Window, flush_track, label_cells
 from .borders import palm_track as track_palm
 from .pieces import cut

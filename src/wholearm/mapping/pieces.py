@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..model import Array
+from ..common.arrays import Array
+from ..geometry.closing import Flags, Numbers
 from .borders import NOWHERE, Piece, Track, Window
-from .closing import Flags, Numbers
 
 PARTS, DIVISIONS = 16, 13
 """An interval in which the label changes is cut into so many parts, so often: to rounding."""

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..curve import metric_weights
-from ..dynamics import Directions, force_rows, inverse, reduced_inertia
-from ..formation import Formation, Kinematics
-from ..model import Array, Scene
-from .closing import Flags, Numbers, full_formation
+from ..common.arrays import Array
+from ..contacts.formation import Formation, Kinematics
+from ..geometry.closing import Flags, Numbers, full_formation
+from ..mechanics.dynamics import Directions, force_rows, inverse, reduced_inertia
+from ..mechanics.metric import metric_weights
+from ..scene.model import Scene
 
 WAYS = ("+x", "-x", "+phi", "-phi")
 """Directions of travel inside a cell."""

@@ -9,14 +9,14 @@ from typing import overload
 
 import numpy as np
 
-from ..contact import Contact
-from ..errors import InputError
-from ..formation import close_finger, place_flush
-from ..model import Array
-from ..outline import outline_phase
-from ..path import trace_phases
-from ..problem import Problem, Until
-from ..sharing import exclusive
+from ..common.arrays import Array
+from ..common.errors import InputError
+from ..common.sharing import exclusive
+from ..contacts.elemental import Contact
+from ..contacts.formation import close_finger, place_flush
+from ..geometry.path_guess import outline_phase
+from ..geometry.tracing import trace_phases
+from ..problem.definition import Problem, Until
 from .borders import Window
 from .legs import describe_place
 from .nearby import describe_miss, find_miss, tolerance

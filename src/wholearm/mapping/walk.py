@@ -9,16 +9,17 @@ from itertools import permutations
 
 import numpy as np
 
-from ..contact import Contact
-from ..curve import describe_pose
-from ..errors import InputError
-from ..explore import STILL, is_inside
-from ..formation import Formation
-from ..metric import metric_weights
-from ..model import Array, Scene
-from ..outline import outline_phase
-from ..path import runs_on_curve, trace_phase
-from ..problem import Phase, Problem, Until
+from ..common.arrays import Array
+from ..common.errors import InputError
+from ..contacts.elemental import Contact
+from ..contacts.formation import Formation
+from ..geometry.curve import describe_pose
+from ..geometry.explore import STILL, is_inside
+from ..geometry.path_guess import outline_phase
+from ..geometry.tracing import runs_on_curve, trace_phase
+from ..mechanics.metric import metric_weights
+from ..problem.definition import Phase, Problem, Until
+from ..scene.model import Scene
 from .legs import Part, split_leg
 from .nearby import tolerance
 

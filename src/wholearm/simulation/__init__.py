@@ -1,1 +1,1 @@
-"""Forward simulation, which shares nothing with planning but the model."""
+"""Forward simulation with contacts and joints that stick, slip and are gained."""

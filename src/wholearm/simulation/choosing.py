@@ -28,9 +28,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import JammingError
-from ..formation import Formation
-from ..model import Array, Scene
+from ..common.arrays import Array
+from ..common.errors import JammingError
+from ..contacts.formation import Formation
+from ..scene.model import Scene
 from .events import EventKind
 from .modes import Mode, Response, Rows, Unit, find_fixed, find_grips, list_units, respond
 from .replay import Replay

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..errors import SimulationError
-from ..formation import Formation
-from ..model import Array
+from ..common.arrays import Array
+from ..common.errors import SimulationError
+from ..contacts.formation import Formation
 
 _CLOSED = 3e-15
 """Gap that counts as rounding, relative to the scene's length."""

@@ -9,9 +9,9 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from ..dynamics import energy
-from ..model import Array
-from ..problem import Phase, Problem
+from ..common.arrays import Array
+from ..mechanics.dynamics import energy
+from ..problem.definition import Phase, Problem
 from .layout import Outputs
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..problem import End
+from ..problem.definition import End
 from .choosing import choose_mode, note_change
 from .events import EventKind, Outcome
 from .locate import find_first

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..model import Array
+from ..common.arrays import Array
 from .replay import Replay
 
 

@@ -22,10 +22,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from ..contact import Expression
-from ..dynamics import build_force_rows
-from ..formation import Formation
-from ..model import Array
+from ..common.arrays import Array, Expression
+from ..contacts.formation import Formation
+from ..mechanics.dynamics import build_force_rows
 
 INDEPENDENT = 1e-9
 """Least singular value of constraints, each of length one, for forces to be determined."""

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from ..model import Array
-from ..problem import End
+from ..common.arrays import Array
+from ..problem.definition import End
 from .events import EventKind, Outcome, OutcomeKind
 from .jumps import (
     Arrival,
@@ -24,7 +24,7 @@ from .jumps import (
 )
 from .locate import find_first
 from .replay import Replay
-from .rungekutta import ORDER
+from .runge_kutta import ORDER
 from .tolerances import REACHED, SHORTEST_STEP, SLOW, measure_units
 
 

@@ -7,10 +7,10 @@ from bisect import bisect_left
 
 import numpy as np
 
-from ..errors import JammingError, SimulationError
-from ..model import Array
-from ..problem import Phase, Problem
-from ..torque import TorqueProfile
+from ..common.arrays import Array
+from ..common.errors import JammingError, SimulationError
+from ..problem.definition import Phase, Problem
+from ..results.torque import TorqueProfile
 from .events import Event, EventKind, Outcome, OutcomeKind, Section
 from .layout import STATE
 from .modes import FREE, Grips

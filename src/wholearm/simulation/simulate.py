@@ -11,7 +11,7 @@ what the contacts of the next formation do not let through; contacts that this f
 have are let go. A phase without an end of its own is over where that happens, where a contact slips
 that slides in the next phase, or where contacts come to rest that roll there. If a phase ends with
 an impact, impulses of the next formation's contacts change the velocity, and all of them have to
-press (`wholearm.impact`).
+press (`mechanics.impact`).
 
 Nothing here is shared with the planner but the contacts and the scene.
 """
@@ -24,10 +24,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import InputError, JammingError, SimulationError
-from ..problem import End, Phase, Problem
-from ..sharing import exclusive
-from ..torque import TorqueProfile
+from ..common.errors import InputError, JammingError, SimulationError
+from ..common.sharing import exclusive
+from ..problem.definition import End, Phase, Problem
+from ..results.torque import TorqueProfile
 from .events import EventKind, Outcome, OutcomeKind, Simulation, collect
 from .jumps import Arrival, Ending, Released, Rested, Switched, is_there
 from .moving import move

@@ -17,9 +17,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..dynamics import Directions
-from ..formation import Formation, Kinematics
-from ..model import Array
+from ..common.arrays import Array
+from ..contacts.formation import Formation, Kinematics
+from ..mechanics.dynamics import Directions
 from .modes import Grips, Mode, Response, Rows, find_grips, list_units, respond
 from .tolerances import ROUNDING_FORCE, Tolerances, find_tolerances, measure_units
 
@@ -93,7 +93,7 @@ class RestDirection:
     acceleration : ndarray, shape (3,)
         Acceleration along `heading` is acceleration @ (1, tau_1, tau_2).
     holds : ndarray, shape (n_c + 2 R, 3)
-        Likewise what has to be positive for the contacts to hold, H c [N] (`wholearm.cones`).
+        Likewise what has to be positive for the contacts to hold, H c [N] (`contacts.cones`).
     ratio : float
         Reduced inertia over that without friction; jammed at zero and below.
     closes : bool
@@ -191,7 +191,7 @@ class Pattern:
     acceleration : ndarray, shape (5, 3)
         z''.
     holds : ndarray, shape (n_c + 2 R, 3), [N]
-        What has to be positive for the contacts to hold, H c (`wholearm.cones`).
+        What has to be positive for the contacts to hold, H c (`contacts.cones`).
     slips : ndarray, shape (n_c + 2, 3)
         Accelerations of the contacts' sliding and of the joints, along `directions`.
     grips : ndarray, shape (2 k, 3), [N, N m]

@@ -6,9 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..contact import Contact
-from ..formation import Formation
-from ..model import Array, Scene
+from ..common.arrays import Array
+from ..contacts.elemental import Contact
+from ..contacts.formation import Formation
+from ..scene.model import Scene
 
 BALANCED = 1e-6
 """Pull that counts as none, relative to the scene's force: the accuracy of the linear programme."""

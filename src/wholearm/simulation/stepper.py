@@ -13,14 +13,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..contact import Expression, Limit, build_features, build_gap
-from ..formation import Formation
-from ..model import Array
-from ..problem import Until
+from ..common.arrays import Array, Expression
+from ..contacts.elemental import Limit, build_features, build_gap
+from ..contacts.formation import Formation
+from ..problem.definition import Until
 from .layout import STATE, EventRows, Inputs, Outputs, lay_out
-from .mechanics import Mechanics, share_mechanics
+from .mode_equations import Mechanics, share_mechanics
 from .modes import FREE, Grips, Mode
-from .rungekutta import build_step
+from .runge_kutta import build_step
 from .tolerances import find_tolerances
 
 

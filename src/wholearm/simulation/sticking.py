@@ -18,12 +18,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cones import find_weakest
-from ..contact import Contact
-from ..dynamics import Directions
-from ..errors import SimulationError
-from ..formation import Formation, Kinematics
-from ..model import Array
+from ..common.arrays import Array
+from ..common.errors import SimulationError
+from ..contacts.cones import find_weakest
+from ..contacts.elemental import Contact
+from ..contacts.formation import Formation, Kinematics
+from ..mechanics.dynamics import Directions
 from .closing import close_contacts
 from .modes import Mode
 from .starting import Departure, RestDirection, Way, find_patterns, respond_at_rest

@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..model import Array, Scene
-from ..problem import Until
+from ..common.arrays import Array
+from ..problem.definition import Until
+from ..scene.model import Scene
 
 ROUNDING_FORCE = 1e-9
 """How far below zero a force, a torque or what friction has left counts as rounding."""

@@ -7,11 +7,11 @@ from itertools import product
 
 import numpy as np
 
-from ..errors import JammingError, SimulationError
-from ..formation import Formation
-from ..impact import Obstacle, strike, transfer
-from ..model import Array
-from ..problem import End, Phase
+from ..common.arrays import Array
+from ..common.errors import JammingError, SimulationError
+from ..contacts.formation import Formation
+from ..mechanics.impact import Obstacle, strike, transfer
+from ..problem.definition import End, Phase
 from .choosing import measure_rates
 from .closing import close_contacts
 from .events import EventKind, Outcome, OutcomeKind

@@ -1,0 +1,348 @@
+"""Run time against error: of the planner, of the simulator, and of plain baselines beside them."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.errors import InputError, WholearmError
+from ..common.sharing import exclusive
+from ..geometry.curve import Curve
+from ..geometry.tracing import trace_phases
+from ..planning.options import Objective, PlanOptions
+from ..planning.path_domain.data import prepare
+from ..planning.path_domain.motion import PathMotion, make_grid
+from ..planning.path_domain.nlp import build_path_nlp
+from ..planning.path_domain.plan import guess, plan_path
+from ..planning.plan import solve
+from ..problem.definition import End, Problem, read_problem
+from ..results.torque import TorqueProfile
+from ..simulation.events import Simulation
+from ..simulation.simulate import simulate
+from ..verification.verify import verify
+from .baseline_opti import plan_with_opti
+from .baseline_simulation import simulate_with_scipy
+from .changes import measure_stress
+from .report import Row, write_results
+from .time_domain import measure_blocks, measure_order, measure_transcriptions
+
+INTERVALS = (10, 20, 40, 80, 160, 320, 640, 800)
+FINE = 1600
+TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
+FINEST = 1e-13
+SCIPY_METHODS = ("DOP853", "RK45")
+BASELINE_INTERVALS = 40
+REPEATS = 3
+
+
+@exclusive
+def run_bench(
+    problem: Problem, folder: str, progress: Callable[[str], None] | None = None
+) -> list[str]:
+    """Measure everything and write a table (Markdown, CSV) and a figure (PNG).
+
+    Parameters
+    ----------
+    problem : Problem
+    folder : str
+        Made if it does not exist.
+    progress : callable, optional
+        Told what is being measured.
+
+    Returns
+    -------
+    list of str
+        The files written.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be made or written.
+    """
+    try:
+        os.makedirs(folder, exist_ok=True)
+    except OSError as error:
+        raise InputError(folder, "", f"cannot be made: {error.strerror}") from None
+    report = progress or (lambda _: None)
+    curves = keep_curves(problem)
+    studies: list[tuple[Callable[[Problem], list[Row]], Problem | None]] = [
+        *((study, curves) for study in ON_CURVES),
+        (measure_blocks, problem),
+        (measure_stress, problem),
+        (measure_parts, problem),
+    ]
+    rows: list[Row] = []
+    for study, what in studies:
+        name = study.__name__.removeprefix("measure_").replace("_", " ")
+        report(f"bench: {name}")
+        try:
+            rows += study(what) if what is not None else []
+        except WholearmError as error:
+            rows.append(Row(name, "not measured", "", 0.0, None, str(error)))
+    stem = os.path.splitext(os.path.basename(problem.source or problem.name))[0]
+    return write_results(problem.name, rows, os.path.join(folder, f"bench_{stem}"))
+
+
+def keep_curves(problem: Problem) -> Problem | None:
+    """The first phases of a problem as far as each is a curve of four sliding contacts.
+
+    These are what the baselines know; None if already the first phase is not.
+    """
+    curves = trace_phases(problem)
+    rolling = [bool(phase.formation.rolling) for phase in problem.phases[: len(curves)]]
+    count = [*rolling, True].index(True)
+    kept = tuple(replace(phase, end=End.REST) for phase in problem.phases[:count])
+    return replace(problem, phases=kept) if kept else None
+
+
+def measure_planner(problem: Problem) -> list[Row]:
+    """Planner over the number of intervals, building included.
+
+    The error of the phase time is the largest relative one against a fine solution; that of the
+    simulated end is the largest difference of any z between plan and simulation at a phase's end.
+    """
+    curves = trace_phases(problem)
+    fine = _plan_times(problem, curves, FINE)
+    rows = []
+    for intervals in INTERVALS:
+        seconds = []
+        for _ in range(REPEATS):
+            build_path_nlp.cache_clear()
+            started = time.perf_counter()
+            times = _plan_times(problem, curves, intervals)
+            seconds.append(time.perf_counter() - started)
+        trajectory = solve(problem, intervals=intervals)
+        ends = trajectory.phase_starts[1:]
+        simulation = simulate(problem, trajectory.torque, tolerance=1e-11, times=ends)
+        missed = 0.0
+        for index, end in enumerate(ends):
+            planned = trajectory.motions[index].evaluate(
+                np.array([end]) - ends[index - 1] * (index > 0)
+            )
+            nearest = np.flatnonzero(simulation.phase == index)[-1]
+            missed = max(missed, float(np.abs(planned.z[0] - simulation.z[nearest]).max()))
+        error = float(np.abs(times / fine - 1).max())
+        median = statistics.median(seconds)
+        rows.append(Row("planner: phase time", "path NLP", str(intervals), median, error))
+        rows.append(Row("planner: simulated end", "path NLP", str(intervals), median, missed))
+    return rows
+
+
+def _plan_times(problem: Problem, curves: Sequence[Curve], intervals: int) -> Array:
+    options = PlanOptions(intervals=intervals)
+    plans = [
+        plan_path(curve, problem.epsilon, options, phase.number)
+        for phase, curve in zip(problem.phases, curves, strict=True)
+    ]
+    return np.array([plan.motion.duration for plan in plans])
+
+
+def measure_simulator(problem: Problem) -> list[Row]:
+    """Simulator over its tolerance, and SciPy's `solve_ivp` on plain NumPy callbacks.
+
+    Both replay all phases, with smooth torques in a few long pieces and with planned ones in many.
+    """
+    slow = [_cosine_motion(curve, problem.epsilon) for curve in trace_phases(problem)]
+    planned = [
+        plan_path(curve, problem.epsilon, PlanOptions(), phase.number).motion
+        for phase, curve in zip(problem.phases, trace_phases(problem), strict=True)
+    ]
+    smooth, few = _join_torques(slow, 14), TOLERANCES
+    rough, many = _join_torques(planned, 6), TOLERANCES[2::3]
+    return [
+        *_replay(problem, "simulator", slow, smooth, few),
+        *_replay(problem, "simulator, planned torques", planned, rough, many),
+    ]
+
+
+def _replay(
+    problem: Problem,
+    study: str,
+    motions: Sequence[PathMotion],
+    torque: TorqueProfile,
+    tolerances: Sequence[float],
+) -> list[Row]:
+    """Replay torques with both simulators, SciPy stretch by stretch from exact states.
+
+    The error is the largest of any z or z' shortly before the end of a stretch between reversals.
+    """
+    marks = _find_marks(motions)
+    looks = marks[:-1] + 0.95 * np.diff(marks)
+    times = np.sort(np.concatenate([marks, looks]))
+    exact = simulate(problem, torque, tolerance=FINEST, times=times)
+    wanted, starts = _states_at(exact, looks), _states_at(exact, marks[:-1])
+    stretches = [(i, part) for i, motion in enumerate(motions) for part in motion.curve.segments]
+    rows = []
+    for tolerance in tolerances:
+        seconds = []
+        for _ in range(REPEATS):
+            started = time.perf_counter()
+            run = simulate(problem, torque, tolerance=tolerance, times=looks)
+            seconds.append(time.perf_counter() - started)
+        error = float(np.abs(_states_at(run, looks) - wanted).max())
+        median = statistics.median(seconds)
+        rows.append(Row(study, "wholearm", f"{tolerance:g}", median, error, f"{run.steps} steps"))
+    import scipy.integrate  # noqa: F401 -- so that no timing below includes it
+
+    for method, tolerance in itertools.product(SCIPY_METHODS, tolerances):
+        started = time.perf_counter()
+        error, calls = 0.0, 0
+        for k, (index, part) in enumerate(stretches):
+            plain = simulate_with_scipy(
+                problem,
+                index,
+                torque,
+                starts[k, :5],
+                starts[k, 5:],
+                part.Xi,
+                part.sigma,
+                (marks[k], looks[k]),
+                rtol=tolerance,
+                atol=tolerance,
+                method=method,
+            )
+            calls += plain.evaluations
+            end = np.append(plain.z[-1], plain.z_dot[-1])
+            error = max(error, float(np.abs(end - wanted[k]).max()))
+        elapsed = time.perf_counter() - started
+        note = f"{calls} evaluations"
+        rows.append(Row(study, f"SciPy {method}", f"{tolerance:g}", elapsed, error, note))
+    return rows
+
+
+def _cosine_motion(curve: Curve, epsilon: float) -> PathMotion:
+    """A slow smooth motion with its squeeze amid the range that limits allow."""
+    data = prepare(curve, epsilon, make_grid(curve, 3 + len(curve.segments)), 0)
+    profile, _ = guess(data)
+    slow = 0.3
+    calm = profile._replace(a=slow * profile.a, b=slow * profile.b)
+    return PathMotion(curve, data.grid, calm)
+
+
+def _join_torques(motions: Sequence[PathMotion], degree: int) -> TorqueProfile:
+    """Torques of motions one after the other, one piece for each interval."""
+    profiles = []
+    for motion in motions:
+        own = motion.times[np.append(motion.grid.steps > 0, True)]
+
+        def torque(t: Array, motion: PathMotion = motion) -> Array:
+            return motion.evaluate(t).tau
+
+        profiles.append(TorqueProfile.fit(own, torque, degree))
+    return TorqueProfile.chain(profiles)
+
+
+def _find_marks(motions: Sequence[PathMotion]) -> Array:
+    """When each stretch between reversals starts, and when the last one ends [s]."""
+    marks, start = [0.0], 0.0
+    for motion in motions:
+        last = np.flatnonzero(np.diff(motion.grid.segment, append=-1))
+        marks += (start + motion.times[last]).tolist()
+        start += motion.duration
+    return np.array(marks)
+
+
+def _states_at(simulation: Simulation, times: Array) -> Array:
+    """States (z, z') of a simulation at instants it was asked for, shape (n, 10)."""
+    return np.array([simulation.at(t) for t in times])
+
+
+def measure_baseline(problem: Problem) -> list[Row]:
+    """Plain time-domain transcription of the same phases, and ours beside it.
+
+    The error is that of the phase time against a fine solution; a negative one is a time that
+    limits do not allow. The note has the least c_n of an open-loop replay of the phase.
+    """
+    rows = []
+    options, fine = PlanOptions(), PlanOptions(intervals=FINE)
+    ours, theirs = 0.0, 0.0
+    build_path_nlp.cache_clear()
+    for phase, curve in zip(problem.phases, trace_phases(problem), strict=True):
+        started = time.perf_counter()
+        plan = plan_path(curve, problem.epsilon, options, phase.number)
+        elapsed = time.perf_counter() - started
+        plain = plan_with_opti(curve, problem.epsilon, BASELINE_INTERVALS)
+        took = plain.build_time + plain.solve_time
+        least = plan_path(curve, problem.epsilon, fine, phase.number).motion.duration
+        number = f"phase {phase.number}"
+        alone = replace(problem, start=curve.start, phases=(replace(phase, index=0),))
+        for method, seconds, duration, torque, iterations in (
+            ("path NLP", elapsed, plan.motion.duration, plan.torque, plan.iterations),
+            ("plain Opti", took, plain.duration, plain.torque, plain.iterations),
+        ):
+            margins = verify(alone, torque).phases[0].contacts
+            weakest = min(contact.least for contact in margins)
+            note = f"T = {duration:.6f} s, {iterations} iterations, least c_n {weakest:.4f} N"
+            rows.append(Row("least time", method, number, seconds, duration / least - 1, note))
+        ours += elapsed
+        theirs += took
+    note = f"{ours / theirs:.4f} of plain Opti"
+    rows.append(Row("least time", "path NLP", "all phases", ours, None, note))
+    note = f"{theirs / ours:.0f} x path NLP"
+    rows.append(Row("least time", "plain Opti", "all phases", theirs, None, note))
+    return rows
+
+
+def measure_parts(problem: Problem) -> list[Row]:
+    """What the parts of planning cost, and the whole process against importing its libraries."""
+    rows = []
+
+    def timed(name: str, run: Callable[[], Any], before: Callable[[], object] = int) -> Any:
+        seconds, result = [], None
+        for _ in range(REPEATS):
+            before()
+            started = time.perf_counter()
+            result = run()
+            seconds.append(time.perf_counter() - started)
+        rows.append(Row("parts", name, "", statistics.median(seconds), None))
+        return result
+
+    def forget() -> None:
+        build_path_nlp.cache_clear()
+        trace_phases.cache_clear()
+
+    if problem.source:
+        timed("read", lambda: read_problem(problem.source))
+    timed("trace", lambda: trace_phases(problem), forget)
+    timed(
+        "build the NLP", lambda: build_path_nlp(4, PlanOptions().intervals, Objective.TIME), forget
+    )
+    trajectory = timed("plan and sample (NLP built)", lambda: solve(problem))
+    rows.append(Row("parts", "Ipopt alone", "", trajectory.meta["timings"]["solve"], None))
+    with tempfile.TemporaryDirectory() as folder:
+        path = os.path.join(folder, "plan.npz")
+        timed("write", lambda: trajectory.save(path))
+        timed("simulate", lambda: simulate(problem, trajectory.torque))
+        imports = [sys.executable, "-c", "import casadi, numpy"]
+        timed("process: import casadi, numpy", lambda: _run(imports))
+        if problem.source:
+            whole = [sys.executable, "-m", "wholearm", "solve", problem.source, "-o", path]
+            timed("process: wholearm solve", lambda: _run(whole))
+            ratio = rows[-1].seconds / rows[-2].seconds
+            rows[-1] = rows[-1]._replace(note=f"{ratio:.2f} x the imports alone")
+    return rows
+
+
+def _run(command: Sequence[str]) -> None:
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+
+
+ON_CURVES: tuple[Callable[[Problem], list[Row]], ...] = (
+    measure_planner,
+    measure_simulator,
+    measure_baseline,
+    measure_order,
+    measure_transcriptions,
+)
+"""Studies of phases that are curves of four sliding contacts."""

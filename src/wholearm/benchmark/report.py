@@ -1,0 +1,127 @@
+"""Tables and the figure of a benchmark."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import platform
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import casadi as ca
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from .. import __version__
+from ..common.files import together, write_whole
+from ..figures.plots import save
+
+_LOOKS = {
+    "phase time": ("#0072B2", "o"),
+    "simulated end": ("#009E73", "D"),
+    "wholearm": ("#0072B2", "o"),
+    "SciPy DOP853": ("#D55E00", "s"),
+    "SciPy RK45": ("#CC79A7", "^"),
+    "plain Opti": ("#D55E00", "s"),
+}
+
+
+class Row(NamedTuple):
+    """One measurement: what was run, with which setting, how long it took and how wrong it was."""
+
+    study: str
+    method: str
+    setting: str
+    seconds: float
+    error: float | None
+    note: str = ""
+
+
+def write_results(name: str, rows: Sequence[Row], stem: str) -> list[str]:
+    """Write all measurements as Markdown, CSV and PNG; return the files' paths."""
+    paths = [f"{stem}.{ending}" for ending in ("md", "csv", "png")]
+    with together():
+        write_whole(paths[0], lambda stream: stream.write(format_markdown(name, rows).encode()))
+        write_whole(paths[1], lambda stream: stream.write(format_csv(rows).encode()))
+        save(draw_run_times(rows), paths[2])
+    return paths
+
+
+def format_markdown(name: str, rows: Sequence[Row]) -> str:
+    """Tables of all studies as Markdown, stamped with versions."""
+    stamp = (
+        f"wholearm {__version__}, casadi {ca.__version__}, numpy {np.__version__}, "
+        f"Python {platform.python_version()}, {os.cpu_count()} cores"
+    )
+    lines = [f"# Run time against error: {name}", "", stamp, ""]
+    for study in dict.fromkeys(row.study for row in rows):
+        lines += [f"## {study[0].upper()}{study[1:]}", ""]
+        lines += ["| method | setting | seconds | error | note |", "|---|---:|---:|---:|---|"]
+        for row in rows:
+            if row.study == study:
+                error = "" if row.error is None else f"{row.error:.2e}"
+                lines.append(
+                    f"| {row.method} | {row.setting} | {row.seconds:.4f} | {error} | {row.note} |"
+                )
+        lines.append("")
+    return "\n".join(lines)
+
+
+def format_csv(rows: Sequence[Row]) -> str:
+    """All measurements as CSV."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(Row._fields)
+    writer.writerows(rows)
+    return stream.getvalue()
+
+
+def draw_run_times(rows: Sequence[Row]) -> Figure:
+    """Run time against error on logarithmic axes: the planner's left, the simulator's right."""
+    with matplotlib.rc_context({"font.size": 10.0}):
+        figure = Figure(figsize=(10.0, 4.4), layout="constrained")
+        FigureCanvasAgg(figure)
+        planner, simulator = figure.subplots(1, 2)
+        _draw_study(planner, rows, "planner: phase time", "path NLP", "phase time")
+        _draw_study(planner, rows, "planner: simulated end", "path NLP", "simulated end")
+        _draw_baseline(planner, rows)
+        planner.set_title("Planning all phases, over the number of intervals")
+        planner.set_xlabel("error of the phase time [-], of the simulated end [m, rad]")
+        for method in ("wholearm", "SciPy DOP853", "SciPy RK45"):
+            _draw_study(simulator, rows, "simulator", method, method)
+        simulator.set_title("Simulating all phases, over the tolerance")
+        simulator.set_xlabel("largest error of z and z' [m, rad, m/s, rad/s]")
+        for axes in (planner, simulator):
+            axes.set_xscale("log")
+            axes.set_yscale("log")
+            axes.set_ylabel("run time [s]")
+            axes.grid(True, which="major", color="#c4c9d0", linewidth=0.6)
+            axes.spines[["top", "right"]].set_visible(False)
+            axes.legend(frameon=False)
+    return figure
+
+
+def _draw_study(axes: Axes, rows: Sequence[Row], study: str, method: str, label: str) -> None:
+    mine = [row for row in rows if row.study == study and row.method == method and row.error]
+    points = [(row.error or 0.0, row.seconds) for row in mine]
+    colour, marker = _LOOKS[label]
+    axes.plot(*zip(*points, strict=True), color=colour, marker=marker, label=label)
+    if label == "phase time":
+        for row, point in zip(mine, points, strict=True):
+            look: Any = {"textcoords": "offset points", "fontsize": 8}
+            axes.annotate(row.setting, point, (4, 4), **look)
+
+
+def _draw_baseline(axes: Axes, rows: Sequence[Row]) -> None:
+    mine = [row for row in rows if row.study == "least time" and row.method == "plain Opti"]
+    errors = [abs(row.error) for row in mine if row.error is not None]
+    whole = [row.seconds for row in mine if row.setting == "all phases"]
+    if errors and whole:
+        colour, marker = _LOOKS["plain Opti"]
+        axes.plot(
+            [max(errors)], whole, color=colour, marker=marker, ls="", label="plain Opti, phase time"
+        )

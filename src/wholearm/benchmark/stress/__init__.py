@@ -1,0 +1,1 @@
+"""The stress study: generated scenes, damaged files, and checks of its own."""

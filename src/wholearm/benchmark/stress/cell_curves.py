@@ -1,0 +1,250 @@
+"""Curves through a cell of the map, and the best motion along any of them.
+
+A motion with two freedoms from rest to the end of its phase follows some curve x(u), phi(u), and
+whether any motion along a given curve keeps all limits is a linear programme, whatever its speeds
+and forces (`lpmotion.fast_margin`). Cubic curves to many places of the end are drawn at random, and
+those with the largest margins are bent further as long as these grow: a search for a plan that
+shares neither transcription nor guesses with the planner.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.arrays import Array
+from ...problem.definition import Phase, Until
+from ...scene.model import Scene
+from .newton import locate
+from .overlap import clearances
+from .rest_motion import rest_margin
+from .slow_motion import fast_margin
+from .tracing import weights
+
+PLACES = 40
+"""Configurations along a curve."""
+INSIDE = 1e-4
+"""Overlap, and distance beyond a feature, that passes, over the radius of gyration."""
+DRAWN = 400
+"""Curves that are drawn at first; most leave the cell."""
+TRIED = 40
+"""Curves of these that are looked at."""
+BENT = (6, 10)
+"""Rounds in which the best curves are bent, and curves in each."""
+BEST = 3
+"""Curves that are bent further in each round."""
+LOOSE = 0.01
+"""Rate of sliding over that of the whole below which a contact may stick: nearby curves roll."""
+ENDS = 16
+"""Most places of the end on either side of the nearest one."""
+STEP = 0.08
+"""How far apart the nearest of these are, over the radius of gyration."""
+GROWTH = 1.12
+"""By how much more each is apart from the one before."""
+ENOUGH = 1e-3
+"""Margin with which a curve is as good as wanted."""
+
+Flags = NDArray[np.bool_]
+
+
+class Best(NamedTuple):
+    """The best of many curves.
+
+    Attributes
+    ----------
+    margin : float
+        As of `fast_margin`, without and with friction of slow contacts in their cones.
+    loose : float
+    z : ndarray, shape (PLACES, 5)
+        The curve that has the margin `margin`.
+    curves : int
+        Curves that were looked at.
+    ends : int
+        Places of the end that were looked at.
+    """
+
+    margin: float
+    loose: float
+    z: Array
+    curves: int
+    ends: int
+
+
+def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -> Array:
+    """Places at which a phase with two freedoms ends, those near the pose `stop`, shape (n, 5)."""
+    guess = z.copy()
+    guess[[0, 2]] = stop
+    first = _settle(scene, phase, place(scene, phase, guess[None], z[None])[0])
+    if first is None:
+        first = _settle(scene, phase, z)
+    if first is None:
+        return np.zeros((0, 5))
+    scale = np.sqrt(weights(scene))
+    found = [first]
+    for way in (1.0, -1.0):
+        here, ahead = first, None
+        for step in STEP * scene.scales.length * GROWTH ** np.arange(ENDS):
+            rows = _end_rows(scene, phase, here)[1] / scale
+            tangent = np.linalg.svd(rows)[2][-1] / scale
+            if ahead is None:
+                tangent = way * tangent
+            elif (tangent * scale) @ (ahead * scale) < 0:
+                tangent = -tangent
+            after = _settle(scene, phase, here + step * tangent)
+            if after is None or np.linalg.norm((after - here) * scale) > 3 * step:
+                break
+            here, ahead = after, tangent
+            found.append(here)
+    points = np.array(found)
+    return points[inside(scene, phase, points)]
+
+
+def find_best(scene: Scene, phase: Phase, epsilon: float, z: Array, ends: Array) -> Best:
+    """Look for the curve from `z` to one of `ends` along which a motion keeps limits best.
+
+    The search stops at a curve with the margin `ENOUGH`.
+    """
+    rng = np.random.default_rng(0)
+    start, size = z[[0, 2]], np.array([scene.scales.length, 1.0])
+    goals = ends[:, [0, 2]]
+
+    def draw(count: int, spread: float) -> Array:
+        """Control points of cubic curves, shape (count, 4, 2), the first of them straight."""
+        last = goals[rng.integers(len(goals), size=count)]
+        points = start + np.linspace(0, 1, 4)[:, None] * (last - start)[:, None]
+        points[:, 1:3] += (
+            spread * rng.uniform(size=(count, 1, 1)) * size * rng.normal(size=(count, 2, 2))
+        )
+        return points
+
+    best: list[tuple[float, float, Array, Array]] = []
+    count = 0
+
+    def look(controls: Array, most: int) -> bool:
+        nonlocal count, best
+        curves = bend(scene, phase, z, controls)
+        kept = np.flatnonzero(keep(scene, phase, curves))[:most]
+        for k in kept:
+            margins = _find_margins(scene, phase, epsilon, curves[k])
+            best.append((*margins, controls[k], curves[k]))
+        count += len(kept)
+        best = sorted(best, key=lambda one: -max(one[0], one[1]))[:BEST]
+        return any(one[0] > ENOUGH for one in best)
+
+    straight = np.linspace(0, 1, 4)[:, None] * (goals - start)[:, None] + start
+    if not look(straight, len(straight)) and not look(draw(DRAWN, 0.5), TRIED):
+        for turn in range(BENT[0]):
+            if not best:
+                break
+            spread = 0.3 * 0.7**turn
+            parents = np.array([best[k % len(best)][2] for k in range(4 * BENT[1])])
+            moves = spread * size * rng.normal(size=(len(parents), 3, 2))
+            children = parents.copy()
+            children[:, 1:3] += moves[:, :2]
+            nearest = goals - (parents[:, 3] + moves[:, 2])[:, None]
+            children[:, 3] = goals[(np.abs(nearest) / size).sum(axis=2).argmin(axis=1)]
+            if look(children, BENT[1]):
+                break
+    if not best:
+        return Best(-np.inf, -np.inf, z[None], 0, len(ends))
+    best.sort(key=lambda one: -one[0])
+    return Best(best[0][0], max(one[1] for one in best), best[0][3], count, len(ends))
+
+
+def best_end(scene: Scene, phase: Phase, epsilon: float, ends: Array) -> float:
+    """Best margin of a motion that comes to rest at one of `ends`; the first one that may."""
+    best = -np.inf
+    for z in ends:
+        best = max(best, rest_margin(scene, phase, epsilon, z, ends=True))
+        if best > 0:
+            break
+    return best
+
+
+def bend(scene: Scene, phase: Phase, z: Array, controls: Array) -> Array:
+    """Configurations of cubic curves from `z`, shape (n, PLACES, 5)."""
+    u = np.linspace(0.0, 1.0, PLACES)[:, None]
+    shares = np.hstack([(1 - u) ** 3, 3 * u * (1 - u) ** 2, 3 * u**2 * (1 - u), u**3])
+    poses = np.einsum("uk,nkd->nud", shares, controls)
+    curves = np.repeat(z[None], len(controls), axis=0)[:, None].repeat(PLACES, axis=1)
+    for k in range(1, PLACES):
+        guess = curves[:, k - 1].copy()
+        guess[:, [0, 2]] = poses[:, k]
+        curves[:, k] = place(scene, phase, guess, curves[:, k - 1])
+    return curves
+
+
+def place(scene: Scene, phase: Phase, z: Array, before: Array) -> Array:
+    """Configurations with the x and phi of `z` that keep the contacts, coming from `before`."""
+    z = z.copy()
+    z[:, [1, 3, 4]] = before[:, [1, 3, 4]]
+    for _ in range(6):
+        touches = [locate(scene, name, z) for name in phase.formation.names]
+        rows = np.stack([touch.normal[:, [1, 3, 4]] for touch in touches], axis=1)
+        gaps = np.stack([touch.gap for touch in touches], axis=1)
+        flat = np.abs(np.linalg.det(rows)) < 1e-12 * scene.scales.length**2
+        rows[flat] = np.eye(3)
+        step = -np.linalg.solve(rows, gaps[..., None])[..., 0]
+        z[:, [1, 3, 4]] += np.clip(step, -0.5, 0.5)
+    return z
+
+
+def keep(scene: Scene, phase: Phase, curves: Array) -> Flags:
+    """Whether curves, shape (n, PLACES, 5), keep their contacts and stay in the cell."""
+    flat = curves.reshape(-1, 5)
+    return np.asarray(inside(scene, phase, flat).reshape(len(curves), -1).all(axis=1))
+
+
+def inside(scene: Scene, phase: Phase, z: Array) -> Flags:
+    """Whether contacts touch within their features at n configurations, and nothing overlaps."""
+    least = INSIDE * scene.scales.length
+    good = np.isfinite(z).all(axis=1)
+    for name in phase.formation.names:
+        touch = locate(scene, name, z)
+        good &= (np.abs(touch.gap) < 1e-8 * scene.scales.length) & (touch.low > -least)
+        good &= touch.high > -least
+    for gap in clearances(scene, z).values():
+        good &= gap > -least
+    return np.asarray(good)
+
+
+def _find_margins(scene: Scene, phase: Phase, epsilon: float, z: Array) -> tuple[float, float]:
+    runs = np.sqrt(np.diff(z, axis=0) ** 2 @ weights(scene))
+    if runs.min() < 1e-6 * scene.scales.length:
+        return -np.inf, -np.inf
+    s = np.append(0.0, np.cumsum(runs))
+    curve = s, z, np.gradient(z, s, axis=0, edge_order=2)
+    plain = fast_margin(scene, phase, epsilon, curve)
+    loose = plain if plain > 0 else fast_margin(scene, phase, epsilon, curve, loose=LOOSE)
+    return np.nan_to_num(plain, nan=-np.inf), np.nan_to_num(loose, nan=-np.inf)
+
+
+def _end_rows(scene: Scene, phase: Phase, z: Array) -> tuple[Array, Array]:
+    """What is missing to contacts and end at one configuration, and its rows."""
+    touches = [locate(scene, name, z[None]) for name in phase.formation.names]
+    gaps = [touch.gap[0] for touch in touches]
+    rows = [touch.normal[0] for touch in touches]
+    until: Until = phase.until
+    if until.contact is not None:
+        touch = locate(scene, until.contact.name, z[None])
+        return np.array([*gaps, touch.gap[0]]), np.array([*rows, touch.normal[0]])
+    row = 2 if until.coordinate == "phi" else 0
+    value = z[row] if until.value is None else until.value
+    return np.array([*gaps, z[row] - value]), np.array([*rows, np.eye(5)[row]])
+
+
+def _settle(scene: Scene, phase: Phase, z: Array) -> Array | None:
+    """The nearest configuration at which a phase ends, or None."""
+    scale, size = np.sqrt(weights(scene)), scene.scales.length
+    for _ in range(20):
+        gaps, rows = _end_rows(scene, phase, z)
+        step = -np.linalg.pinv(rows / scale, rcond=1e-10) @ gaps / scale
+        z = z + step
+        if np.abs(step * scale).max() < 1e-13 * size:
+            break
+    return z if np.abs(_end_rows(scene, phase, z)[0]).max() < 1e-9 * size else None
+
+
+__all__ = ["Best", "best_end", "find_best", "list_ends"]

@@ -1,0 +1,138 @@
+"""Contacts and equations of motion written out for single bodies, to check plans with.
+
+Nothing here uses the C-functions, Jacobians or dynamics of the planner: a contact is a point with a
+normal, bodies move rigidly, and Newton's and Euler's laws hold for each of them. The names are
+those of `scene.model`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ...common.arrays import Array
+from ...scene.model import Scene
+
+
+class Touch(NamedTuple):
+    """A contact at n configurations.
+
+    Attributes
+    ----------
+    gap : ndarray, shape (n,), [m]
+    low, high : ndarray, shape (n,), [m]
+        How far the contact is inside both ends of the feature that it slides on; infinite where
+        the feature has no end of its own.
+    normal, tangent : ndarray, shape (n, 5)
+        Rows that give the rate of separation and of sliding from z', and the force on z from c_n
+        and c_t.
+    friction : float
+        Coefficient mu.
+    """
+
+    gap: Array
+    low: Array
+    high: Array
+    normal: Array
+    tangent: Array
+    friction: float
+
+
+def place_object(scene: Scene, z: Array) -> Array:
+    """World positions of the vertices at n configurations, shape (n, n_v, 2) [m]."""
+    c, s = np.cos(z[:, 2]), np.sin(z[:, 2])
+    turn = np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
+    return np.asarray(z[:, None, :2] + scene.polygon.vertices @ turn.transpose(0, 2, 1))
+
+
+def link_axis(scene: Scene, z: Array, finger: int) -> Array:
+    """Unit vectors from joint to tip, shape (n, 2)."""
+    return np.stack([np.cos(z[:, 3 + finger]), np.sin(z[:, 3 + finger])], axis=1)
+
+
+def locate(scene: Scene, name: str, z: Array) -> Touch:
+    """The contact called `name` at n configurations `z`, shape (n, 5)."""
+    feature, part = name.split("-")
+    index, corners = int(feature[1:]), place_object(scene, z)
+    corner = corners[:, index]
+    endless = np.full(len(z), np.inf)
+    if part == "palm":
+        normal = np.tile([0.0, 1.0], (len(z), 1))
+        return _touch(scene, z, None, corner, normal, corner[:, 1], endless, endless)
+    finger = int(part[-1]) - 1
+    link = scene.fingers[finger]
+    base, axis = np.asarray(link.base), link_axis(scene, z, finger)
+    tip = base + link.length * axis
+    if part.startswith("finger"):
+        side = np.stack([-axis[:, 1], axis[:, 0]], axis=1) * (1 if finger == 0 else -1)
+        gap = _dot(side, corner - base) - link.radius
+        run = _dot(axis, corner - base)
+        return _touch(scene, z, finger, corner, side, gap, run, link.length - run)
+    if feature[0] == "v":
+        apart = corner - tip
+        distance = np.hypot(apart[:, 0], apart[:, 1])
+        normal = apart / np.maximum(distance, np.finfo(float).tiny)[:, None]
+        run = _dot(axis, apart)
+        return _touch(scene, z, finger, corner, normal, distance - link.radius, run, endless)
+    along = corners[:, (index + 1) % corners.shape[1]] - corner
+    length = np.hypot(along[:, 0], along[:, 1])
+    along /= length[:, None]
+    outward = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    gap, run = _dot(outward, tip - corner) - link.radius, _dot(along, tip - corner)
+    point = tip - link.radius * outward
+    return _touch(scene, z, finger, point, -outward, gap, run, length - run)
+
+
+def _touch(
+    scene: Scene,
+    z: Array,
+    finger: int | None,
+    point: Array,
+    normal: Array,
+    gap: Array,
+    low: Array,
+    high: Array,
+) -> Touch:
+    tangent = np.stack([normal[:, 1], -normal[:, 0]], axis=1)
+    rows = []
+    for direction in (normal, tangent):
+        row = np.zeros((len(z), 5))
+        row[:, :2] = direction
+        row[:, 2] = cross(point - z[:, :2], direction)
+        if finger is not None:
+            row[:, 3 + finger] = -cross(point - np.asarray(scene.fingers[finger].base), direction)
+        rows.append(row)
+    return Touch(gap, low, high, rows[0], rows[1], scene.friction.of(finger))
+
+
+def balance(
+    scene: Scene, touches: list[Touch], motion: tuple[Array, Array], tau: Array, forces: Array
+) -> Array:
+    """What is left of Newton's and Euler's laws at n instants, shape (n, 5) [N, N m].
+
+    Parameters
+    ----------
+    touches : list of Touch
+    motion : (ndarray, ndarray), shape (n, 5)
+        z' and z''.
+    tau : ndarray, shape (n, 2), [N m]
+    forces : ndarray, shape (2, n, n_c), [N]
+        c_n and c_t.
+    """
+    z_dot, z_ddot = motion
+    rest = scene.mass_diagonal * z_ddot + scene.viscous * z_dot + scene.dry * np.sign(z_dot)
+    rest = rest - scene.applied_force
+    rest[:, 3:] -= tau
+    for touch, c_n, c_t in zip(touches, forces[0].T, forces[1].T, strict=True):
+        rest -= c_n[:, None] * touch.normal + c_t[:, None] * touch.tangent
+    return np.asarray(rest)
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Plane cross product along the last axis."""
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.asarray((a * b).sum(axis=-1))

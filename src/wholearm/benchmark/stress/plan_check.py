@@ -1,0 +1,204 @@
+"""An independent look at a plan: every instant against Newton, Euler, Coulomb and plain overlap."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...common.arrays import Array
+from ...problem.definition import End, Phase, Problem
+from ...results.trajectory import Samples, Trajectory
+from ...scene.model import Scene
+from .newton import Touch, balance, locate
+from .overlap import clearances
+
+INSTANTS = 401
+"""Instants of a phase that are looked at, besides some in short pieces of its torques."""
+BRIEF = 1e-6
+"""Share of a phase below which a piece of its torques has no length."""
+ROUNDING = 1e-6
+"""What may be left of an equation, over the largest of its terms."""
+OVERLAP = 1e-6
+"""Overlap and open gaps that pass for rounding, over the radius of gyration."""
+STILL = 1e-5
+"""Speed over the scene's own below which friction may point either way."""
+THIN = 2e-3
+"""What a normal force may lack of epsilon, over epsilon: what `verification.verify` allows."""
+
+
+def check_plan(problem: Problem, plan: Trajectory) -> list[str]:
+    """Sentences on what is wrong with a plan; none if nothing is."""
+    found: list[str] = []
+    before: Array | None = None
+    for phase, motion, start in zip(problem.phases, plan.motions, plan.phase_starts, strict=False):
+        t = _choose_times(plan, start, motion.duration)
+        rows = motion.evaluate(t)
+        texts = _check_phase(problem, phase, rows)
+        texts += _check_rates(problem.scene, t, rows)
+        texts += _check_profile(problem.scene, plan, start + t, rows)
+        if before is not None:
+            texts += _check_joint(problem, phase, before, rows)
+        texts += _check_end(problem, phase, rows)
+        before = np.array([rows.z[-1], rows.z_dot[-1]])
+        found += [f"phase {phase.number}: {text}" for text in texts]
+    return found
+
+
+def _choose_times(plan: Trajectory, start: float, duration: float) -> Array:
+    """Instants of a phase, some of them in pieces of its torques that are short [s]."""
+    breaks = plan.torque.breaks - start
+    ends = np.concatenate([[0.0], breaks[(breaks > 0.0) & (breaks < duration)], [duration]])
+    runs = np.diff(ends)
+    short = (runs > BRIEF * duration) & (runs < 2 * duration / INSTANTS)
+    inside = ends[:-1][short, None] + runs[short, None] * np.array([0.1, 0.5, 0.9])
+    return np.unique(np.concatenate([np.linspace(0.0, duration, INSTANTS), inside.ravel()]))
+
+
+def _check_phase(problem: Problem, phase: Phase, rows: Samples) -> list[str]:
+    scene, names = problem.scene, phase.formation.names
+    size, speed = scene.scales.length, scene.scales.speed
+    touches = [locate(scene, name, rows.z) for name in names]
+    texts = []
+    for name, touch in zip(names, touches, strict=True):
+        inside = np.minimum(touch.low, touch.high)
+        worst = {
+            "gap": np.abs(touch.gap).max() / size / OVERLAP,
+            "beyond its feature": -inside.min() / size / OVERLAP,
+            "rate of separation": np.abs((touch.normal * rows.z_dot).sum(axis=1)).max()
+            / max(speed, float(np.abs(rows.z_dot[:, :2]).max()))
+            / ROUNDING,
+        }
+        texts += [f"{what} of {name} is {v:.2g} of its bound" for what, v in worst.items() if v > 1]
+    for pair, gap in clearances(scene, rows.z).items():
+        if gap.min() < -OVERLAP * size:
+            texts.append(f"{pair} overlap by {-gap.min():.3g} m")
+    texts += _check_forces(problem, phase, rows, touches)
+    rest = balance(
+        scene, touches, (rows.z_dot, rows.z_ddot), rows.tau, np.stack([rows.c_n, rows.c_t])
+    )
+    # A joint that all but stands still is held by any dry friction up to its own.
+    still = np.abs(rows.z_dot) < STILL * speed / np.append(np.ones(2), np.full(3, size))
+    slack = np.where(still, 2 * scene.dry, 0.0)
+    biggest = np.maximum(
+        np.abs(scene.mass_diagonal * rows.z_ddot).max(axis=0), scene.scales.force * _arms(scene)
+    )
+    biggest[3:] = np.maximum(biggest[3:], np.abs(rows.tau).max(axis=0))
+    excess = (np.abs(rest) - slack).max(axis=0) / biggest / ROUNDING
+    for k in np.flatnonzero(excess > 1):
+        row = ("x", "y", "phi", "theta_1", "theta_2")[k]
+        at = int((np.abs(rest) - slack)[:, k].argmax())
+        texts.append(
+            f"the equation of {row} misses {rest[at, k]:.3g} ({excess[k]:.2g} of its bound) "
+            f"at instant {at}"
+        )
+    return texts
+
+
+def _arms(scene: Scene) -> Array:
+    length = scene.scales.length
+    return np.array([1.0, 1.0, length, length, length])
+
+
+def _check_forces(problem: Problem, phase: Phase, rows: Samples, touches: list[Touch]) -> list[str]:
+    scene, texts = problem.scene, []
+    force, speed = scene.scales.force, scene.scales.speed
+    names, rolling = phase.formation.names, phase.formation.rolling_rows
+    for k, (name, touch) in enumerate(zip(names, touches, strict=True)):
+        c_n, c_t = rows.c_n[:, k], rows.c_t[:, k]
+        lack = problem.epsilon * (1 - THIN) - c_n.min()
+        if lack > ROUNDING * force:
+            texts.append(f"c_n of {name} is {lack:.3g} N short of epsilon")
+        slip = (touch.tangent * rows.z_dot).sum(axis=1)
+        scale = max(force, float(np.abs(c_n).max())) * ROUNDING * 10
+        over = (np.abs(c_t) - touch.friction * c_n).max()
+        if over > scale:
+            texts.append(f"c_t of {name} is {over:.3g} N outside its friction cone")
+        if k in rolling:
+            if np.abs(slip).max() > 10 * STILL * speed:
+                texts.append(f"{name} rolls, but slides at {np.abs(slip).max():.3g} m/s")
+            continue
+        moving = np.abs(slip) > STILL * speed
+        wrong = np.where(moving, np.abs(c_t + touch.friction * np.sign(slip) * c_n), 0.0).max()
+        if wrong > scale:
+            texts.append(f"friction at {name} is {wrong:.3g} N off Coulomb's for its sliding")
+    over = np.abs(rows.tau).max(axis=0) / scene.torque_limit - 1
+    texts += [
+        f"tau_{j + 1} exceeds its limit by {over[j]:.2g} of it" for j in (0, 1) if over[j] > 1e-5
+    ]
+    quick = np.abs(rows.z_dot[:, 3:]).max(axis=0) / scene.speed_limit - 1
+    texts += [
+        f"joint {j + 1} exceeds its speed by {quick[j]:.2g} of it"
+        for j in (0, 1)
+        if quick[j] > 1e-5
+    ]
+    return texts
+
+
+def _check_rates(scene: Scene, t: Array, rows: Samples) -> list[str]:
+    """Whether z' is the derivative of z, and z'' that of z', as well as samples can tell.
+
+    A step of the acceleration between two instants changes what the trapezium rule gives by no
+    more than what the instants about it show.
+    """
+    texts, h = [], np.diff(t)[:, None]
+    if not (h > 0).all():
+        return ["instants of a phase without a duration"]
+    unit = np.array([1.0, 1.0, *[1.0 / scene.scales.length] * 3])
+    for what, value, rate in (("z", rows.z, rows.z_dot), ("z'", rows.z_dot, rows.z_ddot)):
+        miss = np.abs(np.diff(value, axis=0) - h * (rate[1:] + rate[:-1]) / 2)
+        span = _spread(rate)
+        tiny = 1e-7 * unit * float((np.abs(value) / unit).max())
+        excess = miss - (h * span + tiny)
+        if (excess > 0).any():
+            at, k = np.unravel_index(int(excess.argmax()), excess.shape)
+            texts.append(f"{what} and its rate differ by {miss[at, k]:.3g} in row {k}")
+    return texts
+
+
+def _spread(values: Array) -> Array:
+    """How much values change over the intervals about each interval, shape (n - 1, k)."""
+    padded = np.concatenate([values[:1], values, values[-1:]])
+    windows = np.stack([padded[k : k + len(values) - 1] for k in range(4)])
+    return np.asarray(windows.max(axis=0) - windows.min(axis=0))
+
+
+def _check_profile(scene: Scene, plan: Trajectory, t: Array, rows: Samples) -> list[str]:
+    """Whether the torques as functions of time are those of the motion, between their steps."""
+    breaks = plan.torque.breaks
+    near = np.abs(breaks[np.clip(np.searchsorted(breaks, t), 0, len(breaks) - 1)] - t)
+    before = np.abs(t - breaks[np.clip(np.searchsorted(breaks, t) - 1, 0, len(breaks) - 1)])
+    inside = np.minimum(near, before) > 1e-9 * max(plan.duration, 1e-300)
+    miss = np.abs(plan.torque.at(t) - rows.tau)[inside]
+    share = (miss / scene.torque_limit).max() if miss.size else 0.0
+    return [f"the torque profile is {share:.2g} of the limit off"] if share > 1e-4 else []
+
+
+def _check_joint(problem: Problem, phase: Phase, before: Array, rows: Samples) -> list[str]:
+    """Whether a phase goes on from where the one before ended."""
+    size, speed = problem.scene.scales.length, problem.scene.scales.speed
+    texts = []
+    if np.abs(rows.z[0] - before[0]).max() > 1e-6 * max(1.0, size):
+        texts.append("starts somewhere else than the phase before ends")
+    ends = problem.phases[phase.index - 1].end
+    step = np.abs(rows.z_dot[0] - before[1])[:2].max()
+    if ends is not End.IMPACT and step > 1e-5 * max(speed, float(np.abs(rows.z_dot).max())):
+        texts.append(f"velocity steps by {step:.3g} m/s at the start")
+    return texts
+
+
+def _check_end(problem: Problem, phase: Phase, rows: Samples) -> list[str]:
+    scene, until = problem.scene, phase.until
+    size, texts = scene.scales.length, []
+    if until.contact is not None:
+        off = float(np.abs(locate(scene, until.contact.name, rows.z[-1:]).gap[0])) / size
+    elif until.value is not None:
+        angle = until.coordinate == "phi"
+        off = abs(rows.z[-1, 2 if angle else 0] - until.value) / (1.0 if angle else size)
+    else:
+        off = 0.0
+    if off > 1e-5:
+        texts.append(f"ends {off:.3g} from {until}")
+    if phase.end is End.REST:
+        speed = np.abs(rows.z_dot[-1]) * np.array([1.0, 1.0, size, size, size])
+        if speed.max() > 1e-5 * max(scene.scales.speed, float(np.abs(rows.z_dot).max()) * size):
+            texts.append(f"ends at {speed.max():.3g} m/s, not at rest")
+    return texts

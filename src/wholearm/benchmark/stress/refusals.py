@@ -1,0 +1,172 @@
+"""Whether a refusal is right, by arguments that share nothing with the planner."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ...common.arrays import Array
+from ...common.errors import InputError, WholearmError
+from ...planning.plan import solve
+from ...problem.definition import End, Phase, Problem
+from ...scene.model import Scene
+from .cell_curves import best_end, find_best, list_ends
+from .rest_motion import rest_margin
+from .slow_motion import fast_margin, inertia_ratio, slow_margin
+from .tracing import Trace, follow, spread, weights
+
+PLACES = 60
+"""Places along a curve at which limits are looked at."""
+CLEAR = 1e-3
+"""Margin over the scene's weight, or a torque limit, from which a motion surely exists."""
+UNABLE = -1e-7
+"""Margin below which none exists."""
+FREE = 0.02
+"""Reduced inertia over that without friction above which nothing jams."""
+
+SURE = 0.02
+"""What the best of many curves misses limits by, as a margin, where surely none keeps them."""
+HELD = 1e-3
+"""Length of a phase over the radius of gyration below which it may count as nothing to do."""
+
+
+class Verdict(NamedTuple):
+    """What a second look says about a refusal.
+
+    Attributes
+    ----------
+    kind : {"confirmed", "refuted", "close", "open"}
+        No motion exists; one does; it depends on rounding or on the discretisation; or there is no
+        second argument.
+    reason : str
+    """
+
+    kind: str
+    reason: str
+
+
+def judge(
+    problem: Problem,
+    error: WholearmError,
+    stops: list[tuple[float, float]],
+    objective: str = "time",
+) -> Verdict:
+    """Judge a refusal to plan a problem whose phases stop at the poses `stops` (x, phi).
+
+    Phases after one with two freedoms begin where the plan of the phases before ends, for the
+    `objective` that was asked for.
+    """
+    number = _find_phase(str(error))
+    z = problem.start
+    open_end = Verdict("open", "")
+    planned = False
+    for phase in problem.phases:
+        own = number in (None, phase.number)
+        if planned and not own:
+            continue
+        if phase.formation.n_constraints == 4 and not phase.until.is_release:
+            trace = _reach(problem.scene, phase, z)
+            if (
+                len(trace.z) < 3
+                and _length(problem.scene, trace) < HELD * problem.scene.scales.length
+            ):
+                return Verdict("close", f"phase {phase.number} has nothing to do")
+            if not trace.reached:
+                return Verdict("confirmed", f"phase {phase.number}: {trace.ending}")
+            if own:
+                verdict = _judge_curve(problem, phase, trace)
+                if verdict.kind != "refuted" or number is not None:
+                    return verdict
+                open_end = verdict
+            z = trace.z[-1]
+            continue
+        if own and phase.index < len(stops):
+            return _judge_cell(problem, phase, z, stops[phase.index])
+        before = None if own or number is None else _find_start(problem, number, objective)
+        if before is None:
+            return Verdict("open", f"phase {phase.number} ends where the planner chooses")
+        z, planned = before, True
+    if isinstance(error, InputError) and not open_end.reason:
+        return Verdict("refuted", "every phase reaches its until")
+    return open_end
+
+
+def _find_start(problem: Problem, number: int, objective: str) -> Array | None:
+    """Where the plan of the phases before one ends at rest; None if there is none."""
+    before = problem.phases[: number - 1]
+    if not before or before[-1].end is not End.REST:
+        return None
+    try:
+        plan = solve(replace(problem, phases=before), objective, replay=False)
+    except WholearmError:
+        return None
+    motion = plan.motions[-1]
+    return np.asarray(motion.evaluate(np.array([motion.duration])).z[0])
+
+
+def _length(scene: Scene, trace: Trace) -> float:
+    steps = np.diff(trace.z, axis=0)
+    return float(np.sqrt(steps**2 @ weights(scene)).sum())
+
+
+def _find_phase(text: str) -> int | None:
+    match = re.search(r"phases? (\d+)|phases\[(\d+)\]", text)
+    return int(match[1] or match[2]) if match else None
+
+
+def _reach(scene: Scene, phase: Phase, z: Array) -> Trace:
+    """The way that reaches the phase's end, or the longer one if none does."""
+    ways = follow(scene, phase, z)
+    reached = [way for way in ways if way.reached]
+    return min(reached or ways, key=lambda way: len(way.z) if way.reached else -len(way.z))
+
+
+def _judge_curve(problem: Problem, phase: Phase, trace: Trace) -> Verdict:
+    scene, epsilon = problem.scene, problem.epsilon
+    s, z, z_s = spread(scene, phase, trace, PLACES)
+    slow, place = slow_margin(scene, phase, epsilon, z, z_s)
+    free = float(inertia_ratio(scene, phase, z, z_s).min())
+    at = f"phase {phase.number}, place {place} of {len(z)}"
+    if free < FREE:
+        return Verdict("confirmed" if free < 0.0 else "close", f"{at}: inertia ratio {free:.3g}")
+    if slow > CLEAR:
+        return Verdict("refuted", f"{at}: a slow motion keeps all limits by {slow:.3g}")
+    rests = (_stops_before(problem, phase), phase.end is End.REST)
+    fast = fast_margin(scene, phase, epsilon, (s, z, z_s), rests)
+    if fast < UNABLE:
+        return Verdict("confirmed", f"{at}: no motion keeps all limits, {fast:.3g} short")
+    if np.isnan(fast):
+        return Verdict("open", f"{at}: the linear programme has no answer")
+    if fast > CLEAR and not scene.viscous.any():
+        return Verdict("refuted", f"{at}: a motion keeps all limits by {fast:.3g}")
+    return Verdict("close", f"{at}: slow {slow:.3g}, fast {fast:.3g}")
+
+
+def _stops_before(problem: Problem, phase: Phase) -> bool:
+    return phase.index == 0 or problem.phases[phase.index - 1].end is End.REST
+
+
+def _judge_cell(problem: Problem, phase: Phase, z: Array, stop: tuple[float, float]) -> Verdict:
+    scene, epsilon, at = problem.scene, problem.epsilon, f"phase {phase.number}"
+    if not _stops_before(problem, phase) or phase.end is not End.REST or phase.until.is_release:
+        return Verdict("open", f"{at} does not go from rest to rest")
+    begins = rest_margin(scene, phase, epsilon, z)
+    if begins < -CLEAR:
+        return Verdict("confirmed", f"{at}: no motion from rest at the start, {begins:.3g}")
+    ends = list_ends(scene, phase, z, stop)
+    if not len(ends):
+        return Verdict("open", f"{at}: no place of its end was found")
+    stopped = best_end(scene, phase, epsilon, ends)
+    if stopped < -CLEAR:
+        reason = f"{at}: no motion comes to rest at any of {len(ends)} places, {stopped:.3g}"
+        return Verdict("confirmed", reason)
+    best = find_best(scene, phase, epsilon, z, ends)
+    text = f"{at}: of {best.curves} curves to {best.ends} places the best has {best.margin:.3g}"
+    if best.margin > CLEAR:
+        return Verdict("refuted", text)
+    text += f", {best.loose:.3g} if slow contacts may stick"
+    least = max(best.margin, best.loose)
+    return Verdict("confirmed" if best.curves and least < -SURE else "close", text)

@@ -1,0 +1,133 @@
+"""The time domain: order of convergence, agreement with the path domain, and cost of its blocks."""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..geometry.tracing import runs_on_curve, trace_phases
+from ..planning.options import Objective, PlanOptions
+from ..planning.path_domain.plan import plan_path
+from ..planning.plan import solve
+from ..planning.time_domain.collocation import make_scheme
+from ..planning.time_domain.motion import TimeMotion, make_motions
+from ..planning.time_domain.own_units import to_si
+from ..planning.time_domain.plan import plan_phases
+from ..planning.time_domain.search import Search
+from ..planning.time_domain.staging import outline_stages
+from ..problem.definition import Phase, Problem
+from ..simulation.simulate import simulate
+from .report import Row
+
+SCHEMES = (("radau", 2), ("radau", 3), ("radau", 4), ("legendre", 2), ("legendre", 3))
+"""Schemes whose order is measured."""
+ORDER_INTERVALS = (4, 8, 16, 32)
+TIME_INTERVALS = (8, 16, 32, 64)
+_PACE = 2.0
+
+
+def measure_order(problem: Problem) -> list[Row]:
+    """Error of collocation at the end of a phase over the number of intervals.
+
+    A phase without reversals is planned for least effort, and its torques are integrated by the
+    simulator. The error is the largest difference of any z from the last node.
+    """
+    curves = trace_phases(problem)
+    smooth = [k for k, curve in enumerate(curves) if len(curve.segments) == 1]
+    if not smooth:
+        return []
+    index = smooth[-1]
+    z = curves[index - 1].end if index else problem.start
+    alone = _isolate(problem, index, z)
+    rows = []
+    for name, degree in SCHEMES:
+        before = math.nan
+        for intervals in ORDER_INTERVALS:
+            started = time.perf_counter()
+            error = _find_end_error(alone, name, degree, intervals)
+            seconds = time.perf_counter() - started
+            order = make_scheme(name, degree).order
+            note = "" if math.isfinite(error) else "the replay ends early"
+            if math.isfinite(before) and math.isfinite(error):
+                note = f"order {math.log2(before / error):.2f} observed, {order} in theory"
+            setting = f"{intervals} intervals"
+            known = error if math.isfinite(error) else None
+            rows.append(
+                Row("time domain: order", f"{name} {degree}", setting, seconds, known, note)
+            )
+            before = error
+    return rows
+
+
+def _isolate(problem: Problem, index: int, z: Array) -> Problem:
+    """One phase of a problem as a problem of its own."""
+    phase = problem.phases[index]
+    alone = Phase(0, phase.formation, phase.until)
+    return Problem(problem.name, problem.scene, problem.epsilon, z, (alone,), problem.source)
+
+
+def _find_end_error(problem: Problem, name: str, degree: int, intervals: int) -> float:
+    scheme = make_scheme(name, degree)
+    search = Search.of(problem, PlanOptions(Objective.EFFORT, scheme=name, degree=degree))
+    stages = outline_stages(problem, problem.phases, problem.start, scheme, intervals, _PACE)
+    found = [to_si(stage, problem) for stage in search.solve(stages).stages]
+    torque = TimeMotion(make_motions(found, scheme)).torque
+    simulation = simulate(problem, torque, tolerance=1e-13, times=torque.breaks[-1:])
+    if simulation.t[-1] < torque.breaks[-1] - 1e-3 * torque.duration:
+        return math.nan
+    return float(np.abs(simulation.z[-1] - found[-1].guess.nodes[-1, 0]).max())
+
+
+def measure_transcriptions(problem: Problem) -> list[Row]:
+    """Least time of every one-freedom phase in the time domain against that along its curve."""
+    rows = []
+    z = problem.start
+    for phase, curve in zip(problem.phases, trace_phases(problem), strict=False):
+        least = plan_path(curve, problem.epsilon, PlanOptions(intervals=320), phase.number)
+        for intervals in TIME_INTERVALS:
+            options = PlanOptions(time_intervals=intervals, transcription="time")
+            started = time.perf_counter()
+            plan = plan_phases(problem, (phase,), z, options)[0]
+            seconds = time.perf_counter() - started
+            rows.append(
+                Row(
+                    "time domain: least time against the path domain",
+                    f"phase {phase.number}",
+                    f"{intervals} intervals",
+                    seconds,
+                    plan.value / least.value - 1,
+                    f"{plan.iterations} iterations in {plan.solves} solves",
+                )
+            )
+        z = curve.end
+    return rows
+
+
+def measure_blocks(problem: Problem) -> list[Row]:
+    """Planning of phases that need the time domain, for every objective.
+
+    The error is the largest difference of any z, at the end of any phase, from the simulation.
+    """
+    rows: list[Row] = []
+    if all(runs_on_curve(phase) for phase in problem.phases):
+        return rows
+    for goal in ("time", "effort", "margin"):
+        trajectory = solve(problem, goal)
+        timings = trajectory.meta["timings"]
+        ends = trajectory.phase_starts[1:]
+        simulation = simulate(problem, trajectory.torque, tolerance=1e-11, times=ends)
+        missed = 0.0
+        for motion, end in zip(trajectory.motions, ends, strict=True):
+            planned = motion.evaluate(np.array([motion.duration])).z[0]
+            missed = max(missed, float(np.abs(planned - simulation.at(end)[:5]).max()))
+        for phase, count in enumerate(trajectory.meta["iterations"]):
+            solves = trajectory.meta["solves"][phase]
+            if isinstance(trajectory.motions[phase], TimeMotion) and solves:
+                note = f"{count} iterations in {solves} solves from phase {phase + 1}"
+        share = timings["build"] / timings["plan"]
+        note += f"; building is {share:.0%} of planning"
+        rows.append(Row("time domain: whole plans", goal, "default", timings["plan"], missed, note))
+    return rows

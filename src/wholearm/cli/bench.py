@@ -1,0 +1,110 @@
+"""The command ``wholearm bench``: run times of a problem, or the stress study."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Callable, Sequence
+
+STUDIES = ("problem", "stress")
+"""What can follow ``bench``; the word ``problem`` may be left out."""
+
+
+def name_study(arguments: Sequence[str]) -> list[str]:
+    """Arguments with the word ``problem`` put in where ``bench`` is followed by a file."""
+    given = list(arguments)
+    if given[:1] != ["bench"] or len(given) == 1:
+        return given
+    if given[1] in (*STUDIES, "-h", "--help"):
+        return given
+    return ["bench", "problem", *given[1:]]
+
+
+def add_bench(bench: argparse.ArgumentParser, progress: Callable[[], object]) -> None:
+    """Give the parser of ``bench`` its studies."""
+    studies = bench.add_subparsers(metavar="STUDY", required=True)
+    text = "measure run time against error (the word problem may be left out)"
+    problem = studies.add_parser("problem", help=text, description=text)
+    problem.add_argument("problem", help="problem file (TOML)")
+    problem.add_argument("-o", "--output", default="results", help="folder for tables and figures")
+    problem.set_defaults(run=lambda options: _measure(options, progress))
+
+    text = "plan generated scenes and read damaged files, and count what must not happen"
+    stress = studies.add_parser("stress", help=text, description=text)
+    stress.add_argument("--scenes", type=int, default=1000, help="generated scenes (1000)")
+    stress.add_argument("--files", type=int, default=0, help="damaged files (0)")
+    words = "problem files to plan with noise, and with other masses and forces"
+    stress.add_argument("--problems", nargs="+", default=[], metavar="FILE", help=words)
+    stress.add_argument("--seed", type=int, default=0, help="of everything that is drawn (0)")
+    stress.add_argument("--only", type=int, metavar="K", help="run scene K alone and print it")
+    stress.add_argument("--jobs", type=int, help="worker processes (default: all cores)")
+    words = "start anew instead of going on with the records in the folder"
+    stress.add_argument("--fresh", action="store_true", help=words)
+    stress.add_argument("--again", action="store_true", help="run again what had findings")
+    stress.add_argument("-o", "--output", default="results", help="folder for records and table")
+    stress.set_defaults(run=lambda options: _stress(options, progress))
+
+
+def _measure(options: argparse.Namespace, progress: Callable[[], object]) -> int:
+    from ..benchmark.precision import run_bench
+    from ..geometry.path_guess import load
+
+    show = progress()
+    written = run_bench(load(options.problem), options.output, progress=show)  # type: ignore[arg-type]
+    _clear(show)
+    for path in written:
+        print(f"wrote {path}")
+    return 0
+
+
+def _stress(options: argparse.Namespace, progress: Callable[[], object]) -> int:
+    from ..benchmark.stress.study import StressOptions, run_only, run_stress
+    from ..geometry.path_guess import load
+
+    chosen = StressOptions(
+        scenes=options.scenes,
+        files=options.files,
+        problems=tuple(options.problems),
+        seed=options.seed,
+        only=options.only,
+        jobs=(os.cpu_count() or 1) if options.jobs is None else options.jobs,
+        fresh=options.fresh,
+        again=options.again,
+    )
+    for path in chosen.problems:
+        load(path)
+    if chosen.only is not None:
+        path = _write_scene(chosen.seed, chosen.only, options.output)
+        records = run_only(chosen)
+        print(json.dumps(records, indent=2))
+        print(f"wrote {path}")
+        return 1 if any(record["findings"] for record in records) else 0
+    show = progress()
+    text, path, count = run_stress(chosen, options.output, show)  # type: ignore[arg-type]
+    _clear(show)
+    print(text)
+    print(f"wrote {path}")
+    return 1 if count else 0
+
+
+def _write_scene(seed: int, number: int, folder: str) -> str:
+    """Write the problem file of a scene."""
+    from ..benchmark.stress.cases import draw_case
+    from ..benchmark.stress.toml import to_toml
+    from ..common.errors import InputError
+    from ..common.files import write_whole
+
+    try:
+        os.makedirs(folder, exist_ok=True)
+    except OSError as error:
+        raise InputError(folder, "", f"cannot be made: {error.strerror}") from None
+    path = os.path.join(folder, f"stress_{seed}_{number}.toml")
+    text = to_toml(draw_case(seed, number).table)
+    write_whole(path, lambda stream: stream.write(text.encode()))
+    return path
+
+
+def _clear(show: object) -> None:
+    if callable(show):
+        show("")

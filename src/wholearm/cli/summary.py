@@ -1,0 +1,115 @@
+"""What `solve` prints of a plan, its replay and its torque table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ..results.trajectory import Trajectory
+
+
+def summarise(trajectory: Trajectory, output: str, table: Mapping[str, Any] | None = None) -> str:
+    """What has been planned, as text.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+    output : str
+        The trajectory file.
+    table : mapping, optional
+        Name and figures of the torque table, if one is written; see `planning.table_check`.
+    """
+    meta = trajectory.meta
+    lines = [
+        f"{'phase':>5}  {'duration [s]':>12}  {'least c_n [N]':>13}  {'largest |tau| [N m]':>19}"
+    ]
+    for index, duration in enumerate(meta["phase_durations"]):
+        rows = trajectory.phase == index
+        c_n = trajectory.c_n[rows]
+        least = c_n[c_n == c_n].min()
+        torque = abs(trajectory.tau[rows]).max()
+        lines.append(f"{index + 1:>5}  {duration:>12.6f}  {least:>13.6f}  {torque:>19.6f}")
+    lines += _list_modes(meta)
+    lines += _list_transitions(meta)
+    value = f"{meta['objective']} = {meta['value']:.6f} {meta['value_unit']}"
+    lines += _list_replay(meta.get("replay"))
+    lines += _list_table(table) if table is not None else []
+    return "\n".join([*lines, f"{value}, {trajectory.duration:.6f} s in all; wrote {output}"])
+
+
+def _list_replay(replay: Mapping[str, Any] | None) -> list[str]:
+    """What the replay of the plan has shown, in a line."""
+    if replay is None:
+        return ["the plan was not replayed"]
+    ends = [phase["end_deviation"] for phase in replay["phases"] if phase["end_deviation"]]
+    far = [max((end[unit] for end in ends), default=0.0) for unit in ("m", "rad")]
+    least, finer = replay["least_c_n"], max(replay["refinements"])
+    text = (
+        f"replayed: least c_n {least['value']:.6f} N on {least['contact']}, off by at most "
+        f"{far[0]:.1e} m and {far[1]:.1e} rad at the ends of phases"
+    )
+    return [text + (f", with up to {2**finer} times the intervals" if finer > 0 else "")]
+
+
+def _list_table(table: Mapping[str, Any]) -> list[str]:
+    """The torque table, and what its replay does to the phases if it has samples at a rate."""
+    what = f"{table['rows']} rows"
+    if "sample_rate" in table:
+        what += f", {table['interpolation']} at {table['sample_rate']:g} Hz"
+    lines, replay = [f"wrote {table['file']}: {what}"], table["replay"]
+    if replay is None:
+        return lines
+    verdict = "holds" if replay["ok"] else "does not hold"
+    lines[0] += f"; its replay {verdict}: {replay['reason']}"
+    if "sample_rate" not in table:
+        return lines
+    header = ("phase", "arrival [s]", "planned [s]", "least c_n [N]", "planned [N]")
+    lines.append("  ".join([*header, "contact"]))
+    for row in replay["phases"]:
+        keys = ("arrival", "planned_arrival", "least_c_n", "planned_least_c_n")
+        cells = [str(row["phase"]), *(_show(row[key]) for key in keys)]
+        padded = [cell.rjust(len(name)) for cell, name in zip(cells, header, strict=True)]
+        lines.append("  ".join([*padded, row["contact"] or "-"]))
+    return lines
+
+
+def _list_modes(meta: Mapping[str, Any]) -> list[str]:
+    """Contact modes of the phases that were planned in the time domain; empty if none was."""
+    lines: list[str] = []
+    words = {"+": " slides +", "-": " slides -", "rolls": " rolls"}
+    for index, (modes, tried) in enumerate(zip(meta["modes"], meta["sequences"], strict=True)):
+        for mode in modes:
+            contacts = ", ".join(name + words[how] for name, how in mode["contacts"].items())
+            span = f"{mode['start']:.4f} to {mode['stop']:.4f} s"
+            joints = " ".join(mode["joints"])
+            lines.append(f"{index + 1:>5}  {span}: {contacts}; joints turn {joints}")
+        if tried:
+            lines[-1] += f"; best of {tried} sequences of modes"
+    return ["", "modes, from the start of each phase", *lines, ""] if lines else []
+
+
+def _list_transitions(meta: Mapping[str, Any]) -> list[str]:
+    """Table of the impacts that a problem asks for; empty if it has none."""
+    transitions = meta["transitions"]
+    if not transitions:
+        return []
+    saves = f"saves [{meta['value_unit']}]"
+    width = len(saves)
+    lines = [
+        "",
+        f"{'after phase':>11}  {'velocity ratio':>14}  {'least impulse [N s per m/s]':>27}  "
+        f"{'speed [m/s]':>11}  {saves}",
+    ]
+    for row in transitions:
+        impulse = f"{_show(row['least_impulse'])} {row['least_impulse_contact']}"
+        lines.append(
+            f"{row['phase']:>11}  {_show(row['velocity_ratio']):>14}  {impulse:>27}  "
+            f"{_show(row['speed']):>11}  {_show(row['saves']):>{width}}"
+            + ("" if row["possible"] else f"  stops: {row['reason']}")
+        )
+    return [*lines, ""]
+
+
+def _show(value: float | None) -> str:
+    return "-" if value is None else f"{value:.6f}"

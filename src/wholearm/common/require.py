@@ -1,0 +1,42 @@
+"""Numbers and vectors as they are given, checked."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .arrays import Array
+from .errors import InputError
+
+
+def require_number(
+    value: object, key: str, *, positive: bool = False, nonnegative: bool = False
+) -> float:
+    """Return `value` as a finite float, or raise `InputError` naming `key`."""
+    allowed = "a positive number" if positive else "a number >= 0" if nonnegative else "a number"
+    real = isinstance(value, int | float | np.integer | np.floating)
+    try:
+        result = float(value) if real and not isinstance(value, bool) else math.nan  # type: ignore[arg-type]
+    except OverflowError:
+        result = math.inf
+    if not math.isfinite(result):
+        raise InputError("", key, f"{value!r} is not {allowed} (finite)")
+    if (positive and result <= 0) or (nonnegative and result < 0):
+        raise InputError("", key, f"{value!r} is not {allowed}")
+    return result
+
+
+def require_vector(value: object, key: str, size: int) -> Array:
+    """Return `value` as a read-only float array of `size` finite numbers, or raise `InputError`."""
+    if not isinstance(value, list | tuple | np.ndarray) or len(value) != size:
+        raise InputError("", key, f"{value!r} is not a list of {size} numbers")
+    return frozen([require_number(item, key) for item in value])
+
+
+def frozen(value: ArrayLike) -> Array:
+    """Return a read-only float array."""
+    array = np.array(value, dtype=float)
+    array.setflags(write=False)
+    return array

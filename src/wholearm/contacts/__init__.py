@@ -1,0 +1,1 @@
+"""Elemental contacts, slip, formations, what gaps stay open, friction cones."""

@@ -1,0 +1,326 @@
+"""Elemental contacts: one C-function each, as CasADi expressions of z.
+
+==============  ==============================  =======================================
+name            touching                        C-function
+==============  ==============================  =======================================
+``v3-palm``     vertex 3 on the palm            height of the vertex
+``v3-finger1``  vertex 3 on the side of link 1  n . (p - base) - radius
+``e2-tip1``     fingertip 1 on edge 2           m . (tip - p_2) - radius
+``v3-tip1``     vertex 3 on the arc of tip 1    abs(p - tip) - radius
+==============  ==============================  =======================================
+
+p is a vertex in the world, n the normal of the contact (into the object), m = -n the outward normal
+of an edge; edge j runs from vertex j to vertex j + 1. The right finger touches with its left side,
+the left finger with its right one.
+
+From the contact point p_c and the normal n follow the rows of Eq. (4),
+
+    W_n^T = [n, (p_c - c) x n],  J_n = n . d p_finger / d theta,
+
+and the same with t = (n_y, -n_x) for W_t and J_t. W_n^T = dC/dq and J_n = -dC/dtheta hold exactly.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from ..common.arrays import Array, Expression
+from ..common.errors import InputError
+from ..common.sharing import Store
+from ..scene.model import Scene
+
+_PATTERN = re.compile(r"(v|e)(0|[1-9][0-9]*)-(palm|finger([12])|tip([12]))")
+
+
+@dataclass(frozen=True)
+class Contact:
+    """An elemental contact between a feature of the object and a part of the hand.
+
+    Attributes
+    ----------
+    feature : {"v", "e"}
+        A vertex or an edge of the object.
+    index : int
+        Which vertex or edge.
+    surface : {"palm", "finger", "tip"}
+        The palm, the side of a link or the tip of a link.
+    finger : int or None
+        0 for finger 1, 1 for finger 2, None for the palm.
+    """
+
+    feature: str
+    index: int
+    surface: str
+    finger: int | None = None
+
+    @property
+    def name(self) -> str:
+        """Name as written in problem files."""
+        return f"{self.corner}-{self.surface}{'' if self.finger is None else self.finger + 1}"
+
+    @property
+    def corner(self) -> str:
+        """Name of the object's feature alone, such as ``v3``."""
+        return f"{self.feature}{self.index}"
+
+    @property
+    def part(self) -> str:
+        """The part of the hand, in words."""
+        if self.finger is None:
+            return "the palm"
+        return f"{'the tip of ' if self.surface == 'tip' else ''}finger {self.finger + 1}"
+
+    def __str__(self) -> str:
+        return self.name
+
+
+class LinkFeatures(NamedTuple):
+    """One link against the whole object, as expressions of z.
+
+    Attributes
+    ----------
+    base, tip, normal : expression, shape (2,)
+        Joint [m], centre of the tip [m], and the normal of the link's touching side.
+    vertex_gap, vertex_run : expression, shape (1, n_v), [m]
+        C-function of each vertex with the side, and how far along the link the vertex is.
+    edge_gap, edge_run : expression, shape (1, n_v), [m]
+        C-function of the tip with each edge, and how far along the edge the tip is.
+    arc_gap, arc_run : expression, shape (1, n_v), [m]
+        C-function of each vertex with the tip's arc, and how far beyond the tip's centre it is.
+    """
+
+    base: Expression
+    tip: Expression
+    normal: Expression
+    vertex_gap: Expression
+    vertex_run: Expression
+    edge_gap: Expression
+    edge_run: Expression
+    arc_gap: Expression
+    arc_run: Expression
+
+
+class Features(NamedTuple):
+    """A scene as expressions of its own symbol z: what every contact picks its rows from.
+
+    Attributes
+    ----------
+    z : SX symbol, shape (5,)
+    vertices : expression, shape (2, n_v), [m]
+        World positions of the vertices.
+    edge_normals : expression, shape (2, n_v)
+        Normals of the edges into the object.
+    edge_lengths : ndarray, shape (n_v,), [m]
+    links : tuple of LinkFeatures
+        Finger 1, finger 2.
+    """
+
+    z: Expression
+    vertices: Expression
+    edge_normals: Expression
+    edge_lengths: Array
+    links: tuple[LinkFeatures, LinkFeatures]
+
+
+class Geometry(NamedTuple):
+    """A contact as expressions of z.
+
+    Attributes
+    ----------
+    gap : scalar expression, [m]
+        The C-function.
+    point, normal : expression, shape (2,), [m], [-]
+        Where the contact is, and its normal into the object.
+    A, A_t : expression, shape (1, 5)
+        The contact's rows [W_n^T, -J_n] and [W_t^T, -J_t].
+    """
+
+    gap: Expression
+    point: Expression
+    normal: Expression
+    A: Expression
+    A_t: Expression
+
+
+class Limit(NamedTuple):
+    """A quantity that is positive while a contact formation is valid.
+
+    Attributes
+    ----------
+    value : scalar expression, [m]
+    text : str
+        What has happened when it is zero.
+    gained : Contact or None
+        The contact that is gained there, if any.
+    also : tuple of Contact
+        Others that may be gained there: a pointed tip at a vertex may go on along either edge,
+        or along the link.
+    """
+
+    value: Expression
+    text: str
+    gained: Contact | None = None
+    also: tuple[Contact, ...] = ()
+
+    def gains(self, contact: Contact | None) -> bool:
+        """Whether a contact is gained there."""
+        return contact is not None and (contact == self.gained or contact in self.also)
+
+
+def parse_contact(name: object, scene: Scene) -> Contact:
+    """Return the contact called `name`.
+
+    Raises
+    ------
+    InputError
+        If there is no such contact on this object and hand; lists what is allowed.
+    """
+    count = scene.polygon.n_vertices
+    match = _PATTERN.fullmatch(name) if isinstance(name, str) else None
+    allowed = (
+        f"allowed are vN-palm, vN-fingerK, eN-tipK and vN-tipK with N from 0 to {count - 1} "
+        "and K 1 or 2"
+    )
+    if match is None:
+        raise InputError("", "", f"{name!r} is not a contact; {allowed}")
+    feature, index, _, finger, tip = match.groups()
+    contact = Contact(
+        feature,
+        int(index),
+        "finger" if finger else "tip" if tip else "palm",
+        int(finger or tip) - 1 if finger or tip else None,
+    )
+    if contact.index >= count or (feature == "e" and not tip):
+        raise InputError("", "", f"{name!r} does not exist; {allowed}")
+    if feature == "v" and tip and scene.fingers[int(tip) - 1].radius == 0:
+        raise InputError(
+            "", "", f"{name!r} needs a rounded tip, but fingers.{tip}.radius is 0; give it a radius"
+        )
+    return contact
+
+
+def candidate_contacts(scene: Scene, finger: int | None) -> list[Contact]:
+    """Every contact that the object can have with the palm (None) or with one finger."""
+    features = range(scene.polygon.n_vertices)
+    if finger is None:
+        return [Contact("v", i, "palm") for i in features]
+    contacts = [Contact("v", i, "finger", finger) for i in features]
+    contacts += [Contact("e", i, "tip", finger) for i in features]
+    if scene.fingers[finger].radius > 0:
+        contacts += [Contact("v", i, "tip", finger) for i in features]
+    return contacts
+
+
+def build_features(scene: Scene) -> Features:
+    """Return the scene's features as expressions, the same for scenes of one shape.
+
+    Expressions of different contacts only fit together if they share one symbol z, so the features
+    are kept for as long as the scene lives.
+    """
+    return _FEATURES(scene)
+
+
+def _build_features(scene: Scene) -> Features:
+    z = ca.SX.sym("z", 5)
+    body = scene.polygon.vertices
+    run = np.roll(body, -1, axis=0) - body
+    lengths = np.hypot(run[:, 0], run[:, 1])
+    c, s = ca.cos(z[2]), ca.sin(z[2])
+    rotation = ca.vertcat(ca.horzcat(c, -s), ca.horzcat(s, c))
+    vertices = rotation @ ca.DM(body.T) + ca.repmat(z[:2], 1, len(body))
+    along = rotation @ ca.DM((run / lengths[:, None]).T)
+    normals = ca.vertcat(-along[1, :], along[0, :])
+    links = tuple(_build_link(scene, finger, z, vertices, along, normals) for finger in range(2))
+    return Features(z, vertices, normals, lengths, (links[0], links[1]))
+
+
+_FEATURES = Store(_build_features, lambda scene: scene.shape)
+
+
+def _build_link(
+    scene: Scene,
+    finger: int,
+    z: Expression,
+    vertices: Expression,
+    along: Expression,
+    edge_normals: Expression,
+) -> LinkFeatures:
+    link = scene.fingers[finger]
+    axis = ca.vertcat(ca.cos(z[3 + finger]), ca.sin(z[3 + finger]))
+    normal = rotate_quarter(axis) if finger == 0 else -rotate_quarter(axis)
+    base = ca.DM(link.base)
+    tip = base + link.length * axis
+    count = vertices.shape[1]
+    from_base = vertices - ca.repmat(base, 1, count)
+    to_tip = ca.repmat(tip, 1, count) - vertices
+    return LinkFeatures(
+        base=base,
+        tip=tip,
+        normal=normal,
+        vertex_gap=normal.T @ from_base - link.radius,
+        vertex_run=axis.T @ from_base,
+        edge_gap=-ca.sum1(edge_normals * to_tip) - link.radius,
+        edge_run=ca.sum1(along * to_tip),
+        arc_gap=ca.sqrt(ca.sum1(to_tip**2)) - link.radius,
+        arc_run=-axis.T @ to_tip,
+    )
+
+
+def build_gap(contact: Contact, scene: Scene) -> Expression:
+    """Return the C-function of `contact` [m], an expression of the features' symbol z."""
+    features = build_features(scene)
+    if contact.finger is None:
+        return features.vertices[1, contact.index]
+    link = features.links[contact.finger]
+    if contact.surface == "finger":
+        return link.vertex_gap[contact.index]
+    return (link.edge_gap if contact.feature == "e" else link.arc_gap)[contact.index]
+
+
+def build_geometry(contact: Contact, scene: Scene) -> Geometry:
+    """Return `contact` as expressions of the features' symbol z."""
+    features = build_features(scene)
+    gap = build_gap(contact, scene)
+    point = features.vertices[:, contact.index]
+    if contact.finger is None:
+        normal = ca.DM([0.0, 1.0])
+    else:
+        link = features.links[contact.finger]
+        radius = scene.fingers[contact.finger].radius
+        if contact.surface == "finger":
+            normal = link.normal
+        elif contact.feature == "e":
+            normal = features.edge_normals[:, contact.index]
+            point = link.tip + radius * normal
+        else:
+            normal = (point - link.tip) / (gap + radius)
+    tangent = ca.vertcat(normal[1], -normal[0])
+    return Geometry(
+        gap,
+        point,
+        normal,
+        _build_row(contact, scene, point, normal),
+        _build_row(contact, scene, point, tangent),
+    )
+
+
+def _build_row(
+    contact: Contact, scene: Scene, point: Expression, direction: Expression
+) -> Expression:
+    arm = point - build_features(scene).z[:2]
+    moment = arm[0] * direction[1] - arm[1] * direction[0]
+    row = [direction[0], direction[1], moment, ca.SX(1, 1), ca.SX(1, 1)]
+    if contact.finger is not None:
+        lever = point - ca.DM(scene.fingers[contact.finger].base)
+        row[3 + contact.finger] = -ca.dot(direction, rotate_quarter(lever))
+    return ca.horzcat(*row)
+
+
+def rotate_quarter(vector: Expression) -> Expression:
+    """Turn a plane vector by +90 degrees."""
+    return ca.vertcat(-vector[1], vector[0])

@@ -1,0 +1,331 @@
+"""Contact formations: contacts as constraints P z' = 0, and where they stop being valid.
+
+With the rows of each contact stacked, Eq. (4) reads A z' = 0 with A = [W_n^T, -J_n], the sliding
+velocities are v_t = A_t z' with A_t = [W_t^T, -J_t], and differentiating once more gives
+A z'' + A' z' = 0. A contact that rolls has v_t = 0 as well, so with R of them the constraints are
+
+    P z' = 0,  P z'' + P' z' = 0,  P = [A; A_t(rolling)],
+
+n_c + R = 2R + S rows for S sliding contacts. Rolling is holonomic here: v_t is the rate of a slip
+coordinate (`contacts.slip`), which keeps its value from where the rolling begins.
+
+For four sliding contacts, Eqs. (6)-(9) split A by the columns of (q, theta_2) and
+theta_1,
+
+    P_AI (q', theta_2') + P_AII theta_1' = 0,  P_AI = [W_n^T, -j_2n],  P_AII = -j_1n.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from ..common.arrays import Array, Expression
+from ..common.batch import Batch
+from ..common.errors import InputError
+from ..common.sharing import Keeper, Store, exclusive, kept_property
+from ..scene.model import Finger, Scene
+from .elemental import Contact, Limit, build_features, build_gap, build_geometry, candidate_contacts
+from .limits import build_clearance, list_limits
+from .slip import build_slip
+
+
+class Kinematics(NamedTuple):
+    """A formation at n configurations.
+
+    Attributes
+    ----------
+    C : ndarray, shape (n, n_c), [m]
+    A, A_t : ndarray, shape (n, n_c, 5)
+    A_dot_v : ndarray, shape (n, n_c)
+        A' v for the velocities v that were given, so that A z'' = -A' z'.
+    P : ndarray, shape (n, n_c + R, 5)
+        Constraint rows [A; A_t(rolling)]; A itself where nothing rolls.
+    P_dot_v : ndarray, shape (n, n_c + R)
+        P' v; A' v itself where nothing rolls.
+    """
+
+    C: Array
+    A: Array
+    A_t: Array
+    A_dot_v: Array
+    P: Array
+    P_dot_v: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Formation(Keeper):
+    """A contact formation of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    contacts : tuple of Contact
+        In the order of every array over contacts.
+    rolling : tuple of Contact
+        Those of the contacts that roll; the others slide.
+    """
+
+    scene: Scene
+    contacts: tuple[Contact, ...]
+    rolling: tuple[Contact, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not set(self.rolling) <= set(self.contacts):
+            raise ValueError(f"{describe(self.rolling)} roll, which are no contacts")
+
+    def __repr__(self) -> str:
+        rolls = [" rolling" if contact in self.rolling else "" for contact in self.contacts]
+        return f"Formation({', '.join(map(str.__add__, self.names, rolls))})"
+
+    @property
+    def n_contacts(self) -> int:
+        """Number of contacts n_c."""
+        return len(self.contacts)
+
+    @property
+    def n_rolling(self) -> int:
+        """Number of rolling contacts R."""
+        return len(self.rolling)
+
+    @property
+    def n_constraints(self) -> int:
+        """Number of constraint rows, n_c + R, and of independent contact forces."""
+        return len(self.contacts) + len(self.rolling)
+
+    @cached_property
+    def rolling_rows(self) -> tuple[int, ...]:
+        """Which contacts roll, in the order of every array over rolling contacts."""
+        return tuple(self.contacts.index(c) for c in self.contacts if c in self.rolling)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the contacts."""
+        return tuple(contact.name for contact in self.contacts)
+
+    def turn_with(self, row: int) -> tuple[int, ...]:
+        """Rows of (contacts, joints) that turn as one with a row: a flush edge's, or its own."""
+        if row >= self.n_contacts or self.contacts[row].surface == "tip":
+            return (row,)
+        own = self.contacts[row]
+        on_side = [(c.surface, c.finger) == (own.surface, own.finger) for c in self.contacts]
+        return tuple(np.flatnonzero(on_side).tolist())
+
+    @cached_property
+    def friction(self) -> Array:
+        """Diagonal of U, shape (n_c,)."""
+        return np.array([self.scene.friction.of(contact.finger) for contact in self.contacts])
+
+    @cached_property
+    def sliding_friction(self) -> Array:
+        """Diagonal of U, shape (n_c,), with zeros for rolling contacts: their c_t is free."""
+        friction = self.friction.copy()
+        friction[list(self.rolling_rows)] = 0.0
+        return friction
+
+    @kept_property
+    def function(self) -> Expression:
+        """CasADi function (z, v) -> (C, A, A_t, A' v), with n_c rows each."""
+        z, v = build_features(self.scene).z, ca.SX.sym("v", 5)
+        parts = [build_geometry(contact, self.scene) for contact in self.contacts]
+        gaps = ca.vertcat(*(part.gap for part in parts))
+        A = ca.vertcat(*(part.A for part in parts))
+        A_t = ca.vertcat(*(part.A_t for part in parts))
+        outputs = [gaps, A, A_t, ca.jtimes(A @ v, z, v)]
+        return ca.Function("formation", [z, v], [ca.densify(part) for part in outputs])
+
+    @kept_property
+    def roll_function(self) -> Expression:
+        """CasADi function (z, v) -> (slip coordinates [m], A_t' v), one row per rolling contact."""
+        z, v = build_features(self.scene).z, ca.SX.sym("v", 5)
+        rolling = [self.contacts[row] for row in self.rolling_rows]
+        slip = ca.vertcat(ca.SX(0, 1), *(build_slip(c, self.scene) for c in rolling))
+        rows = [build_geometry(c, self.scene).A_t for c in rolling]
+        A_t = ca.vertcat(ca.SX(0, 5), *rows)
+        bend = ca.jtimes(A_t @ v, z, v)
+        return ca.Function("roll", [z, v], [ca.densify(slip), ca.densify(bend)])
+
+    def build_constraints(self, z: Expression, v: Expression) -> tuple[Expression, ...]:
+        """Expressions of z and v: the gaps and slip coordinates [m], P, P' v and A_t.
+
+        Gaps and slip coordinates are one column of n_c + R rows. The contacts hold where the gaps
+        are zero and the slip coordinates what they were when the rolling began.
+        """
+        C, A, A_t, A_dot_v = self.function(z, v)
+        if not self.rolling:
+            return C, A, A_dot_v, A_t
+        slip, bend = self.roll_function(z, v)
+        P = ca.vertcat(A, A_t[list(self.rolling_rows), :])
+        return ca.vertcat(C, slip), P, ca.vertcat(A_dot_v, bend), A_t
+
+    @kept_property
+    def _batch(self) -> Batch:
+        return Batch(self.function)
+
+    @kept_property
+    def _roll_batch(self) -> Batch:
+        return Batch(self.roll_function)
+
+    @kept_property
+    def limits(self) -> tuple[Limit, ...]:
+        """Where this formation stops being valid."""
+        return tuple(list_limits(self.scene, self.contacts))
+
+    @kept_property
+    def limit_function(self) -> Expression:
+        """CasADi function z -> values of `limits`, shape (n_limits,) [m]."""
+        values = ca.vertcat(*(limit.value for limit in self.limits))
+        return ca.Function("limits", [build_features(self.scene).z], [ca.densify(values)])
+
+    @kept_property
+    def _limit_batch(self) -> Batch:
+        return Batch(self.limit_function)
+
+    def evaluate(self, z: Array, v: Array) -> Kinematics:
+        """Evaluate the formation at n configurations.
+
+        Parameters
+        ----------
+        z, v : ndarray, shape (n, 5)
+            Configurations, and the velocities for A' v.
+        """
+        C, A, A_t, A_dot_v = self._batch(z, v)
+        P, P_dot_v = A, A_dot_v
+        if self.rolling:
+            P = np.concatenate([A, A_t[:, list(self.rolling_rows)]], axis=1)
+            P_dot_v = np.concatenate([A_dot_v, self._roll_batch(z, v)[1]], axis=1)
+        return Kinematics(C[..., 0], A, A_t, A_dot_v[..., 0], P, P_dot_v[..., 0])
+
+    def evaluate_slip(self, z: Array) -> Array:
+        """Slip coordinates of the rolling contacts at n configurations, shape (n, R) [m]."""
+        if not self.rolling:
+            return np.zeros((len(z), 0))
+        return self._roll_batch(z, z)[0][..., 0]
+
+    def evaluate_limits(self, z: Array) -> Array:
+        """Values of `limits` at n configurations, shape (n, n_limits) [m]."""
+        return self._limit_batch(z)[0][..., 0]
+
+    @exclusive
+    def evaluate_gap(self, contact: Contact, z: Array) -> Array:
+        """C-function of any contact of the scene at n configurations, shape (n,) [m]."""
+        function = ca.Function(
+            "gap", [build_features(self.scene).z], [build_gap(contact, self.scene)]
+        )
+        return np.asarray(function(z.T).full()[0])
+
+
+def split_by_first_joint(A: Array) -> tuple[Array, Array]:
+    """Return P_AI, shape (..., 4, 4), and P_AII, shape (..., 4), of Eqs. (6)-(9)."""
+    return A[..., [0, 1, 2, 4]], A[..., 3]
+
+
+def place_flush(scene: Scene, edge: int, x: float) -> Array:
+    """Pose q with `edge` on the palm and the centroid at `x`, shape (3,) [m, m, rad]."""
+    phi = scene.polygon.flush_angle(edge)
+    height = -_rotate(phi, scene.polygon.vertices[edge])[1]
+    return np.array([x, height, phi])
+
+
+def close_finger(scene: Scene, q: Array, finger: int) -> float:
+    """Joint angle at which a finger, closing from outside, first touches the object at `q` [rad].
+
+    Raises
+    ------
+    InputError
+        If the finger reaches no part of the object, or its joint is in the object or too near.
+    """
+    link = scene.fingers[finger]
+    sign = 1.0 if finger == 0 else -1.0
+    base = np.asarray(link.base)
+    corners = q[:2] + np.array([_rotate(q[2], v) for v in scene.polygon.vertices]) - base
+    if _distance_from_origin(corners) <= link.radius or _hangs_into(link, corners):
+        raise InputError(
+            "",
+            f"fingers.{finger + 1}.base",
+            f"{base.tolist()} is inside the object or nearer to it than the link's radius, "
+            "or right above it",
+        )
+    angles: list[float] = []
+    for corner in corners:
+        distance, bearing = math.hypot(*corner), math.atan2(corner[1], corner[0])
+        run = math.sqrt(distance**2 - link.radius**2)
+        if run <= link.length:
+            angles.append(bearing - sign * math.asin(link.radius / distance))
+        else:
+            reach = (distance**2 + link.length**2 - link.radius**2) / (2 * distance * link.length)
+            if reach <= 1:
+                angles.append(bearing - sign * math.acos(reach))
+    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        along = (end - start) / math.hypot(*(end - start))
+        outward = np.array([along[1], -along[0]])
+        offset = (link.radius + outward @ start) / link.length
+        if abs(offset) <= 1:
+            heading = math.atan2(outward[1], outward[0])
+            for angle in (heading - math.acos(offset), heading + math.acos(offset)):
+                tip = link.length * np.array([math.cos(angle), math.sin(angle)])
+                if 0 <= along @ (tip - start) <= along @ (end - start):
+                    angles.append(angle)
+    if not angles:
+        raise InputError("", "start", f"finger {finger + 1} is too short to reach the object")
+    # A closing finger sweeps from pointing outwards and down, so angles count from there.
+    outside = -math.pi / 2
+    swept = [
+        (sign * (a - (outside if finger == 0 else math.pi - outside))) % math.tau for a in angles
+    ]
+    return (outside if finger == 0 else math.pi - outside) + sign * min(swept)
+
+
+@exclusive
+def find_touching(scene: Scene, z: Array) -> tuple[Contact, ...]:
+    """Return the contacts that touch at `z`, in the order palm, finger 1, finger 2."""
+    candidates, function = _CLEARANCES(scene)
+    values = function(z).full()[:, 0]
+    near = np.abs(values) < scene.touching
+    return tuple(c for c, touches in zip(candidates, near, strict=True) if touches)
+
+
+def _build_clearances(scene: Scene) -> tuple[tuple[Contact, ...], Expression]:
+    """Every contact that a scene's object can have, and a function z -> their clearances [m]."""
+    candidates = tuple(c for part in (None, 0, 1) for c in candidate_contacts(scene, part))
+    values = ca.vertcat(*(build_clearance(c, scene, touching=False).value for c in candidates))
+    return candidates, ca.Function("clearances", [build_features(scene).z], [ca.densify(values)])
+
+
+_CLEARANCES = Store(_build_clearances, lambda scene: scene.shape)
+
+
+def describe(contacts: Sequence[Contact]) -> str:
+    """Names of the contacts in one line."""
+    return " ".join(sorted(contact.name for contact in contacts)) or "nothing"
+
+
+def _hangs_into(link: Finger, corners: Array) -> bool:
+    """Whether a link that points down, from where it closes, overlaps the object."""
+    hanging = np.array([0.0, -link.length])
+    for (x, y), (x_after, y_after) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if abs(x) < link.radius and -link.length < y < 0:
+            return True
+        if x * x_after < 0 and -link.length < y - x * (y_after - y) / (x_after - x) < 0:
+            return True
+    return _distance_from_origin(corners - hanging) < link.radius
+
+
+def _distance_from_origin(corners: Array) -> float:
+    """Distance of a convex anticlockwise polygon from the origin, zero when it is inside."""
+    runs = np.roll(corners, -1, axis=0) - corners
+    if (corners[:, 0] * runs[:, 1] >= corners[:, 1] * runs[:, 0]).all():
+        return 0.0
+    part = np.clip(-(corners * runs).sum(axis=1) / (runs**2).sum(axis=1), 0.0, 1.0)
+    return float(np.hypot(*(corners + part[:, None] * runs).T).min())
+
+
+def _rotate(angle: float, vector: Array) -> Array:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])

@@ -1,0 +1,128 @@
+"""Where a contact formation stops being valid.
+
+It does where a contact leaves its own range, where another feature of object and hand is touched,
+and where the links touch each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+
+from ..scene.model import Scene
+from .elemental import Contact, Limit, build_features, build_gap, candidate_contacts
+from .links import build_finger_limit
+from .obstacles import build_obstacles, face
+
+
+def list_limits(scene: Scene, contacts: Sequence[Contact]) -> list[Limit]:
+    """Return every limit of a formation: of its contacts, of other features, and of the links."""
+    limits = [limit for contact in contacts for limit in build_limits(contact, scene)]
+    for finger in (None, 0, 1):
+        held = [contact for contact in contacts if contact.finger == finger]
+        clearances = _list_clearances(scene, finger, held)
+        if finger is not None:
+            clearances = clearances if held else face(scene, finger, clearances)
+            clearances += build_obstacles(scene, finger, held)
+        limits += clearances
+    return limits + build_finger_limit(scene)
+
+
+def _list_clearances(scene: Scene, finger: int | None, held: Sequence[Contact]) -> list[Limit]:
+    """Limits at which contacts with one part of the hand are gained that it does not have."""
+    on_side = {contact.index for contact in held if contact.surface == "finger"}
+    count = scene.polygon.n_vertices
+    # A link that touches a vertex can only turn onto the edge that leads from it to the tip;
+    # one whose tip touches an edge is outside the edge's line, and only the end of the edge
+    # that is behind the tip can come to its side.
+    ahead = {(index - (finger or 0)) % count for index in on_side}
+    tips = [contact for contact in held if contact.surface == "tip"]
+    behind = {(c.index + (finger or 0)) % count for c in tips if c.feature == "e"}
+    limits = []
+    for contact in candidate_contacts(scene, finger):
+        if contact in held:
+            continue
+        on_tip = contact.surface == "tip"
+        if on_side and on_tip and not (contact.feature == "e" and contact.index in ahead):
+            continue
+        if tips and not on_side and (on_tip or contact.index not in behind):
+            continue
+        limits.append(build_clearance(contact, scene, bool(on_side)))
+    return limits
+
+
+def build_limits(contact: Contact, scene: Scene) -> list[Limit]:
+    """Return the limits of one contact's own range: between base and tip, between two vertices.
+
+    Where the range goes over into that of a neighbour, the neighbour is the contact gained.
+    """
+    finger = contact.finger
+    if finger is None:
+        return []
+    link = build_features(scene).links[finger]
+    lengths = build_features(scene).edge_lengths
+    i, part, count = contact.index, contact.part, len(lengths)
+    before, after = (i - 1) % count, (i + 1) % count
+
+    pointed = scene.fingers[finger].radius == 0
+
+    def gains(feature: str, index: int, surface: str = "tip") -> Contact | None:
+        if (feature, surface) == ("v", "tip") and pointed:
+            return None
+        return Contact(feature, index, surface, finger)
+
+    def meeting(vertex: int) -> tuple[Contact, ...]:
+        """What else a pointed tip touches at a vertex."""
+        side = Contact("v", vertex, "finger", finger)
+        edges = [Contact("e", (vertex - k) % count, "tip", finger) for k in (0, 1)]
+        return tuple(c for c in (side, *edges) if c != contact) if pointed else ()
+
+    if contact.surface == "finger":
+        run = link.vertex_run[i]
+        off = f"v{i} runs off {part} at its"
+        return [
+            Limit(run, f"{off} base"),
+            Limit(scene.fingers[finger].length - run, f"{off} tip", gains("v", i), meeting(i)),
+        ]
+    if contact.feature == "e":
+        run = link.edge_run[i]
+        off = f"{part} runs off edge {i} at v"
+        return [
+            Limit(run, f"{off}{i}", gains("v", i), meeting(i)),
+            Limit(lengths[i] - run, f"{off}{after}", gains("v", after), meeting(after)),
+        ]
+    # Both sides of the link begin where the arc ends.
+    beyond, side = link.arc_run[i], link.vertex_gap[i] + scene.fingers[finger].radius
+    off = f"v{i} leaves {part} for the"
+    return [
+        Limit(ca.fmax(beyond, -side), f"{off} side of the link", gains("v", i, "finger")),
+        Limit(ca.fmax(beyond, side), f"{off} far side of the link"),
+        Limit(
+            link.edge_run[before] - lengths[before],
+            f"edge {before} turns onto {part}",
+            gains("e", before),
+        ),
+        Limit(-link.edge_run[i], f"edge {i} turns onto {part}", gains("e", i)),
+    ]
+
+
+def build_clearance(contact: Contact, scene: Scene, touching: bool) -> Limit:
+    """Return the limit at which `contact`, not in the formation, is gained.
+
+    A feature beyond the ends of its partner cannot touch it, so its gap does not count there, and
+    a tip that is farther outside another edge cannot touch this one. The exception is a link that
+    already touches a vertex with its side (`touching`): by convexity the whole object then stays
+    on that side of the link's line.
+    """
+    gap = own = build_gap(contact, scene)
+    text = f"{contact.corner} touches {contact.part}"
+    if contact.feature == "e" and contact.finger is not None and not touching:
+        gaps = build_features(scene).links[contact.finger].edge_gap
+        for other in range(scene.polygon.n_vertices):
+            if other != contact.index:
+                gap = ca.fmax(gap, gaps[other] - own)
+    if contact.finger is not None and not (touching and contact.surface == "finger"):
+        for limit in build_limits(contact, scene):
+            gap = ca.fmax(gap, -limit.value)
+    return Limit(gap, text, contact)

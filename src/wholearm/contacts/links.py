@@ -1,0 +1,74 @@
+"""The gap between the two links, which are solid to each other.
+
+Two convex bodies are apart by the largest separation over all directions d, that of the projections
+on d; where they overlap it is minus the least push that parts them. For two segments the candidates
+are both sides of each link and the lines from an end of one to an end of the other, so that
+
+    gap = max_d (min_(q on link 2) d . q - max_(p on link 1) d . p) - radius_1 - radius_2
+
+is the distance of the two capsules when apart, minus the depth when they overlap, and continuous.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from ..common.arrays import Array, Expression
+from ..common.sharing import Store, exclusive
+from ..scene.model import Scene
+from .elemental import Limit, build_features, rotate_quarter
+
+FINGERS_TOUCH = "finger 1 touches finger 2"
+"""What has happened where the gap of the fingers is zero."""
+_ROUNDING = 1e-30
+"""Added to squared distances over squared lengths, so that ends that coincide have a direction."""
+
+
+def build_finger_gap(scene: Scene) -> Expression:
+    """Return the gap between the two links [m], an expression of the features' symbol z."""
+    links = build_features(scene).links
+    radii = sum(link.radius for link in scene.fingers)
+    lengths = [link.length for link in scene.fingers]
+    axes = [(link.tip - link.base) / length for link, length in zip(links, lengths, strict=True)]
+    parts = []
+    for own, other, axis in ((*links, axes[0]), (*links[::-1], axes[1])):
+        ends = rotate_quarter(axis).T @ ca.horzcat(other.base - own.base, other.tip - own.base)
+        parts += [ca.fmin(ends[0], ends[1]), -ca.fmax(ends[0], ends[1])]
+    # From base and tip of link 1 to base and tip of link 2; each link goes on from there along its
+    # axis or against it, and what goes on towards the other link takes from the separation.
+    first = ca.horzcat(links[0].base, links[0].base, links[0].tip, links[0].tip)
+    second = ca.horzcat(links[1].base, links[1].tip, links[1].base, links[1].tip)
+    run = second - first
+    distance = ca.sqrt(ca.sum1(run**2) + _ROUNDING * sum(lengths) ** 2)
+    onwards = axes[0].T @ run * ca.DM([[1.0, 1.0, -1.0, -1.0]]) * lengths[0]
+    backwards = axes[1].T @ run * ca.DM([[-1.0, 1.0, -1.0, 1.0]]) * lengths[1]
+    parts.append((distance - (ca.fmax(onwards, 0) + ca.fmax(backwards, 0)) / distance).T)
+    return ca.mmax(ca.vertcat(*parts)) - radii
+
+
+def build_finger_limit(scene: Scene) -> list[Limit]:
+    """Return the limit that the gap between the links is; none where they pass each other."""
+    return [Limit(build_finger_gap(scene), FINGERS_TOUCH)] if scene.fingers_collide else []
+
+
+def _build_gap_function(scene: Scene) -> Expression:
+    return ca.Function("finger_gap", [build_features(scene).z], [build_finger_gap(scene)])
+
+
+_GAP_FUNCTIONS = Store(_build_gap_function, lambda scene: scene.shape)
+
+
+@exclusive
+def evaluate_finger_gap(scene: Scene, z: Array) -> Array:
+    """Gap between the two links at n configurations, shape (n,) [m], negative where they overlap.
+
+    Parameters
+    ----------
+    scene : Scene
+    z : ndarray, shape (n, 5)
+        NaN where a joint angle is unknown, which makes the gap NaN.
+    """
+    if not len(z):
+        return np.zeros(0)
+    return np.asarray(_GAP_FUNCTIONS(scene)(z.T).full()[0])

@@ -1,0 +1,153 @@
+"""Where the object runs into a part of a link that makes no contact with a name.
+
+Contacts are made with the touching side of a link and with its tip. The far side and the circle
+about the joint, of the link's radius, are solid as well:
+
+====================  ===========================================  ========================
+object                link                                         C-function
+====================  ===========================================  ========================
+vertex 3              far side                                     -n . (p - base) - radius
+vertex 3              circle about the joint                       abs(p - base) - radius
+edge 2                circle about the joint                       m . (base - p_2) - radius
+====================  ===========================================  ========================
+
+A link that touches a vertex with its side needs none of these: by convexity the whole object is on
+that side of the link's line. Nor does one that touches a vertex with its tip: the tangent to the
+tip there has the link on one side and the object on the other. One whose tip touches an edge can
+only turn onto the edge's line, with either side.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+
+from ..common.arrays import Expression
+from ..scene.model import Scene
+from .elemental import Contact, Limit, build_features
+
+_ROUNDING = 1e-30
+"""Added to squared distances over squared lengths: points that coincide have a direction."""
+
+
+def build_far_side(scene: Scene, finger: int, vertex: int, apart: Expression | None) -> Limit:
+    """Return the limit at which a vertex touches the far side of a link.
+
+    Parameters
+    ----------
+    apart : expression, optional, [m]
+        Gap between the whole link and the object, where nothing else says on which side of the
+        link the object is.
+    """
+    link, part = build_features(scene).links[finger], scene.fingers[finger]
+    gap = -link.vertex_gap[vertex] - 2 * part.radius
+    text = f"v{vertex} touches the far side of finger {finger + 1}"
+    return Limit(confine(gap, link.vertex_run[vertex], part.length, apart), text)
+
+
+def build_joint_edge(scene: Scene, finger: int, edge: int, held: bool) -> Limit:
+    """Return the limit at which an edge touches the circle about a joint.
+
+    `held` says that the tip touches the same edge, so that no other edge is nearer.
+    """
+    features = build_features(scene)
+    gaps, runs = _place_joint(scene, finger)
+    gap = confine(gaps[edge], runs[edge], float(features.edge_lengths[edge]))
+    for other in range(0 if held else gaps.shape[1]):
+        if other != edge:
+            gap = ca.fmax(gap, gaps[other] - gaps[edge])
+    return Limit(gap, f"e{edge} touches the joint of finger {finger + 1}")
+
+
+def build_joint_vertex(scene: Scene, finger: int, vertex: int) -> Limit:
+    """Return the limit at which a vertex touches the circle about a joint."""
+    features = build_features(scene)
+    link, lengths = features.links[finger], features.edge_lengths
+    _, runs = _place_joint(scene, finger)
+    before = (vertex - 1) % len(lengths)
+    gap = _distance(features.vertices[:, vertex] - link.base) - scene.fingers[finger].radius
+    beyond = ca.fmax(runs[vertex], float(lengths[before]) - runs[before])
+    gap = ca.fmax(gap, ca.fmax(link.vertex_run[vertex], beyond))
+    return Limit(gap, f"v{vertex} touches the joint of finger {finger + 1}")
+
+
+def build_obstacles(scene: Scene, finger: int, held: list[Contact]) -> list[Limit]:
+    """Return the limits of a link's far side and joint, given its contacts of a formation."""
+    vertices = range(scene.polygon.n_vertices)
+    if not held:
+        apart = build_apart(scene, finger)
+        limits = [build_far_side(scene, finger, i, apart) for i in vertices]
+        limits += [build_joint_edge(scene, finger, i, held=False) for i in vertices]
+        if scene.fingers[finger].radius > 0:
+            limits += [build_joint_vertex(scene, finger, i) for i in vertices]
+        return limits
+    if any((c.surface, c.feature) != ("tip", "e") for c in held):
+        return []
+    limits = []
+    for contact in held:
+        ahead = (contact.index + 1 - finger) % len(vertices)
+        limits.append(build_far_side(scene, finger, ahead, None))
+        limits.append(build_joint_edge(scene, finger, contact.index, held=True))
+    return limits
+
+
+def face(scene: Scene, finger: int, limits: list[Limit]) -> list[Limit]:
+    """Return limits of a link without contacts for an object that may be on its far side, too."""
+    apart = build_apart(scene, finger)
+    gaps = build_features(scene).links[finger].vertex_gap
+    return [
+        limit._replace(value=ca.fmax(limit.value, apart - gaps[limit.gained.index] / 2))
+        if limit.gained is not None and limit.gained.surface == "finger"
+        else limit
+        for limit in limits
+    ]
+
+
+def confine(
+    gap: Expression, run: Expression, length: float, apart: Expression | None = None
+) -> Expression:
+    """Return a gap that counts only where 0 <= run <= length.
+
+    With `apart`, the gap of the whole bodies, it counts only where they overlap nowhere else: the
+    gap to one side of a link is negative on all of the other side.
+    """
+    value = ca.fmax(gap, ca.fmax(-run, run - length))
+    return value if apart is None else ca.fmax(value, apart - gap / 2)
+
+
+def build_apart(scene: Scene, finger: int) -> Expression:
+    """Return the gap between a link and the object [m]: the largest separation of any direction.
+
+    The candidates are the normals of the link and of every edge, and the lines from either end of
+    the link to every vertex. Where the two overlap it is minus the least push that parts them.
+    """
+    features = build_features(scene)
+    link, part = features.links[finger], scene.fingers[finger]
+    at_joint, _ = _place_joint(scene, finger)
+    parts = [
+        ca.mmin(link.vertex_gap),
+        -ca.mmax(link.vertex_gap) - 2 * part.radius,
+        ca.mmax(ca.fmin(at_joint, link.edge_gap)),
+    ]
+    for own, other in ((link.base, link.tip), (link.tip, link.base)):
+        rays = features.vertices - ca.repmat(own, 1, features.vertices.shape[1])
+        distance = ca.sqrt(ca.sum1(rays**2) + _ROUNDING * part.length**2)
+        table = rays.T @ ca.horzcat(rays, other - own) / ca.repmat(distance.T, 1, rays.shape[1] + 1)
+        nearest = table[:, 0]
+        for column in range(1, rays.shape[1]):
+            nearest = ca.fmin(nearest, table[:, column])
+        parts.append(ca.mmax(nearest - ca.fmax(table[:, -1], 0)) - part.radius)
+    return ca.mmax(ca.vertcat(*parts))
+
+
+def _place_joint(scene: Scene, finger: int) -> tuple[Expression, Expression]:
+    """Gaps of a joint's circle with each edge's line, and runs along it, shape (1, n_v) [m]."""
+    features = build_features(scene)
+    to_joint = ca.repmat(features.links[finger].base, 1, features.vertices.shape[1])
+    to_joint = to_joint - features.vertices
+    normals = features.edge_normals
+    along = ca.vertcat(normals[1, :], -normals[0, :])
+    return -ca.sum1(normals * to_joint) - scene.fingers[finger].radius, ca.sum1(along * to_joint)
+
+
+def _distance(vector: Expression) -> Expression:
+    return ca.sqrt(ca.sum1(vector**2))

@@ -1,0 +1,1 @@
+"""Curves of one freedom, tangent spaces, and motions to start from."""

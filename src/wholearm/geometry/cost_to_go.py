@@ -1,0 +1,48 @@
+"""What is still to come costs, as a function of where a motion ends.
+
+A block of phases may leave open where it ends; planned alone it ends where it costs least itself,
+however long the way is that it leaves to the phases after it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..mechanics.metric import metric_weights
+from ..problem.definition import Phase, Problem
+from .tracing import trace_phase
+
+_STEP = 1e-2
+"""Step of the difference quotient, over the length of the curve that follows."""
+
+
+@dataclass(frozen=True, eq=False)
+class CostToGo:
+    """The cost of the phases that follow, the first of them with one freedom.
+
+    Attributes
+    ----------
+    problem : Problem
+    phase : Phase
+        The first of them. Its curve is where the motion before it may end.
+    value : callable
+        Their least cost from a configuration z, shape (5,). Raises a `WholearmError` without a
+        plan from there.
+    """
+
+    problem: Problem
+    phase: Phase
+    value: Callable[[Array], float]
+
+    def expand(self, z: Array) -> tuple[float, Array]:
+        """The cost from `z`, shape (5,), and its gradient along the curve, shape (5,)."""
+        curve = trace_phase(self.problem, self.phase, z)
+        step = _STEP * curve.length
+        point = curve.evaluate(np.array([0.0, step]))
+        here, ahead = (self.value(place) for place in point.z)
+        slope = (ahead - here) / step
+        return here, slope * metric_weights(self.problem.scene) * point.z_s[0]

@@ -1,0 +1,253 @@
+"""The curve z(s) that one freedom leaves, with its tangent, curvature and reversals.
+
+The parameter is the arc length s in metres, in the metric
+
+    ds^2 = dx^2 + dy^2 + rho^2 (dphi^2 + dtheta_1^2 + dtheta_2^2),
+
+rho being the object's radius of gyration, unless the curve has a pace of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..contacts.formation import Formation, Kinematics
+from ..mechanics.metric import metric_weights
+
+REFINE = 3
+"""Places per node of a panel at which limits and reversals are looked for."""
+
+
+class CurvePoint(NamedTuple):
+    """A curve at n places: z, its tangent z_s and its curvature z_ss, each (n, 5).
+
+    `kinematics` is the formation there.
+    """
+
+    z: Array
+    z_s: Array
+    z_ss: Array
+    kinematics: Kinematics
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """A stretch of a curve, as the polynomial through its nodes.
+
+    Attributes
+    ----------
+    s : ndarray, shape (n,), [m]
+        Arc lengths of the nodes, increasing.
+    z, z_s : ndarray, shape (n, 5)
+        Configurations and unit tangents there.
+    """
+
+    s: Array
+    z: Array
+    z_s: Array
+
+    @cached_property
+    def _weights(self) -> Array:
+        # Barycentric weights; on an interval of length 4 their products stay near 1.
+        x = 4 * (self.s - self.s[0]) / (self.s[-1] - self.s[0])
+        difference = x[:, None] - x[None, :]
+        np.fill_diagonal(difference, 1.0)
+        return np.asarray(1 / difference.prod(axis=1))
+
+    def interpolate(self, s: Array) -> tuple[Array, Array]:
+        """Return z and z_s at the arc lengths `s`, each of shape (n, 5)."""
+        difference = s[:, None] - self.s[None, :]
+        at_node = difference == 0
+        difference[at_node] = 1.0
+        terms = self._weights / difference
+        rows = at_node.any(axis=1)
+        terms[rows] = at_node[rows]
+        terms /= terms.sum(axis=1, keepdims=True)
+        return terms @ self.z, terms @ self.z_s
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """A stretch of a curve without a reversal.
+
+    Attributes
+    ----------
+    start, stop : float, [m]
+        Arc lengths of its ends.
+    Xi : ndarray, shape (n_c,)
+        Sliding directions of the contacts for motion along +s, zero for rolling ones.
+    sigma : ndarray, shape (2,)
+        Directions of the joints for motion along +s.
+    """
+
+    start: float
+    stop: float
+    Xi: Array
+    sigma: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """The curve z(s) of a one-freedom formation, for s from 0 to `length`.
+
+    Attributes
+    ----------
+    formation : Formation
+    panels : tuple of Panel
+    length : float, [m]
+    ending : str
+        What happens at the end, in words.
+    reached : bool
+        Whether that is what the curve was traced for.
+    pace : float
+        Arc length per unit of the parameter s, hence the length of its tangents.
+    """
+
+    formation: Formation
+    panels: tuple[Panel, ...]
+    length: float
+    ending: str
+    reached: bool
+    pace: float = 1.0
+
+    def evaluate(self, s: Array) -> CurvePoint:
+        """Return z, its tangent z_s and its curvature z_ss at the places `s`, shape (n,)."""
+        z, tangent = self._interpolate(np.asarray(s, dtype=float))
+        formation = self.formation
+        kinematics = formation.evaluate(z, tangent)
+        metric = metric_weights(formation.scene)
+        z_s, z_ss = _solve_tangent(kinematics.P, kinematics.P_dot_v, tangent, metric)
+        return CurvePoint(z, z_s * self.pace, z_ss * self.pace**2, kinematics)
+
+    def _interpolate(self, s: Array) -> tuple[Array, Array]:
+        starts = np.array([panel.s[0] for panel in self.panels])
+        owner = np.clip(np.searchsorted(starts, s, side="right") - 1, 0, None)
+        z, tangent = np.empty((len(s), 5)), np.empty((len(s), 5))
+        for index, panel in enumerate(self.panels):
+            mine = owner == index
+            if mine.any():
+                z[mine], tangent[mine] = panel.interpolate(s[mine])
+        return z, tangent
+
+    def at_pace(self, pace: float) -> Curve:
+        """Return the same curve with a parameter that runs through it at another pace."""
+        share = self.pace / pace
+        panels = tuple(Panel(share * panel.s, panel.z, panel.z_s) for panel in self.panels)
+        return replace(self, panels=panels, length=share * self.length, pace=pace)
+
+    @property
+    def start(self) -> Array:
+        """Configuration at s = 0, shape (5,)."""
+        return np.asarray(self.panels[0].z[0])
+
+    @cached_property
+    def end(self) -> Array:
+        """Configuration at s = length, shape (5,)."""
+        return np.asarray(self._interpolate(np.array([self.length]))[0][0])
+
+    def sliding(self, s: Array) -> Array:
+        """Sliding rates A_t z_s of the contacts and rates of the joints, shape (n, n_c + 2)."""
+        point = self.evaluate(s)
+        rho = self.formation.scene.polygon.gyration_radius
+        slip = np.einsum("nij,nj->ni", point.kinematics.A_t, point.z_s)
+        slip[:, list(self.formation.rolling_rows)] = 0.0
+        return np.hstack([slip, rho * point.z_s[:, 3:]])
+
+    @cached_property
+    def segments(self) -> tuple[Segment, ...]:
+        """The curve split wherever a contact's sliding or a joint reverses."""
+        grids = [refine(panel.s, self.length) for panel in self.panels]
+        grid = np.concatenate([grid[index > 0 :] for index, grid in enumerate(grids)])
+        rates = self.sliding(grid)
+        rates[np.abs(rates) < 1e-9] = 0.0
+        breaks = []
+        for column in range(rates.shape[1]):
+            moving = np.flatnonzero(rates[:, column])
+            flips = np.flatnonzero(np.diff(np.sign(rates[moving, column])))
+            for flip in flips:
+                low, high = grid[moving[flip]], grid[moving[flip + 1]]
+
+                def rate(s: float, k: int = column) -> float:
+                    return float(self.sliding(np.array([s]))[0, k])
+
+                breaks.append(find_root(rate, low, high))
+        margin = 1e-7 * self.length
+        inner = [s for s in sorted(breaks) if margin < s < self.length - margin]
+        ends = [0.0, *(s for i, s in enumerate(inner) if i == 0 or s > inner[i - 1] + margin)]
+        segments = []
+        for start, stop in zip(ends, [*ends[1:], self.length], strict=True):
+            within = rates[(grid > start) & (grid < stop)]
+            if not len(within):
+                within = self.sliding(np.array([(start + stop) / 2]))
+            signs = np.sign(within[np.abs(within).argmax(axis=0), range(rates.shape[1])])
+            segments.append(Segment(start, stop, signs[:-2], signs[-2:]))
+        return tuple(segments)
+
+
+def _solve_tangent(P: Array, P_dot_v: Array, tangent: Array, metric: Array) -> tuple[Array, Array]:
+    """Unit null vector of P nearest to `tangent`, and the curvature orthogonal to it."""
+    matrix = border(P, tangent * metric)
+    right = np.zeros((len(P), 5, 2))
+    right[:, 4, 0] = 1.0
+    right[:, :4, 1] = -P_dot_v
+    solution = np.linalg.solve(matrix, right)
+    z_s, z_ss = solution[..., 0], solution[..., 1]
+    z_s = z_s / np.sqrt(z_s**2 @ metric)[:, None]
+    z_ss = z_ss - ((z_ss * z_s) @ metric)[:, None] * z_s
+    return z_s, z_ss
+
+
+def border(P: Array, last: Array) -> Array:
+    """Append a row to each P: (n, 4, 5) and (5,) or (n, 5) to (n, 5, 5)."""
+    last = np.broadcast_to(last, (len(P), 5))
+    return np.concatenate([P, last[:, None, :]], axis=1)
+
+
+def tangent_basis(formation: Formation, z: Array) -> Array:
+    """Covectors N of the null space of P at `z`, shape (5, f), in radii of gyration.
+
+    N^T dz are the coordinates of a displacement in an orthonormal basis of that space; N over the
+    metric spans it.
+    """
+    metric = metric_weights(formation.scene)
+    P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
+    _, values, right = np.linalg.svd(P / np.sqrt(metric))
+    rank = int((values > 1e-9 * values[0]).sum())
+    return np.asarray((right[rank:] * np.sqrt(metric)).T / np.sqrt(metric[2]))
+
+
+def refine(s: Array, stop: float) -> Array:
+    """Places to look at along a panel with nodes `s`, up to `stop`."""
+    grid = np.interp(np.linspace(0, len(s) - 1, REFINE * len(s)), np.arange(len(s)), s)
+    return np.append(grid[grid < stop], min(stop, s[-1]))
+
+
+def find_root(function: Callable[[float], float], low: float, high: float) -> float:
+    """Root of a scalar function between a sign change, to rounding (the Illinois method)."""
+    f_low, f_high = function(low), function(high)
+    rounding = 4 * np.finfo(float).eps * max(abs(low), abs(high))
+    for _ in range(60):
+        middle = high - f_high * (high - low) / (f_high - f_low)
+        f_middle = function(middle)
+        if f_middle == 0.0 or abs(high - low) < rounding:
+            return float(middle)
+        if f_middle * f_high < 0:
+            low, f_low = high, f_high
+        else:
+            f_low /= 2
+        if abs(middle - high) < rounding:
+            return float(middle)
+        high, f_high = middle, f_middle
+    return float(high)
+
+
+def describe_pose(z: Array) -> str:
+    """Pose of the object in words."""
+    x, phi = round(1e3 * float(z[0]), 6) + 0.0, round(float(np.degrees(z[2])), 6) + 0.0
+    return f"x = {x:.4g} mm, phi = {phi:.4g} deg"

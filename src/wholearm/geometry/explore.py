@@ -1,0 +1,163 @@
+"""Closing contacts from nearby, and looking for the end of a phase all over a formation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..contacts.formation import Formation
+from ..mechanics.metric import metric_weights
+from .closing import close as closed_at
+from .closing import lower
+
+GRID = (120, 60)
+"""Places across x and phi at which a formation is looked at."""
+SEEDS = 24
+"""Most places from which an end is looked for: those that are nearest to it."""
+STILL = 1e-4
+"""Distance from the start, in radii of gyration, below which a phase would have nothing to do."""
+CLOSED = 3e-11
+"""Largest gap of closed contacts, in radii of gyration, and error of a coordinate likewise."""
+_STEP = 1e-5
+"""Step of the differences that give the gradients of limits, in radii of gyration or radians."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ending:
+    """What has to hold where a phase ends.
+
+    Attributes
+    ----------
+    formation : Formation
+        Contacts that are closed.
+    fixed : (int, float), or None
+        Row of z and the value that it has to take.
+    active : tuple of int
+        Limits of the formation that are met exactly.
+    """
+
+    formation: Formation
+    fixed: tuple[int, float] | None = None
+    active: tuple[int, ...] = ()
+
+    def measure(self, z: Array) -> Array:
+        """How far configurations with the phase's own contacts closed are from the end [m]."""
+        metric = metric_weights(self.formation.scene)
+        off = np.abs(self.formation.evaluate(z, z).C).max(axis=1)
+        if self.fixed is not None:
+            row, value = self.fixed
+            off = np.maximum(off, np.abs(z[:, row] - value) * np.sqrt(metric[row]))
+        if self.active:
+            limits = self.formation.evaluate_limits(z)[:, list(self.active)]
+            off = np.maximum(off, np.abs(limits).max(axis=1))
+        return np.asarray(off)
+
+
+def explore(formation: Formation, z: Array, slip: Array, ends: list[Ending]) -> Array | None:
+    """An end of a phase, found from places all over the formation; None if none is found.
+
+    Only with palm and both fingers touching, where (x, phi) says the whole configuration.
+
+    Parameters
+    ----------
+    formation : Formation
+    z : ndarray, shape (5,)
+        Where the phase starts.
+    slip : ndarray, shape (R,), [m]
+        Slip coordinates that rolling contacts keep.
+    ends : list of Ending
+        Any of these will do.
+    """
+    parts = [contact.finger for contact in formation.contacts]
+    if len(parts) != 3 or set(parts) != {None, 0, 1} or formation.rolling:
+        return None
+    metric = metric_weights(formation.scene)
+    places = _list_places(formation, z)
+    found, least = None, np.inf
+    for end in ends:
+        off = end.measure(places)
+        order = np.argsort(off)[:SEEDS]
+        for k in order[np.argsort((places[order] - z) ** 2 @ metric)]:
+            goal = close(end.formation, places[k], slip, end.fixed, end.active)
+            if goal is None or not is_inside(end.formation, goal):
+                continue
+            distance = float(metric @ (goal - z) ** 2)
+            # One that holds at the start is no end to go to.
+            if STILL * formation.scene.scales.length < np.sqrt(distance) < least:
+                found, least = goal, np.sqrt(distance)
+    return found
+
+
+def is_inside(formation: Formation, z: Array) -> bool:
+    """Whether a configuration, shape (5,), keeps all limits of a formation."""
+    return bool(formation.evaluate_limits(z[None]).min() > -formation.scene.touching)
+
+
+def _list_places(formation: Formation, z: Array) -> Array:
+    """Configurations all over a formation of palm and both fingers, shape (n, 5)."""
+    scene = formation.scene
+    turned = z[2] + np.linspace(-np.pi, np.pi, 721)
+    (lowest,) = (c.index for c in formation.contacts if c.finger is None)
+    turned = turned[lower(scene, turned)[1] == lowest]
+    size = float(np.hypot(*scene.polygon.vertices.T).max())
+    bases = np.array([np.asarray(finger.base)[0] for finger in scene.fingers])
+    reach = np.array([size + finger.length + finger.radius for finger in scene.fingers])
+    across = np.linspace((bases - reach).max(), (bases + reach).min(), GRID[0])
+    x, phi = np.meshgrid(across, np.linspace(turned.min(), turned.max(), GRID[1]))
+    closed = closed_at(scene, x.ravel(), phi.ravel()).z
+    closed = np.vstack([z, closed[np.isfinite(closed).all(axis=1)]])
+    gaps = np.abs(formation.evaluate(closed, closed).C).max(axis=1)
+    inside = formation.evaluate_limits(closed).min(axis=1) > -scene.touching
+    return np.asarray(closed[inside & (gaps < scene.touching)])
+
+
+def close(
+    formation: Formation,
+    z: Array,
+    slip: Array,
+    fixed: tuple[int, float] | None = None,
+    active: tuple[int, ...] = (),
+) -> Array | None:
+    """Nearest configuration with all contacts closed, by Gauss-Newton; None if there is none.
+
+    Parameters
+    ----------
+    formation : Formation
+    z : ndarray, shape (5,)
+        Where to start.
+    slip : ndarray, shape (R,), [m]
+        Slip coordinates that rolling contacts keep.
+    fixed : (int, float), optional
+        Row of z and the value that it has to take.
+    active : tuple of int
+        Limits of the formation that are met exactly.
+    """
+    metric, rho = metric_weights(formation.scene), formation.scene.scales.length
+    sizes = np.full(formation.n_constraints, rho)
+    steps = _STEP * np.diag([rho, rho, 1.0, 1.0, 1.0])
+    if fixed is not None:
+        sizes = np.append(sizes, rho if fixed[0] == 0 else 1.0)
+    sizes = np.append(sizes, np.full(len(active), rho))
+    for _ in range(50):
+        kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
+        slipped = formation.evaluate_slip(z[None])[0] - slip
+        residual, rows = np.append(kinematics.C[0], slipped), kinematics.P[0]
+        if fixed is not None:
+            residual = np.append(residual, z[fixed[0]] - fixed[1])
+            rows = np.vstack([rows, np.eye(5)[fixed[0]]])
+        if active:
+            residual = np.append(residual, formation.evaluate_limits(z[None])[0, active])
+            around = formation.evaluate_limits(z + np.vstack([steps, -steps]))[:, active]
+            ahead, behind = np.split(around, 2)
+            rows = np.vstack([rows, (ahead - behind).T / (2 * steps.diagonal())])
+        rows, residual = rows / sizes[:, None], residual / sizes
+        lift = (rows / metric).T
+        change = lift @ np.linalg.lstsq(rows @ lift, residual, rcond=1e-12)[0]
+        # Long steps overshoot where links turn; a tenth of a radian keeps to one branch.
+        change *= min(1.0, 0.1 / max(np.abs(change[2:]).max(), 1e-12))
+        z = z - change
+        if np.abs(residual).max() < CLOSED:
+            return z
+    return None

@@ -1,0 +1,275 @@
+"""A first idea of a motion, from geometry alone: what the time-domain planner starts from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.errors import InputError
+from ..common.sharing import exclusive
+from ..contacts.formation import Formation
+from ..contacts.limits import build_limits
+from ..mechanics.dynamics import Directions
+from ..mechanics.metric import metric_weights
+from ..problem.definition import Phase, Problem, read_problem
+from .curve import Curve, tangent_basis
+from .explore import Ending, close, explore, is_inside
+from .tracing import require_touching, runs_on_curve, trace_phase, trace_phases
+
+POINTS = 25
+"""Configurations along an outline."""
+RELEASE_AT = 0.8
+"""Where on a curve without an end of its own a release is guessed."""
+_MOST_ACTIVE = 2
+"""Most limits that a phase's end may be right on."""
+_AHEAD = (0.25, 0.5, 1.0, 2.0)
+"""How far ahead ends are looked for, over the distance to the nearest."""
+_TURNS = np.linspace(-1.0, 1.0, 21)
+"""How far the object is turned to look for an end that is not the nearest [rad]."""
+
+
+@exclusive
+def load(path: str) -> Problem:
+    """Read a problem file and check that every phase can be carried out geometrically.
+
+    Raises
+    ------
+    InputError
+        If the file is malformed, a formation does not touch, or an `until` is never reached.
+    """
+    problem = read_problem(path)
+    require_phases(problem)
+    return problem
+
+
+def require_phases(problem: Problem) -> None:
+    """Check that every phase of a problem can be carried out geometrically.
+
+    Raises
+    ------
+    InputError
+        If a formation does not touch, or an `until` is never reached.
+    """
+    curves = trace_phases(problem)
+    z = curves[-1].end if curves else problem.start
+    for phase in problem.phases[len(curves) :]:
+        if runs_on_curve(phase):
+            z = trace_phase(problem, phase, z).end
+        else:
+            z = outline_phase(problem, phase, z)[-1].z[-1]
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """A stretch of a phase without a reversal, as configurations along it.
+
+    Attributes
+    ----------
+    formation : Formation
+    z : ndarray, shape (n, 5)
+        With all contacts closed, evenly spread.
+    directions : Directions
+    turns : tuple of int
+        Rows of (contacts, joints) whose rate is zero at the end of the stretch, where it reverses.
+    """
+
+    formation: Formation
+    z: Array
+    directions: Directions
+    turns: tuple[int, ...] = ()
+
+    @property
+    def length(self) -> float:
+        """Arc length in the metric of curves [m]."""
+        steps = np.diff(self.z, axis=0)
+        return float(np.sqrt(steps**2 @ metric_weights(self.formation.scene)).sum())
+
+
+def outline_curve(curve: Curve, share: float = 1.0) -> list[Outline]:
+    """Outline a curve, or the first `share` of it, split at its reversals."""
+    stop = share * curve.length
+    parts = [part for part in curve.segments if part.start < stop]
+    outlines = []
+    for part, following in zip(parts, [*parts[1:], None], strict=True):
+        s = np.linspace(part.start, min(part.stop, stop), POINTS)
+        signs = np.concatenate([part.Xi, part.sigma])
+        turns: tuple[int, ...] = ()
+        if following is not None:
+            flips = signs != np.concatenate([following.Xi, following.sigma])
+            turns = tuple(np.flatnonzero(flips).tolist())
+        directions = Directions(part.Xi, part.sigma)
+        outlines.append(Outline(curve.formation, curve.evaluate(s).z, directions, turns))
+    return outlines
+
+
+def outline_phase(
+    problem: Problem, phase: Phase, z: Array, release_at: float = RELEASE_AT
+) -> list[Outline]:
+    """Outline a phase from `z`, shape (5,), to its end; a release is at a share of the curve.
+
+    Raises
+    ------
+    InputError
+        If the contacts do not touch at `z`, leave no freedom, or the end cannot be reached.
+    """
+    formation = phase.formation
+    require_touching(problem, phase, z)
+    freedoms = count_freedoms(formation, z)
+    if freedoms == 0:
+        key = f"phases[{phase.number}].contacts"
+        raise InputError(problem.source, key, "the contacts leave no freedom to move")
+    if freedoms == 1:
+        curve = trace_phase(problem, phase, z)
+        return outline_curve(curve, release_at if phase.until.is_release else 1.0)
+    goal = _find_goal(problem, phase, z)
+    return [connect(formation, z, goal)]
+
+
+def count_freedoms(formation: Formation, z: Array) -> int:
+    """Freedoms that a formation leaves at `z`: 5 less the rank of P."""
+    return int(tangent_basis(formation, z).shape[1])
+
+
+def _find_goal(problem: Problem, phase: Phase, z: Array) -> Array:
+    """Nearest configuration at which the phase ends."""
+    key = f"phases[{phase.number}].until"
+    if phase.until.is_release:
+        ends = [later.until for later in problem.phases[phase.index + 1 :]]
+        ends = [until for until in ends if not until.is_release]
+        if not ends:
+            raise InputError(problem.source, key, "is missing; only one freedom needs none")
+        # On the way to where a phase ends next, as far as this one's contacts lead there.
+        ahead = _find_goal(problem, replace(phase, until=ends[0]), z)
+        middle = close(phase.formation, (z + ahead) / 2, phase.formation.evaluate_slip(z[None])[0])
+        return ahead if middle is None else middle
+    slip, reasons, goals = phase.formation.evaluate_slip(z[None])[0], [], []
+    endings = list_ends(phase)
+    for end in endings:
+        goal, reason = _settle(end, z, slip)
+        reasons.append(reason)
+        goals += [goal] if goal is not None else []
+    if not goals and phase.until.contact is not None:
+        found = _look_around(phase.formation, _end_formation(phase), z, slip)
+        goals = [found] if found is not None else []
+    if not goals:
+        found = explore(phase.formation, z, slip, endings)
+        goals = [found] if found is not None else []
+    if goals:
+        metric = metric_weights(problem.scene)
+        return min(goals, key=lambda goal: float(metric @ (goal - z) ** 2))
+    text = f"{phase.until} cannot be reached with these contacts{reasons[0]}"
+    raise InputError(problem.source, key, text)
+
+
+def list_ends(phase: Phase) -> list[Ending]:
+    """What has to hold where a phase ends; a contact may be gained in more than one way."""
+    formation, until = phase.formation, phase.until
+    if until.value is not None:
+        return [Ending(formation, (0 if until.coordinate == "x" else 2, until.value))]
+    own = sum(len(build_limits(c, formation.scene)) for c in formation.contacts)
+    gaining = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
+    # Where a contact changes its name its gap has no slope, but the end of its range has.
+    ends = [Ending(formation, active=(k,)) for k in gaining if k < own]
+    if not ends or any(k >= own for k in gaining):
+        ends.append(Ending(_end_formation(phase)))
+    return ends
+
+
+def _settle(end: Ending, z: Array, slip: Array) -> tuple[Array | None, str]:
+    """The end nearest to `z`, up to `_MOST_ACTIVE` limits met exactly, or what is in the way."""
+    formation, active, reason = end.formation, end.active, ""
+    goal = close(formation, z, slip, end.fixed, active)
+    while goal is not None:
+        limits = formation.evaluate_limits(goal[None])[0]
+        if limits.min() > -formation.scene.touching:
+            return goal, ""
+        worst = int(limits.argmin())
+        reason = f": {formation.limits[worst].text} first"
+        if worst in active or len(active) == _MOST_ACTIVE + len(end.active):
+            break
+        active = (*active, worst)
+        goal = close(formation, goal, slip, end.fixed, active)
+    return None, reason
+
+
+def outline_onwards(phase: Phase, before: Outline) -> list[Outline]:
+    """Outline a phase that goes on from another outline, to ends that lie ahead of it.
+
+    Where a contact may be gained in many places, the nearest is often beside the motion so far:
+    these are nearest to places ahead. There are none for a phase with one freedom.
+    """
+    formation, z = phase.formation, before.z[-1]
+    if phase.until.contact is None or count_freedoms(formation, z) < 2:
+        return []
+    ending, slip = _end_formation(phase), formation.evaluate_slip(z[None])[0]
+    step = z - before.z[-2]
+    metric, outlines = metric_weights(formation.scene), []
+    nearest = close(ending, z, slip)
+    if nearest is None:
+        return []
+    far = np.sqrt((metric @ (nearest - z) ** 2) / (metric @ step**2))
+    for share in _AHEAD:
+        goal = close(ending, z + share * far * step, slip)
+        if goal is not None and is_inside(ending, goal):
+            outlines.append(connect(formation, z, goal))
+    return outlines
+
+
+def _end_formation(phase: Phase) -> Formation:
+    """A phase's formation with the contact that is gained at the end."""
+    formation, gained = phase.formation, phase.until.contact
+    if gained is None:
+        return formation
+    return Formation(formation.scene, (*formation.contacts, gained), formation.rolling)
+
+
+def _look_around(formation: Formation, ending: Formation, z: Array, slip: Array) -> Array | None:
+    """Nearest end inside all limits that is found from `z` turned by some angle, if any."""
+    metric, best, least = metric_weights(formation.scene), None, np.inf
+    for turn in _TURNS:
+        turned = close(formation, z, slip, (2, z[2] + turn))
+        goal = None if turned is None else close(ending, turned, slip)
+        if goal is None or not is_inside(ending, goal):
+            continue
+        distance = float(metric @ (goal - z) ** 2)
+        if distance < least:
+            best, least = goal, distance
+    return best
+
+
+def connect(
+    formation: Formation, start: Array, goal: Array, bends: tuple[float, float] = (0.0, 0.0)
+) -> Outline:
+    """A straight line, pulled onto the contacts, with the directions of its middle.
+
+    Parameters
+    ----------
+    formation : Formation
+    start, goal : ndarray, shape (5,)
+    bends : (float, float)
+        How far it bends to one side in one arc and in two, over its length; with two freedoms.
+    """
+    points, slip = [start], formation.evaluate_slip(start[None])[0]
+    aside = _find_side(formation, start, goal) if any(bends) else np.zeros(5)
+    for x in np.linspace(0.0, 1.0, POINTS)[1:]:
+        off = bends[0] * np.sin(np.pi * x) + bends[1] * np.sin(2 * np.pi * x)
+        point = close(formation, start + x * (goal - start) + off * aside, slip)
+        points.append(points[-1] if point is None else point)
+    z = np.array(points)
+    speed = np.gradient(z, axis=0)
+    slip = np.einsum("nij,nj->ni", formation.evaluate(z, speed).A_t, speed)
+    rates = np.hstack([slip, speed[:, 3:]]).sum(axis=0)
+    signs = np.where(rates < 0, -1.0, 1.0)
+    return Outline(formation, z, Directions(signs[:-2], signs[-2:]))
+
+
+def _find_side(formation: Formation, start: Array, goal: Array) -> Array:
+    """The way aside of a line in the tangent plane at its start, as long as the line."""
+    metric = np.sqrt(metric_weights(formation.scene))
+    line = (goal - start) * metric
+    plane = np.linalg.qr(tangent_basis(formation, start) / metric[:, None])[0]
+    ahead = plane.T @ line
+    aside = plane @ np.array([-ahead[1], ahead[0]]) / max(np.linalg.norm(ahead), 1e-300)
+    return np.asarray(aside * np.linalg.norm(line) / metric)

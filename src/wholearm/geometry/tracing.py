@@ -1,0 +1,350 @@
+"""One-freedom phases: tracing the curve z(s) that the contacts leave free, from phase to phase.
+
+Four constraints P(z) z' = 0, of four sliding contacts or of two sliding and one rolling, leave
+one direction, so the motion runs along a curve. It is traced panel by panel: on each, the points
+whose projection on the panel's first tangent is a Chebyshev-Lobatto node are solved for by Newton,
+all at once, and the arc length is integrated spectrally. No coordinate is singled out, so places
+where theta_1 (or any other) is stationary are nothing special.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.errors import InputError
+from ..contacts.formation import Formation, describe, find_touching
+from ..mechanics.metric import metric_weights
+from ..problem.definition import End, Phase, Problem, Until
+from ..scene.model import TOUCHING
+from .curve import Curve, Panel, border, describe_pose, find_root, refine
+
+NODES = 17
+"""Nodes of a panel."""
+RESOLVED = 1e-13
+"""Largest trailing Chebyshev coefficient of a resolved panel, relative to the object's size."""
+HELD = 3e-5
+"""Distance to `until`, in radii of gyration or radians, below which there is nothing to do."""
+ROUNDING = 3e-10
+"""Below zero by no more than this, in radii of gyration, a limit counts as kept."""
+CLOSER = 4
+"""Times that dips of a limit between two places are looked at more closely."""
+LONGEST = 60.0
+"""Longest curve that is traced, in radii of gyration: several turns of the object."""
+
+
+@lru_cache(maxsize=8)
+def trace_phases(problem: Problem) -> tuple[Curve, ...]:
+    """Trace the curve of every phase, each from the end of the one before.
+
+    Only as far as geometry alone says where a phase ends: up to the first that has more than one
+    freedom or passes smoothly into the next.
+
+    Raises
+    ------
+    InputError
+        If a phase's contacts do not touch at its start, or its `until` is never reached.
+    """
+    curves: list[Curve] = []
+    z = problem.start
+    for phase in problem.phases:
+        if not runs_on_curve(phase):
+            break
+        curves.append(trace_phase(problem, phase, z))
+        z = curves[-1].end
+    return tuple(curves)
+
+
+def runs_on_curve(phase: Phase) -> bool:
+    """Whether a phase has one freedom and ends at rest or with an impact."""
+    return phase.formation.n_constraints == 4 and phase.end is not End.SMOOTH
+
+
+def trace_phase(problem: Problem, phase: Phase, z: Array) -> Curve:
+    """Trace a one-freedom phase from `z` to its `until`, or as far as it goes before a release.
+
+    Raises
+    ------
+    InputError
+        If the contacts do not touch at `z`, or the `until` is never reached.
+    """
+    require_touching(problem, phase, z)
+    if not phase.until.is_release:
+        return _trace_phase(problem, phase, z)
+    formation, until = phase.formation, phase.until
+    later = problem.phases[phase.index + 1 :]
+    ends = [*(p.until for p in later if not p.until.is_release), until]
+    ways = [trace_curve(formation, z, way, until) for way in _headings(formation, z, ends[0])]
+    curve, least = max(ways, key=lambda curve: curve.length), HELD * problem.scene.scales.length
+    same = later and set(later[0].formation.contacts) == set(formation.contacts)
+    if same and ways[0].length >= least:
+        # Only modes change, which can be anywhere on the way to where a phase ends next.
+        curve = ways[0]
+    if curve.length < least:
+        key = f"phases[{phase.number}].contacts"
+        raise InputError(problem.source, key, f"cannot move: {curve.ending}")
+    return curve
+
+
+def require_touching(problem: Problem, phase: Phase, z: Array) -> None:
+    """Check that a phase's contacts touch at `z`, shape (5,), and that nothing is overlapped.
+
+    Raises
+    ------
+    InputError
+        If not; lists what touches.
+    """
+    key = f"phases[{phase.number}].contacts"
+    formation = phase.formation
+    gaps = formation.evaluate(z[None], np.zeros((1, 5))).C[0]
+    touching = problem.scene.touching
+    if np.abs(gaps).max() > touching:
+        missing = [
+            c.name for c, gap in zip(formation.contacts, gaps, strict=True) if abs(gap) > touching
+        ]
+        when = f"at the end of phase {phase.index}" if phase.index else "at the start"
+        found = describe(find_touching(problem.scene, z))
+        raise InputError(
+            problem.source,
+            key,
+            f"{', '.join(missing)} does not touch {when}; touching are {found}",
+        )
+    limits = formation.evaluate_limits(z[None])[0]
+    if limits.min() < -touching:
+        text = formation.limits[int(limits.argmin())].text
+        raise InputError(problem.source, key, f"cannot hold at {describe_pose(z)}: {text}")
+
+
+def _trace_phase(problem: Problem, phase: Phase, z: Array) -> Curve:
+    formation, until = phase.formation, phase.until
+    key = f"phases[{phase.number}].until"
+    if _holds(formation, until, z):
+        raise InputError(problem.source, key, f"{until} holds already at the start of the phase")
+    reason = []
+    for heading in _headings(formation, z, until):
+        curve = trace_curve(formation, z, heading, until)
+        if curve.reached and _is_regular(curve):
+            return curve
+        reason.append(curve.ending)
+    raise InputError(
+        problem.source,
+        key,
+        f"{until} is never reached: going one way {reason[0]}, going the other way {reason[1]}",
+    )
+
+
+def _holds(formation: Formation, until: Until, z: Array) -> bool:
+    """Whether `until` holds at `z`.
+
+    Of a contact counts where it can be gained: what is on a line only because an edge lies flush
+    there, beyond the end of the edge or of the link, does not touch.
+    """
+    if until.contact is None:
+        return bool(abs(until_distance(formation, until, z[None])[0]) < HELD)
+    gaining = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
+    gaps = formation.evaluate_limits(z[None])[0, gaining] / formation.scene.scales.length
+    return bool(len(gaps) and (np.abs(gaps) < HELD).all())
+
+
+def _is_regular(curve: Curve) -> bool:
+    """Whether the contacts stay independent all along the curve, which its segments need."""
+    try:
+        return bool(curve.segments)
+    except np.linalg.LinAlgError:
+        return False
+
+
+def _headings(formation: Formation, z: Array, until: Until) -> list[Array]:
+    """Both unit tangents at `z`, the one that approaches `until` first."""
+    metric = metric_weights(formation.scene)
+    P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
+    null = np.linalg.svd(P / np.sqrt(metric))[2][-1] / np.sqrt(metric)
+    step = 1e-6 * formation.scene.polygon.gyration_radius
+    distances = until_distance(formation, until, np.array([z, z + step * null]))
+    forward = null if abs(distances[1]) <= abs(distances[0]) else -null
+    return [forward, -forward]
+
+
+def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) -> Curve:
+    """Trace a formation's curve from `z` along `heading` to `until` or to where it ends early.
+
+    Parameters
+    ----------
+    formation : Formation
+        With four constraints.
+    z : ndarray, shape (5,)
+        Start, with all contacts closed; rolling ones roll from there.
+    heading : ndarray, shape (5,)
+        Which way to go.
+    until : Until
+        What to trace for.
+    """
+    rho = formation.scene.polygon.gyration_radius
+    names = [limit.text for limit in formation.limits] + [str(until)]
+    wanted = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
+    # What is closed from the start, such as the end of a flush edge that the link does not reach
+    # yet, is not what is waited for.
+    closed = np.abs(formation.evaluate_limits(z[None])[0]) / rho < HELD
+    wanted = [k for k in wanted if not closed[k]] or wanted
+    wanted = [len(names) - 1] if until.contact is None else wanted
+
+    def margins(points: Array) -> Array:
+        values = formation.evaluate_limits(points) / rho
+        if until.contact is not None:
+            return np.hstack([values, np.ones((len(points), 1))])
+        return np.hstack([values, until_distance(formation, until, points)[:, None] * side])
+
+    side = 1.0
+    if until.contact is None:
+        side = float(np.sign(until_distance(formation, until, z[None])[0])) or 1.0
+    panels: list[Panel] = []
+    slip = formation.evaluate_slip(z[None])[0]
+    step, start = rho, 0.0
+    tangent = heading
+    while start < LONGEST * rho:
+        panel = _build_panel(formation, slip, z, tangent, start, step)
+        if panel is None:
+            step /= 2
+            if step < 1e-6 * rho:
+                text = f"the contacts become dependent at {describe_pose(z)}"
+                return Curve(formation, tuple(panels), start, text, False)
+            continue
+        panels.append(panel)
+        crossing = _first_crossing(panel, margins)
+        if crossing is not None:
+            s, active = crossing
+            place = describe_pose(panel.interpolate(np.array([s]))[0][0])
+            reached = [k for k in active if k in wanted]
+            text = f"{names[(reached or active)[0]]} at {place}"
+            return Curve(formation, tuple(panels), s, text, bool(reached))
+        start, z, tangent = panel.s[-1], panel.z[-1], panel.z_s[-1]
+        step *= 1.6
+    text = f"nothing happens up to {describe_pose(z)}"
+    return Curve(formation, tuple(panels), start, text, False)
+
+
+def until_distance(formation: Formation, until: Until, z: Array) -> Array:
+    """How far each configuration is from `until`, shape (n,), in radii of gyration or radians."""
+    rho = formation.scene.scales.length
+    if until.contact is not None:
+        return formation.evaluate_gap(until.contact, z) / rho
+    if until.value is None:
+        return np.ones(len(z))
+    if until.coordinate == "x":
+        return np.asarray((z[:, 0] - until.value) / rho)
+    return np.asarray(z[:, 2] - until.value)
+
+
+def _first_crossing(
+    panel: Panel, margins: Callable[[Array], Array]
+) -> tuple[float, list[int]] | None:
+    """Where on the panel a margin first falls below zero, and which ones do so there.
+
+    Margins are in radii of gyration or radians.
+    """
+    grid = refine(panel.s, panel.s[-1])
+    values = margins(panel.interpolate(grid)[0])
+    for _ in range(CLOSER):
+        inner = _look_closer(grid, values)
+        if not len(inner):
+            break
+        grid = np.append(grid, inner)
+        order = grid.argsort()
+        values = np.vstack([values, margins(panel.interpolate(inner)[0])])[order]
+        grid = grid[order]
+    # What starts closed (the contact just given up) has to open; rounding is not closing.
+    broken = values < -ROUNDING
+    if not broken.any():
+        return None
+    row = int(broken.any(axis=1).argmax())
+    roots = {}
+    for k in np.flatnonzero(broken[row]):
+        if row == 0 or values[row - 1, k] <= 10 * ROUNDING:
+            roots[int(k)] = float(grid[max(row - 1, 0)])
+        else:
+
+            def margin(s: float, k: int = int(k)) -> float:
+                return float(margins(panel.interpolate(np.array([s]))[0])[0, k])
+
+            roots[int(k)] = find_root(margin, grid[row - 1], grid[row])
+    first = min(roots.values())
+    closed = np.abs(margins(panel.interpolate(np.array([first]))[0])[0]) < TOUCHING
+    return first, sorted(
+        set(np.flatnonzero(closed).tolist()) | {k for k in roots if roots[k] == first}
+    )
+
+
+def _look_closer(grid: Array, values: Array) -> Array:
+    """More places around dips that may fall below zero between two places, shape (n,).
+
+    The gap of the fingers falls and rises again at a steady rate where a tip passes the other
+    link, so a dip is no deeper than half the second difference.
+    """
+    before, here, after = values[:-2], values[1:-1], values[2:]
+    dips = (here <= before) & (here <= after) & (here > ROUNDING)
+    rows = np.flatnonzero((dips & (here < before - 2 * here + after)).any(axis=1))
+    if not len(rows):
+        return rows.astype(float)
+    inner = np.linspace(0.0, 1.0, 14)[1:-1]
+    low, high = grid[rows, None], grid[rows + 2, None]
+    return np.setdiff1d(low + (high - low) * inner, grid)
+
+
+def _build_panel(
+    formation: Formation, slip: Array, z: Array, heading: Array, start: float, step: float
+) -> Panel | None:
+    """Trace one panel of about `step` metres, or return None when that is too far.
+
+    Rolling contacts keep the slip coordinates `slip`, shape (R,) [m].
+    """
+    unit, integrate, analyse = _chebyshev()
+    metric = metric_weights(formation.scene)
+    projection = heading * metric
+    u = step * unit
+    points = z + u[:, None] * heading
+    rho = formation.scene.polygon.gyration_radius
+    kinematics = formation.evaluate(points, points)
+    for _ in range(12):
+        slid = formation.evaluate_slip(points) - slip
+        residual = np.column_stack([kinematics.C, slid, (points - z) @ projection - u])
+        matrix = border(kinematics.P, projection)
+        try:
+            change = np.linalg.solve(matrix, -residual[..., None])[..., 0]
+        except np.linalg.LinAlgError:
+            return None
+        points = points + change
+        kinematics = formation.evaluate(points, points)
+        size = np.abs(change * np.sqrt(metric)).max()
+        if size < 1e-10 * rho or size > 10 * rho:
+            break
+    if not size < 1e-10 * rho:
+        return None
+    z_u = np.linalg.solve(border(kinematics.P, projection), np.eye(5)[:, 4:])[..., 0]
+    speed = np.sqrt(z_u**2 @ metric)
+    scaled = np.column_stack([(points - z) * np.sqrt(metric) / rho, speed])
+    tail = np.abs(analyse @ scaled)[-2:].max()
+    if speed.max() > 1.5 or tail > RESOLVED:
+        return None
+    return Panel(start + step * (integrate @ speed), points, z_u / speed[:, None])
+
+
+@lru_cache(maxsize=1)
+def _chebyshev() -> tuple[Array, Array, Array]:
+    """Lobatto nodes on [0, 1], the matrix of integrals from 0, and that of coefficients."""
+    n = NODES - 1
+    angles = np.pi * np.arange(NODES) / n
+    unit = (1 - np.cos(angles)) / 2
+    vandermonde = np.cos(np.outer(np.pi - angles, np.arange(NODES + 1)))
+    analyse = np.linalg.inv(vandermonde[:, :NODES])
+    integral = np.zeros((NODES, NODES))
+    x = 2 * unit - 1
+    integral[:, 0] = x + 1
+    integral[:, 1] = (x**2 - 1) / 2
+    for k in range(2, NODES):
+        above, below = vandermonde[:, k + 1] / (k + 1), vandermonde[:, k - 1] / (k - 1)
+        term = (above - below) / 2
+        integral[:, k] = term - term[0]
+    return unit, integral @ analyse / 2, analyse

@@ -1,0 +1,329 @@
+"""The contact-formation map: the (x, phi) plane as cells, borders and crossings.
+
+With palm and both fingers touching, a configuration is a function of (x, phi). Inside a cell three
+contacts touch (two freedoms), on its borders four (one freedom), at crossings five.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.errors import InputError
+from ..common.sharing import exclusive
+from ..contacts.elemental import Contact
+from ..geometry.closing import Flags, Numbers, close, contact_table, full_formation, lower
+from ..problem.definition import Problem
+from ..scene.model import Scene
+from .borders import NOWHERE, Piece, Window, label_cells, label_closed, list_tracks, name_contacts
+from .pieces import cut
+from .quasistatic import WAYS, check_border, check_cell
+from .route import Stretch, list_formations, trace_problem
+
+Flush = tuple[int | None, int]
+"""A finger (None for the palm) and an edge that lies flush on it."""
+CHUNK = 4096
+"""Poses that are closed at a time."""
+SAMPLES = 100
+"""Places per radian of the window, and least across it, at which borders are looked for."""
+ARROWS = 24
+"""Places across the map at which directions inside cells are checked."""
+BEYOND = np.radians(6.0)
+"""How far the window reaches beyond the flush angles next to the plan [rad]."""
+CROSSED = -5
+"""Cell of the places where the closed fingers would overlap."""
+SAME_PLACE = 3e-5
+"""Distance, in radii of gyration and radians, below which ends of borders are one crossing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Border:
+    """A stretch of a cell border with one contact formation.
+
+    Attributes
+    ----------
+    contacts : tuple of Contact
+        The four that touch.
+    flush : tuple (int or None, int), or None
+        The finger (None for the palm) and the edge that lies flush on it. None where a contact
+        passes from the side of a link to its tip or along the tip: there two names stand for one
+        contact and nothing holds the motion to the border.
+    along : {"x", "phi"}
+        The coordinate that increases along the border.
+    points : ndarray, shape (n, 2), [m, rad]
+        x and phi.
+    z : ndarray, shape (n, 5)
+        Configurations there.
+    forth, back : ndarray of bool, shape (n,)
+        Whether a quasistatic motion is possible with the coordinate increasing, and decreasing;
+        all False where nothing is flush.
+    """
+
+    contacts: tuple[Contact, ...]
+    flush: Flush | None
+    along: str
+    points: Array
+    z: Array
+    forth: Flags
+    back: Flags
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the contacts."""
+        return tuple(contact.name for contact in self.contacts)
+
+
+@dataclass(frozen=True, eq=False)
+class Crossing:
+    """A place where borders meet and five or more contacts touch.
+
+    Attributes
+    ----------
+    point : ndarray, shape (2,), [m, rad]
+        x and phi.
+    z : ndarray, shape (5,)
+    contacts : tuple of Contact
+    flush : tuple
+        What lies flush on the borders that meet, as in `Border`. With two or more, five contacts
+        press at places of their own; with one, a contact changes its name on a border.
+    """
+
+    point: Array
+    z: Array
+    contacts: tuple[Contact, ...]
+    flush: tuple[Flush, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class FormationMap:
+    """The cells, borders and crossings of a window of the (x, phi) plane.
+
+    Attributes
+    ----------
+    problem : Problem
+    x, phi : ndarray, shape (n_x,) and (n_phi,), [m] and [rad]
+        Grid.
+    cell : ndarray of int, shape (n_phi, n_x)
+        Index into `formations`; -1 and -2 where finger 1 and 2 is too short, -3 and -4 where the
+        joint of finger 1 and 2 is in the object, `CROSSED` where the fingers would overlap.
+    formations : tuple of tuple of Contact
+        The three contacts of each cell.
+    borders : tuple of Border
+    crossings : tuple of Crossing
+    places : ndarray, shape (m, 2), [m, rad]
+        Where directions inside cells were checked.
+    possible : ndarray of bool, shape (m, 4)
+        Whether a quasistatic motion is possible there with x increasing, x decreasing, phi
+        increasing and phi decreasing while the other stays.
+    """
+
+    problem: Problem
+    x: Array
+    phi: Array
+    cell: Numbers
+    formations: tuple[tuple[Contact, ...], ...]
+    borders: tuple[Border, ...]
+    crossings: tuple[Crossing, ...]
+    places: Array
+    possible: Flags
+
+
+@exclusive
+def build_map(
+    problem: Problem,
+    resolution: int = 200,
+    window: Window | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> FormationMap:
+    """Build the contact-formation map of a problem's scene.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its phases only say which part of the plane is of interest.
+    resolution : int
+        Points of the grid each way, at least 10. Borders do not depend on it.
+    window : Window, optional
+        The part of the plane; by default all x at which both fingers reach the object, and phi
+        from the flush angle below the plan to that above it.
+    progress : callable, optional
+        Receives a line of text now and then.
+
+    Raises
+    ------
+    InputError
+        If the resolution is too low or nothing in the window can be reached.
+    """
+    if resolution < 10:
+        raise InputError("", "resolution", f"{resolution!r} given; allowed is 10 or more")
+    scene, report = problem.scene, progress or (lambda text: None)
+    report("map: cells")
+    window = window or choose_window(problem)
+    x, phi = np.linspace(*window.x, resolution), np.linspace(*window.phi, resolution)
+    labels, obstacle = _label_grid(scene, x, phi)
+    triples = labels[..., [0, 2, 4]]
+    known, cell = np.unique(triples[obstacle == 0], axis=0, return_inverse=True)
+    if not len(known):
+        raise InputError(problem.source, "", "the fingers reach the object nowhere in the window")
+    cells = -obstacle
+    cells[obstacle == 0] = cell.ravel()
+    table = contact_table(scene)
+    report("map: borders")
+    borders: list[Border] = []
+    samples = round(SAMPLES * max(1.0, window.phi[1] - window.phi[0]))
+    for track in list_tracks(scene, window, samples):
+        borders += [_build_border(problem, piece) for piece in cut(track, window)]
+    report("map: crossings and directions")
+    places, possible = _check_cells(problem, window)
+    return FormationMap(
+        problem,
+        x,
+        phi,
+        cells,
+        tuple(name_contacts(table, row) for row in known),
+        tuple(borders),
+        _find_crossings(scene, borders),
+        places,
+        possible,
+    )
+
+
+@exclusive
+def choose_window(problem: Problem, phi_deg: tuple[float, float] | None = None) -> Window:
+    """All x that both fingers reach, and phi one flush angle beyond what the phases cover.
+
+    Parameters
+    ----------
+    problem : Problem
+    phi_deg : (float, float), [deg]
+        Take this range of phi instead.
+
+    Raises
+    ------
+    InputError
+        If both fingers reach the object nowhere.
+    """
+    scene = problem.scene
+    low, high = _cover_phases(problem) if phi_deg is None else np.radians(phi_deg).tolist()
+    size = float(np.hypot(*scene.polygon.vertices.T).max())
+    reach = [size + f.length + f.radius for f in scene.fingers]
+    bases = [float(np.asarray(f.base)[0]) for f in scene.fingers]
+    left = max(base - r for base, r in zip(bases, reach, strict=True))
+    right = min(base + r for base, r in zip(bases, reach, strict=True))
+    grid = np.linspace(left, max(left, right), 60)
+    _, obstacle = _label_grid(scene, grid, np.linspace(low, high, 60))
+    reached = grid[(obstacle == 0).any(axis=0)]
+    if not len(reached):
+        raise InputError(problem.source, "fingers", "nowhere do both reach the object")
+    step = grid[1] - grid[0]
+    return Window((float(reached[0] - step), float(reached[-1] + step)), (low, high))
+
+
+def _cover_phases(problem: Problem) -> tuple[float, float]:
+    """Range of phi [rad] that reaches a little beyond the flush angles next to the phases."""
+    angles = [float(problem.start[2])]
+    angles += [float(phi) for path in trace_problem(problem) for phi in path[[0, -1], 1]]
+    for phase in problem.phases:
+        if phase.until.coordinate == "phi" and phase.until.value is not None:
+            angles.append(phase.until.value)
+    low, high = min(angles), max(angles)
+    around = Window((0.0, 0.0), (low - 2 * np.pi, high + 2 * np.pi)).flush_angles(problem.scene)
+    flush = np.array([angle for angle, _ in around])
+    # What is flush at an end of the plan is not yet the next edge.
+    low = float(flush[flush < low - 1e-6].max()) - BEYOND
+    high = float(flush[flush > high + 1e-6].min()) + BEYOND
+    return low, high
+
+
+def _label_grid(scene: Scene, x: Array, phi: Array) -> tuple[Numbers, Numbers]:
+    """Labels (n_phi, n_x, 6) and obstacles (n_phi, n_x), 0 or as in `FormationMap.cell`."""
+    x, phi = (part.ravel() for part in np.meshgrid(x, phi))
+    labels, obstacles = [], []
+    for start in range(0, len(x), CHUNK):
+        part = slice(start, start + CHUNK)
+        closed = close(scene, x[part], phi[part])
+        labels.append(label_closed(closed, lower(scene, phi[part])[1]))
+        both = closed.obstacle
+        codes = np.where(both > 0, 2 * both - 1 + np.array([0, 1]), 0)
+        obstacles.append(np.where(codes[:, 0] > 0, codes[:, 0], codes[:, 1]))
+    shape = (len(np.unique(phi)), -1)
+    return np.concatenate(labels).reshape(*shape, 6), np.concatenate(obstacles).reshape(shape)
+
+
+def _build_border(problem: Problem, piece: Piece) -> Border:
+    scene = problem.scene
+    x, phi = piece.track.pose(piece.places)
+    z = close(scene, x, phi).z
+    flush = piece.track.flush
+    along = "x" if flush is not None and flush[0] is None else "phi"
+    label = piece.label[piece.label != NOWHERE]
+    forth = back = np.zeros(len(z), dtype=bool)
+    if flush is not None:
+        row = 0 if along == "x" else 2
+        forth, back = check_border(scene, problem.epsilon, label, z, row)
+    contacts = name_contacts(contact_table(scene), label)
+    return Border(contacts, flush, along, np.column_stack([x, phi]), z, forth, back)
+
+
+def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]:
+    """Where ends of borders meet, with the contacts of all of them, if these are five or more."""
+    ends = [(border, k) for border in borders for k in (0, -1)]
+    points = np.array([border.points[k] for border, k in ends]).reshape(-1, 2)
+    size = SAME_PLACE * np.array([scene.scales.length, 1.0])
+    full = full_formation(scene)
+    crossings, free = [], np.ones(len(points), dtype=bool)
+    for k in range(len(points)):
+        if not free[k]:
+            continue
+        same = free & (np.abs(points - points[k]) < size).all(axis=1)
+        free &= ~same
+        meeting = [ends[i][0] for i in np.flatnonzero(same)]
+        met = {contact for border in meeting for contact in border.contacts}
+        if len(met) < 5:
+            continue
+        border, end = ends[k]
+        z = border.z[end]
+        # Borders also end where a finger's first touch jumps from one side of its joint to the
+        # other; what they touch there is not touched at once.
+        gaps = np.abs(full.evaluate(z[None], z[None]).C[0])
+        contacts = tuple(
+            contact
+            for contact, gap in zip(full.contacts, gaps, strict=True)
+            if contact in met and gap < scene.touching
+        )
+        if len(contacts) >= 5:
+            edges = tuple(dict.fromkeys(b.flush for b in meeting if b.flush is not None))
+            crossings.append(Crossing(points[k], z, contacts, edges))
+    return tuple(crossings)
+
+
+def _check_cells(problem: Problem, window: Window) -> tuple[Array, Flags]:
+    """Directions of possible motion at the points of a lattice inside cells."""
+    scene = problem.scene
+    x, phi = (np.linspace(*ends, ARROWS + 1) for ends in (window.x, window.phi))
+    x, phi = np.meshgrid((x[1:] + x[:-1]) / 2, (phi[1:] + phi[:-1]) / 2)
+    places = np.column_stack([x.ravel(), phi.ravel()])
+    labels = label_cells(scene, *places.T)
+    places, labels = places[labels[:, 0] != NOWHERE], labels[labels[:, 0] != NOWHERE]
+    z, triples = close(scene, *places.T).z, labels[:, [0, 2, 4]]
+    known, owner = np.unique(triples, axis=0, return_inverse=True)
+    possible = np.zeros((len(places), len(WAYS)), dtype=bool)
+    for index, label in enumerate(known):
+        mine = owner.ravel() == index
+        possible[mine] = check_cell(scene, problem.epsilon, label, z[mine])
+    return places, possible
+
+
+__all__ = [
+    "Border",
+    "Crossing",
+    "FormationMap",
+    "Stretch",
+    "Window",
+    "build_map",
+    "choose_window",
+    "list_formations",
+]

@@ -1,0 +1,1 @@
+"""Equations of motion, impacts, and the metric of kinetic energy."""

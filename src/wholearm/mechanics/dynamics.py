@@ -1,0 +1,349 @@
+"""The constrained equations of motion of object and fingers, forward and inverse.
+
+With the notation of `scene.model`, Eqs. (1)-(4) are together
+
+    M5 z'' + b(z') = g + S tau + G^T c,   P z'' + P' z' = 0,   P = [A; A_t(rolling)],
+
+where b = B z' + D sigma is joint friction, sigma the directions of the joints and S = [0; I]. The
+contact forces c = [c_n; c_t(rolling)] are as many as the constraints, n_c + R, and
+
+    G = [A - U Xi A_t; A_t(rolling)],  with zero for U Xi of a rolling contact,
+
+are their rows: a sliding contact's c_t = -U Xi c_n is part of G, a rolling one's is free. Where
+nothing rolls c is c_n, P is A and G = A - U Xi A_t. Three routes through the equations:
+
+* forward, tau to (z'', c): c from K c = -P' z' - P M5^-1 (g + S tau - b), K = P M5^-1 G^T;
+* inverse, along a curve z(s) with speed s' and acceleration s'': the object's rows leave one free
+  number, the squeeze lambda, and the joints' rows then give tau;
+* the paper's, Eqs. (6)-(16): everything but theta_1 eliminated, Phi_1 theta_1'' + Phi_2 theta_1' +
+  Phi_3 = 0.
+
+Friction can make the reduced inertia vanish or turn negative (jamming). Its sign is that of
+det(P M5^-1 G^T) / det(P M5^-1 P^T), which is 1 without friction: `reduced_inertia`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from ..common.arrays import Array, Expression
+from ..common.errors import JammingError
+from ..contacts.formation import Formation, Kinematics, split_by_first_joint
+
+
+class Directions(NamedTuple):
+    """Signs that friction depends on.
+
+    Attributes
+    ----------
+    Xi : ndarray, shape (n_c,)
+        Sliding directions of the contacts; those of rolling ones do not count.
+    sigma : ndarray, shape (2,)
+        Directions of the joints.
+    """
+
+    Xi: Array
+    sigma: Array
+
+
+class PathForces(NamedTuple):
+    """Forces along a curve, affine in a = s'', b = s'^2, the squeeze and the speed.
+
+    c = C0 + Ca a + Cb b + Cl lambda and tau = T0 + Ta a + Tb b + Tl lambda + Tv sqrt(b), with
+    c = [c_n; c_t(rolling)] in N, tau in N m, lambda in N; arrays of shape (n, n_c + R) or (n, 2).
+    """
+
+    C0: Array
+    Ca: Array
+    Cb: Array
+    Cl: Array
+    T0: Array
+    Ta: Array
+    Tb: Array
+    Tl: Array
+    Tv: Array
+
+    def c(self, a: Array, b: Array, squeeze: Array) -> Array:
+        """Contact forces, shape (n, n_c + R) [N], for a, b and squeeze of shape (n,)."""
+        a, b, squeeze = a[:, None], b[:, None], squeeze[:, None]
+        return self.C0 + self.Ca * a + self.Cb * b + self.Cl * squeeze
+
+    def tau(self, a: Array, b: Array, squeeze: Array) -> Array:
+        """Joint torques, shape (n, 2) [N m], for a, b and squeeze of shape (n,)."""
+        a, b, squeeze = a[:, None], b[:, None], squeeze[:, None]
+        affine = self.T0 + self.Ta * a + self.Tb * b + self.Tl * squeeze
+        return affine + self.Tv * np.sqrt(np.maximum(b, 0.0))
+
+    def press(self, H: Array) -> PathForces:
+        """With H c in place of c, for H of shape (m, n_c + R)."""
+        C0, Ca, Cb, Cl = (part @ H.T for part in self[:4])
+        return self._replace(C0=C0, Ca=Ca, Cb=Cb, Cl=Cl)
+
+
+def build_forward(formation: Formation) -> Expression:
+    """CasADi function (z, z', tau, Xi, sigma) -> (z'', c, K) of a formation.
+
+    K = P M5^-1 G^T is singular where the formation jams.
+    """
+    scene, n_c = formation.scene, formation.n_contacts
+    z, v = ca.SX.sym("z", 5), ca.SX.sym("v", 5)
+    tau, Xi, sigma = ca.SX.sym("tau", 2), ca.SX.sym("Xi", n_c), ca.SX.sym("sigma", 2)
+    _, P, P_dot_v, A_t = formation.build_constraints(z, v)
+    inverse_mass = ca.DM(1 / scene.mass_diagonal)
+    G = build_force_rows(formation, P, A_t, Xi)
+    friction = ca.DM(scene.viscous) * v + ca.DM(scene.dry) * ca.vertcat(0, 0, 0, sigma)
+    applied = ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau) - friction
+    K = P @ (inverse_mass * G.T)
+    c = ca.solve(K, -P_dot_v - P @ (inverse_mass * applied))
+    acceleration = inverse_mass * (applied + G.T @ c)
+    names = ["z", "v", "tau", "Xi", "sigma"], ["acceleration", "c", "K"]
+    return ca.Function("forward", [z, v, tau, Xi, sigma], [acceleration, c, K], *names)
+
+
+def build_force_rows(
+    formation: Formation, P: Expression, A_t: Expression, Xi: Expression
+) -> Expression:
+    """G, an expression of shape (n_c + R, 5), from those of P, A_t and Xi."""
+    slip = ca.diag(ca.DM(formation.sliding_friction) * Xi) @ A_t
+    return P - ca.vertcat(slip, ca.SX(formation.n_rolling, 5))
+
+
+def split_forces(formation: Formation, c: Array, Xi: Array) -> tuple[Array, Array]:
+    """Normal and tangential forces of every contact, shape (..., n_c) each, from c [N].
+
+    Parameters
+    ----------
+    c : ndarray, shape (..., n_c + R), [N]
+        Contact forces [c_n; c_t(rolling)].
+    Xi : ndarray, shape (..., n_c)
+        Sliding directions.
+    """
+    n_c = formation.n_contacts
+    c_n = c[..., :n_c]
+    c_t = np.asarray(-formation.sliding_friction * Xi * c_n)
+    if formation.rolling:
+        c_t[..., list(formation.rolling_rows)] = c[..., n_c:]
+    return c_n, c_t
+
+
+def forward(
+    formation: Formation, z: Array, v: Array, tau: Array, directions: Directions
+) -> tuple[Array, Array]:
+    """Accelerations z'', shape (5,), and contact forces c, shape (n_c + R,), from joint torques.
+
+    Parameters
+    ----------
+    z, v : ndarray, shape (5,)
+        Configuration and velocity, consistent with the contacts.
+    tau : ndarray, shape (2,), [N m]
+    directions : Directions
+        Signs of friction, those of `v` (or of the impending motion at rest).
+
+    Raises
+    ------
+    JammingError
+        If friction makes the reduced inertia vanish or turn negative.
+    """
+    kinematics = formation.evaluate(z[None], v[None])
+    inertia = reduced_inertia(formation, kinematics, directions)[0]
+    if inertia <= 0:
+        raise JammingError(
+            f"{' '.join(formation.names)} jams: friction makes the reduced inertia "
+            f"{inertia:.3g} of its frictionless value"
+        )
+    acceleration, c, _ = build_forward(formation)(z, v, tau, *directions)
+    return acceleration.full()[:, 0], c.full()[:, 0]
+
+
+def reduced_inertia(formation: Formation, kinematics: Kinematics, directions: Directions) -> Array:
+    """Reduced inertia over that without friction, shape (n,): jamming at zero and below."""
+    inverse_mass = 1 / formation.scene.mass_diagonal
+    P = kinematics.P
+    G = force_rows(formation, kinematics, directions)
+    return np.asarray(
+        np.linalg.det((P * inverse_mass) @ G.transpose(0, 2, 1))
+        / np.linalg.det((P * inverse_mass) @ P.transpose(0, 2, 1))
+    )
+
+
+def inverse(
+    formation: Formation,
+    z: Array,
+    z_s: Array,
+    z_ss: Array,
+    directions: Directions,
+    kinematics: Kinematics | None = None,
+) -> PathForces:
+    """Forces that carry a formation along a curve, at n places.
+
+    The object's rows M q'' = g + [W_n - W_t U Xi, W_t(rolling)] c leave the four numbers c one that
+    is free: the squeeze lambda, the component of c along a unit null vector.
+
+    Parameters
+    ----------
+    z, z_s, z_ss : ndarray, shape (n, 5)
+        The curve: z' = z_s s' and z'' = z_s s'' + z_ss s'^2.
+    directions : Directions
+        Signs for motion along +s, one for all places or one row for each.
+    kinematics : Kinematics, optional
+        The formation at `z`, where it is known already.
+    """
+    scene = formation.scene
+    kinematics = kinematics or formation.evaluate(z, z_s)
+    G = force_rows(formation, kinematics, directions)
+    wrench = G[:, :, :3].transpose(0, 2, 1)
+    null = _null_vector(wrench)
+    mass = scene.mass_diagonal
+    # Bordering by the null vector makes each solution the shortest one.
+    right = np.zeros((len(z), 4, 3))
+    right[:, :3, 0] = -scene.applied_force[:3]
+    right[:, :3, 1] = mass[:3] * z_s[:, :3]
+    right[:, :3, 2] = mass[:3] * z_ss[:, :3]
+    solution = np.linalg.solve(np.concatenate([wrench, null[:, None, :]], axis=1), right)
+    C0, Ca, Cb = (solution[..., k] for k in range(3))
+    joint = G[:, :, 3:]
+
+    def reaction(c: Array) -> Array:
+        return np.asarray(np.einsum("nij,ni->nj", joint, c))
+
+    dry = scene.dry[3:] * directions.sigma
+    return PathForces(
+        C0,
+        Ca,
+        Cb,
+        null,
+        T0=dry - reaction(C0),
+        Ta=mass[3:] * z_s[:, 3:] - reaction(Ca),
+        Tb=mass[3:] * z_ss[:, 3:] - reaction(Cb),
+        Tl=-reaction(null),
+        Tv=scene.viscous[3:] * z_s[:, 3:],
+    )
+
+
+@dataclass(frozen=True)
+class ReducedMotion:
+    """The paper's scalar equation Phi_1 theta_1'' + Phi_2 theta_1' + Phi_3 = 0 at one state.
+
+    Attributes
+    ----------
+    Phi_1 : float, [kg m^2]
+        Reduced inertia.
+    Phi_2 : float, [N m s]
+        Velocity terms over theta_1'.
+    Phi_3 : float, [N m]
+        Gravity, dry friction and torques.
+    acceleration : float, [rad/s^2]
+        theta_1''.
+    c : ndarray, shape (4,), [N]
+        Contact forces [c_n; c_t(rolling)].
+    """
+
+    Phi_1: float
+    Phi_2: float
+    Phi_3: float
+    acceleration: float
+    c: Array
+
+
+def reduce_to_first_joint(
+    formation: Formation,
+    z: Array,
+    theta_1_dot: float,
+    tau: Array,
+    directions: Directions,
+) -> ReducedMotion:
+    """Eliminate everything but theta_1 as the paper does (Eqs. 6-16), for four constraints.
+
+    Eqs. (6)-(9) give (q', theta_2') = -P_AI^+ P_AII theta_1'. The equations of q and theta_2 then
+    give c, and that of theta_1 becomes the scalar equation. The pseudoinverse keeps the formula
+    defined where P_AI is singular, but where that is because theta_1 is stationary the motion is
+    not a multiple of theta_1' and no such formula describes it; `forward` does.
+
+    Raises
+    ------
+    JammingError
+        If Phi_1 is zero or has the wrong sign.
+    """
+    scene = formation.scene
+    others = [0, 1, 2, 4]
+
+    def extend(P: Array, right: Array, first: float) -> Array:
+        P_AI, P_AII = split_by_first_joint(P)
+        full = np.empty(5)
+        full[others] = np.linalg.pinv(P_AI) @ (right - P_AII * first)
+        full[3] = first
+        return full
+
+    P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
+    slope = extend(P, np.zeros(4), 1.0)
+    kinematics = formation.evaluate(z[None], slope[None])
+    bend = extend(P, -kinematics.P_dot_v[0], 0.0)
+    G = force_rows(formation, kinematics, directions)[0]
+    mass = scene.mass_diagonal
+    dry = scene.dry * np.array([0.0, 0.0, 0.0, *directions.sigma])
+    resting = dry - scene.applied_force - np.array([0.0, 0.0, 0.0, *tau])
+    # Rows of each term of M5 z'' + b - g - S tau = G^T c; the others' rows solve for c.
+    eliminate = G[:, 3] @ np.linalg.inv(G[:, others].T)
+
+    def scalar(term: Array) -> float:
+        return float(term[3] - eliminate @ term[others])
+
+    moving = mass * bend * theta_1_dot + scene.viscous * slope
+    Phi_1, Phi_2, Phi_3 = scalar(mass * slope), scalar(moving), scalar(resting)
+    ratio = reduced_inertia(formation, kinematics, directions)[0]
+    if ratio <= 0:
+        raise JammingError(
+            f"{' '.join(formation.names)} jams: Phi_1 = {Phi_1:.3g} kg m^2, "
+            f"{ratio:.3g} of its frictionless value"
+        )
+    acceleration = -(Phi_2 * theta_1_dot + Phi_3) / Phi_1
+    total = mass * slope * acceleration + moving * theta_1_dot + resting
+    c = np.linalg.solve(G[:, others].T, total[others])
+    return ReducedMotion(Phi_1, Phi_2, Phi_3, acceleration, c)
+
+
+def energy(formation: Formation, z: Array, v: Array) -> Array:
+    """Kinetic and potential energy at n states, shape (n,) [J]."""
+    scene = formation.scene
+    kinetic = 0.5 * (v**2) @ scene.mass_diagonal
+    return np.asarray(kinetic + scene.polygon.mass * scene.gravity * z[:, 1])
+
+
+def _null_vector(wrench: Array) -> Array:
+    """Unit null vector of each (3, 4) matrix, by its minors.
+
+    Minors change continuously along a curve. A sign chosen place by place would not: where it
+    changes, a squeeze interpolated between two places would step.
+    """
+    minors = [np.linalg.det(np.delete(wrench, k, axis=2)) for k in range(4)]
+    null = np.stack([minors[0], -minors[1], minors[2], -minors[3]], axis=1)
+    return np.asarray(null / np.linalg.norm(null, axis=1)[:, None])
+
+
+def force_rows(formation: Formation, kinematics: Kinematics, directions: Directions) -> Array:
+    """G at n configurations, shape (n, n_c + R, 5)."""
+    slip = formation.sliding_friction * directions.Xi
+    G = kinematics.A - slip[..., :, None] * kinematics.A_t
+    if formation.rolling:
+        G = np.concatenate([G, kinematics.P[:, formation.n_contacts :]], axis=1)
+    return G
+
+
+__all__ = [
+    "Directions",
+    "PathForces",
+    "ReducedMotion",
+    "build_force_rows",
+    "build_forward",
+    "energy",
+    "force_rows",
+    "forward",
+    "inverse",
+    "reduce_to_first_joint",
+    "reduced_inertia",
+    "split_forces",
+]

@@ -1,0 +1,224 @@
+"""Plastic impacts: a contact gained at speed throws the velocity onto the next formation.
+
+In no time at all, only impulses act: those of the contacts of the new formation, with friction by
+the sliding law. With v- and v+ the velocities z' before and after,
+
+    M5 (v+ - v-) = G^T p,   P v+ = 0,
+
+where P and G are the constraint and force rows of the new formation (`mechanics.dynamics`): where
+nothing rolls P = A and G = A - U Xi A_t with the sliding directions Xi of v+. The impulses p are
+those of c, and have to obey the same inequalities: every contact presses, and those that roll stay
+in their friction cones. Joint torques, gravity and joint friction are finite and give no impulse.
+The energy lost is half (v+ - v-)^T M5 (v+ - v-) plus the work |v_t|^T U p against sliding friction,
+so it is never gained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..contacts.cones import hold_rows
+from ..contacts.formation import Formation
+from .dynamics import Directions, force_rows, reduced_inertia
+from .metric import measure_speed, metric_weights
+
+ROUNDING = 1e-6
+"""Share of the momentum or of the speed, in the metric of curves, that counts as rounding."""
+_STEP = 1e-5
+"""Step of the difference quotient of limits, in radii of gyration or radians."""
+
+
+class Obstacle(Enum):
+    """What keeps an impact from throwing the velocity onto a formation."""
+
+    JAM = "jam"
+    """Friction makes the reduced inertia vanish or turn negative."""
+    HELD = "held"
+    """Friction holds a contact: no sliding directions are those of the velocity that they give."""
+    PULL = "pull"
+    """A contact would have to pull."""
+    SLIP = "slip"
+    """A rolling contact would leave its friction cone."""
+    CLOSING = "closing"
+    """Something that touches, but is not in the formation, would be driven into."""
+
+
+class Hindrance(NamedTuple):
+    """One reason why an impact is not possible.
+
+    Attributes
+    ----------
+    kind : Obstacle
+    name : str
+        The contact, or what would happen.
+    value : float
+        Its impulse or margin to slipping [N s], or rate [m/s]; the reduced inertia over that
+        without friction.
+    """
+
+    kind: Obstacle
+    name: str
+    value: float
+
+    def describe(self, per: str = "") -> str:
+        """Say it in words; `per` is what the numbers are for, if not for the velocity itself."""
+        if self.kind is Obstacle.PULL:
+            return f"impulse on {self.name} would be {self.value:.3g} N s{per}"
+        if self.kind is Obstacle.SLIP:
+            return f"{self.name} would slip, {-self.value:.3g} N s{per} beyond its friction cone"
+        if self.kind is Obstacle.CLOSING:
+            return f"{self.name}, at {-self.value:.3g} m/s{per}"
+        if self.kind is Obstacle.HELD:
+            return f"friction would hold {self.name}"
+        return f"{self.name} would jam, with {self.value:.3g} of the reduced inertia"
+
+
+@dataclass(frozen=True, eq=False)
+class Impact:
+    """What an impact does to a velocity.
+
+    Attributes
+    ----------
+    formation : Formation
+        The new one.
+    v : ndarray, shape (5,)
+        v+, in m/s and rad/s; NaN if the formation jams.
+    p : ndarray, shape (n_c + R,), [N s]
+        Impulses of the contacts: normal, then tangential of rolling ones. NaN likewise.
+    Xi : ndarray, shape (n_c,)
+        Sliding directions that friction assumes, zero for rolling contacts.
+    hindrances : tuple of Hindrance
+        Why it is not possible, the worst first; empty if it is.
+    """
+
+    formation: Formation
+    v: Array
+    p: Array
+    Xi: Array
+    hindrances: tuple[Hindrance, ...]
+
+    @property
+    def possible(self) -> bool:
+        """Whether the motion goes on in the new formation."""
+        return not self.hindrances
+
+    @property
+    def least(self) -> tuple[str, float]:
+        """The contact with the least normal impulse, and that impulse [N s]."""
+        k = int(self.p[: self.formation.n_contacts].argmin())
+        return self.formation.names[k], float(self.p[k])
+
+
+def strike(before: Formation, after: Formation, z: Array, v: Array) -> Impact:
+    """Throw a velocity onto a formation.
+
+    Parameters
+    ----------
+    before, after : Formation
+        What the motion comes from and what it goes on with, all contacts closed.
+    z, v : ndarray, shape (5,)
+        Configuration, and velocity z' just before.
+    """
+    kinematics = after.evaluate(z[None], v[None])
+    P, A_t = kinematics.P[0], kinematics.A_t[0]
+    slides = np.ones(after.n_contacts)
+    slides[list(after.rolling_rows)] = 0.0
+
+    def directions(velocity: Array) -> tuple[float, ...]:
+        return tuple(slides * np.where(A_t @ velocity < 0, -1.0, 1.0))
+
+    # Try the sliding of the frictionless impact, then that of each answer; rarely any other.
+    likely = directions(transfer(after.scene.mass_diagonal, P, P, v)[0])
+    others = product(*((1.0, -1.0) if one else (0.0,) for one in slides))
+    tried: dict[tuple[float, ...], Impact] = {}
+    for choice in (likely, *others):
+        Xi = choice
+        while Xi not in tried:
+            tried[Xi] = impact = _strike(before, after, z, v, np.array(Xi))
+            if _is_sound(impact):
+                return impact
+            Xi = directions(impact.v)
+    return tried[likely]
+
+
+def _strike(before: Formation, after: Formation, z: Array, v: Array, Xi: Array) -> Impact:
+    """Throw a velocity onto a formation with given sliding directions."""
+    kinematics = after.evaluate(z[None], v[None])
+    P, mass = kinematics.P[0], after.scene.mass_diagonal
+    directions = Directions(Xi, np.ones(2))
+    ratio = float(reduced_inertia(after, kinematics, directions)[0])
+    if ratio <= 0:
+        jam = Hindrance(Obstacle.JAM, " ".join(after.names), ratio)
+        return Impact(after, np.full(5, np.nan), np.full(len(P), np.nan), Xi, (jam,))
+    v_after, p = transfer(mass, P, force_rows(after, kinematics, directions)[0], v)
+    speed = measure_speed(after.scene, v)
+    momentum = float(np.abs(mass * v / np.sqrt(metric_weights(after.scene))).max())
+    rolls = [after.names[row] for row in after.rolling_rows]
+    normal, cones = np.split(hold_rows(after) @ p, [after.n_contacts])
+    found = [
+        *_list(Obstacle.HELD, after.names, Xi * (kinematics.A_t[0] @ v_after), ROUNDING * speed),
+        *_list(Obstacle.PULL, after.names, normal, ROUNDING * momentum),
+        *_list(Obstacle.SLIP, [*rolls, *rolls], cones, ROUNDING * momentum),
+        *_list(Obstacle.CLOSING, *_rates(before, after, z, v_after), ROUNDING * speed),
+    ]
+    return Impact(after, v_after, p, Xi, tuple(found))
+
+
+def transfer(mass: Array, rows: Array, force_rows: Array, v: Array) -> tuple[Array, Array]:
+    """Velocity and impulses p of the jump M5 (v+ - v) = force_rows^T p with rows v+ = 0.
+
+    Parameters
+    ----------
+    mass : ndarray, shape (5,)
+        Diagonal of M5.
+    rows, force_rows : ndarray, shape (r, 5)
+        Constraints on the velocity after, and where the impulse of each acts: G = A without
+        friction, and then v+ is the nearest velocity in the metric M5.
+    v : ndarray, shape (5,)
+    """
+    lift = force_rows.T / mass[:, None]
+    p = -np.linalg.solve(rows @ lift, rows @ v)
+    return np.asarray(v + lift @ p), np.asarray(p)
+
+
+def _is_sound(impact: Impact) -> bool:
+    """Whether the sliding directions are those of the velocity they give."""
+    return all(h.kind not in (Obstacle.JAM, Obstacle.HELD) for h in impact.hindrances)
+
+
+def _list(kind: Obstacle, names: Sequence[str], values: Array, rounding: float) -> list[Hindrance]:
+    """Those of the values that are below zero, the least first."""
+    return [
+        Hindrance(kind, names[k], float(values[k]))
+        for k in np.argsort(values)
+        if values[k] < -rounding
+    ]
+
+
+def _rates(
+    before: Formation, after: Formation, z: Array, v: Array
+) -> tuple[tuple[str, ...], Array]:
+    """Names and opening rates [m/s] of what touches but is not in the new formation."""
+    released = {k: c for k, c in enumerate(before.contacts) if c not in after.contacts}
+    texts = [f"{contact.name} would not part" for contact in released.values()]
+    rates = list((before.evaluate(z[None], v[None]).A[0] @ v)[list(released)])
+    values = after.evaluate_limits(z[None])[0]
+    others = [
+        k
+        for k, limit in enumerate(after.limits)
+        if abs(values[k]) < after.scene.touching and limit.gained not in released.values()
+    ]
+    if others:
+        scene = after.scene
+        h = _STEP * scene.scales.length / max(measure_speed(scene, v), np.finfo(float).tiny)
+        ahead, behind = after.evaluate_limits(np.array([z + h * v, z - h * v]))[:, others]
+        rates += list((ahead - behind) / (2 * h))
+        texts += [after.limits[k].text for k in others]
+    return tuple(texts), np.array(rates)

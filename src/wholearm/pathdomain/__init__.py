@@ -1,1 +1,0 @@
-"""One-freedom phases, planned along their curves."""

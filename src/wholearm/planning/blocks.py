@@ -1,0 +1,336 @@
+"""Blocks of phases that are planned together, and how they are planned one after the other.
+
+Phases joined at rest are problems of their own; those joined smoothly or by impacts are one. Phases
+with one freedom are planned along their curves, unless they pass smoothly into another, and
+anything else in the time domain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.errors import InfeasibleError
+from ..geometry.cost_to_go import CostToGo
+from ..geometry.tracing import runs_on_curve, trace_phase, trace_phases
+from ..mechanics.metric import measure_speed
+from ..problem.definition import End, Phase, Problem
+from ..results.trajectory import Motion
+from ..scene.model import Scene
+from .options import Objective, PlanOptions
+from .path_domain.impact_sequence import Chain, make_chain
+from .path_domain.sequence_plan import add_up, plan_chain
+from .phase_plan import PhasePlan
+
+PLAIN = -1
+"""In place of how often intervals are doubled: as many as at first, and no search for modes."""
+FINEST = 64
+"""Most intervals of a phase in the time domain that refining asks for."""
+MOVED = 1e-9
+"""Distance from which on a block starts somewhere else, in radii of gyration or radians."""
+SHORT = 5e-7
+"""How far below epsilon a margin may be by rounding, over the scene's force."""
+
+Plans = list[PhasePlan[Motion]]
+
+
+@dataclass(frozen=True, eq=False)
+class BlockPlan:
+    """A block as it is planned.
+
+    Attributes
+    ----------
+    phases : tuple of Phase
+    start : ndarray, shape (5,)
+        Where it starts.
+    finer : int
+        How often its intervals are doubled, or `PLAIN`.
+    duration : float or None, [s]
+        Its longest duration, for the objective `margin`.
+    fastest : list of PhasePlan
+        Plans of least duration from this start, if they were made for it.
+    plans : list of PhasePlan
+        One for each of its phases.
+    chain : Chain or None
+        Its curves; None if it is planned in the time domain.
+    """
+
+    phases: tuple[Phase, ...]
+    start: Array
+    finer: int
+    duration: float | None
+    fastest: Plans
+    plans: Plans
+    chain: Chain | None
+
+    @property
+    def end(self) -> Array:
+        """Where the block ends, shape (5,)."""
+        if self.chain is not None:
+            return self.chain.curves[-1].end
+        motion = self.plans[-1].motion
+        return np.asarray(motion.evaluate(np.array([motion.duration])).z[0])
+
+    @property
+    def intervals(self) -> int:
+        """Most intervals of a phase in the time domain: each is a piece of the torques."""
+        return max(len(plan.torque.coefficients) for plan in self.plans)
+
+    @property
+    def is_finest(self) -> bool:
+        """Whether it is planned in the time domain with all the intervals that it may have."""
+        return self.chain is None and self.intervals >= FINEST
+
+
+@dataclass(frozen=True, eq=False)
+class Planning:
+    """The plans of all phases of a problem.
+
+    Attributes
+    ----------
+    problem : Problem
+    options : PlanOptions
+    blocks : tuple of BlockPlan
+    shares, allowed : list of float or None, [s]
+        The longest duration of each phase, for the objective `margin`: in proportion to plans of
+        least duration, and as used, where a block turned out to start from somewhere else.
+    least : list of PhasePlan
+        Those plans of least duration; empty for other objectives.
+    ahead : bool
+        Whether blocks end with regard to what follows them. Plans that durations are shared out
+        by do not, as blocks for the objective `margin` cannot.
+    """
+
+    problem: Problem
+    options: PlanOptions
+    blocks: tuple[BlockPlan, ...]
+    shares: list[float | None]
+    allowed: list[float | None]
+    least: Plans = field(default_factory=list)
+    ahead: bool = True
+
+    @property
+    def plans(self) -> Plans:
+        """One for each phase."""
+        return [plan for block in self.blocks for plan in block.plans]
+
+    @property
+    def chains(self) -> list[Chain]:
+        """The curves of the blocks that are planned along them."""
+        return [block.chain for block in self.blocks if block.chain is not None]
+
+
+def split_blocks(problem: Problem) -> list[tuple[Phase, ...]]:
+    """Phases that have to be planned together: those joined smoothly or by impacts."""
+    blocks: list[tuple[Phase, ...]] = []
+    block: tuple[Phase, ...] = ()
+    for phase in problem.phases:
+        block = (*block, phase)
+        if phase.end is End.REST:
+            blocks.append(block)
+            block = ()
+    return blocks
+
+
+def plan_blocks(problem: Problem, options: PlanOptions, report: Callable[[str], None]) -> Planning:
+    """Plan every block of a problem, each from where the one before ends.
+
+    Raises
+    ------
+    InputError, InfeasibleError, JammingError, SolverError
+        If there is no plan.
+    """
+    count = len(split_blocks(problem))
+    none: list[float | None] = [None] * len(problem.phases)
+    planning = Planning(problem, options, (), none, none)
+    if options.goal is Objective.MARGIN:
+        first = replace(planning, options=_for_time(options), ahead=False)
+        least = _plan_each(first, [0] * count, report).plans
+        planning = replace(planning, shares=_share_duration(least, options.duration), least=least)
+    return _require_margin(_plan_each(planning, [0] * count, report))
+
+
+def refine_block(
+    planning: Planning, index: int, report: Callable[[str], None], plain: bool = False
+) -> Planning:
+    """Plan one block anew, and those after it that then start elsewhere.
+
+    It has twice the intervals, or if it is to be `plain`, no search for modes.
+    """
+    finer = [block.finer for block in planning.blocks]
+    finer[index] = PLAIN if plain else finer[index] + 1
+    return _require_margin(_plan_each(planning, finer, report))
+
+
+def runs_along_curves(block: Sequence[Phase], options: PlanOptions) -> bool:
+    """Whether phases are planned along their curves: a single one, or several that slide."""
+    if options.transcription != "auto" or not all(map(runs_on_curve, block)):
+        return False
+    return len(block) == 1 or not any(phase.formation.rolling for phase in block)
+
+
+def _plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str], None]) -> Planning:
+    """Plan block after block, but for those that are planned as wanted.
+
+    Where a block starts from somewhere else than in the plans of least duration, the allowed
+    durations are shared out again.
+    """
+    problem, options, least = planning.problem, planning.options, planning.least
+    allowed = list(planning.shares)
+    blocks: list[BlockPlan] = []
+    z = problem.start
+    for index, phases in enumerate(split_blocks(problem)):
+        known = planning.blocks[index] if planning.blocks else None
+        moved = known is None or _distance(problem.scene, known.start, z) > MOVED
+        fastest: Plans = [] if moved or known is None else known.fastest
+        if moved and least and _starts_off(problem.scene, least[phases[0].index].motion, z):
+            fastest = _plan_block(problem, phases, z, _for_time(options), None)[0]
+        if fastest:
+            _share_again(allowed, phases, least, fastest)
+        duration = add_up(phases, allowed)
+        wanted = finer[index], duration
+        if known is None or moved or (known.finer, known.duration) != wanted:
+            numbers = "-".join(str(phase.number) for phase in phases)
+            report(f"phase {numbers} of {len(problem.phases)}: {options.goal.value}")
+            own = _refine(options, known, finer[index])
+            to_go = _look_ahead(problem, phases, own) if planning.ahead else None
+            made = _plan_block(problem, phases, z, own, allowed, to_go)
+            known = BlockPlan(phases, z, *wanted, fastest, *made)
+        blocks.append(known)
+        z = known.end
+    return replace(planning, blocks=tuple(blocks), allowed=allowed)
+
+
+def _refine(options: PlanOptions, known: BlockPlan | None, finer: int) -> PlanOptions:
+    """Options for a block whose intervals are doubled `finer` times."""
+    if finer == 0:
+        return options
+    if finer == PLAIN:
+        return replace(options, mode_search=False)
+    wanted = options.time_intervals
+    if known is not None and known.chain is None:
+        wanted = min(known.intervals * 2 ** (finer - known.finer), FINEST)
+    return replace(options, intervals=options.intervals * 2**finer, time_intervals=wanted)
+
+
+def _plan_block(
+    problem: Problem,
+    block: Sequence[Phase],
+    z: Array,
+    options: PlanOptions,
+    allowed: Sequence[float | None] | None,
+    to_go: CostToGo | None = None,
+) -> tuple[Plans, Chain | None]:
+    """Plan a block from `z`, along its curves or in the time domain; also its curves."""
+    plans: Plans = []
+    allowed = [None] * len(problem.phases) if allowed is None else allowed
+    if not runs_along_curves(block, options):
+        from .time_domain.impacts import plan_struck
+
+        plans += plan_struck(problem, block, z, options, add_up(block, allowed), to_go)
+        return plans, None
+    curves, known = [], trace_phases(problem)
+    for phase in block:
+        traced = phase.index < len(known)
+        curves.append(known[phase.index] if traced else trace_phase(problem, phase, z))
+        z = curves[-1].end
+    chain = make_chain(block, curves)
+    for part in chain.split():
+        plans += plan_chain(part, problem.epsilon, options, add_up(part.phases, allowed))
+    return plans, chain
+
+
+def _look_ahead(problem: Problem, block: Sequence[Phase], options: PlanOptions) -> CostToGo | None:
+    """What follows a block in the time domain, if that decides where on a curve it should end."""
+    index = block[-1].index + 1
+    if runs_along_curves(block, options) or index == len(problem.phases):
+        return None
+    phase, ending = problem.phases[index], block[-1]
+    until = ending.until.contact
+    gained = set(phase.formation.contacts) - set(ending.formation.contacts)
+    following = next(own for own in split_blocks(problem) if own[0] is phase)
+    if (
+        options.goal is Objective.MARGIN
+        or until is None
+        or gained != {until}
+        or not runs_along_curves(following, options)
+    ):
+        return None
+
+    def value(z: Array) -> float:
+        return sum(plan.value for plan in _plan_block(problem, following, z, options, None)[0])
+
+    return CostToGo(problem, phase, value)
+
+
+def _require_margin(planning: Planning) -> Planning:
+    """The planning, or an error for a phase that cannot keep epsilon in its duration."""
+    if planning.options.goal is not Objective.MARGIN:
+        return planning
+    epsilon = planning.problem.epsilon
+    for phase, plan in zip(planning.problem.phases, planning.plans, strict=True):
+        if plan.value < epsilon - SHORT * planning.problem.scene.scales.force:
+            raise InfeasibleError(
+                f"phase {phase.number}: in its share of the duration, "
+                f"{planning.allowed[phase.index]:.5g} s, the largest least c_n is "
+                f"{plan.value:.4g} N, below epsilon = {epsilon:g} N; allow a longer duration"
+            )
+    return planning
+
+
+def _for_time(options: PlanOptions) -> PlanOptions:
+    return replace(options, objective=Objective.TIME, duration=None)
+
+
+def _distance(scene: Scene, one: Array, other: Array) -> float:
+    """Distance of two configurations, in radii of gyration or radians."""
+    return measure_speed(scene, one - other) / scene.scales.length
+
+
+def _starts_off(scene: Scene, motion: Motion, z: Array) -> bool:
+    """Whether a motion starts somewhere else than at `z`."""
+    return _distance(scene, motion.evaluate(np.zeros(1)).z[0], z) > MOVED
+
+
+def _share_again(
+    allowed: list[float | None],
+    block: Sequence[Phase],
+    least: Sequence[PhasePlan[Motion]],
+    fastest: Sequence[PhasePlan[Motion]],
+) -> None:
+    """Give a block its share for another least duration, at the cost of the phases after it."""
+    later = range(block[-1].index + 1, len(allowed))
+    rest = sum(allowed[k] or 0.0 for k in later)
+    if not rest:
+        return
+    gain = 0.0
+    for phase, plan in zip(block, fastest, strict=True):
+        own = allowed[phase.index]
+        if own is not None:
+            ratio = plan.motion.duration / least[phase.index].motion.duration
+            gain += own * (ratio - 1)
+            allowed[phase.index] = own * ratio
+    for k in later:
+        own = allowed[k]
+        allowed[k] = None if own is None else own * (1 - gain / rest)
+
+
+def _share_duration(
+    least: Sequence[PhasePlan[Motion]], duration: float | None
+) -> list[float | None]:
+    """Longest duration of each phase [s]: the whole, shared in proportion to the least times."""
+    times = [plan.motion.duration for plan in least]
+    total = 2 * sum(times) if duration is None else duration
+    if total <= sum(times):
+        from .advice import Change, Limit, describe_changes, round_outwards
+
+        # The least-time plan shows it; a little more leaves something to choose.
+        enough = Change(Limit("duration", total, "s", 1), round_outwards(1.005 * sum(times), 1))
+        raise InfeasibleError(
+            f"duration = {total:g} s is not longer than the least time, {sum(times):.6g} s; "
+            f"{describe_changes([enough])}"
+        )
+    return [total / sum(times) * own for own in times]

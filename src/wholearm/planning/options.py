@@ -1,0 +1,132 @@
+"""What to plan for, and how finely."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from ..common.errors import InputError
+from ..common.require import require_number
+
+
+class Objective(Enum):
+    """What a plan makes best."""
+
+    TIME = "time"
+    """Least duration."""
+    EFFORT = "effort"
+    """Least integral of tau^T tau, plus a weight on time."""
+    MARGIN = "margin"
+    """Largest least normal force within a given duration."""
+    ELASTIC = "elastic"
+    """Least shortfall of the limits; used to explain why there is no plan."""
+    RELAX = "relax"
+    """Least relaxation of one limit; used to say what would make a plan possible."""
+
+
+CHOICES = tuple(
+    choice.value for choice in Objective if choice not in (Objective.ELASTIC, Objective.RELAX)
+)
+"""Objectives that a user can ask for."""
+
+OPENING = 0.01
+"""Least acceleration of a gap that opens, over gravity."""
+CLEARANCE = 5e-4
+"""Least gap of a contact that has been let go, over the radius of gyration."""
+
+
+@dataclass(frozen=True)
+class PlanOptions:
+    """Options of the planner.
+
+    Attributes
+    ----------
+    objective : Objective or str
+        ``"time"``, ``"effort"`` or ``"margin"``.
+    intervals : int
+        Intervals of the grid of each phase, at least 10.
+    time_weight : float, [(N m)^2]
+        Weight of the duration against the effort.
+    duration : float, optional, [s]
+        What `margin` may take for all phases together; twice the least time when left out.
+    samples : int
+        Rows per phase of the trajectory file, at least 2.
+    transcription : str
+        ``"auto"`` plans phases with one freedom that are joined at rest or by impacts along their
+        curves and others in the time domain; ``"time"`` plans all in the time domain.
+    opening : float
+        Least acceleration, over gravity, with which the gap of a contact that a smooth phase lets
+        go opens in the time domain.
+    clearance : float
+        What that gap is at least, over the object's radius of gyration, from a third of the first
+        stage without the contact on.
+    time_intervals : int, optional
+        Intervals of each phase in the time domain, at least 4; when left out, 32 for a phase with
+        one freedom that is planned alone and 10 for others.
+    degree : int
+        Collocation points per interval in the time domain, from 2 to 6.
+    scheme : str
+        Which points: ``"radau"`` or ``"legendre"``.
+    replay : bool
+        Whether to replay the plan, to refine what does not hold and to return only what does.
+    mode_search : bool
+        Whether contact modes are changed, in the time domain, for as long as that makes a plan
+        better.
+
+    Raises
+    ------
+    InputError
+        If an option is out of its range.
+    """
+
+    objective: Objective | str = Objective.TIME
+    intervals: int = 80
+    time_weight: float = 1.0
+    duration: float | None = None
+    samples: int = 201
+    transcription: str = "auto"
+    time_intervals: int | None = None
+    opening: float = OPENING
+    clearance: float = CLEARANCE
+    degree: int = 3
+    scheme: str = "radau"
+    replay: bool = True
+    mode_search: bool = True
+
+    def __post_init__(self) -> None:
+        given = self.objective
+        if given not in CHOICES and given not in [Objective(choice) for choice in CHOICES]:
+            raise InputError("", "objective", f"{given!r} given; allowed are {', '.join(CHOICES)}")
+        object.__setattr__(self, "objective", Objective(given))
+        for key, least in (("intervals", 10), ("samples", 2), ("time_intervals", 4), ("degree", 2)):
+            value = getattr(self, key)
+            if value is None and key == "time_intervals":
+                continue
+            if not isinstance(value, int) or isinstance(value, bool) or value < least:
+                raise InputError("", key, f"{value!r} is not a whole number of {least} or more")
+        if self.degree > 6:
+            raise InputError("", "degree", f"{self.degree} given; allowed are 2 to 6")
+        if self.scheme not in ("radau", "legendre"):
+            given = self.scheme
+            raise InputError("", "scheme", f"{given!r} given; allowed are radau and legendre")
+        if self.transcription not in ("auto", "time"):
+            given = self.transcription
+            raise InputError("", "transcription", f"{given!r} given; allowed are auto and time")
+        for key in ("replay", "mode_search"):
+            if not isinstance(value := getattr(self, key), bool):
+                raise InputError("", key, f"{value!r} given; allowed are true and false")
+        for key in ("opening", "clearance"):
+            value = require_number(getattr(self, key), key, nonnegative=True)
+            object.__setattr__(self, key, value)
+        weight = require_number(self.time_weight, "time_weight", positive=True)
+        object.__setattr__(self, "time_weight", weight)
+        if self.duration is not None:
+            duration = require_number(self.duration, "duration", positive=True)
+            object.__setattr__(self, "duration", duration)
+            if self.objective is not Objective.MARGIN:
+                raise InputError("", "duration", "is for the objective margin only")
+
+    @property
+    def goal(self) -> Objective:
+        """The objective as an enumeration member."""
+        return Objective(self.objective)

@@ -1,0 +1,1 @@
+"""Planning of phases with one freedom, along their curves."""

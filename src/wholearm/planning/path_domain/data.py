@@ -1,0 +1,316 @@
+"""What phases give the planner: forces along their curves, at nodes and between them.
+
+Forces are evaluated at the nodes and at a few places of every interval, the knots. They are smooth
+there, so polynomials through the knots carry them to all places where limits are looked at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.arrays import Array
+from ...common.errors import JammingError, SolverError
+from ...common.minima import find_least
+from ...contacts.cones import hold_least, hold_rows
+from ...geometry.curve import Curve, describe_pose
+from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
+from ...results.torque import TorqueProfile
+from .motion import Grid, PathMotion, Profile, directions_of
+
+TORQUE_ERROR = 5e-7
+"""Largest error of the torque's polynomials between the knots, over the torque limit."""
+PLACES = 9
+"""Places that they go through where that is exceeded."""
+
+
+class Fineness(NamedTuple):
+    """Where in an interval forces are evaluated and limits looked at, its ends included."""
+
+    knots: Array
+    looks: Array
+
+
+class Places(NamedTuple):
+    """Forces and rates of the joints, d theta / ds with shape (n, 2), at n places of a curve.
+
+    In `forces`, H c (`contacts.cones`) stands for the contact forces c: c itself if nothing rolls.
+    """
+
+    forces: PathForces
+    rates: Array
+
+    def pick(self, rows: Any) -> Places:
+        """Return the places that `rows` indexes."""
+        return Places(PathForces(*(part[rows] for part in self.forces)), self.rates[rows])
+
+
+class Relaxation(NamedTuple):
+    """Which limit gives way when the relaxation grows, and how fast.
+
+    Attributes
+    ----------
+    worth : ndarray, shape (n_h + 3,), [N, N m, 1]
+        By how much H c >= least and |tau| <= limit give way per unit of it, and the square of a
+        speed limit, relative to that square.
+    finger : int or None
+        Whose speed limit that is.
+    """
+
+    worth: Array
+    finger: int | None = None
+
+
+class PhaseData(NamedTuple):
+    """What one phase, or several that are joined, gives the NLP.
+
+    Attributes
+    ----------
+    curve : Curve
+        The first one's where phases are joined.
+    epsilon : float, [N]
+    grid : Grid
+    nodes : Places
+        At the nodes.
+    fine : Fineness
+    knots : Places
+        At the knots of every solid interval, interval by interval.
+    looks : Places
+        At the looks of every solid interval, interval by interval.
+    solid : ndarray of int
+        The intervals that have a length.
+    """
+
+    curve: Curve
+    epsilon: float
+    grid: Grid
+    nodes: Places
+    fine: Fineness
+    knots: Places
+    looks: Places
+    solid: NDArray[np.int64]
+
+    @property
+    def least(self) -> Array:
+        """The least that each row of H c may be, shape (n_h,) [N]."""
+        return hold_least(self.curve.formation, self.epsilon)
+
+    @property
+    def torque_limit(self) -> Array:
+        """Torque limits, shape (2,) [N m]."""
+        return self.curve.formation.scene.torque_limit
+
+    @property
+    def spans(self) -> Array:
+        """What is much for each limit, shape (n_h + 4,): the scene's force, the torque limits."""
+        force = self.curve.formation.scene.scales.force
+        return np.append(np.full(len(self.least), force), np.tile(self.torque_limit, 2))
+
+    def slack(self, places: Places, profile: Profile, margin: float = 0.0) -> Array:
+        """How far each limit is from being missed, shape (n, n_h + 4) [N, N m].
+
+        In the order H c - least (less `margin` for normal forces), tau + limit, limit - tau.
+        """
+        held, tau = places.forces.c(*profile), places.forces.tau(*profile)
+        limit, spare = self.torque_limit, self.least.copy()
+        spare[: self.curve.formation.n_contacts] += margin
+        return np.hstack([held - spare, tau + limit, limit - tau])
+
+    def largest_b(self, places: Places, spared: int | None = None) -> Array:
+        """Largest b that the joints' speed limits allow, shape (n,) [m^2/s^2].
+
+        Without that of the joint `spared`, if one is given.
+        """
+        limit = self.curve.formation.scene.speed_limit
+        if spared is not None:
+            limit[spared] = np.inf
+        if np.isinf(limit).all():
+            return np.full(len(places.rates), np.inf)
+        # A joint that stands still has no limit, but dividing by zero would warn.
+        rates = np.maximum(np.abs(places.rates), np.finfo(float).tiny ** 0.25)
+        return np.asarray(((limit / rates) ** 2).min(axis=1))
+
+    def relative_rates(self, places: Places, finger: int | None) -> Array:
+        """Rate of a joint over its speed limit, shape (n,) [s/m]; zero without a joint."""
+        if finger is None:
+            return np.zeros(len(places.rates))
+        limit = self.curve.formation.scene.speed_limit[finger]
+        return np.asarray(places.rates[:, finger] / limit)
+
+    def spread(self, profile: Profile, fractions: Array) -> Profile:
+        """The profile at `fractions` of every solid interval, interval by interval."""
+        k, x, h = self.solid, fractions, self.grid.steps[self.solid, None]
+        a, rise = profile.a[k, None], (profile.a[k + 1] - profile.a[k])[:, None]
+        b = profile.b[k, None] + h * x * (2 * a + x * rise)
+        squeeze = profile.squeeze[k, None] * (1 - x) + profile.squeeze[k + 1, None] * x
+        return Profile((a + x * rise).ravel(), np.maximum(b, 0.0).ravel(), squeeze.ravel())
+
+    def misses(self, profile: Profile, margin: float) -> tuple[Array, Array]:
+        """What limits miss inside each solid interval, shape (n_solid, n_h + 4) [N, N m].
+
+        And how far b is beyond what the speed limits allow, shape (n_solid,), relative.
+        """
+        here = self.spread(profile, self.fine.looks)
+        speed_slack = 1 - here.b / self.largest_b(self.looks)
+        slack = np.column_stack([self.slack(self.looks, here, margin), speed_slack])
+        least = find_least(slack.reshape(len(self.solid), len(self.fine.looks), -1))
+        short = np.maximum(-least, 0.0)
+        return short[:, :-1], short[:, -1]
+
+    def slack_beside(self, profile: Profile, margin: float, short: Array) -> Array:
+        """The lesser slack of the two nodes of each solid interval, shape (n_solid, n_h + 4).
+
+        Zero where nothing is `short` in the interval.
+        """
+        slack = self.slack(self.nodes, profile, margin)
+        least = np.minimum(slack[self.solid], slack[self.solid + 1])
+        return np.where(short > 0, np.maximum(least, 0.0), 0.0)
+
+    def beside(self, inside: Array) -> Array:
+        """The larger value of the two solid intervals beside each node, shape (N + 1, ...)."""
+        table = np.zeros((len(self.grid.s), *inside.shape[1:]))
+        table[self.solid] = inside
+        table[self.solid + 1] = np.maximum(table[self.solid + 1], inside)
+        return table
+
+
+def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
+    """Evaluate a curve's forces at the nodes of a grid and between them.
+
+    Raises
+    ------
+    JammingError
+        If friction makes the reduced inertia vanish or turn negative anywhere.
+    """
+    solid = np.flatnonzero(grid.steps > 0)
+    fine = choose_fineness(len(grid.s))
+    inner = fine.knots[1:-1]
+    between = (grid.s[solid, None] + inner * grid.steps[solid, None]).ravel()
+    s = np.concatenate([grid.s, between])
+    segment = np.concatenate([grid.segment, np.repeat(grid.segment[solid], len(inner))])
+    point = curve.evaluate(s)
+    formation, directions = curve.formation, directions_of(curve, segment)
+    inertia = reduced_inertia(formation, point.kinematics, directions)
+    if inertia.min() <= 0:
+        worst = int(inertia.argmin())
+        raise JammingError(
+            f"phase {phase}: {' '.join(formation.names)} jams at {describe_pose(point.z[worst])}: "
+            f"friction makes the reduced inertia {inertia[worst]:.3g} of its frictionless value"
+        )
+    forces = inverse(formation, *point[:3], directions, point.kinematics)
+    if formation.rolling:
+        forces = forces.press(hold_rows(formation))
+    every = Places(forces, point.z_s[:, 3:])
+    own = len(grid.s) + np.arange(len(between)).reshape(len(solid), -1)
+    order = np.hstack([solid[:, None], own, solid[:, None] + 1])
+    knots = every.pick(order.ravel())
+
+    powers = np.arange(len(fine.knots))
+    # Powers on [-1, 1]: on [0, 1] thirteen knots would cost nine digits.
+    looks_x, knots_x = 2 * fine.looks - 1, 2 * fine.knots - 1
+    carrier = looks_x[:, None] ** powers @ np.linalg.inv(knots_x[:, None] ** powers)
+
+    def carry(values: Array) -> Array:
+        table = values.reshape(len(solid), len(fine.knots), -1)
+        return (carrier @ table).reshape(len(solid) * len(fine.looks), -1)
+
+    looks = Places(PathForces(*(carry(part) for part in knots.forces)), carry(knots.rates))
+    nodes = every.pick(slice(None, len(grid.s)))
+    return PhaseData(curve, epsilon, grid, nodes, fine, knots, looks, solid)
+
+
+def join(parts: Sequence[PhaseData]) -> PhaseData:
+    """Put phases one after the other, each with as many nodes and as many sliding contacts.
+
+    Where two meet, the grid has an interval of length zero, as where a direction reverses.
+    """
+    starts = np.cumsum([0.0, *(part.grid.s[-1] for part in parts)])
+    segments = np.cumsum([0, *(part.grid.segment[-1] + 1 for part in parts)])
+    nodes = np.cumsum([0, *(len(part.grid.s) for part in parts)])
+
+    def chain(arrays: Iterable[NDArray[Any]], firsts: NDArray[Any]) -> Any:
+        pairs = zip(arrays, firsts[:-1], strict=True)
+        return np.concatenate([array + first for array, first in pairs])
+
+    def stack(places: Sequence[Places]) -> Places:
+        columns = zip(*(own.forces for own in places), strict=True)
+        forces = PathForces(*(np.concatenate(column) for column in columns))
+        return Places(forces, np.concatenate([own.rates for own in places]))
+
+    return parts[0]._replace(
+        grid=Grid(
+            chain((part.grid.s for part in parts), starts),
+            chain((part.grid.segment for part in parts), segments),
+        ),
+        nodes=stack([part.nodes for part in parts]),
+        knots=stack([part.knots for part in parts]),
+        looks=stack([part.looks for part in parts]),
+        solid=chain((part.solid for part in parts), nodes),
+    )
+
+
+def name_phases(phases: Sequence[int], what: str = "") -> str:
+    """One phase or several, for messages, and that they are `what`."""
+    if len(phases) == 1:
+        return f"phase {phases[0]} is {what}" if what else f"phase {phases[0]}"
+    several = f"phases {phases[0]} to {phases[-1]}"
+    return f"{several} are {what}" if what else several
+
+
+def cut(parts: Sequence[PhaseData], profile: Profile) -> list[Profile]:
+    """Return the profile of each of several joined phases."""
+    ends = np.cumsum([len(part.grid.s) for part in parts])[:-1]
+    columns = (np.split(values, ends) for values in profile)
+    return [Profile(*own) for own in zip(*columns, strict=True)]
+
+
+def choose_fineness(nodes: int) -> Fineness:
+    """Choose more knots and looks where intervals are long.
+
+    Looks are as the cosine of evenly spaced angles: near rest the speed, and with it viscous
+    friction, goes with the root of the way.
+    """
+    knots, looks = (5, 25) if nodes > 64 else (13, 97)
+    angles = np.linspace(0.0, np.pi, looks)
+    return Fineness(np.linspace(0.0, 1.0, knots), (1 - np.cos(angles)) / 2)
+
+
+def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, float]:
+    """Torque of a motion as one polynomial in time per interval, through its values at the knots.
+
+    Where that misses the torque between the knots, it goes through more places. Also returns the
+    integral of tau^T tau [(N m)^2 s].
+
+    Raises
+    ------
+    SolverError
+        If the motion takes no time, or for ever, between two nodes.
+    """
+    knots, looks = data.fine
+    torque = _fit(data, motion, data.knots, knots)
+    times = motion.times[data.solid, None] + motion.durations(looks)[data.solid]
+    wanted = data.looks.forces.tau(*data.spread(motion.profile, looks))
+    inner = np.tile((looks > 0) & (looks < 1), len(data.solid))
+    misfit = torque.at(times.ravel()[inner]) - wanted[inner]
+    if np.abs(misfit / data.torque_limit).max() > TORQUE_ERROR and len(knots) < PLACES:
+        every = (len(looks) - 1) // (PLACES - 1)
+        rows = np.tile(np.arange(len(looks)) % every == 0, len(data.solid))
+        torque = _fit(data, motion, data.looks.pick(rows), looks[::every])
+    return torque, torque.integrate_squares()
+
+
+def _fit(data: PhaseData, motion: PathMotion, places: Places, fractions: Array) -> TorqueProfile:
+    """Polynomials through the torques at `fractions` of every solid interval."""
+    k = data.solid
+    values = places.forces.tau(*data.spread(motion.profile, fractions))
+    spans = motion.durations(fractions)[k]
+    if not (np.isfinite(spans).all() and (np.diff(spans, axis=1) > 0).all()):
+        raise SolverError("the motion all but stops between two nodes; plan with more intervals")
+    x = 2 * spans / spans[:, -1:] - 1
+    vandermonde = x[..., None] ** np.arange(len(fractions))
+    coefficients = np.linalg.solve(vandermonde, values.reshape(len(k), len(fractions), 2))
+    breaks = np.append(motion.times[k], motion.times[-1])
+    return TorqueProfile(breaks, np.asarray(coefficients.transpose(0, 2, 1), dtype=float))

@@ -1,0 +1,106 @@
+"""One-freedom phases that impacts join: curves that are run through without a stop.
+
+At the end of a curve the velocity is z_s s', and the impact makes it a multiple of the next curve's
+tangent, whatever the speed: v+ = ratio s' z_s. So whether an impact is possible is known before
+anything is planned, and with a parameter that runs along the next curve at the pace of `ratio` the
+speed is continuous: the curves are planned as one. Where an impact is not possible the motion has
+to stop, and the chain ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...geometry.curve import Curve
+from ...mechanics.impact import Impact, strike
+from ...mechanics.metric import metric_weights
+from ...problem.definition import Phase
+
+PER_SPEED = " per m/s"
+"""What impulses and rates of an impact are for: one unit of speed along the curve that ends."""
+
+
+@dataclass(frozen=True, eq=False)
+class Join:
+    """An impact between two curves, for unit speed along the first one.
+
+    Attributes
+    ----------
+    phase : Phase
+        The one that it ends.
+    impact : Impact
+        Velocities per m/s, hence without unit and in rad/m; impulses in N s per m/s.
+    ratio : float
+        Speed along the second curve; negative if the motion would turn back.
+    """
+
+    phase: Phase
+    impact: Impact
+    ratio: float
+
+    @property
+    def possible(self) -> bool:
+        """Whether the motion can go on at speed."""
+        return self.impact.possible and self.ratio > 0
+
+    @property
+    def reason(self) -> str:
+        """Why it cannot, empty if it can."""
+        if self.impact.hindrances:
+            return self.impact.hindrances[0].describe(PER_SPEED)
+        return "" if self.possible else f"phase {self.phase.number + 1} would be run backwards"
+
+
+def meet(phase: Phase, before: Curve, after: Curve) -> Join:
+    """The impact at the end of a phase, from its curve to the next one's."""
+    v = before.evaluate(np.array([before.length])).z_s[0] / before.pace
+    impact = strike(before.formation, after.formation, after.start, v)
+    heading = after.evaluate(np.zeros(1)).z_s[0] / after.pace
+    ratio = float(impact.v * metric_weights(after.formation.scene) @ heading)
+    return Join(phase, impact, ratio)
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """One-freedom phases, each but the last ended by an impact.
+
+    Attributes
+    ----------
+    phases : tuple of Phase
+    curves : tuple of Curve
+        Parametrised by arc length.
+    joins : tuple of Join
+        Between one curve and the next.
+    """
+
+    phases: tuple[Phase, ...]
+    curves: tuple[Curve, ...]
+    joins: tuple[Join, ...]
+
+    def part(self, start: int, stop: int) -> Chain:
+        """Phases `start` to `stop`, without the latter."""
+        return Chain(self.phases[start:stop], self.curves[start:stop], self.joins[start : stop - 1])
+
+    def split(self) -> list[Chain]:
+        """Split where an impact is not possible."""
+        ends = [k + 1 for k, join in enumerate(self.joins) if not join.possible]
+        bounds = zip([0, *ends], [*ends, len(self.phases)], strict=True)
+        return [self.part(start, stop) for start, stop in bounds]
+
+    @property
+    def paced(self) -> tuple[Curve, ...]:
+        """The curves at such paces that the speed is the same on both sides of a join."""
+        paces = np.cumprod([1.0, *(join.ratio for join in self.joins)])
+        return tuple(
+            curve.at_pace(float(pace)) if pace != 1 else curve
+            for curve, pace in zip(self.curves, paces, strict=True)
+        )
+
+
+def make_chain(phases: Sequence[Phase], curves: Sequence[Curve]) -> Chain:
+    """Chain phases along their curves."""
+    pairs = zip(phases[:-1], curves[:-1], curves[1:], strict=True)
+    return Chain(tuple(phases), tuple(curves), tuple(meet(*pair) for pair in pairs))

@@ -1,0 +1,140 @@
+"""Torque tables checked by replaying them: what rows, or samples at a rate, do to a plan."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.errors import JammingError, ReplayError, SimulationError
+from ..problem.definition import Problem
+from ..results.report import Report
+from ..results.torque_table import ERROR, place_rows, read_rows, sample_rows
+from ..results.trajectory import Trajectory
+from ..verification.verdict import Allowance, find_least_force
+from ..verification.verify import inspect
+from .self_check import PIECES, divide_pieces, pick_times
+
+FINER = 8.0
+"""How much less the rows of a table may miss when its replay does not hold."""
+ATTEMPTS = 3
+"""How many tables are tried."""
+
+
+class Table(NamedTuple):
+    """Rows of torques, and what their replay does.
+
+    Attributes
+    ----------
+    rows : ndarray, shape (n, 3), [s, N m, N m]
+        t, tau_1 and tau_2; a time given twice is a step.
+    figures : dict
+        Plain values: number of rows, rate and interpolation of samples, and from the replay whether
+        it holds, why, and the arrival and the least normal force of each phase beside those of the
+        plan.
+    """
+
+    rows: Array
+    figures: dict[str, Any]
+
+
+def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) -> Table:
+    """Rows from which a replay gives the plan back, as dense as that takes.
+
+    Parameters
+    ----------
+    problem : Problem
+    trajectory : Trajectory
+    replay : bool
+        Whether to replay them.
+
+    Raises
+    ------
+    ReplayError
+        If the replay of the table loses a contact or misses the goal, however dense its rows are.
+    JammingError, SimulationError
+        If the simulation cannot go on.
+    """
+    rows = place_rows(trajectory.torque)
+    if not replay:
+        return Table(rows, {"rows": len(rows), "replay": None})
+    times = pick_times(trajectory)
+    for attempt in range(ATTEMPTS):
+        rows = place_rows(trajectory.torque, ERROR / FINER**attempt)
+        # The table has to keep the limits of the plan, and to stay near it.
+        report = inspect(problem, read_rows(rows), trajectory, times, Allowance(), 1e-9)
+        if report.ok:
+            break
+    else:
+        report = inspect(problem, read_rows(rows), None, times, Allowance(), 1e-9)
+    if not report.ok:
+        raise ReplayError(
+            f"the torques as a table of {len(rows)} rows do not hold in their replay: "
+            f"{report.reason}; --no-replay (replay=False) leaves the check out"
+        )
+    return Table(rows, {"rows": len(rows), "replay": _compare(trajectory, report)})
+
+
+def sample_table(
+    problem: Problem,
+    trajectory: Trajectory,
+    rate: float,
+    interpolation: str,
+    replay: bool = True,
+) -> Table:
+    """Samples of a plan's torques at a rate [Hz], and what becomes of the motion with them.
+
+    That they lose contacts or miss the goal is a result and not an error.
+
+    Raises
+    ------
+    InputError
+        If the rate or the interpolation is not one that is allowed.
+    """
+    rows = sample_rows(trajectory.torque, rate, interpolation)
+    figures: dict[str, Any] = {
+        "rows": len(rows),
+        "sample_rate": rate,
+        "interpolation": interpolation,
+        "replay": None,
+    }
+    if not replay:
+        return Table(rows, figures)
+    torque, starts = read_rows(rows), trajectory.phase_starts
+    times = divide_pieces(torque, starts, np.diff(starts) / PIECES)
+    try:
+        report = inspect(problem, torque, None, times, Allowance(), 1e-9)
+    except (JammingError, SimulationError) as error:
+        return Table(rows, figures | {"replay": {"ok": False, "reason": str(error), "phases": []}})
+    return Table(rows, figures | {"replay": _compare(trajectory, report)})
+
+
+def _compare(trajectory: Trajectory, report: Report) -> dict[str, Any]:
+    """Arrival and least normal force of each phase of a replay, beside those of the plan."""
+    return {
+        "ok": report.ok,
+        "reason": report.reason,
+        "phases": [
+            _compare_phase(trajectory, index, report) for index in range(len(trajectory.motions))
+        ],
+    }
+
+
+def _compare_phase(trajectory: Trajectory, index: int, report: Report) -> dict[str, Any]:
+    c_n = trajectory.c_n[trajectory.phase == index]
+    found: dict[str, Any] = {
+        "phase": index + 1,
+        "planned_arrival": float(trajectory.phase_starts[index + 1]),
+        "arrival": None,
+        "planned_least_c_n": float(np.nanmin(c_n)),
+        "least_c_n": None,
+        "contact": None,
+    }
+    if index < len(report.phases):
+        phase = report.phases[index]
+        least = find_least_force(phase)
+        found["arrival"] = phase.arrival
+        if least is not None:
+            found |= {"least_c_n": least.least, "contact": least.contact}
+    return found

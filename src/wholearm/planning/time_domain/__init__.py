@@ -1,0 +1,1 @@
+"""Planning of phases with any number of freedoms, in time."""

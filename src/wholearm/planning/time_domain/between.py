@@ -1,0 +1,171 @@
+"""What a motion in the time domain misses between its collocation points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ...common.arrays import Array
+from ...common.minima import find_least
+from ...contacts.cones import hold_least, slip_margins
+from ...results.trajectory import Samples
+from .motion import StageMotion
+from .nlp import SLIDING, TimeNLP, least_rates
+from .stage import Stage
+
+MISS = 2.5e-7
+"""Largest miss of a force limit between points, over the weight of the object."""
+GRAZE = 3e-7
+"""Deepest overlap between points, over the radius of gyration."""
+FALTER = 0.1
+"""How far a rate may fall below half of the least one between points, over the least one: what
+turned there for an instant might be held by friction in a replay."""
+LOOKS = 25
+"""Places per interval at which limits are looked at."""
+_OVER = 1.5
+"""How much more than the miss a limit is tightened."""
+
+
+class Limits(NamedTuple):
+    """Amounts by which limits of one stage are missed or raised, never negative.
+
+    Attributes
+    ----------
+    c_n : ndarray, shape (K, n_c)
+    cone : ndarray, shape (K, R)
+    gap : ndarray, shape (K, n_watched)
+    sense : ndarray, shape (K, n_c + 2)
+        Of the rates of contacts and joints; nothing of rolling contacts.
+    """
+
+    c_n: Array
+    cone: Array
+    gap: Array
+    sense: Array
+
+    @staticmethod
+    def none(stage: Stage) -> Limits:
+        """Nothing is raised."""
+        formation = stage.formation
+        n_c = formation.n_contacts
+        widths = (n_c, formation.n_rolling, len(stage.watched), n_c + 2)
+        return Limits(*(np.zeros((stage.intervals, width)) for width in widths))
+
+    def raised(self, misses: Limits) -> Limits:
+        """Raised by somewhat more than the misses."""
+        return Limits(*(own + _OVER * miss for own, miss in zip(self, misses, strict=True)))
+
+    @property
+    def worst(self) -> float:
+        """The largest, over what is allowed."""
+        allowed = (MISS, MISS, GRAZE, FALTER * SLIDING)
+        return max(float(t.max(initial=0.0)) / a for t, a in zip(self, allowed, strict=True))
+
+
+class Look(NamedTuple):
+    """A stage at `LOOKS` places of each of its K intervals, one after the other.
+
+    Attributes
+    ----------
+    places : ndarray, shape (K LOOKS,)
+        Shares of the duration.
+    samples : Samples
+        Motion and forces there.
+    limits : ndarray, shape (K LOOKS, n_limits), [m]
+        Values of every limit of the formation.
+    """
+
+    places: Array
+    samples: Samples
+    limits: Array
+
+
+def look_between(stage: Stage, motion: StageMotion) -> Look:
+    """Look at a stage between its points."""
+    places = stage.guess.places(np.linspace(1e-9, 1 - 1e-9, LOOKS)).ravel()
+    samples = motion.evaluate(places * motion.duration)
+    return Look(places, samples, stage.formation.evaluate_limits(samples.z))
+
+
+def find_misses(stage: Stage, look: Look, epsilon: float, margin: float = 0.0) -> Limits:
+    """By how much limits are missed in each interval, at worst.
+
+    Parameters
+    ----------
+    epsilon, margin : float
+        Least c_n, and what c_n but no friction cone has to exceed it by.
+    """
+    samples = look.samples
+    grip = slip_margins(stage.formation, samples.c_n - epsilon, samples.c_t)
+    clear = stage.list_clearances(look.places, after=1 / 2) / 2
+    # What a stage is short of where it starts, no bound within it can mend.
+    values = look.limits[:, list(stage.watched)]
+    values = values - np.minimum(values[:1], 0.0)
+    tables = (
+        samples.c_n - (epsilon + margin),
+        grip,
+        values - clear,
+        _measure_senses(stage, samples) - 0.5 * least_rates(stage, look.places)[:, None],
+    )
+    shape = (stage.intervals, LOOKS)
+    slack = (find_least(table.reshape(*shape, table.shape[1])) for table in tables)
+    return Limits(*(np.maximum(-part, 0.0) for part in slack))
+
+
+def _measure_senses(stage: Stage, samples: Samples) -> Array:
+    """Rates in a stage's directions, shape (n, n_c + 2); those of rolling contacts are 1."""
+    senses = stage.measure_senses(samples.z, samples.z_dot)
+    senses[:, list(stage.formation.rolling_rows)] = 1.0
+    return senses
+
+
+def watch_missed(stages: Sequence[Stage], looks: Sequence[Look]) -> list[Stage] | None:
+    """Stages that also watch the limits which are broken between points; None if none is."""
+    changed = []
+    for stage, look in zip(stages, looks, strict=True):
+        values = look.limits.reshape(stage.intervals, LOOKS, -1)
+        deepest = -GRAZE * stage.formation.scene.scales.length
+        broken = np.flatnonzero(find_least(values).min(axis=0) < deepest).tolist()
+        changed.append(replace(stage, watched=tuple(sorted({*stage.watched, *broken}))))
+    news = [one.watched != other.watched for one, other in zip(changed, stages, strict=True)]
+    return changed if any(news) else None
+
+
+def raise_bounds(
+    nlp: TimeNLP,
+    stages: Sequence[Stage],
+    limits: Sequence[Limits],
+    epsilon: float,
+    bounds: tuple[Array, Array],
+) -> tuple[Array, Array]:
+    """Bounds of the NLP's rows; raises `bounds`, those of its unknowns, in place.
+
+    Parameters
+    ----------
+    epsilon : float
+        Least c_n.
+    """
+    low, high = nlp.rows.bounds
+    low_x, high_x = bounds
+    for k, (stage, raised) in enumerate(zip(stages, limits, strict=True)):
+        formation, own = stage.formation, nlp.rows_of[k]
+        floor = epsilon + raised.c_n
+        c_n = nlp.layouts[k].forces[:, :, : formation.n_contacts]
+        # Where rows hold c_n at the points too, its own bounds must not.
+        if own.limits.presses.shape[1] <= 2:
+            low_x[c_n] = floor[:, None]
+        low[own.limits.presses] = floor[:, None]
+        cushion = hold_least(formation, epsilon)[formation.n_contacts :]
+        low[own.limits.cones] = cushion + np.tile(raised.cone, 2)[:, None]
+        low[own.watches] += raised.gap[:, None]
+        sliding = [i for i in range(formation.n_contacts) if i not in formation.rolling_rows]
+        senses = own.points[:, :, own.points.shape[2] - len(sliding) :]
+        low[senses] += raised.sense[:, None, sliding]
+        for joint, sigma in enumerate(stage.directions.sigma):
+            rates, more = nlp.layouts[k].v[..., 3 + joint], raised.sense[:, -2 + joint, None]
+            low_x[rates] += more * (sigma > 0)
+            high_x[rates] -= more * (sigma < 0)
+    return low, high

@@ -1,0 +1,79 @@
+"""Collocation schemes as data: points in an interval, and integrals of what passes through them."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from ...common.arrays import Array
+
+
+class Scheme(NamedTuple):
+    """A collocation scheme on [0, 1].
+
+    Attributes
+    ----------
+    name : str
+    points : ndarray, shape (d,)
+        Increasing.
+    integrals : ndarray, shape (d, d)
+        Row j integrates, from 0 to point j, the polynomial through values at the points.
+    weights : ndarray, shape (d,)
+        The same from 0 to 1.
+    order : int
+        Of the error at the end of an interval.
+    """
+
+    name: str
+    points: Array
+    integrals: Array
+    weights: Array
+    order: int
+
+    @property
+    def degree(self) -> int:
+        """Number of points d."""
+        return len(self.points)
+
+    @property
+    def ends(self) -> bool:
+        """Whether the last point is the end of the interval."""
+        return bool(self.points[-1] == 1.0)
+
+    def interpolate(self, places: Array) -> Array:
+        """Values at `places`, shape (n,), from those at the points: a matrix of shape (n, d)."""
+        powers = np.arange(self.degree)
+        invert = np.linalg.inv(self.points[:, None] ** powers)
+        return np.asarray(places[:, None] ** powers @ invert)
+
+
+@lru_cache(maxsize=8)
+def make_scheme(name: str, degree: int) -> Scheme:
+    """Radau IIA points, order 2 d - 1, or Gauss-Legendre points, order 2 d.
+
+    Radau points are the zeros of P_d - P_d-1, 1 among them, Legendre points those of P_d.
+
+    Parameters
+    ----------
+    name : {"radau", "legendre"}
+    degree : int
+        Number of points d.
+
+    Notes
+    -----
+    Source: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II, section IV.5.
+    """
+    series = np.zeros(degree + 1)
+    series[degree] = 1.0
+    if name == "radau":
+        series[degree - 1] = -1.0
+    points = (np.sort(np.polynomial.legendre.legroots(series).real) + 1) / 2
+    if name == "radau":
+        points[-1] = 1.0
+    powers = np.arange(1, degree + 1)
+    invert = np.linalg.inv(points[:, None] ** (powers - 1))
+    integrals = (points[:, None] ** powers / powers) @ invert
+    order = 2 * degree - (name == "radau")
+    return Scheme(name, points, integrals, (1 / powers) @ invert, order)

@@ -1,0 +1,66 @@
+"""The search for the modes of stages: moves, each solved, until none makes the plan better."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from .modes import sign_sequence
+from .moves import list_moves
+from .search import Search, Solution
+from .stage import Stage
+
+MOST = 12
+"""Most sequences of modes to try from one start."""
+PATIENCE = 60
+"""Most iterations of one of them."""
+STRETCH = 1e-3
+"""What it costs all intervals to change their durations by as much as they are, over the cost: of
+many equal choices the nearest is made."""
+WORTH = 1e-4
+"""Least gain of a move over the cost; dropping what has shrunk to nothing may cost as much."""
+
+
+def improve(search: Search, solution: Solution) -> Solution:
+    """Change the modes of a solution for as long as that makes it better."""
+    known = {sign_sequence(solution.stages)}
+    waiting = _list(search, solution)
+    while waiting and len(known) < MOST:
+        moved = waiting.pop(0)
+        signs = sign_sequence(moved)
+        if signs in known:
+            continue
+        known.add(signs)
+        other = search.solve(moved, most=PATIENCE)
+        search.effort.sequences += 1
+        if not other.success:
+            continue
+        gain = solution.cost - other.cost
+        least = WORTH if len(moved) >= len(solution.stages) else -WORTH
+        if gain > least * abs(solution.cost):
+            solution, waiting = other, _list(search, other)
+        elif _rolls(moved) > _rolls(solution.stages):
+            # No better by itself, but it tells which way its contacts would slide.
+            waiting = [*_list(search, other, leaning=True), *waiting]
+    return solution
+
+
+def adapt(search: Search, solution: Solution) -> Solution:
+    """Let the intervals choose their shares of the duration: torques then switch between them.
+
+    The stages returned still choose, at a price that solving for finer ones leaves out.
+    """
+    count = sum(stage.intervals for stage in solution.stages)
+    price = STRETCH * abs(solution.cost) / count
+    loose = [replace(stage, adapts=price) for stage in solution.stages]
+    moved = search.solve(loose, solution, most=PATIENCE)
+    return moved if moved.success and moved.cost < solution.cost else solution
+
+
+def _list(search: Search, solution: Solution, leaning: bool = False) -> list[list[Stage]]:
+    own = [search.problem.phases[stage.phase].formation for stage in solution.stages]
+    epsilon = search.problem.epsilon
+    return list(list_moves(solution.stages, search.scheme, own, epsilon, leaning))
+
+
+def _rolls(stages: list[Stage]) -> int:
+    return sum(stage.formation.n_rolling for stage in stages)

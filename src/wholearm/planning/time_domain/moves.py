@@ -1,0 +1,221 @@
+"""Changes of a sequence of modes that a solution asks for.
+
+Where the least rate of a sense holds a contact back over a stretch, rolling there allows what the
+stretch does and more; where a rolling contact leans on one side of its cone over a stretch, so does
+sliding that way. A stage that has shrunk to nothing is in the way of others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.arrays import Array
+from ...contacts.formation import Formation
+from .collocation import Scheme
+from .modes import drop, link, merge, mode_of, release_earlier, split
+from .nlp import least_rates
+from .stage import Stage
+
+_STALLED = 1e-6
+"""Rate over the largest one at which a direction of friction counts as held back."""
+_SLOW = 1e-2
+"""Rate over the largest one below which what is held back stays in all of an interval."""
+_LEANS = 1e-4
+"""Margin to the friction cone over mu c_n at which a rolling contact counts as leaning on it."""
+_GONE = 2e-4
+"""Mean duration of an interval, in the scene's unit of time, below which its stage counts as shrunk
+to nothing."""
+
+
+class Run(NamedTuple):
+    """A stretch of a stage over which something is at its limit.
+
+    Attributes
+    ----------
+    row : int
+        Of (contacts, joints).
+    begin, stop : int
+        Its intervals.
+    sign : float
+        Direction, of a rolling contact that leans on its cone, in which it would slide; 0 for one
+        that its least rate holds back.
+    share : float, [s]
+        How long it lasts.
+    """
+
+    row: int
+    begin: int
+    stop: int
+    sign: float
+    share: float
+
+
+def list_moves(
+    stages: Sequence[Stage],
+    scheme: Scheme,
+    own: Sequence[Formation],
+    epsilon: float,
+    leaning: bool = False,
+) -> Iterator[list[Stage]]:
+    """Sequences of stages that a solution asks for, the most promising ones first.
+
+    Parameters
+    ----------
+    stages : sequence of Stage
+        With the solution as guesses.
+    own : sequence of Formation
+        The formation that each stage's phase asks for: what rolls there has to.
+    epsilon : float
+    leaning : bool
+        Whether only contacts count that lean on their cones.
+    """
+    if leaning:
+        runs = [
+            (run, k)
+            for k, stage in enumerate(stages)
+            for run in _find_leaning(stage, scheme, own[k], epsilon)
+        ]
+        yield from _apply(stages, scheme, own, runs)
+        return
+    for index, stage in enumerate(stages):
+        if stage.guess.duration < _GONE * stage.intervals:
+            left = drop(stages, index)
+            if left is not None:
+                yield link(merge(left))
+    for index in range(len(stages)):
+        left = release_earlier(stages, index)
+        if left is not None:
+            yield link(merge(left))
+    runs = [
+        (run, index)
+        for index, stage in enumerate(stages)
+        for run in [
+            *_find_held(stage, scheme),
+            *_find_leaning(stage, scheme, own[index], epsilon),
+        ]
+    ]
+    yield from _apply(stages, scheme, own, runs)
+
+
+def _apply(
+    stages: Sequence[Stage],
+    scheme: Scheme,
+    own: Sequence[Formation],
+    runs: list[tuple[Run, int]],
+) -> Iterator[list[Stage]]:
+    """Stages in which what is at its limit over a run moves in another way; whole ones first."""
+    wide = [
+        (run._replace(begin=0, stop=stages[k].intervals), k)
+        for run, k in runs
+        if _is_most(run, stages[k])
+    ]
+    runs.sort(key=lambda found: -found[0].share)
+    wide.sort(key=lambda found: -found[0].share)
+    for run, index in [*wide, *runs]:
+        stage = stages[index]
+        signs = [run.sign] if run.sign else [0.0, -mode_of(stage).signs[run.row]]
+        if _comes_to_rest(stages, index, own, run.row):
+            signs = [sign for sign in signs if sign]
+        pieces = [_change(stages, index, run, sign, scheme) for sign in signs]
+        # What can roll turns by rolling first.
+        found = next((piece for piece in pieces if piece is not None), None)
+        if found is not None:
+            yield link(merge([*stages[:index], *found, *stages[index + 1 :]]))
+
+
+def _comes_to_rest(stages: Sequence[Stage], index: int, own: Sequence[Formation], row: int) -> bool:
+    """Whether a contact slides until its phase ends, since the next phase lets it roll."""
+    stage = stages[index]
+    last = max(k for k, other in enumerate(stages) if other.phase == stage.phase)
+    if row >= stage.formation.n_contacts or last + 1 == len(stages):
+        return False
+    return stage.formation.contacts[row] in set(own[last + 1].rolling) - set(own[index].rolling)
+
+
+def _is_most(run: Run, stage: Stage) -> bool:
+    """Whether a run is more than half of its stage."""
+    return 2 * run.share > stage.guess.duration
+
+
+def _change(
+    stages: Sequence[Stage], index: int, run: Run, sign: float, scheme: Scheme
+) -> list[Stage] | None:
+    """Pieces of a stage with another direction in a run, or None if that cannot be."""
+    stage, formation = stages[index], stages[index].formation
+    rows = formation.turn_with(run.row)
+    if sign == 0:
+        full = formation.n_constraints >= 4
+        if run.row >= formation.n_contacts or len(rows) > 1 or full:
+            return None
+        if formation.friction[run.row] == 0:
+            return None
+    mode = mode_of(stage).changed(rows, sign)
+    # Where the neighbour is in that mode already, the place between them has been chosen.
+    at_start, at_end = run.begin == 0, run.stop == stage.intervals
+    if not (at_start and at_end):
+        near = [stages[index - 1]] if at_start and index else []
+        near += [stages[index + 1]] if at_end and index + 1 < len(stages) else []
+        if any(other.phase == stage.phase and mode_of(other) == mode for other in near):
+            return None
+    return split(stage, scheme, run.begin, run.stop, mode)
+
+
+def _find_held(stage: Stage, scheme: Scheme) -> list[Run]:
+    """Stretches over which a least rate holds something back.
+
+    A polynomial that is held back touches the least rate at few points of an interval, so whole
+    intervals count that touch it and are slow throughout.
+    """
+    formation, part = stage.formation, stage.guess
+    z, v = part.z.reshape(-1, 5), part.v.reshape(-1, 5)
+    senses = stage.measure_senses(z, v)
+    fast = np.abs(v[:, 2:]).max()
+    least = 1.01 * least_rates(stage, stage.guess.places(scheme.points)).reshape(-1, 1)
+    touches = senses < least + _STALLED * fast
+    touches &= (np.abs(senses).max(axis=1) > 1e-3 * fast)[:, None]
+    shape = (stage.intervals, scheme.degree, -1)
+    slow = (senses < least + _SLOW * fast).reshape(shape).all(axis=1)
+    held = np.repeat(slow & touches.reshape(shape).any(axis=1), scheme.degree, axis=0)
+    held[:, list(formation.rolling_rows)] = False
+    return _find_runs(held, stage, scheme, np.zeros(held.shape[1]))
+
+
+def _find_leaning(stage: Stage, scheme: Scheme, own: Formation, epsilon: float) -> list[Run]:
+    """Stretches over which a contact that need not roll leans on one side of its cone."""
+    formation, n_c = stage.formation, stage.formation.n_contacts
+    runs = []
+    for k, row in enumerate(formation.rolling_rows):
+        if formation.contacts[row] in own.rolling:
+            continue
+        c_n = stage.guess.forces[..., row].ravel()
+        c_t = stage.guess.forces[..., n_c + k].ravel()
+        mu = formation.friction[row]
+        near = mu * (c_n - epsilon) - np.abs(c_t) < _LEANS * mu * c_n
+        for sign in (1.0, -1.0):
+            leaning = np.zeros((len(c_n), n_c + 2), dtype=bool)
+            # Friction pushes against sliding.
+            leaning[:, row] = near & (sign * c_t < 0)
+            runs += _find_runs(leaning, stage, scheme, np.full(n_c + 2, sign))
+    return runs
+
+
+def _find_runs(flags: NDArray[np.bool_], stage: Stage, scheme: Scheme, signs: Array) -> list[Run]:
+    """Longest run of True in each column, of shape (K d, n), if it is an interval long."""
+    found = []
+    for row, column in enumerate(flags.T):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], column.astype(int), [0]])))
+        runs = list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+        if not runs:
+            continue
+        first, last = max(runs, key=lambda run: run[1] - run[0])
+        if last - first < scheme.degree:
+            continue
+        begin, stop = first // scheme.degree, -(-last // scheme.degree)
+        breaks = stage.guess.breaks
+        share = float(breaks[stop] - breaks[begin]) * stage.guess.duration
+        found.append(Run(row, begin, stop, float(signs[row]), share))
+    return found

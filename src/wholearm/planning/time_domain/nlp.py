@@ -1,0 +1,395 @@
+"""The planning NLP in the time domain, for formations with any number of freedoms.
+
+A stage is a stretch on one formation with fixed directions of friction, in K intervals of unknown
+durations h with d collocation points each. Torques are linear in each interval and may step
+between. Unknowns are z and z' at the nodes between intervals, h of each interval, and z, z', z''
+and the contact forces c at every point, where
+
+    C(z) = 0,  P z' = 0,  P z'' + P' z' = 0,
+    M5 z'' + B z' = g - D sigma + S tau + G^T c,
+    c_n >= epsilon,  |tau| <= limit,  Xi A_t z' >= 0,  sigma theta' >= 0,
+    |c_t| <= mu (c_n - epsilon) (rolling).
+
+So contacts hold at every point, without drift, and friction never pushes the wrong way. Along the
+contacts' tangent space alone, with an orthonormal basis N of the null space of P at a guess of
+each interval, the differential equations are collocated:
+
+    N^T (z_j - z_0 - h sum_l a_jl z'_l) = 0,  N^T (z'_j - z'_0 - h sum_l a_jl z''_l) = 0.
+
+Nothing but these rows knows of durations, so that a stage may shrink to nothing. The intervals of a
+stage keep their shares of it, or within bounds choose them. Unknowns and rows are in the order of
+time. What stands still at an instant has no sense of friction there: an inequality that equations
+keep at zero would leave the solver no interior. All quantities are in units that fit the scene.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.arrays import Array, Expression
+from ...geometry.curve import tangent_basis
+from ...solvers.ipopt import build_solver
+from ..options import Objective
+from .assembly import Assembled, Indices, assemble_nlp
+from .collocation import Scheme
+from .kernels import (
+    collocation_kernel,
+    effort_kernel,
+    end_kernel,
+    goal_kernel,
+    impact_kernel,
+    opening_kernel,
+    point_kernel,
+    stretch_kernel,
+    watch_kernel,
+)
+from .layout import MARGIN, StageLayout, V, Z, lay_out
+from .limits import Give, LimitRows, add_limits
+from .rows import Rows
+from .stage import Stage
+
+SLIDING = 1e-5
+"""Least sliding, over the radius of gyration, and least speed of a joint, in the scene's unit of
+time: what does not move at all would have no sense."""
+SHORTEST = 1e-6
+"""Least duration of an interval, in the scene's unit: next to nothing, and not nothing."""
+EVEN = 0.2
+"""Least duration of an interval that chooses its share over that of its neighbour."""
+_HURRY = 3e-4
+"""Weight of time against shortfalls: keeps a motion that is short of something brisk."""
+LONGEST = 120.0
+"""Most processor time of one run of the solver [s]: iterations need not end by themselves."""
+NEAR, FAR = 1e-6, 1e-2
+"""How far from its bounds a start is kept: a solution, and a first guess."""
+
+
+@dataclass(frozen=True, eq=False)
+class StageRows:
+    """Rows of one stage, interval by interval.
+
+    Attributes
+    ----------
+    states : ndarray of int, shape (K, m)
+        How z and z' go on.
+    points : ndarray of int, shape (K, d, m)
+        What holds at the points.
+    limits : LimitRows
+    watches : ndarray of int, shape (K, d, m)
+        Limits of the formation.
+    """
+
+    states: Indices
+    points: Indices
+    limits: LimitRows
+    watches: Indices
+
+    @property
+    def groups(self) -> tuple[Indices, ...]:
+        """All of them."""
+        return (self.states, self.points, *self.limits, self.watches)
+
+
+@dataclass(frozen=True, eq=False)
+class TimeNLP:
+    """A built NLP.
+
+    Attributes
+    ----------
+    assembled : Assembled
+    max_iter : int
+        Most iterations of the solver.
+    seconds : float, [s]
+        Most processor time of the solver.
+    layouts : list of StageLayout
+    rows : Rows
+    rows_of : list of StageRows
+    lasts : int
+        Row of the whole duration, if something gives way; otherwise -1.
+    soft : ndarray of bool, shape (2,)
+        Which torque limits are rows and not bounds.
+    build_time : float, [s]
+    """
+
+    assembled: Assembled
+    max_iter: int
+    seconds: float
+    layouts: list[StageLayout]
+    rows: Rows
+    rows_of: list[StageRows]
+    lasts: int
+    soft: NDArray[np.bool_]
+    build_time: float
+
+    @cached_property
+    def solver(self) -> Expression:
+        """Ipopt, to start from a solution."""
+        return self._build(NEAR)
+
+    @cached_property
+    def first_solver(self) -> Expression:
+        """Ipopt, to start from a guess."""
+        return self._build(FAR)
+
+    def _build(self, push: float) -> Expression:
+        built = self.assembled
+        return build_solver(
+            "time_nlp",
+            built.nlp,
+            push,
+            built.derivatives,
+            max_iter=self.max_iter,
+            max_cpu_time=self.seconds,
+        )
+
+
+def build_time_nlp(
+    stages: Sequence[Stage],
+    scheme: Scheme,
+    objective: Objective,
+    time_weight: float,
+    max_iter: int,
+    give: Give | None = None,
+    seconds: float = LONGEST,
+    price: Array | None = None,
+) -> TimeNLP:
+    """Build the NLP of stages that follow one another and end at rest.
+
+    Parameters
+    ----------
+    stages : sequence of Stage
+    scheme : Scheme
+    objective : Objective
+    time_weight : float, [(N m)^2]
+        For `effort`.
+    max_iter : int
+        Most iterations of the solver.
+    give : Give, optional
+        Which limits give way, for `relax`; for `margin` it is every c_n.
+    seconds : float, [s]
+        Most processor time of the solver.
+    price : ndarray, optional, shape (5,)
+        What z at the end costs.
+    """
+    started = time.perf_counter()
+    if objective is Objective.MARGIN:
+        give = Give(-1.0)
+    layouts = lay_out(stages, scheme, give is not None, objective is Objective.ELASTIC)
+    rows, cost = Rows(), np.zeros(layouts[-1].stop)
+    own = rows.linear(
+        10, low=stages[0].guess.nodes[0].ravel(), high=stages[0].guess.nodes[0].ravel()
+    )
+    rows.put(own, layouts[0].nodes[0, :10], 1.0)
+    weights = {Objective.TIME: 1.0, Objective.EFFORT: time_weight, Objective.ELASTIC: _HURRY}
+    rows_of = []
+    for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True)):
+        rows_of.append(_add_stage(rows, stage, layout, scheme, stage is stages[-1], give))
+        if k + 1 < len(stages):
+            _join(rows, stage, stages[k + 1], layout, layouts[k + 1].nodes[0])
+        if objective is Objective.EFFORT:
+            columns = np.hstack([layout.tau, layout.h[:, None]])
+            rows.charge(effort_kernel(), columns, np.zeros((len(columns), 0)))
+        if stage.adapts:
+            lengths = stage.guess.duration * stage.guess.fractions
+            parameters = np.column_stack([np.full(len(lengths), stage.adapts), lengths])
+            rows.charge(stretch_kernel(), layout.h[:, None], parameters)
+        cost[layout.h] = weights.get(objective, 0.0)
+        cost[layout.short] = 1 / stage.intervals
+    lasts, last, end = -1, stages[-1], layouts[-1].nodes[-1]
+    if give is not None:
+        cost[end[MARGIN]] = -1.0 if objective is Objective.MARGIN else 1.0
+        total = rows.linear(1, high=np.inf)
+        rows.put(total, np.concatenate([layout.h for layout in layouts]), 1.0)
+        lasts = int(total[0])
+    if price is not None:
+        cost[end[Z]] = price
+    N = tangent_basis(last.formation, last.guess.nodes[-1, 0])
+    rest = rows.linear(N.shape[1])
+    rows.put(rest[:, None], end[V], N.T)
+    built = assemble_nlp(len(cost), rows.triplets, rows.linear_rows, rows.blocks, cost)
+    soft = np.array(give.tau if give else (0.0, 0.0)) + (objective is Objective.ELASTIC) > 0
+    build_time = time.perf_counter() - started
+    return TimeNLP(built, max_iter, seconds, layouts, rows, rows_of, lasts, soft, build_time)
+
+
+def _add_stage(
+    rows: Rows,
+    stage: Stage,
+    layout: StageLayout,
+    scheme: Scheme,
+    last: bool,
+    give: Give | None,
+) -> StageRows:
+    """What holds in a stage."""
+    formation = stage.formation
+    node, coming = layout.nodes[:-1], layout.nodes[1:]
+    chain = rows.linear(*node.shape)
+    rows.put(chain, coming, 1.0)
+    rows.put(chain[:, :MARGIN], layout.ends, -1.0)
+    rows.put(chain[:, MARGIN:], node[:, MARGIN:], -1.0)
+    states = np.hstack([chain, _collocate(rows, stage, layout, scheme)])
+    _share(rows, stage, layout)
+    points = _balance(rows, stage, layout, scheme, last)
+    if not scheme.ends:
+        first = node[:, Z] if formation.rolling else node[:, :0]
+        kernel = end_kernel(formation)
+        own = rows.nonlinear(stage.intervals, kernel.outputs)
+        rows.repeat(kernel, np.hstack([layout.ends, first]), own)
+        states = np.hstack([states, own])
+    watches = _watch(rows, stage, layout, scheme)
+    gained = [formation.limits[k].gained for k in stage.released]
+    for contact in [c for c in gained if c is not None and stage.opens]:
+        columns = [layout.z[0], layout.v[0], layout.a[0]]
+        own = rows.nonlinear(scheme.degree, 1, low=stage.opening, high=np.inf)
+        rows.repeat(opening_kernel(formation, contact), np.hstack(columns), own)
+    goal = goal_kernel(formation, stage.until, stage.turns, stage.gained)
+    if goal is not None:
+        rows.repeat(goal, layout.nodes[-1:, :MARGIN], rows.nonlinear(1, goal.outputs))
+    limits = add_limits(rows, stage, layout, scheme, give)
+    return StageRows(states, points, limits, watches)
+
+
+def _collocate(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
+    """Collocate z and z' along the tangent space, shape (K, m)."""
+    middles = stage.guess.z[:, scheme.degree // 2]
+    bases = [tangent_basis(stage.formation, z) for z in middles]
+    kernel = collocation_kernel(scheme.name, scheme.degree, bases[0].shape[1])
+    parameters = np.array([N.ravel(order="F") for N in bases])
+    K, collected = stage.intervals, []
+    if not kernel.outputs:
+        return np.zeros((K, 0), dtype=np.int64)
+    for state, rate, part in ((layout.z, layout.v, Z), (layout.v, layout.a, V)):
+        columns = [layout.nodes[:-1, part], state.reshape(K, -1)]
+        columns += [] if scheme.ends else [layout.ends[:, part]]
+        columns += [rate.reshape(K, -1), layout.h[:, None]]
+        own = rows.nonlinear(K, kernel.outputs)
+        rows.repeat(kernel, np.hstack(columns), own, parameters)
+        collected.append(own)
+    return np.hstack(collected)
+
+
+def _share(rows: Rows, stage: Stage, layout: StageLayout) -> None:
+    """Intervals keep their shares of the stage, or are not too uneven."""
+    before, after = layout.h[:-1], layout.h[1:]
+    if not stage.adapts:
+        own = rows.linear(len(before))
+        # In shares of an even interval, rows are of the size of others.
+        shares = stage.intervals * stage.guess.fractions
+        rows.put(own, before, shares[1:])
+        rows.put(own, after, -shares[:-1])
+        return
+    for shorter, longer in ((before, after), (after, before)):
+        own = rows.linear(len(before), high=np.inf)
+        rows.put(own, shorter, 1.0)
+        rows.put(own, longer, -EVEN)
+
+
+def _balance(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool) -> Indices:
+    """The equations of motion, constraints and senses at every point, shape (K, d, n)."""
+    formation, shape = stage.formation, layout.z.shape[:2]
+    n_c, kernel = formation.n_contacts, point_kernel(formation)
+    node = layout.nodes[:-1]
+
+    def spread(table: Indices) -> Indices:
+        return np.broadcast_to(table[:, None], (*shape, table.shape[1]))
+
+    columns = [layout.z, layout.v, layout.a, layout.forces, spread(layout.tau)]
+    columns += [spread(node[:, Z] if formation.rolling else node[:, :0])]
+    signs = np.concatenate(stage.directions)
+    parameters = np.empty((*shape, n_c + 4))
+    parameters[..., : n_c + 2] = signs
+    parameters[..., n_c + 2] = scheme.points
+    parameters[..., n_c + 3] = least_rates(stage, stage.guess.places(scheme.points))
+    sliding = [k for k in range(n_c) if k not in formation.rolling_rows]
+    still = find_still(stage, last) if scheme.ends else set()
+    senses = kernel.outputs - len(sliding)
+    high = np.where(np.arange(kernel.outputs) < senses, 0.0, np.inf)
+    low = np.zeros((*shape, kernel.outputs))
+    low[-1, -1, [senses + i for i, k in enumerate(sliding) if k in still]] = -np.inf
+    own = rows.nonlinear(*shape, kernel.outputs, low=low, high=high)
+    count = shape[0] * shape[1]
+    table = np.concatenate(columns, axis=2).reshape(count, -1)
+    rows.repeat(kernel, table, own.reshape(count, -1), parameters.reshape(count, -1))
+    return own
+
+
+def least_rates(stage: Stage, places: Array) -> Array:
+    """Least rate at `places`, shares of a stage's duration, in their shape.
+
+    It is nothing where motion starts, stops or turns, and in a stage with one freedom: there all
+    moves together, and friction cannot hold one contact alone.
+    """
+    free = stage.formation.n_constraints < 4
+    return np.asarray(SLIDING * free * np.minimum(1.0, 8 * np.minimum(places, 1 - places)))
+
+
+def find_still(stage: Stage, last: bool) -> set[int]:
+    """Rows of (contacts, joints) that stand still at the end of a stage."""
+    if last:
+        return set(range(stage.formation.n_contacts + 2))
+    coming = stage.gained.rolling if stage.gained else ()
+    rolls = [k for k, c in enumerate(stage.formation.contacts) if c in coming]
+    return {*stage.turns, *rolls}
+
+
+def _watch(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
+    """Keep limits positive, but for the one that is reached at the end, shape (K, d, m)."""
+    formation, (K, d) = stage.formation, layout.z.shape[:2]
+    if not stage.watched:
+        return np.zeros((K, d, 0), dtype=np.int64)
+    places = stage.guess.places(scheme.points).ravel()
+    low = stage.list_clearances(places, after=1 / 3).reshape(K, d, -1)
+    goal = None if stage.until is None else stage.until.contact
+    reached = [formation.limits[k].gains(goal) for k in stage.watched]
+    if scheme.ends:
+        low[-1, -1, reached] = -np.inf
+    own = rows.nonlinear(K, d, len(stage.watched), low=low, high=np.inf)
+    kernel = watch_kernel(formation, stage.watched)
+    rows.repeat(kernel, layout.z.reshape(K * d, 5), own.reshape(K * d, -1))
+    return own
+
+
+def _join(rows: Rows, stage: Stage, coming: Stage, layout: StageLayout, first: Indices) -> None:
+    """Position and velocity go on from one stage to the next; an impact changes the velocity."""
+    last = layout.nodes[-1]
+    same = np.setdiff1d(np.arange(len(first)), np.arange(5, 10)) if stage.strikes else slice(None)
+    own = rows.linear(len(first[same]))
+    rows.put(own, first[same], 1.0)
+    rows.put(own, last[same], -1.0)
+    if stage.strikes:
+        kernel = impact_kernel(stage.formation, coming.formation)
+        equal = np.arange(kernel.outputs) < 5 + coming.formation.n_constraints
+        own = rows.nonlinear(1, kernel.outputs, high=np.where(equal, 0.0, np.inf))
+        columns = [first[V], last[V], last[Z], layout.impulses]
+        rows.repeat(kernel, np.concatenate(columns)[None], own, coming.directions.Xi[None])
+
+
+def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tuple[Array, Array]:
+    """Bounds of the unknowns but for the least c_n: durations, torques, joint speeds, impulses."""
+    size = nlp.layouts[-1].stop
+    low, high = np.full(size, -np.inf), np.full(size, np.inf)
+    for stage, coming, layout in zip(stages, [*stages[1:], None], nlp.layouts, strict=True):
+        limit = np.tile(stage.formation.scene.torque_limit, 2)
+        soft = np.tile(nlp.soft, 2)
+        low[layout.tau] = np.where(soft, -np.inf, -limit)
+        high[layout.tau] = np.where(soft, np.inf, limit)
+        low[layout.short] = 0.0
+        low[layout.h] = SHORTEST
+        still = find_still(stage, stage is stages[-1]) if scheme.ends else set()
+        rate = least_rates(stage, stage.guess.places(scheme.points))
+        fastest = stage.formation.scene.speed_limit
+        for joint, sigma in enumerate(stage.directions.sigma):
+            own = layout.v[..., 3 + joint]
+            ends = np.zeros_like(own, dtype=bool)
+            ends[-1, -1] = stage.formation.n_contacts + joint in still
+            slow = np.where(ends, -fastest[joint], rate)
+            low[own] = np.where(sigma > 0, slow, -fastest[joint])
+            high[own] = np.where(sigma > 0, fastest[joint], -slow)
+        if coming is not None and stage.strikes:
+            low[layout.impulses[: coming.formation.n_contacts]] = 0.0
+    return low, high

@@ -1,0 +1,120 @@
+"""The scene's own units, in which phases are planned: whatever a problem is written in, the same.
+
+The unit of length is the object's radius of gyration, that of force its weight, that of mass its
+mass; the unit of time follows (`scene.model.Scales`). Everything that is tolerated, guessed or
+weighed in the time domain counts in these.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from ...common.arrays import Array
+from ...contacts.formation import Formation
+from ...problem.definition import Phase, Problem
+from ...scene.model import Finger, Scales, Scene
+from ...scene.polygon import Polygon
+from ..options import Objective, PlanOptions
+from .stage import Stage, StagePoints
+
+
+@lru_cache(maxsize=16)
+def in_own_units(problem: Problem) -> Problem:
+    """The problem in its scene's own units; the same object every time."""
+    scales = problem.scene.scales
+    scene = _scale_scene(problem.scene, scales)
+    phases = tuple(_scale_phase(phase, scene, scales) for phase in problem.phases)
+    return replace(
+        problem,
+        scene=scene,
+        epsilon=problem.epsilon / scales.force,
+        start=scale_state(problem.start, scales),
+        phases=phases,
+        table={},
+    )
+
+
+def _scale_scene(scene: Scene, scales: Scales) -> Scene:
+    body = scene.polygon
+    assert body.inertia is not None
+    inertia = scales.mass * scales.length**2
+    polygon = Polygon(
+        body.vertices / scales.length, body.mass / scales.mass, body.inertia / inertia
+    )
+
+    def scale(finger: Finger) -> Finger:
+        return replace(
+            finger,
+            base=np.asarray(finger.base) / scales.length,
+            length=finger.length / scales.length,
+            radius=finger.radius / scales.length,
+            inertia=finger.inertia / inertia,
+            viscous=finger.viscous / (scales.torque * scales.time),
+            dry=finger.dry / scales.torque,
+            torque_limit=finger.torque_limit / scales.torque,
+            speed_limit=finger.speed_limit * scales.time,
+        )
+
+    right, left = scene.fingers
+    gravity = scene.gravity / scales.acceleration
+    return replace(scene, polygon=polygon, fingers=(scale(right), scale(left)), gravity=gravity)
+
+
+def _scale_phase(phase: Phase, scene: Scene, scales: Scales) -> Phase:
+    until = phase.until
+    if until.coordinate == "x" and until.value is not None:
+        until = replace(until, value=until.value / scales.length)
+    formation = Formation(scene, phase.formation.contacts, phase.formation.rolling)
+    return replace(phase, formation=formation, until=until)
+
+
+def scale_state(z: Array, scales: Scales) -> Array:
+    """Configurations, shape (..., 5), in own units."""
+    return np.asarray(z / unit_lengths(scales))
+
+
+def scale_options(options: PlanOptions, scales: Scales) -> PlanOptions:
+    """Options in own units."""
+    return replace(options, time_weight=options.time_weight / scales.torque**2)
+
+
+def unit_of(goal: Objective, scales: Scales) -> float:
+    """What one unit of an objective is in SI units."""
+    efforts = scales.torque**2 * scales.time
+    return {Objective.TIME: scales.time, Objective.EFFORT: efforts}.get(goal, scales.force)
+
+
+def unit_lengths(scales: Scales) -> Array:
+    """What one unit of each coordinate of z is in SI units, shape (5,)."""
+    return np.array([scales.length, scales.length, 1.0, 1.0, 1.0])
+
+
+def to_si(stage: Stage, problem: Problem) -> Stage:
+    """A stage in SI units, of the same problem in SI units."""
+    scales, part = problem.scene.scales, stage.guess
+    lengths, unit = unit_lengths(scales), scales.time
+    points = StagePoints(
+        part.duration * unit,
+        part.fractions,
+        part.nodes * lengths / np.array([[1.0], [unit]]),
+        part.z * lengths,
+        part.v * lengths / unit,
+        part.a * lengths / unit**2,
+        part.forces * scales.force,
+        part.tau * scales.torque,
+        part.impulses * scales.force * unit,
+    )
+    formation = problem.phases[stage.phase].formation
+    rolling = stage.formation.rolling
+    if set(rolling) != set(formation.rolling):
+        formation = _with_rolling(formation, rolling)
+    return replace(stage, formation=formation, guess=points, gained=None)
+
+
+@lru_cache(maxsize=64)
+def _with_rolling(formation: Formation, rolling: tuple[object, ...]) -> Formation:
+    contacts = tuple(contact for contact in formation.contacts if contact in rolling)
+    return Formation(formation.scene, formation.contacts, contacts)

@@ -1,0 +1,77 @@
+"""Stages that a solution asks for: limits watched, intervals halved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.arrays import Array
+from .collocation import Scheme
+from .mesh import bisect
+from .stage import Stage, StagePoints
+
+DEFECT = 2e-8
+"""What collocation may miss z and z' by at the end of an interval, in the scene's own units."""
+DEAR = 1e-5
+"""What limits that are raised in an interval may cost, over the cost, without halving it."""
+AT_ONCE = 2
+"""Most times that an interval is halved at once."""
+_CHEAPER = 3
+"""Power of two by which a halving makes misses of limits cheaper."""
+_BROKEN = 1e-6
+"""How far below zero a limit is broken, over the radius of gyration."""
+
+
+def adopt(stages: Sequence[Stage], points: Sequence[StagePoints]) -> list[Stage]:
+    """The same stages with a solution as their guess."""
+    return [replace(stage, guess=part) for stage, part in zip(stages, points, strict=True)]
+
+
+def halve(
+    stages: Sequence[Stage], scheme: Scheme, times: Sequence[NDArray[np.int64]]
+) -> list[Stage]:
+    """Stages with intervals halved so many times, each of shape (K,), which keep their shares."""
+    return [
+        replace(stage, guess=bisect(stage.guess, scheme, mine)) if mine.any() else stage
+        for stage, mine in zip(settle(stages), times, strict=True)
+    ]
+
+
+def count_halvings(prices: Array, defects: Array, scheme: Scheme) -> NDArray[np.int64]:
+    """How often to halve each interval and its parts, shape (K,).
+
+    So often that what is too much will not be, by what a halving makes of it: defects shrink with
+    the scheme's order, and what misses of limits cost, to less than a tenth.
+
+    Parameters
+    ----------
+    prices : ndarray, shape (K,)
+        What raising limits by their misses would cost, over the cost.
+    defects : ndarray, shape (K, 2, 5)
+        What collocation misses at the end of an interval.
+    scheme : Scheme
+    """
+    dear = np.maximum(prices / DEAR, 1.0)
+    off = np.maximum(np.abs(defects).max(axis=(1, 2)) / DEFECT, 1.0)
+    times = np.maximum(np.log2(dear) / _CHEAPER, np.log2(off) / scheme.order)
+    return np.asarray(np.clip(np.ceil(times), 0, AT_ONCE), dtype=np.int64)
+
+
+def settle(stages: Sequence[Stage]) -> list[Stage]:
+    """Stages whose intervals keep the shares of the duration that they have."""
+    return [replace(stage, adapts=0.0) if stage.adapts else stage for stage in stages]
+
+
+def watch_broken(stages: Sequence[Stage]) -> list[Stage] | None:
+    """Stages that also watch the limits which their guesses break, or None if they break none."""
+    changed = []
+    for stage in stages:
+        values = stage.formation.evaluate_limits(stage.guess.z.reshape(-1, 5))
+        rho = stage.formation.scene.polygon.gyration_radius
+        broken = np.flatnonzero(values.min(axis=0) < -_BROKEN * rho).tolist()
+        changed.append(replace(stage, watched=tuple(sorted({*stage.watched, *broken}))))
+    watched = [stage.watched for stage in stages]
+    return changed if [stage.watched for stage in changed] != watched else None

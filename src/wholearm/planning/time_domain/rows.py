@@ -1,0 +1,68 @@
+"""Constraints of an NLP under construction: linear rows, and rows that are kernels' outputs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...common.arrays import Array
+from .assembly import Block, Indices, Kernel, Triplets
+
+
+class Rows:
+    """Constraints in the order in which they are added, with their bounds."""
+
+    def __init__(self) -> None:
+        self.blocks: list[Block] = []
+        self._count = 0
+        self._low: list[Array] = []
+        self._high: list[Array] = []
+        self._linear: list[Indices] = []
+        self._entries: list[tuple[Array, Array, Array]] = []
+
+    def nonlinear(self, *shape: int, low: Any = 0.0, high: Any = 0.0) -> Indices:
+        """Rows of a kernel, equal to zero unless bounds are given."""
+        own = self._count + np.arange(int(np.prod(shape))).reshape(shape)
+        self._count += own.size
+        for bounds, given in ((self._low, low), (self._high, high)):
+            bounds.append(np.broadcast_to(np.asarray(given, dtype=float), shape).ravel())
+        return own
+
+    def linear(self, *shape: int, low: Any = 0.0, high: Any = 0.0) -> Indices:
+        """Rows that are sums of unknowns, equal to zero unless bounds are given."""
+        own = self.nonlinear(*shape, low=low, high=high)
+        self._linear.append(own.ravel())
+        return own
+
+    def put(self, rows: Any, columns: Any, values: Any) -> None:
+        """Add entries to linear rows; the three are broadcast against one another."""
+        parts = np.broadcast_arrays(rows, columns, np.asarray(values, dtype=float))
+        self._entries.append((parts[0].ravel(), parts[1].ravel(), parts[2].ravel()))
+
+    def repeat(
+        self, kernel: Kernel, columns: Indices, rows: Indices, parameters: Array | None = None
+    ) -> None:
+        """Say which rows are copies of a kernel, one per row of `columns`."""
+        given = np.zeros((len(columns), 0)) if parameters is None else parameters
+        self.blocks.append(Block(kernel, columns, rows, given))
+
+    def charge(self, kernel: Kernel, columns: Indices, parameters: Array) -> None:
+        """Add copies of a kernel to the cost."""
+        nothing = np.zeros((len(columns), 0), dtype=np.int64)
+        self.blocks.append(Block(kernel, columns, nothing, parameters))
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of all rows."""
+        return np.concatenate(self._low), np.concatenate(self._high)
+
+    @property
+    def linear_rows(self) -> Indices:
+        """Which rows are linear."""
+        return np.concatenate(self._linear)
+
+    @property
+    def triplets(self) -> Triplets:
+        """Entries of the linear rows."""
+        return Triplets(*(np.concatenate(part) for part in zip(*self._entries, strict=True)))

@@ -1,0 +1,320 @@
+"""Solving for stages: one NLP after another, until limits hold between points too."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ...common.arrays import Array
+from ...geometry.cost_to_go import CostToGo
+from ...problem.definition import Problem
+from ..options import Objective, PlanOptions
+from .between import Limits, find_misses, look_between, raise_bounds, watch_missed
+from .collocation import Scheme, make_scheme
+from .layout import pack, unpack
+from .limits import Give
+from .motion import make_motions
+from .nlp import LONGEST, TimeNLP, bound_unknowns, build_time_nlp
+from .own_units import in_own_units, scale_options, unit_lengths, unit_of
+from .refinement import adopt, count_halvings, halve, settle, watch_broken
+from .stage import Stage
+from .warm_start import FIRST_SIZE, Multipliers, carry_multipliers, first_multipliers
+
+ROUNDS = 24
+"""Most times that limits are tightened."""
+REFINEMENTS = 8
+"""Most times that intervals are halved because of misses."""
+MOST = 64
+"""Intervals of each phase from which on none is halved."""
+_PATIENCE = 80
+"""Most iterations of one solve on finer intervals, that starts from a solution."""
+_ITERATIONS = {Objective.ELASTIC: 300, Objective.RELAX: 150}
+"""Most iterations of one solve, if not 150."""
+_DEARER = 0.2
+"""How much dearer, relatively, a plan may get by tightening before it counts as lost."""
+_COARSE = 0.1
+"""How much dearer, relatively, it may get on finer intervals."""
+
+
+@dataclass
+class Effort:
+    """What solving has cost so far; `sequences` counts the sequences of modes that were tried."""
+
+    iterations: int = 0
+    solves: int = 0
+    build_time: float = 0.0
+    solve_time: float = 0.0
+    sequences: int = 1
+
+
+class Price(NamedTuple):
+    """What the end of stages costs: `gradient` @ (z - `origin`), both of shape (5,)."""
+
+    gradient: Array
+    origin: Array
+
+
+class Solution(NamedTuple):
+    """Stages with what the solver found as their guess.
+
+    Attributes
+    ----------
+    stages : list of Stage
+    cost : float
+        Objective.
+    margin : float
+        Least c_n over epsilon, if that is an unknown.
+    status : str
+        How it ended, in words.
+    success : bool
+    nlp : TimeNLP
+        What was solved.
+    multipliers : dict
+        What it ended with.
+    """
+
+    stages: list[Stage]
+    cost: float
+    margin: float
+    status: str
+    success: bool
+    nlp: TimeNLP
+    multipliers: Multipliers
+
+    @property
+    def end(self) -> Array:
+        """Where the stages end, shape (5,)."""
+        return np.asarray(self.stages[-1].guess.nodes[-1, 0])
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether it was one on coarse intervals, and did not hold on finer ones."""
+        return not self.success and not self.status.startswith("Ipopt")
+
+    @property
+    def watched(self) -> list[tuple[int, ...]]:
+        """Limits that each stage watches."""
+        return [stage.watched for stage in self.stages]
+
+
+@dataclass
+class Search:
+    """A search for a plan: what stays the same from solve to solve, and what it has cost.
+
+    It works in the scene's own units.
+
+    Attributes
+    ----------
+    problem : Problem
+    options : PlanOptions
+    scheme : Scheme
+    duration : float or None
+        Longest duration, for the objective `margin`.
+    goal : Objective
+    give : Give or None
+        Which limits give way, for the objective `relax`.
+    to_go : callable or None
+        What follows costs from where stages end, and its gradient, each by the objective.
+    price : Price or None
+    effort : Effort
+    """
+
+    problem: Problem
+    options: PlanOptions
+    scheme: Scheme
+    duration: float | None
+    goal: Objective
+    give: Give | None = None
+    to_go: Callable[[Array], tuple[float, Array]] | None = None
+    price: Price | None = None
+    effort: Effort = field(default_factory=Effort)
+
+    @staticmethod
+    def of(
+        problem: Problem,
+        options: PlanOptions,
+        duration: float | None = None,
+        to_go: CostToGo | None = None,
+    ) -> Search:
+        """A search for a problem, options, a longest duration and a cost-to-go in SI units."""
+        scales = problem.scene.scales
+        lengths, unit = unit_lengths(scales), unit_of(options.goal, scales)
+
+        def expand(z: Array) -> tuple[float, Array]:
+            assert to_go is not None
+            value, gradient = to_go.expand(z * lengths)
+            return value / unit, gradient * lengths / unit
+
+        return Search(
+            in_own_units(problem),
+            scale_options(options, scales),
+            make_scheme(options.scheme, options.degree),
+            None if duration is None else duration / scales.time,
+            options.goal,
+            to_go=expand if to_go else None,
+        )
+
+    def aiming(self, goal: Objective, give: Give | None = None) -> Search:
+        """The same search with another objective."""
+        return replace(self, goal=goal, give=give, duration=None, to_go=None, price=None)
+
+    def charge(self, z: Array) -> float:
+        """What it costs to end at `z`, shape (5,)."""
+        return float(self.price.gradient @ (z - self.price.origin)) if self.price else 0.0
+
+    def solve(
+        self,
+        stages: list[Stage],
+        before: Solution | None = None,
+        most: int = 150,
+        seconds: float = LONGEST,
+    ) -> Solution:
+        """Solve from the stages' guesses, until no limit is broken at the points.
+
+        Parameters
+        ----------
+        most : int
+            Most iterations.
+        seconds : float, [s]
+            Most processor time of each run of the solver.
+        """
+        while True:
+            nlp = self.build(stages, most, seconds)
+            multipliers = None
+            if before is not None and before.watched == [stage.watched for stage in stages]:
+                multipliers = carry_multipliers(
+                    before.multipliers, before.nlp, nlp, before.stages, stages
+                )
+            plain = [Limits.none(stage) for stage in stages]
+            margin = before.margin if before else 0.0
+            solution = self.run(nlp, stages, plain, multipliers, margin)
+            watching = watch_broken(solution.stages) if solution.success else None
+            if watching is None:
+                return solution
+            stages = watching
+
+    def build(self, stages: Sequence[Stage], most: int = 150, seconds: float = LONGEST) -> TimeNLP:
+        """Build the NLP."""
+        weight, limit = self.options.time_weight, _ITERATIONS.get(self.goal, most)
+        gradient = self.price.gradient if self.price else None
+        nlp = build_time_nlp(
+            stages, self.scheme, self.goal, weight, limit, self.give, seconds, gradient
+        )
+        self.effort.build_time += nlp.build_time
+        return nlp
+
+    def run(
+        self,
+        nlp: TimeNLP,
+        stages: Sequence[Stage],
+        limits: Sequence[Limits],
+        multipliers: Multipliers | None,
+        margin: float,
+    ) -> Solution:
+        """Run the solver once."""
+        low, high = bound_unknowns(nlp, stages, self.scheme)
+        low_g, high_g = raise_bounds(nlp, stages, limits, self.problem.epsilon, (low, high))
+        if self.duration is not None and nlp.lasts >= 0:
+            high_g[nlp.lasts] = self.duration
+        solver = nlp.first_solver if multipliers is None else nlp.solver
+        result = solver(
+            x0=pack([stage.guess for stage in stages], nlp.layouts, margin),
+            lbx=low,
+            ubx=high,
+            lbg=low_g,
+            ubg=high_g,
+            **(multipliers or first_multipliers((low, high), (low_g, high_g), FIRST_SIZE)),
+        )
+        stats = solver.stats()
+        self.effort.iterations += stats["iter_count"]
+        self.effort.solves += 1
+        self.effort.solve_time += stats["t_wall_total"]
+        x, cost = result["x"].full()[:, 0], float(result["f"])
+        cost -= float(self.price.gradient @ self.price.origin) if self.price else 0.0
+        return Solution(
+            adopt(stages, unpack(x, nlp.layouts)),
+            cost,
+            -cost if self.goal is Objective.MARGIN else 0.0,
+            f"Ipopt stopped with {stats['return_status']}",
+            stats["success"],
+            nlp,
+            {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")},
+        )
+
+    def price_misses(self, solution: Solution, misses: Sequence[Limits]) -> list[Array]:
+        """What raising limits by their misses would cost in each interval, over the cost, (K,)."""
+        on_x, on_g = (np.abs(solution.multipliers[key]) for key in ("lam_x0", "lam_g0"))
+        prices = []
+        for k, (stage, miss) in enumerate(zip(solution.stages, misses, strict=True)):
+            layout, rows = solution.nlp.layouts[k], solution.nlp.rows_of[k].limits
+            n_c, R = stage.formation.n_contacts, stage.formation.n_rolling
+            price = on_x[layout.forces[:, :, :n_c]].sum(axis=1) + on_g[rows.presses].sum(axis=1)
+            both = on_g[rows.cones].sum(axis=1)
+            grip = both[:, :R] + both[:, R:]
+            cost = (price * miss.c_n).sum(axis=1) + (grip * miss.cone).sum(axis=1)
+            prices.append(np.asarray(cost / max(abs(solution.cost), 1e-300)))
+        return prices
+
+    def hold(self, solution: Solution) -> Solution:
+        """Go on from a solution until limits hold between points too."""
+        refined, first = 0, solution.cost
+        limits = [Limits.none(stage) for stage in solution.stages]
+        for _ in range(ROUNDS):
+            motions = make_motions(solution.stages, self.scheme)
+            looks = [
+                look_between(stage, motion)
+                for stage, motion in zip(solution.stages, motions, strict=True)
+            ]
+            watching = watch_missed(solution.stages, looks)
+            if watching is not None:
+                solution = self.solve(watching, solution)
+                if not solution.success:
+                    return solution
+                limits = [Limits.none(stage) for stage in solution.stages]
+                continue
+            misses = [
+                find_misses(stage, look, self.problem.epsilon, solution.margin)
+                for stage, look in zip(solution.stages, looks, strict=True)
+            ]
+            worst = max(miss.worst for miss in misses)
+            prices = self.price_misses(solution, misses)
+            times = [
+                count_halvings(price, motion.defects, self.scheme)
+                for price, motion in zip(prices, motions, strict=True)
+            ]
+            phases = len({stage.phase for stage in solution.stages})
+            few = sum(stage.intervals for stage in solution.stages) < MOST * phases
+            if few and refined < REFINEMENTS and any(mine.any() for mine in times):
+                refined += 1
+                finer = self.solve(
+                    halve(solution.stages, self.scheme, times), solution, most=_PATIENCE
+                )
+                if finer.success:
+                    if finer.cost - first > _COARSE * abs(first):
+                        status = "a plan on finer intervals is much dearer"
+                        return finer._replace(status=status, success=False)
+                    solution = finer
+                    limits = [Limits.none(stage) for stage in solution.stages]
+                    continue
+            if any(stage.adapts for stage in solution.stages):
+                solution = self.solve(settle(solution.stages), solution)
+                if not solution.success:
+                    return solution
+                continue
+            if worst <= 1:
+                return solution
+            limits = [raised.raised(miss) for raised, miss in zip(limits, misses, strict=True)]
+            tighter = self.run(
+                solution.nlp, solution.stages, limits, solution.multipliers, solution.margin
+            )
+            if not tighter.success:
+                return tighter
+            if tighter.cost - solution.cost > _DEARER * abs(solution.cost):
+                status = "a plan that keeps limits between points is much dearer"
+                return tighter._replace(status=status, success=False)
+            solution = tighter
+        status = f"limits are still missed {worst:.2g} times what is allowed between points"
+        return solution._replace(status=status, success=False)

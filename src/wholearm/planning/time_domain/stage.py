@@ -1,0 +1,138 @@
+"""Stages: stretches of a motion in the time domain, on one formation with fixed friction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ...common.arrays import Array
+from ...contacts.formation import Formation
+from ...mechanics.dynamics import Directions
+from ...problem.definition import Until
+from ..options import CLEARANCE, OPENING
+
+
+class StagePoints(NamedTuple):
+    """Motion and forces of a stage in K intervals with d points each.
+
+    Attributes
+    ----------
+    duration : float, [s]
+    fractions : ndarray, shape (K,)
+        Share of the duration that each interval has.
+    nodes : ndarray, shape (K + 1, 2, 5)
+        z and z' at the start of each interval and at the end of the last.
+    z, v, a : ndarray, shape (K, d, 5)
+        z, z' and z'' at the collocation points.
+    forces : ndarray, shape (K, d, n_c + R), [N]
+        c_n of all contacts, then c_t of the rolling ones.
+    tau : ndarray, shape (K, 2, 2), [N m]
+        At the start and at the end of each interval; linear in between.
+    impulses : ndarray, shape (n_c + R,) of the next stage, or (0,), [N s]
+        Of the impact with which the stage ends, if it does.
+    """
+
+    duration: float
+    fractions: Array
+    nodes: Array
+    z: Array
+    v: Array
+    a: Array
+    forces: Array
+    tau: Array
+    impulses: Array
+
+    @property
+    def breaks(self) -> Array:
+        """Start of each interval and end of the last, as shares of the duration, shape (K + 1,)."""
+        breaks = np.append(0.0, np.cumsum(self.fractions))
+        breaks[-1] = 1.0
+        return breaks
+
+    def places(self, points: Array) -> Array:
+        """Shares of the duration passed at `points` of every interval, shape (K, n)."""
+        return np.asarray(self.breaks[:-1, None] + self.fractions[:, None] * points)
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """A stretch on one formation with fixed directions of friction.
+
+    Attributes
+    ----------
+    phase : int
+        Index of the phase it belongs to.
+    formation : Formation
+    directions : Directions
+    guess : StagePoints
+        Where the search starts; its intervals are those of the NLP.
+    until : Until or None
+        What is reached at the end; None if the stage ends by a reversal or a release.
+    turns : tuple of int
+        Rows of (contacts, joints) whose rate is zero at the end.
+    gained : Formation or None
+        The next stage's formation where that has a constraint more, which is gained softly.
+    strikes : bool
+        Whether an impact leads to the next stage.
+    watched : tuple of int
+        Limits of the formation that are kept positive at every point.
+    released : tuple of int
+        Limits of the contacts that were let go where the phase began.
+    opens : bool
+        Whether they are let go at the start of this stage.
+    opening : float
+        Least acceleration with which the gaps of contacts that are let go open, over gravity.
+    clearance : float
+        What these gaps are at least after a third of the first stage, over the radius of gyration.
+    apart : tuple of int
+        Watched limits that are as clear at the end: what comes next ends by closing them.
+    adapts : float
+        What it costs to change the duration of an interval; nothing if they keep their shares.
+    """
+
+    phase: int
+    formation: Formation
+    directions: Directions
+    guess: StagePoints
+    until: Until | None = None
+    turns: tuple[int, ...] = ()
+    gained: Formation | None = None
+    strikes: bool = False
+    watched: tuple[int, ...] = ()
+    released: tuple[int, ...] = ()
+    opens: bool = False
+    opening: float = OPENING
+    clearance: float = CLEARANCE
+    apart: tuple[int, ...] = ()
+    adapts: float = 0.0
+
+    @property
+    def intervals(self) -> int:
+        """Number of intervals K."""
+        return len(self.guess.fractions)
+
+    def list_clearances(self, places: Array, after: float) -> Array:
+        """Least values of watched limits at `places`, shape (n,), of the stage: (n, n_watched).
+
+        From the share `after` of the stage on, but for contacts that were let go before it.
+        """
+        late = (places > after)[:, None]
+        released, apart = (np.isin(self.watched, own) for own in (self.released, self.apart))
+        return np.asarray(self.clearance * (released & (late | (not self.opens)) | apart & late))
+
+    def measure_senses(self, z: Array, v: Array) -> Array:
+        """Rates of contacts and joints in the stage's directions, shape (n, n_c + 2) [rad/s].
+
+        Those of contacts are over the radius of gyration; what moves against its direction has a
+        negative one.
+
+        Parameters
+        ----------
+        z, v : ndarray, shape (n, 5)
+            Configurations and velocities.
+        """
+        slip = np.einsum("nij,nj->ni", self.formation.evaluate(z, v).A_t, v)
+        rates = np.hstack([slip / self.formation.scene.polygon.gyration_radius, v[:, 3:]])
+        return np.asarray(rates * np.concatenate(self.directions))

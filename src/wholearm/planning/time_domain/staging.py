@@ -1,0 +1,249 @@
+"""Which stages a motion has at first: those of its outlines, with a first guess on each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from ...common.arrays import Array
+from ...geometry.path_guess import RELEASE_AT, Outline, outline_onwards, outline_phase
+from ...mechanics.dynamics import Directions, force_rows
+from ...problem.definition import End, Phase, Problem
+from .collocation import Scheme
+from .modes import LEAST_INTERVALS, link
+from .own_units import in_own_units, scale_state
+from .stage import Stage, StagePoints
+from .way_guess import PacedWay
+from .way_pace import Pace
+
+PRESS = 0.5
+"""Normal forces that a first guess is near, over the weight of the object."""
+_NEAR = 0.02
+"""Distance over the radius of gyration at which a limit is watched from the start."""
+_TOUCHES = 1e-5
+"""Gap over the radius of gyration below which a contact touches that a phase lets go."""
+
+
+def outline_stages(
+    problem: Problem,
+    phases: Sequence[Phase],
+    z: Array,
+    scheme: Scheme,
+    intervals: int,
+    pace: float,
+    onwards: bool = False,
+    release_at: float = RELEASE_AT,
+    way: PacedWay | None = None,
+) -> list[Stage]:
+    """Stages of phases that are planned as one, with a first guess, in the scene's own units.
+
+    The guessed duration is `pace` times that of a fall over the length of the outlines. With
+    `onwards`, phases that go on in motion may end farther away where that takes fewer reversals.
+    A phase that ends by a release is guessed to do so at the share `release_at` of its curve.
+    A single phase may be guessed to go a way of its own instead, at the pace of that.
+    """
+    parts: list[tuple[Phase, Outline, bool]] = []
+    for phase in phases:
+        outlines = list(way.stretches if way else outline_phase(problem, phase, z, release_at))
+        if parts and parts[-1][0].end is End.SMOOTH:
+            outlines = [*_turn_first(outlines[0], parts[-1][1]), *outlines[1:]]
+            if onwards:
+                outlines = _go_straight(phase, outlines, parts[-1][1])
+        parts += [(phase, outline, outline is outlines[-1]) for outline in outlines]
+        z = outlines[-1].z[-1]
+    own, scales = in_own_units(problem), problem.scene.scales
+    phases = [own.phases[phase.index] for phase in phases]
+    parts = [
+        (
+            own.phases[phase.index],
+            replace(
+                outline,
+                formation=own.phases[phase.index].formation,
+                z=scale_state(outline.z, scales),
+            ),
+            last,
+        )
+        for phase, outline, last in parts
+    ]
+    lengths = np.array([outline.length for _, outline, _ in parts])
+    total = pace * float(np.sqrt(lengths.sum()))
+    ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
+    # The guess runs as (1 - cos) over all stages, so each has its own share of the time.
+    own_pace = None if way is None else way.pace
+    if own_pace is not None:
+        total = float(own_pace.t[-1]) / scales.time
+        clock = np.interp(ends, own_pace.s, own_pace.t / own_pace.t[-1])
+    else:
+        clock = np.arccos(1 - 2 * np.clip(ends, 0.0, 1.0)) / np.pi
+    longest = {phase.index: lengths[[p is phase for p, _, _ in parts]].sum() for phase in phases}
+    stages: list[Stage] = []
+    released: tuple[int, ...] = ()
+    for k, (phase, outline, last) in enumerate(parts):
+        count = max(LEAST_INTERVALS, round(lengths[k] / longest[phase.index] * intervals))
+        following = own.phases[phase.index + 1] if phase is not phases[-1] and last else None
+        strikes = following is not None and phase.end is End.IMPACT
+        clocks, spans = (clock[k], clock[k + 1]), (ends[k], ends[k + 1])
+        guess = _guess(outline, scheme, count, clocks, spans, total, own_pace)
+        if strikes and following is not None:
+            guess = guess._replace(impulses=np.zeros(following.formation.n_constraints))
+        opens = k > 0 and parts[k - 1][0] is not phase
+        if opens:
+            touching = np.abs(phase.formation.evaluate_limits(outline.z[:1])[0]) < _TOUCHES
+            released = tuple(np.flatnonzero(touching).tolist())
+        stages.append(
+            Stage(
+                phase.index,
+                phase.formation,
+                outline.directions,
+                guess,
+                until=phase.until if last and not phase.until.is_release else None,
+                strikes=strikes,
+                watched=tuple(sorted({*_choose_watched(phase, outline), *released})),
+                released=released,
+                opens=opens,
+            )
+        )
+    return link(stages)
+
+
+def _guess(
+    outline: Outline,
+    scheme: Scheme,
+    count: int,
+    clock: tuple[float, float],
+    ends: tuple[float, float],
+    total: float,
+    pace: Pace | None = None,
+) -> StagePoints:
+    """Motion along an outline, without accelerations and with every contact pressed alike.
+
+    Parameters
+    ----------
+    clock, ends : tuple of float
+        Shares of all stages' time and length at the start and the end.
+    total : float, [s]
+        Duration of all stages.
+    pace : Pace, optional
+        When they are where, if not as (1 - cos).
+    """
+    knots = np.linspace(0.0, 1.0, len(outline.z))
+    slopes = np.gradient(outline.z, knots, axis=0)
+    bends = np.gradient(slopes, knots, axis=0)
+    breaks = np.linspace(0.0, 1.0, count + 1)
+
+    def follow(share: Array) -> tuple[Array, Array, Array]:
+        passed = clock[0] + share * (clock[1] - clock[0])
+        span = max(ends[1] - ends[0], 1e-12)
+        place, rate, gain = _run(passed) if pace is None else _run_at(pace, passed)
+        place = (place - ends[0]) / span
+        rate, gain = rate[..., None] / (span * total), gain[..., None] / (span * total**2)
+        z, slope, bend = (
+            np.stack([np.interp(place, knots, column) for column in table.T], axis=-1)
+            for table in (outline.z, slopes, bends)
+        )
+        return z, slope * rate, slope * gain + bend * rate**2
+
+    z, v, a = follow(breaks[:-1, None] + scheme.points / count)
+    forces, tau = _balance(outline, z, v, a)
+    return StagePoints(
+        total * (clock[1] - clock[0]),
+        np.full(count, 1 / count),
+        np.stack(follow(breaks)[:2], axis=1),
+        z,
+        v,
+        a,
+        forces,
+        tau,
+        np.zeros(0),
+    )
+
+
+def _run(passed: Array) -> tuple[Array, Array, Array]:
+    """Share of the length at shares of the time, and its derivatives, from rest to rest."""
+    angle = np.pi * passed
+    return (1 - np.cos(angle)) / 2, np.pi / 2 * np.sin(angle), np.pi**2 / 2 * np.cos(angle)
+
+
+def _run_at(pace: Pace, passed: Array) -> tuple[Array, Array, Array]:
+    """The same at a pace of its own."""
+    t = pace.t / pace.t[-1]
+    rates = np.gradient(pace.s, t)
+    rates[[0, -1]] = 0.0
+    place, rate, gain = (
+        np.interp(passed, t, table) for table in (pace.s, rates, np.gradient(rates, t))
+    )
+    return place, rate, gain
+
+
+def _balance(outline: Outline, z: Array, v: Array, a: Array) -> tuple[Array, Array]:
+    """Forces of a motion, shape (K, d, n_c + R), and torques, shape (K, 2, 2), within limits.
+
+    The object's equations of motion leave forces of which the ones nearest to a light press are
+    taken; the joints' then give the torques.
+    """
+    formation, scene = outline.formation, outline.formation.scene
+    flat = [table.reshape(-1, 5) for table in (z, v, a)]
+    sigma = outline.directions.sigma
+    G = force_rows(formation, formation.evaluate(*flat[:2]), outline.directions)
+    applied = scene.applied_force - scene.dry * np.append(np.zeros(3), sigma)
+    needed = scene.mass_diagonal * flat[2] + scene.viscous * flat[1] - applied
+    light = np.zeros(formation.n_constraints)
+    light[: formation.n_contacts] = PRESS
+    forces = []
+    for rows, wanted in zip(G[:, :, :3], needed[:, :3], strict=True):
+        missing = wanted - light @ rows
+        forces.append(light + np.linalg.lstsq(rows.T, missing, rcond=1e-6)[0])
+    c = np.array(forces)
+    c[:, : formation.n_contacts] = np.clip(c[:, : formation.n_contacts], 0.1 * PRESS, 20.0)
+    tau = needed[:, 3:] - np.einsum("nij,ni->nj", G[:, :, 3:], c)
+    tau = np.clip(tau, -0.9 * scene.torque_limit, 0.9 * scene.torque_limit)
+    count, degree = z.shape[:2]
+    tau = tau.reshape(count, degree, 2)
+    return c.reshape(count, degree, -1), np.stack([tau[:, 0], tau[:, -1]], axis=1)
+
+
+def _go_straight(phase: Phase, nearest: list[Outline], before: Outline) -> list[Outline]:
+    """Of outlines to the nearest end and to ends ahead, those with the fewest reversals."""
+    ahead = [_turn_first(other, before) for other in outline_onwards(phase, before)]
+    return min([nearest, *ahead], key=lambda way: (len(way), sum(part.length for part in way)))
+
+
+def _turn_first(outline: Outline, before: Outline) -> list[Outline]:
+    """Split an outline so that it starts with the directions of the one that it goes on from.
+
+    Velocities are continuous, so what slides the other way in the outline has to turn on the way.
+    """
+    # What rolled has no direction to keep.
+    slides = np.setdiff1d(np.arange(before.formation.n_contacts), before.formation.rolling_rows)
+    known = {before.formation.names[k]: before.directions.Xi[k] for k in slides}
+    own, formation = np.concatenate(outline.directions), outline.formation
+    n_c = formation.n_contacts
+    signs = own.copy()
+    signs[n_c:] = before.directions.sigma
+    for k in range(n_c):
+        if k not in formation.rolling_rows:
+            together = [formation.names[i] for i in formation.turn_with(k)]
+            signs[k] = next((known[name] for name in together if name in known), signs[k])
+    differing = np.flatnonzero(signs != own).tolist()
+    turns = list(dict.fromkeys(formation.turn_with(k) for k in differing))
+    pieces = []
+    cuts = np.linspace(0, len(outline.z) - 1, len(turns) + 2).astype(int)
+    for k, (begin, stop) in enumerate(pairwise(cuts)):
+        turn = turns[k] if k < len(turns) else outline.turns
+        directions = Directions(signs[:n_c].copy(), signs[n_c:].copy())
+        z = outline.z[begin : stop + 1]
+        pieces.append(replace(outline, z=z, directions=directions, turns=turn))
+        if k < len(turns):
+            signs[list(turns[k])] = own[list(turns[k])]
+    return pieces
+
+
+def _choose_watched(phase: Phase, outline: Outline) -> tuple[int, ...]:
+    """Limits that are near zero along the outline, and the phase's own end."""
+    values = outline.formation.evaluate_limits(outline.z)
+    near = values.min(axis=0) < _NEAR
+    mine = np.array([limit.gains(phase.until.contact) for limit in outline.formation.limits])
+    return tuple(np.flatnonzero(near | mine).tolist())

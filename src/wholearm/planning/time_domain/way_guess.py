@@ -1,0 +1,190 @@
+"""Ways to the end of a phase with two freedoms along which a motion keeps its limits.
+
+The nearest end is not always one that contacts can reach: pushed that way, some would have to pull.
+Ends beside it are looked at too, and straight ways to them are ranked by the largest margin that
+any motion along them can have (`planning.time_domain.way_pace`). Where none keeps its limits, the
+best of them are bent.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from ...common.arrays import Array
+from ...geometry.curve import tangent_basis
+from ...geometry.explore import close, is_inside
+from ...geometry.path_guess import Outline, connect, list_ends, outline_phase
+from ...mechanics.dynamics import Directions
+from ...mechanics.metric import metric_weights
+from ...problem.definition import Phase, Problem
+from .way_pace import Pace, WayForces
+
+STEP = 0.15
+"""How far apart ends are looked at, over the length of the way to the nearest end."""
+GROWTH = 1.2
+"""By how much more each of these is apart from the one before."""
+STEPS = 12
+"""Most ends on either side of the nearest one."""
+BENT = 4
+"""How many of the best ways are bent, twice; the best one alone after that."""
+SCALES = (1.0, 0.4, 0.3, 0.2, 0.1)
+"""How far ways are bent in each round, over `BENDS`."""
+CLOSE = -0.2
+"""Margin from which on it is worth to go on."""
+BENDS = ((0.4, 0.0), (-0.4, 0.0), (0.8, 0.0), (-0.8, 0.0), (0.0, 0.3), (0.0, -0.3))
+"""How ways are bent: parts of one arc and of two, over their length."""
+_STRETCHES = 4
+"""Most stretches of a way, between which something turns."""
+_SHORTEST = 2
+"""Fewest configurations, after its first, of a stretch that is not merged into another."""
+
+AMPLE = 1e-3
+"""Margin from which a motion surely keeps its limits."""
+
+Way = list[Outline]
+
+
+class PacedWay(NamedTuple):
+    """Stretches of a way, the largest margin of a motion along it, and a motion that is brisk."""
+
+    stretches: Way
+    margin: float
+    pace: Pace | None
+
+
+class _Bent(NamedTuple):
+    """A way to a goal with its bends, and its margin."""
+
+    goal: Array
+    bends: tuple[float, float]
+    way: Way
+    forces: WayForces
+    margin: float
+
+    @property
+    def rank(self) -> tuple[float, float]:
+        """Ways that keep limits are better the shorter they are, others the less they miss."""
+        length = float(self.forces.runs.sum())
+        return (-AMPLE, length) if self.margin > AMPLE else (-self.margin, length)
+
+
+def list_ways(problem: Problem, phase: Phase, z: Array, most: int) -> list[PacedWay]:
+    """Ways of a phase, in different modes, those on which motions keep limits best first.
+
+    Parameters
+    ----------
+    problem : Problem
+    phase : Phase
+        Of other than two freedoms, and of one that ends by a release, there are none.
+    z : ndarray, shape (5,)
+        Where it starts.
+    most : int
+        How many at most.
+    """
+    formation = phase.formation
+    if phase.until.is_release or tangent_basis(formation, z).shape[1] != 2:
+        return []
+    (nearest,) = outline_phase(problem, phase, z)
+    found: list[_Bent] = []
+
+    def look(goal: Array, bends: tuple[float, float]) -> None:
+        way = split_way(connect(formation, z, goal, bends))
+        forces = WayForces(way, problem.epsilon) if _is_free(way) else None
+        if forces is not None and np.isfinite(margin := forces.find_margin()):
+            found.append(_Bent(goal, bends, way, forces, margin))
+
+    for goal in list_goals(phase, z, nearest.z[-1]):
+        look(goal, (0.0, 0.0))
+    for turn, scale in enumerate(SCALES):
+        found.sort(key=lambda bent: bent.rank)
+        near = bool(found) and (turn < 2 or found[0].margin > CLOSE)
+        if not near or found[0].margin > AMPLE:
+            break
+        for bent in found[: BENT if turn < 2 else 1]:
+            for first, second in BENDS:
+                own, other = bent.bends
+                look(bent.goal, (own + scale * first, other + scale * second))
+    found.sort(key=lambda bent: bent.rank)
+    best: dict[tuple[float, ...], _Bent] = {}
+    for bent in found:
+        signs = [np.concatenate(part.directions) for part in bent.way]
+        best.setdefault(tuple(np.concatenate(signs).tolist()), bent)
+    return [
+        PacedWay(bent.way, bent.margin, bent.forces.find_pace(bent.margin))
+        for bent in list(best.values())[:most]
+    ]
+
+
+def _is_free(way: Way) -> bool:
+    """Whether nothing is in a way, and it has few stretches and no end of its contacts."""
+    if len(way) > _STRETCHES:
+        return False
+    touching = way[0].formation.scene.touching
+    return all(part.formation.evaluate_limits(part.z).min() > -touching for part in way)
+
+
+def list_goals(phase: Phase, z: Array, nearest: Array) -> list[Array]:
+    """Ends of a phase: the nearest, shape (5,), and others on both sides of it."""
+    formation, goals = phase.formation, [nearest]
+    metric = np.sqrt(metric_weights(formation.scene))
+    step = STEP * float(np.linalg.norm((nearest - z) * metric))
+    slip, ends = formation.evaluate_slip(z[None])[0], list_ends(phase)
+    N = tangent_basis(formation, nearest) * metric[2] / metric[:, None] ** 2
+
+    def settle(guess: Array, last: Array, step: float) -> Array | None:
+        for end in ends:
+            goal = close(end.formation, guess, slip, end.fixed, end.active)
+            if goal is None or not is_inside(end.formation, goal):
+                continue
+            if 0.2 * step < np.linalg.norm((goal - last) * metric) < 5 * step:
+                return goal
+        return None
+
+    sides: list[Array] = []
+    for way in (*N.T, *-N.T):
+        goal = settle(nearest + step * way, nearest, step)
+        # Directions across the ends lead back to those that are known.
+        if goal is not None and all((goal - nearest) @ (s - nearest) <= 0 for s in sides):
+            sides.append(goal)
+    for goal in sides:
+        last, own = nearest, step
+        for _ in range(STEPS):
+            goals.append(goal)
+            ahead = (goal - last) * metric
+            own *= GROWTH
+            ahead = own * ahead / np.linalg.norm(ahead) / metric
+            found = settle(goal + ahead, goal, own)
+            if found is None:
+                break
+            last, goal = goal, found
+    return goals
+
+
+def split_way(outline: Outline) -> Way:
+    """A way as stretches without a reversal."""
+    z, formation = outline.z, outline.formation
+    steps, middles = np.diff(z, axis=0), (z[1:] + z[:-1]) / 2
+    slip = np.einsum("nij,nj->ni", formation.evaluate(middles, steps).A_t, steps)
+    signs = np.where(np.hstack([slip, steps[:, 3:]]) < 0, -1.0, 1.0)
+    signs[:, list(formation.rolling_rows)] = 1.0
+    cuts = [0]
+    for k in range(1, len(signs)):
+        if (signs[k] != signs[cuts[-1]]).any():
+            if k - cuts[-1] < _SHORTEST:
+                signs[cuts[-1] : k] = signs[k]
+            else:
+                cuts.append(k)
+    if len(signs) - cuts[-1] < _SHORTEST and len(cuts) > 1:
+        signs[cuts.pop() :] = signs[cuts[-1]]
+    n_c, way = formation.n_contacts, list[Outline]()
+    for begin, stop in pairwise([*cuts, len(signs)]):
+        own = signs[begin]
+        turns: tuple[int, ...] = ()
+        if stop < len(signs):
+            turns = tuple(np.flatnonzero(own != signs[stop]).tolist())
+        directions = Directions(own[:n_c].copy(), own[n_c:].copy())
+        way.append(Outline(formation, z[begin : stop + 1], directions, turns))
+    return way

@@ -1,0 +1,231 @@
+"""The table of a problem file: changed by name, and kept in step with the problem it belongs to."""
+
+from __future__ import annotations
+
+import copy
+import math
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import fields
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..common.errors import InputError
+from ..contacts.formation import place_flush
+from ..scene.model import Scene
+from ..scene.polygon import Polygon
+
+if TYPE_CHECKING:
+    from .definition import Phase, Problem
+
+_OWN = {
+    "mass": ("object.mass",),
+    "vertices": ("object.vertices",),
+    "flush": ("start.flush",),
+    "x": ("start.x",),
+    "friction": ("friction.palm", "friction.finger1", "friction.finger2"),
+    "friction_palm": ("friction.palm",),
+    "friction_finger1": ("friction.finger1",),
+    "friction_finger2": ("friction.finger2",),
+}
+_OBJECT_INERTIA = {"inertia": ("object.inertia",)}
+_STEP = re.compile(r"([^.\[\]]+)|\[([1-9][0-9]*)\]")
+
+
+def name_keys(top: Collection[str], finger: Collection[str]) -> dict[str, tuple[str, ...]]:
+    """Short names for `Problem.with_` and the dotted keys that each stands for.
+
+    Parameters
+    ----------
+    top, finger : collection of str
+        Keys of a problem file, and of each finger in it.
+    """
+    names = {key: (key,) for key in top} | _OWN
+    for key in finger:
+        both = (f"fingers.1.{key}", f"fingers.2.{key}")
+        name = "finger_inertia" if key == "inertia" else key
+        names |= {f"{name}1": both[:1], f"{name}2": both[1:]}
+        if key != "base":
+            names[name] = both
+    return names | _OBJECT_INERTIA
+
+
+def change_table(
+    table: Mapping[str, Any], changes: Mapping[str, Any], names: Mapping[str, Sequence[str]]
+) -> dict[str, Any]:
+    """Return a copy of `table` with other values.
+
+    Parameters
+    ----------
+    table : mapping
+        The nested tables of a problem file.
+    changes : mapping
+        New values by short name, or by a dotted key as messages write it, such as
+        ``phases[2].until``. None removes a key.
+    names : mapping
+        Short names and their dotted keys, see `name_keys`.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown, or a dotted key leads through something that is no table.
+    """
+    changed: dict[str, Any] = copy.deepcopy(dict(table))
+    for name, value in changes.items():
+        dotted = "." in name or "[" in name
+        if not dotted and name not in names:
+            near = get_close_matches(name, names, 1, 0.5)
+            hint = f"did you mean {near[0]!r}? " if near else ""
+            raise InputError(
+                "", name, f"unknown name; {hint}allowed are {', '.join(sorted(names))}"
+            )
+        whole = name == "friction" and isinstance(value, Mapping)
+        for key in (name,) if dotted or whole else names[name]:
+            _set(changed, key, _to_plain(value))
+    return changed
+
+
+def _set(table: dict[str, Any], key: str, value: object) -> None:
+    """Set a dotted key; None removes it."""
+    steps = [word or int(number) - 1 for word, number in _STEP.findall(key)]
+    place: Any = table
+    for step in steps[:-1]:
+        place = _enter(place, step, key)
+    last = steps[-1] if steps else key
+    if isinstance(last, int):
+        _enter(place, last, key)
+        place[last] = value
+    elif not isinstance(place, dict):
+        raise InputError("", key, f"{place!r} is not a table")
+    elif value is None:
+        place.pop(last, None)
+    else:
+        place[last] = value
+
+
+def _enter(place: Any, step: str | int, key: str) -> Any:
+    if isinstance(step, int):
+        if not isinstance(place, list) or step >= len(place):
+            count = len(place) if isinstance(place, list) else 0
+            raise InputError("", key, f"there is no number {step + 1}; the list has {count}")
+    elif not isinstance(place, dict) or step not in place:
+        known = ", ".join(place) if isinstance(place, dict) else "no table"
+        raise InputError("", key, f"there is no {step!r}; what is there: {known}")
+    return place[step]
+
+
+def _to_plain(value: Any) -> Any:
+    """Numbers, text, lists and tables as a file has them."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): _to_plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_to_plain(item) for item in value]
+    return value
+
+
+def match_table(problem: Problem) -> Mapping[str, Any]:
+    """Return the problem's table with everything that differs from the problem written into it.
+
+    Empty where there is none, or where the start is no edge flush on the palm, which no file can
+    say.
+    """
+    table = problem.table
+    if not table:
+        return table
+    known = {"name": problem.name, "epsilon": problem.epsilon} | describe_scene(problem.scene)
+    differing = {key: value for key, value in known.items() if not _agrees(table, key, value)}
+    start = _match_start(table["start"], problem)
+    if start is None:
+        return {}
+    phases = [_match_phase(table["phases"], phase) for phase in problem.phases]
+    if not differing and start is table["start"] and phases == table["phases"]:
+        return table
+    changed = copy.deepcopy({**table, "start": start, "phases": phases})
+    for key, value in differing.items():
+        _set(changed, key, value)
+    return changed
+
+
+def describe_scene(scene: Scene) -> dict[str, Any]:
+    """Values of a scene by the dotted keys of a problem file; None for what is left out there."""
+    body, friction = scene.polygon, scene.friction
+    points: Any = body.points
+    uniform = Polygon(points, body.mass).inertia == body.inertia
+    values: dict[str, Any] = {
+        "object.vertices": points.tolist(),
+        "object.mass": body.mass,
+        "object.inertia": None if uniform else body.inertia,
+        "friction.palm": friction.palm,
+        "friction.finger1": friction.finger1,
+        "friction.finger2": friction.finger2,
+    }
+    for number, link in enumerate(scene.fingers, 1):
+        for field in fields(link):
+            value = _to_plain(getattr(link, field.name))
+            if field.name != "name":
+                values[f"fingers.{number}.{field.name}"] = None if value == math.inf else value
+    for field in fields(scene):
+        if field.name not in ("polygon", "fingers", "friction"):
+            values[field.name] = getattr(scene, field.name)
+    return values
+
+
+_DEFAULTS = {"name": "unnamed", "radius": 0.0, "viscous": 0.0, "dry": 0.0} | {
+    field.name: field.default for field in fields(Scene)
+}
+
+
+def _agrees(table: Mapping[str, Any], key: str, value: object) -> bool:
+    """Whether a table has a value, or leaves out a default."""
+    *path, last = key.split(".")
+    place: Any = table
+    for step in path:
+        place = place[step]
+    if key == "object.inertia" and value is None and last in place:
+        uniform = Polygon(place["vertices"], place["mass"]).inertia
+        return bool(place[last] == uniform)
+    return bool(place.get(last, _DEFAULTS.get(last)) == value)
+
+
+def _match_start(start: Mapping[str, Any], problem: Problem) -> Mapping[str, Any] | None:
+    """The table of the start, or None if no edge is flush there."""
+    q, scene = problem.start[:3], problem.scene
+    edges = [start["flush"], *range(scene.polygon.n_vertices)]
+    for edge in edges:
+        flush = edge < scene.polygon.n_vertices and place_flush(scene, edge, float(q[0]))
+        if flush is not False and np.abs(flush - q).max() <= 1e-12 * scene.scales.length:
+            same = edge == start["flush"] and q[0] == start["x"]
+            return start if same else {"flush": edge, "x": float(q[0])}
+    return None
+
+
+def _match_phase(entries: Sequence[Mapping[str, Any]], phase: Phase) -> Mapping[str, Any]:
+    """The entry that says what a phase is, or a new one."""
+    until = phase.until
+    own: dict[str, Any] = {"contacts": name_contacts(phase)}
+    if until.contact is not None:
+        own["until"] = until.contact.name
+    elif until.value is not None:
+        x = until.coordinate == "x"
+        own["until"] = {"x": until.value} if x else {"phi_deg": math.degrees(until.value)}
+    for entry in (*entries[phase.index : phase.index + 1], *entries):
+        given = entry.get("until")
+        if isinstance(given, Mapping) and "phi_deg" in given and until.coordinate == "phi":
+            same = math.radians(given["phi_deg"]) == until.value
+        else:
+            same = given == own.get("until")
+        same = same and entry["contacts"] == own["contacts"]
+        if same and entry.get("end", "rest") == phase.end.value:
+            return entry
+    return own | ({} if phase.end.value == "rest" else {"end": phase.end.value})
+
+
+def name_contacts(phase: Phase) -> list[str]:
+    """Contacts of a phase as its file names them."""
+    formation = phase.formation
+    rolling = formation.rolling
+    return [c.name + (" rolling" if c in rolling else "") for c in formation.contacts]

@@ -1,0 +1,1 @@
+"""What planning and simulation return: torques, trajectories, reports."""

@@ -1,0 +1,1 @@
+"""What does not move by plan: object, fingers, friction, gravity."""

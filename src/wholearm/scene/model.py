@@ -1,0 +1,249 @@
+"""The data model: a polygon, a hand of a palm and two fingers, friction and gravity.
+
+The notation that every docstring of the package refers to:
+
+========  =======================================================  ============
+symbol    meaning                                                  shape, unit
+========  =======================================================  ============
+q         pose (x, y, phi) of the object's centroid                (3,) m, rad
+theta     joint angles, anticlockwise from +x                      (2,) rad
+z         the five degrees of freedom (q, theta)                   (5,)
+C         C-functions: signed gaps, positive when apart            (n_c,) m
+W_n, W_t  normal and tangential wrench matrices of the object      (3, n_c)
+J_n, J_t  normal and tangential Jacobians of the fingers           (n_c, 2)
+c_n, c_t  normal and tangential wrench intensities                 (n_c,) N
+U, Xi     friction coefficients; sliding directions (+1 or -1)     (n_c,)
+tau       joint torques                                            (2,) N m
+A, A_t    [W_n^T, -J_n] and [W_t^T, -J_t]                          (n_c, 5)
+c         contact forces: c_n, then c_t of the R rolling contacts  (n_c + R,) N
+P         constraints: A, then A_t of rolling contacts             (n_c + R, 5)
+G         forces: A - U Xi A_t, then A_t of rolling contacts       (n_c + R, 5)
+M5        diag(m, m, I, J_1, J_2)                                  (5, 5)
+========  =======================================================  ============
+
+Finger 1 (index 0) is the right one, finger 2 (index 1) the left one. The normal n of a contact
+points into the object and its tangent is t = (n_y, -n_x).
+
+References
+----------
+S. L. Yeap and J. C. Trinkle, "Dynamic Whole-Arm Dexterous Manipulation in the Plane".
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..common.arrays import Array
+from ..common.errors import InputError
+from ..common.require import require_number, require_vector
+from .polygon import Polygon
+
+LIGHT = 1e-4
+"""Weight, over what the weaker finger can press with, that is next to nothing."""
+TOUCHING = 3e-6
+"""Gap below which features count as touching, in radii of gyration of the object."""
+
+
+@dataclass(frozen=True, eq=False)
+class Finger:
+    """A single-link finger: a capsule on a motorised revolute joint.
+
+    Parameters
+    ----------
+    base : array_like, shape (2,), [m]
+        The joint.
+    length : float, [m]
+        From the joint to the centre of the tip.
+    radius : float, [m]
+        Half thickness of the link and radius of its tip; zero for a pointed line.
+    inertia : float, [kg m^2]
+        J_i about the joint.
+    viscous, dry : float, [N m s], [N m]
+        Viscous and dry friction of the joint, B_i and D_i.
+    torque_limit : float, [N m]
+    speed_limit : float, optional, [rad/s]
+        Infinite when left out.
+    name : str
+        Key of this finger in messages.
+    """
+
+    base: ArrayLike
+    length: float
+    radius: float
+    inertia: float
+    viscous: float
+    dry: float
+    torque_limit: float
+    speed_limit: float = math.inf
+    name: str = "fingers"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "base", require_vector(self.base, f"{self.name}.base", 2))
+        for key in ("length", "inertia", "torque_limit"):
+            value = require_number(getattr(self, key), f"{self.name}.{key}", positive=True)
+            object.__setattr__(self, key, value)
+        for key in ("radius", "viscous", "dry"):
+            value = require_number(getattr(self, key), f"{self.name}.{key}", nonnegative=True)
+            object.__setattr__(self, key, value)
+        if self.speed_limit != math.inf:
+            key = f"{self.name}.speed_limit"
+            value = require_number(self.speed_limit, key, positive=True)
+            object.__setattr__(self, "speed_limit", value)
+
+
+@dataclass(frozen=True)
+class Friction:
+    """Coulomb coefficients between the object and each part of the hand."""
+
+    palm: float
+    finger1: float
+    finger2: float
+
+    def __post_init__(self) -> None:
+        for key in ("palm", "finger1", "finger2"):
+            value = require_number(getattr(self, key), f"friction.{key}", nonnegative=True)
+            object.__setattr__(self, key, value)
+
+    def of(self, finger: int | None) -> float:
+        """Coefficient with finger 0 or 1, or with the palm when `finger` is None."""
+        return self.palm if finger is None else (self.finger1, self.finger2)[finger]
+
+
+class Scales(NamedTuple):
+    """The scene's own units, which every tolerance is relative to.
+
+    Attributes
+    ----------
+    length : float, [m]
+        Radius of gyration of the object.
+    mass : float, [kg]
+        Of the object.
+    force : float, [N]
+        Weight of the object; next to nothing, or without gravity, a hundredth of what the weaker
+        finger can press with at its tip.
+    """
+
+    length: float
+    mass: float
+    force: float
+
+    @property
+    def torque(self) -> float:
+        """Force times length [N m]."""
+        return self.force * self.length
+
+    @property
+    def time(self) -> float:
+        """In which the force moves the mass by about the length [s]."""
+        return math.sqrt(self.mass * self.length / self.force)
+
+    @property
+    def speed(self) -> float:
+        """Length over time [m/s]."""
+        return self.length / self.time
+
+    @property
+    def acceleration(self) -> float:
+        """Force over mass [m/s^2]."""
+        return self.force / self.mass
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Everything that does not move by plan: object, both fingers, friction and gravity.
+
+    Parameters
+    ----------
+    polygon : Polygon
+    fingers : (Finger, Finger)
+        The right one, then the left one.
+    friction : Friction
+    gravity : float, [m/s^2]
+    fingers_collide : bool
+        Whether the links are solid to each other; False for fingers in different planes.
+
+    Raises
+    ------
+    InputError
+        If finger 1 is not to the right of finger 2, or a value is not of its type.
+    """
+
+    polygon: Polygon
+    fingers: tuple[Finger, Finger]
+    friction: Friction
+    gravity: float = 9.81
+    fingers_collide: bool = True
+
+    def __post_init__(self) -> None:
+        value = require_number(self.gravity, "gravity", nonnegative=True)
+        object.__setattr__(self, "gravity", value)
+        if not isinstance(self.fingers_collide, bool):
+            given = f"{self.fingers_collide!r} given; allowed are true and false"
+            raise InputError("", "fingers_collide", given)
+        right, left = (np.asarray(finger.base) for finger in self.fingers)
+        if right[0] <= left[0]:
+            raise InputError(
+                "",
+                "fingers.1.base",
+                f"{right.tolist()} is not to the right of fingers.2.base {left.tolist()}",
+            )
+
+    @cached_property
+    def scales(self) -> Scales:
+        """Units that fit the scene: tolerances count in them."""
+        mass = self.polygon.mass
+        press = min(finger.torque_limit / finger.length for finger in self.fingers)
+        weight = mass * self.gravity
+        force = weight if weight > LIGHT * press else press / 100
+        return Scales(self.polygon.gyration_radius, mass, force)
+
+    @cached_property
+    def shape(self) -> tuple[object, ...]:
+        """Equal for scenes whose object and links have the same shapes and joints."""
+        joints = [np.asarray(finger.base).tobytes() for finger in self.fingers]
+        sizes = [(finger.length, finger.radius) for finger in self.fingers]
+        return (self.polygon.vertices.tobytes(), *joints, *sizes)
+
+    @property
+    def touching(self) -> float:
+        """Gap below which features count as touching [m]: above rounding, below real clearance."""
+        return TOUCHING * self.scales.length
+
+    @property
+    def mass_diagonal(self) -> Array:
+        """Diagonal of M5, shape (5,): m, m, I, J_1, J_2 [kg, kg m^2]."""
+        body = self.polygon
+        assert body.inertia is not None
+        joints = [finger.inertia for finger in self.fingers]
+        return np.array([body.mass, body.mass, body.inertia, *joints])
+
+    @property
+    def applied_force(self) -> Array:
+        """Gravity as a force on z, shape (5,) [N, N m]: the vector g of the equations of motion."""
+        return np.array([0.0, -self.polygon.mass * self.gravity, 0.0, 0.0, 0.0])
+
+    @property
+    def viscous(self) -> Array:
+        """Joint viscous friction B as a force on z' per speed, shape (5,) [N m s]."""
+        return np.array([0.0, 0.0, 0.0, *(finger.viscous for finger in self.fingers)])
+
+    @property
+    def dry(self) -> Array:
+        """Joint dry friction D as a force on z, shape (5,) [N m]."""
+        return np.array([0.0, 0.0, 0.0, *(finger.dry for finger in self.fingers)])
+
+    @property
+    def torque_limit(self) -> Array:
+        """Torque limits, shape (2,) [N m]."""
+        return np.array([finger.torque_limit for finger in self.fingers])
+
+    @property
+    def speed_limit(self) -> Array:
+        """Joint speed limits, shape (2,) [rad/s], infinite where there is none."""
+        return np.array([finger.speed_limit for finger in self.fingers])

@@ -1,0 +1,181 @@
+"""The object: a rigid convex polygon, checked when it is made."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..common.arrays import Array
+from ..common.errors import InputError
+from ..common.require import frozen, require_number, require_vector
+
+SIZES = (1e-4, 1e3)
+"""Least and largest distance between the two corners of a polygon that are farthest apart [m]."""
+FAR = 1e3
+"""How far from the origin corners may be given, over that distance."""
+SLENDER = 1e-3
+"""Least width of a polygon, over that distance."""
+SHORTEST_EDGE = 1e-4
+"""Least length of an edge, over that distance."""
+MOST_VERTICES = 500
+"""Most corners of a polygon."""
+
+
+@dataclass(frozen=True, eq=False)
+class Polygon:
+    """The object: a rigid convex polygon.
+
+    Parameters
+    ----------
+    points : array_like, shape (n_v, 2), [m]
+        Corners, anticlockwise, in any frame.
+    mass : float, [kg]
+    inertia : float, optional, [kg m^2]
+        About the centroid; that of uniform density when left out.
+
+    Attributes
+    ----------
+    vertices : ndarray, shape (n_v, 2), [m]
+        Corners relative to the centroid, in the orientation phi = 0.
+    centroid : ndarray, shape (2,), [m]
+        The centroid in the frame of `points`.
+    uniform_inertia : float, [kg m^2]
+        What the inertia about the centroid would be for uniform density.
+    size : float, [m]
+        Largest distance between two corners.
+
+    Raises
+    ------
+    InputError
+        If the corners are not those of a convex anticlockwise polygon, or a number is not positive;
+        if the polygon is too small, too large or too slender, or has too short an edge.
+    """
+
+    points: ArrayLike
+    mass: float
+    inertia: float | None = None
+    vertices: Array = field(init=False, repr=False)
+    centroid: Array = field(init=False, repr=False)
+    uniform_inertia: float = field(init=False, repr=False)
+    size: float = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        given = self.points
+        if not isinstance(given, list | tuple | np.ndarray) or len(given) < 3:
+            raise InputError("", "object.vertices", f"{given!r} is not a list of 3 or more points")
+        if len(given) > MOST_VERTICES:
+            allowed = f"allowed are 3 to {MOST_VERTICES}"
+            raise InputError("", "object.vertices", f"{len(given)} corners given; {allowed}")
+        corners = np.array(
+            [require_vector(p, f"object.vertices[{i}]", 2) for i, p in enumerate(given)]
+        )
+        size = _check_size(corners)
+        edges = np.roll(corners, -1, axis=0) - corners
+        # About a corner: far from the origin, areas would lose their digits.
+        local = corners - corners[0]
+        cross = _cross(local, np.roll(local, -1, axis=0))
+        area = cross.sum() / 2
+        if area <= 0:
+            raise InputError(
+                "",
+                "object.vertices",
+                f"the polygon is clockwise or flat (signed area {area:.3g} m^2); "
+                "list its corners anticlockwise",
+            )
+        turns = _cross(np.roll(edges, 1, axis=0), edges)
+        headings = np.arctan2(turns, np.sum(np.roll(edges, 1, axis=0) * edges, axis=1))
+        reflex = np.flatnonzero(turns <= 1e-9 * area)
+        if reflex.size:
+            raise InputError(
+                "",
+                f"object.vertices[{reflex[0]}]",
+                f"the polygon is not strictly convex at {corners[reflex[0]].tolist()}; "
+                "every corner must turn left",
+            )
+        _check_shape(corners, edges, size)
+        if headings.sum() > 2 * np.pi + 1e-6:
+            raise InputError("", "object.vertices", "the polygon crosses itself; it must be convex")
+        neighbours = local + np.roll(local, -1, axis=0)
+        middle = (neighbours * cross[:, None]).sum(axis=0) / (6 * area)
+        vertices = local - middle
+        mass = require_number(self.mass, "object.mass", positive=True)
+        after = np.roll(vertices, -1, axis=0)
+        squares = (vertices**2 + vertices * after + after**2).sum(axis=1)
+        uniform = mass * float(_cross(vertices, after) @ squares) / (12 * float(area))
+        inertia = uniform
+        if self.inertia is not None:
+            inertia = require_number(self.inertia, "object.inertia", positive=True)
+        object.__setattr__(self, "points", frozen(corners))
+        object.__setattr__(self, "vertices", frozen(vertices))
+        object.__setattr__(self, "centroid", frozen(corners[0] + middle))
+        object.__setattr__(self, "mass", mass)
+        object.__setattr__(self, "inertia", inertia)
+        object.__setattr__(self, "uniform_inertia", uniform)
+        object.__setattr__(self, "size", size)
+
+    @property
+    def n_vertices(self) -> int:
+        """Number of corners, which is also the number of edges."""
+        return len(self.vertices)
+
+    @property
+    def gyration_radius(self) -> float:
+        """Radius of gyration about the centroid [m], which weighs angles against lengths."""
+        assert self.inertia is not None
+        return math.sqrt(self.inertia / self.mass)
+
+    def flush_angle(self, edge: int) -> float:
+        """Angle phi in (-pi, pi] at which `edge` lies on the palm below the object [rad]."""
+        run = self.vertices[(edge + 1) % self.n_vertices] - self.vertices[edge]
+        return -math.atan2(run[1], run[0])
+
+
+def _check_size(corners: Array) -> float:
+    """Largest distance between two corners [m], if that is neither too small nor too large."""
+    key, (least, largest) = "object.vertices", SIZES
+    if np.abs(corners).max() > FAR * largest:
+        far = corners[int(np.abs(corners).max(axis=1).argmax())].tolist()
+        raise InputError("", key, f"{far} given; allowed are coordinates up to {FAR * largest:g} m")
+    size = float(np.hypot(*(corners[:, None] - corners).transpose(2, 0, 1)).max())
+    if not least <= size <= largest:
+        raise InputError(
+            "", key, f"{size:.3g} m from corner to corner; allowed are {least:g} to {largest:g} m"
+        )
+    if np.abs(corners).max() > FAR * size:
+        raise InputError(
+            "",
+            key,
+            f"{np.abs(corners).max():.3g} m from the origin; allowed are {FAR * size:.3g} m, "
+            f"{FAR:g} times the polygon's size",
+        )
+    return size
+
+
+def _check_shape(corners: Array, edges: Array, size: float) -> None:
+    """Check that a convex polygon is not too slender, and that it has no too short edge."""
+    lengths = np.hypot(*edges.T)
+    shortest = int(lengths.argmin())
+    if lengths[shortest] < SHORTEST_EDGE * size:
+        raise InputError(
+            "",
+            f"object.vertices[{shortest}]",
+            f"the edge from there has {lengths[shortest]:.3g} m; allowed are "
+            f"{SHORTEST_EDGE * size:.3g} m and more, {SHORTEST_EDGE:g} of the polygon's size",
+        )
+    away = _cross(edges[:, None], corners - corners[:, None]) / lengths[:, None]
+    width = float(away.max(axis=1).min())
+    if width < SLENDER * size:
+        raise InputError(
+            "",
+            "object.vertices",
+            f"the polygon is {width:.3g} m wide; allowed are {SLENDER * size:.3g} m and more, "
+            f"{SLENDER:g} of its size",
+        )
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Plane cross product a_x b_y - a_y b_x along the last axis."""
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

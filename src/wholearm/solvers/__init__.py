@@ -1,0 +1,1 @@
+"""Ipopt as every NLP uses it."""

@@ -1,0 +1,90 @@
+"""Ipopt as every NLP of this package uses it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+
+from ..common.arrays import Expression
+from ..common.interrupts import check
+
+STOPPED = "User_Requested_Stop"
+"""Status of a solver that an interrupt stopped: nothing else asks it to."""
+_OPTIONS = {
+    "print_level": 0,
+    "sb": "yes",
+    "tol": 1e-8,
+    # The default relaxes every bound by 1e-8, so that limits would be missed with success.
+    "bound_relax_factor": 0.0,
+    "fast_step_computation": "yes",
+    # A fixed ordering: the automatic one can differ between machines, and is slow on long grids.
+    "mumps_permuting_scaling": 0,
+    "mumps_pivot_order": 0,
+    # Starting from a solution then takes few iterations.
+    "mu_strategy": "adaptive",
+    "warm_start_init_point": "yes",
+}
+
+
+def build_solver(
+    name: str,
+    nlp: dict[str, Expression],
+    push: float,
+    derivatives: dict[str, Expression] | None = None,
+    **options: Any,
+) -> Solver:
+    """Return what solves an NLP with Ipopt.
+
+    Parameters
+    ----------
+    name : str
+    nlp : dict
+        Expressions of x, p, f and g.
+    push : float
+        How far a given start is kept from its bounds; small to start at a solution.
+    derivatives : dict, optional
+        Functions that CasADi would derive otherwise: `jac_g` and `hess_lag`.
+    **options
+        Ipopt's, over those that all NLPs share.
+    """
+    kinds = ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
+    pushes = {f"warm_start_{kind}": push for kind in kinds}
+    casadi_options = {
+        "ipopt": _OPTIONS | pushes | options,
+        "print_time": False,
+        "record_time": True,
+        # Neither multipliers of parameters nor their gradient are used, and both cost.
+        "calc_lam_p": False,
+        "no_nlp_grad": True,
+        "show_eval_warnings": False,
+        "error_on_fail": False,
+        **(derivatives or {}),
+    }
+    return Solver(ca.nlpsol(name, "ipopt", nlp, casadi_options))
+
+
+class Solver:
+    """An NLP solver that an interrupt ends: CasADi would stop it and go on as if it had failed."""
+
+    def __init__(self, function: Expression) -> None:
+        self.function = function
+
+    def __call__(self, **arguments: Any) -> dict[str, Expression]:
+        """Solve; inputs and outputs are those of a CasADi NLP solver.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            If a signal stopped the solver.
+        """
+        result: dict[str, Expression] = self.function(**arguments)
+        check()
+        if self.function.stats()["return_status"] == STOPPED:
+            raise KeyboardInterrupt
+        return result
+
+    def stats(self) -> dict[str, Any]:
+        """Statistics of the last call."""
+        statistics: dict[str, Any] = self.function.stats()
+        return statistics

@@ -1,1 +1,0 @@
-"""Phases with any number of freedoms, planned over time by collocation."""

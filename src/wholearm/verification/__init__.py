@@ -1,0 +1,1 @@
+"""Replay of plans and torques, and the verdict on them."""

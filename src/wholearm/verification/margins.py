@@ -1,0 +1,115 @@
+"""Least values over time of what a simulation recorded: normal forces and margins to slipping."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.arrays import Array
+from ..contacts.cones import slip_margins
+from ..contacts.links import evaluate_finger_gap
+from ..problem.definition import Phase, Problem
+from ..results.report import ContactMargin, FingerGap, SlipMargin
+from ..scene.model import Scene
+from ..simulation.events import EventKind, Simulation
+from ..simulation.tolerances import SETTLING
+
+SHORTEST = 2 * SETTLING
+"""Interval below which forces may jump, and rounding spoils a parabola, relative to the scene's
+time."""
+
+
+def list_contact_margins(
+    problem: Problem, simulation: Simulation, rows: NDArray[np.int64], phase: Phase, breaks: Array
+) -> tuple[ContactMargin, ...]:
+    """Least normal forces in a phase, which the simulation has at `rows`."""
+    lost = {e.contact: e for e in simulation.find(EventKind.CONTACT_LOST) if e.phase == phase.index}
+    shortest, contacts = SHORTEST * problem.scene.scales.time, []
+    for name in phase.formation.names:
+        column = simulation.contacts.index(name)
+        least, time = find_least(simulation.t[rows], simulation.c_n[rows, column], breaks, shortest)
+        if name in lost and not least <= lost[name].value:
+            least, time = lost[name].value, lost[name].time
+        contacts.append(ContactMargin(name, least, time, least - problem.epsilon))
+    return tuple(contacts)
+
+
+def list_slip_margins(
+    phase: Phase, simulation: Simulation, rows: NDArray[np.int64], breaks: Array
+) -> tuple[SlipMargin, ...]:
+    """Least margins to slipping in a phase, which the simulation has at `rows`."""
+    formation = phase.formation
+    columns = [simulation.contacts.index(name) for name in formation.names]
+    c_n, c_t = simulation.c_n[rows][:, columns], simulation.c_t[rows][:, columns]
+    slipped = {e.contact: e for e in simulation.find(EventKind.SLIP) if e.phase == phase.index}
+    shortest, margins = SHORTEST * formation.scene.scales.time, []
+    for row, values in zip(
+        formation.rolling_rows, slip_margins(formation, c_n, c_t).T, strict=True
+    ):
+        name = formation.names[row]
+        least, time = find_least(simulation.t[rows], values, breaks, shortest)
+        if name in slipped and not least <= slipped[name].value:
+            least, time = slipped[name].value, slipped[name].time
+        margins.append(SlipMargin(name, least, time))
+    return tuple(margins)
+
+
+def find_finger_gap(scene: Scene, simulation: Simulation, breaks: Array) -> FingerGap | None:
+    """Least gap between the links in a replay; None if they pass each other."""
+    if not scene.fingers_collide:
+        return None
+    gaps, shortest = evaluate_finger_gap(scene, simulation.z), SHORTEST * scene.scales.time
+    return FingerGap(*find_least(simulation.t, gaps, breaks, shortest))
+
+
+def find_least(
+    t: Array, values: Array, breaks: Array, shortest: float = 0.0
+) -> tuple[float, float]:
+    """Least value of a sampled function and where, refined by parabolas inside smooth stretches.
+
+    Parameters
+    ----------
+    t : ndarray, shape (n,), [s]
+        Never decreasing; a jump is there twice.
+    values : ndarray, shape (n,)
+        NaN where unknown.
+    breaks : ndarray, [s]
+        Where the function may have a kink: no parabola has one inside.
+    shortest : float, [s]
+        Interval below which the function may jump.
+
+    Returns
+    -------
+    least, time : float
+        NaN if no value is known.
+    """
+    if np.isnan(values).all():
+        return math.nan, math.nan
+    first = int(np.nanargmin(values))
+    least, time = float(values[first]), float(t[first])
+    left, right = np.diff(t)[:-1], np.diff(t)[1:]
+    smooth = (left > shortest) & (right > shortest) & ~_is_among(t[1:-1], breaks)
+    smooth &= ~np.isnan(values[:-2] + values[1:-1] + values[2:])
+    left, right = left[smooth], right[smooth]
+    middle = values[1:-1][smooth]
+    fall = (values[1:-1] - values[:-2])[smooth] / left
+    rise = (values[2:] - values[1:-1])[smooth] / right
+    bend = (rise - fall) / (left + right)
+    slope = (fall * right + rise * left) / (left + right)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shift = -slope / (2 * bend)
+    inside = (bend > 0) & (shift > -left) & (shift < right)
+    if inside.any():
+        lowest = middle[inside] + slope[inside] * shift[inside] / 2
+        k = int(lowest.argmin())
+        if lowest[k] < least:
+            least, time = float(lowest[k]), float((t[1:-1][smooth] + shift)[inside][k])
+    return least, time
+
+
+def _is_among(t: Array, breaks: Array) -> NDArray[np.bool_]:
+    """Whether each of `t` is one of the increasing `breaks`."""
+    near = np.minimum(np.searchsorted(breaks, t), len(breaks) - 1)
+    return np.asarray(breaks[near] == t)

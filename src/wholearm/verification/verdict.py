@@ -1,0 +1,213 @@
+"""Whether a replay holds, and the reasons why not, in words.
+
+Nothing is decided by a sign: each limit has a tolerance, relative to the scene's scales.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.require import require_number
+from ..contacts.links import FINGERS_TOUCH
+from ..problem.definition import End, Problem
+from ..results.report import ContactMargin, Deviation, Failure, FingerGap, PhaseReport
+from ..scene.model import Scene
+from ..simulation.events import EventKind, OutcomeKind, Simulation
+from .margins import SHORTEST
+
+DEPARTURE = 1e-3
+"""How far a replay may be from its plan, relative to the scene's length, and in rad."""
+REST_SPEED = 2e-2
+"""Speed at the end of a phase that passes for rest, relative to the scene's speed."""
+STRAY = 2e-3
+"""How far below epsilon a normal force of a plan may fall, relative to epsilon: a replay strays."""
+ROUNDING = 5e-7
+"""The same by rounding, relative to the scene's force."""
+GOAL = 3e-4
+"""Distance to the end of the last phase that counts as there, relative to the scene's length, and
+in rad."""
+OVERLAP = 3e-5
+"""Overlap of the links that passes for touching, relative to the scene's length."""
+
+
+@dataclass(frozen=True)
+class Allowance:
+    """What a replay may differ by from what is asked and still hold.
+
+    Attributes
+    ----------
+    departure : float
+        Distance from the plan, over the scene's length for positions and in rad for angles.
+    rest_speed : float
+        Speed where a phase ends at rest, over the scene's speed; angular speeds count times the
+        scene's length.
+    stray : float
+        How far normal forces of a plan may fall below epsilon, over epsilon.
+
+    Raises
+    ------
+    InputError
+        If one of the numbers is not positive.
+    """
+
+    departure: float = DEPARTURE
+    rest_speed: float = REST_SPEED
+    stray: float = STRAY
+
+    def __post_init__(self) -> None:
+        for key in ("departure", "rest_speed", "stray"):
+            value = require_number(getattr(self, key), key, positive=True)
+            object.__setattr__(self, key, value)
+
+    def scale(self, share: float) -> Allowance:
+        """A share of what is allowed from the plan; the speed that passes for rest stays."""
+        return Allowance(share * self.departure, self.rest_speed, share * self.stray)
+
+
+def describe_overlap(
+    scene: Scene, phases: Sequence[PhaseReport], gap: FingerGap | None
+) -> list[Failure]:
+    """A sentence on links that overlap."""
+    if gap is None or gap.least >= -OVERLAP * scene.scales.length:
+        return []
+    number = [phase.number for phase in phases if phase.start <= gap.time][-1]
+    text = f"{FINGERS_TOUCH} at t = {gap.time:.5g} s: they overlap by {-gap.least:.3g} m"
+    return [Failure(number, f"{text}, phase {number}")]
+
+
+def judge_end(problem: Problem, simulation: Simulation, allowance: Allowance) -> tuple[bool, str]:
+    """Whether the goal is reached, and the sentence that says how the replay ended.
+
+    By rounding the torques may end within a hair of the goal.
+    """
+    outcome, last = simulation.outcome, problem.phases[-1]
+    if outcome.reached:
+        return True, outcome.text
+    missed = abs(simulation.missed_by)
+    is_angle = last.until.coordinate == "phi"
+    near = (
+        outcome.kind is OutcomeKind.GOAL_MISSED
+        and int(simulation.phase[-1]) == last.index
+        and missed <= GOAL * (1.0 if is_angle else problem.scene.scales.length)
+        and measure_speed(problem.scene, simulation.z_dot[-1])
+        <= allowance.rest_speed * problem.scene.scales.speed
+    )
+    if not near:
+        return False, outcome.text
+    unit = "rad" if is_angle else "m"
+    return True, (
+        f"{last.until} is reached to {missed:.1g} {unit} at t = {simulation.t[-1]:.5g} s, "
+        f"the end of phase {last.number}"
+    )
+
+
+def measure_speed(scene: Scene, v: Array) -> float:
+    """Largest speed in z', shape (5,) [m/s]: angular ones count times the scene's length."""
+    length = scene.scales.length
+    return max(math.hypot(v[0], v[1]), length * float(np.abs(v[2:]).max()))
+
+
+def describe_speed(scene: Scene, v: Array) -> str:
+    """What moves fastest, and how fast, to follow "while"."""
+    turns = scene.scales.length * np.abs(v[2:])
+    fastest = int(turns.argmax())
+    if math.hypot(v[0], v[1]) >= turns[fastest]:
+        return f"the object moves at {math.hypot(v[0], v[1]):.3g} m/s"
+    what = ("the object", "finger 1", "finger 2")[fastest]
+    return f"{what} turns at {abs(v[2 + fastest]):.3g} rad/s"
+
+
+def describe_stops(problem: Problem, simulation: Simulation, allowance: Allowance) -> list[Failure]:
+    """Sentences on phases that end at rest but are reached at a speed."""
+    scene, failures = problem.scene, []
+    for event in simulation.find(EventKind.ARRIVAL):
+        phase = problem.phases[event.phase]
+        v = simulation.z_dot[int(np.flatnonzero(simulation.phase == event.phase)[-1])]
+        fast = measure_speed(scene, v) > allowance.rest_speed * scene.scales.speed
+        if phase.end is End.REST and fast:
+            energy = 0.5 * float(scene.mass_diagonal @ v**2)
+            unit = "rad/s" if phase.until.coordinate == "phi" else "m/s"
+            text = (
+                f"phase {phase.number} does not end at rest: {phase.until} is reached at "
+                f"{event.value:.3g} {unit} at t = {event.time:.5g} s, while "
+                f"{describe_speed(scene, v)}, with {energy:.3g} J left"
+            )
+            failures.append(Failure(phase.number, text))
+    return failures
+
+
+def describe_departures(
+    problem: Problem, phases: Sequence[PhaseReport], allowance: Allowance
+) -> list[Failure]:
+    """The sentence on the first phase whose replay is too far from the plan, if there is one."""
+    length = problem.scene.scales.length
+    for phase in phases:
+        worst = [d for d in (phase.deviation, phase.end_deviation) if d is not None]
+        if any(measure_departure(d, length) > allowance.departure for d in worst):
+            far = max(worst, key=lambda d: measure_departure(d, length))
+            text = (
+                f"phase {phase.number} departs from the plan, by {far.position:.2g} m and "
+                f"{far.angle:.2g} rad at t = {far.time:.5g} s; {allowance.departure * length:.2g} "
+                f"m and {allowance.departure:.2g} rad are allowed"
+            )
+            return [Failure(phase.number, text)]
+    return []
+
+
+def measure_departure(deviation: Deviation, length: float) -> float:
+    """Size of a difference, over the scene's `length` [m] and in rad; zero where none is known."""
+    sizes = (deviation.position / length, deviation.angle)
+    return max((size for size in sizes if not math.isnan(size)), default=0.0)
+
+
+def describe_thin(
+    problem: Problem, phases: Sequence[PhaseReport], simulation: Simulation, allowance: Allowance
+) -> list[Failure]:
+    """Sentences on the normal forces below epsilon, but for contacts where they were lost.
+
+    A contact that is let go without a jump of the torques passes epsilon on its way to zero.
+    """
+    let_go = {
+        (e.phase + 1, n): e.time
+        for e in simulation.find(EventKind.RELEASE)
+        for n in e.contact.split(", ")
+    }
+    lost = {(e.phase + 1, e.contact) for e in simulation.find(EventKind.CONTACT_LOST)}
+    shortest = SHORTEST * problem.scene.scales.time
+    allowed = ROUNDING * problem.scene.scales.force + allowance.stray * problem.epsilon
+    return [
+        Failure(
+            phase.number,
+            f"c_n of {c.contact} falls to {c.least:.5g} N, below epsilon = {problem.epsilon:g} N, "
+            f"at t = {c.time:.5g} s, phase {phase.number}",
+        )
+        for phase in phases
+        for c in phase.contacts
+        if c.margin < -allowed
+        and (phase.number, c.contact) not in lost
+        and abs(c.time - let_go.get((phase.number, c.contact), math.inf)) > shortest
+    ]
+
+
+def find_least_force(phase: PhaseReport) -> ContactMargin | None:
+    """The contact with the least normal force in a phase; None if nothing moved.
+
+    Contacts that are let go count until just before.
+    """
+    released = phase.until.startswith("release of ") and phase.arrival is not None
+    known = [
+        margin
+        for margin in phase.contacts
+        if not math.isnan(margin.least)
+        and not (
+            released
+            and margin.contact in phase.until
+            and abs(margin.time - (phase.arrival or 0.0)) <= SHORTEST
+        )
+    ]
+    return min(known, key=lambda margin: margin.least, default=None)

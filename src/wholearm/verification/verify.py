@@ -1,0 +1,258 @@
+"""Check torques by replaying them open loop: margins between nodes, goal, deviation and energy."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.errors import InputError
+from ..common.sharing import exclusive
+from ..problem.definition import End, Phase, Problem
+from ..results.report import (
+    Deviation,
+    EnergyBalance,
+    Failure,
+    LeastImpulse,
+    ModeChange,
+    PhaseReport,
+    Report,
+)
+from ..results.torque import TorqueProfile
+from ..results.trajectory import Trajectory
+from ..simulation.events import Event, EventKind, Simulation
+from ..simulation.simulate import simulate
+from .margins import find_finger_gap, list_contact_margins, list_slip_margins
+from .verdict import (
+    DEPARTURE,
+    REST_SPEED,
+    Allowance,
+    describe_departures,
+    describe_overlap,
+    describe_stops,
+    describe_thin,
+    judge_end,
+    measure_speed,
+)
+
+_ENDS = (EventKind.ARRIVAL, EventKind.RELEASE)
+_CHANGES = {EventKind.STICK: "sticks", EventKind.SLIP: "slips", EventKind.REVERSAL: "reverses"}
+SAMPLES = 2000
+"""About how many instants normal forces are looked at, besides the simulation's own steps."""
+
+
+@exclusive
+def verify(
+    problem: Problem,
+    what: Trajectory | TorqueProfile,
+    *,
+    tolerance: float = 1e-9,
+    departure: float = DEPARTURE,
+    rest_speed: float = REST_SPEED,
+) -> Report:
+    """Replay a trajectory's torques, or given ones, open loop and report what happens.
+
+    Every contact has to hold, every phase with an end at rest has to be at rest there, and the goal
+    has to be reached. A trajectory has to keep every normal force above epsilon, too, and its
+    replay has to stay near it; of torques alone a force below epsilon is a warning.
+
+    Parameters
+    ----------
+    problem : Problem
+    what : Trajectory or TorqueProfile
+    tolerance : float
+        Of the simulation.
+    departure : float
+        How far the replay may be from the trajectory: positions relative to the scene's length
+        (the object's radius of gyration), angles in rad.
+    rest_speed : float
+        Speed at the end of a phase that passes for rest, relative to the scene's speed (the root
+        of length times gravity); angular speeds count times the scene's length.
+
+    Raises
+    ------
+    InputError
+        If the trajectory has other contacts than the problem, or a number is out of its range.
+    JammingError, SimulationError
+        If the simulation cannot go on.
+    """
+    plan = what if isinstance(what, Trajectory) else None
+    torque = what.torque if isinstance(what, Trajectory) else what
+    allowance = Allowance(departure, rest_speed)
+    names = {contact.name for contact in problem.contacts}
+    if plan is not None and set(plan.contacts) != names:
+        odd = ", ".join(sorted(set(plan.contacts) ^ names))
+        raise InputError("", "contacts", f"trajectory and problem differ in {odd}")
+    return inspect(problem, torque, plan, choose_times(torque, plan), allowance, tolerance)
+
+
+def inspect(
+    problem: Problem,
+    torque: TorqueProfile,
+    plan: Trajectory | None,
+    times: Array,
+    allowance: Allowance,
+    tolerance: float,
+) -> Report:
+    """Replay torques, look at what happens at `times` [s] and judge it; see `verify`."""
+    simulation = simulate(problem, torque, tolerance=tolerance, times=times)
+    phases = tuple(
+        _report_phase(problem, simulation, torque, plan, index)
+        for index in range(int(simulation.phase[-1]) + 1)
+    )
+    reached, outcome = judge_end(problem, simulation, allowance)
+    failures = [] if reached else [Failure(len(phases), outcome)]
+    failures += describe_stops(problem, simulation, allowance)
+    gap = find_finger_gap(problem.scene, simulation, torque.breaks)
+    failures += describe_overlap(problem.scene, phases, gap) if reached else []
+    thin = describe_thin(problem, phases, simulation, allowance)
+    warnings = _describe_torques(problem, torque)
+    if plan is not None:
+        failures += thin + describe_departures(problem, phases, allowance)
+    else:
+        warnings += [failure.text for failure in thin]
+    return Report(
+        name=problem.name,
+        epsilon=problem.epsilon,
+        outcome=outcome,
+        reached=reached,
+        missed_by=simulation.missed_by,
+        failures=tuple(failure.text for failure in failures),
+        failed_phase=failures[0].phase if failures else None,
+        warnings=tuple(warnings),
+        phases=phases,
+        energy=_balance(problem, simulation),
+        finger_gap=gap,
+        tolerance=tolerance,
+        steps=simulation.steps,
+        changes=tuple(
+            ModeChange(float(e.time), e.phase + 1, e.contact, _CHANGES[e.kind])
+            for e in simulation.events
+            if e.kind in _CHANGES and e.contact
+        ),
+    )
+
+
+def choose_times(torque: TorqueProfile, plan: Trajectory | None) -> Array:
+    """Instants inside every piece of the torques, at least one, and the rows of the plan."""
+    count = max(1, SAMPLES // len(torque.coefficients))
+    share = np.arange(1, count + 1) / (count + 1)
+    inside = torque.breaks[:-1, None] + np.diff(torque.breaks)[:, None] * share
+    return np.append(inside.ravel(), [] if plan is None else plan.t)
+
+
+def _report_phase(
+    problem: Problem,
+    simulation: Simulation,
+    torque: TorqueProfile,
+    plan: Trajectory | None,
+    index: int,
+) -> PhaseReport:
+    phase = problem.phases[index]
+    rows = np.flatnonzero(simulation.phase == index)
+    arrivals = [e for e in simulation.events if e.phase == index and e.kind in _ENDS]
+    impacts = [e for e in simulation.find(EventKind.IMPACT) if e.phase == index]
+    stops = bool(arrivals) and phase.end is End.REST
+    end = worst = None
+    if plan is not None:
+        # A motion that goes on is compared when its phase was planned to end, not when it did.
+        passes, length = phase.end is not End.REST, problem.scene.scales.length
+        end, worst = _compare(simulation, plan, index, bool(arrivals), passes, length)
+    return PhaseReport(
+        number=phase.number,
+        until=_describe_end(arrivals, phase),
+        end=phase.end.value,
+        start=float(simulation.t[rows[0]]),
+        contacts=list_contact_margins(problem, simulation, rows, phase, torque.breaks),
+        rolling=list_slip_margins(phase, simulation, rows, torque.breaks),
+        arrival=arrivals[0].time if arrivals else None,
+        arrival_rate=arrivals[0].value if arrivals and not phase.until.is_release else None,
+        end_speed=measure_speed(problem.scene, simulation.z_dot[rows[-1]]) if stops else None,
+        impact=LeastImpulse(impacts[0].contact, impacts[0].value) if impacts else None,
+        end_deviation=end,
+        deviation=worst,
+    )
+
+
+def _compare(
+    simulation: Simulation,
+    plan: Trajectory,
+    index: int,
+    arrived: bool,
+    passes: bool,
+    length: float,
+) -> tuple[Deviation | None, Deviation | None]:
+    """Difference from the plan at the end of a phase and at worst."""
+    planned = np.flatnonzero(plan.phase == index)
+    if not len(planned):
+        return None, None
+    at = np.searchsorted(simulation.t, plan.t[planned])
+    at = np.minimum(at, len(simulation.t) - 1)
+    known = simulation.t[at] == plan.t[planned]
+    difference = (simulation.z[at] - plan.z[planned])[known]
+    worst = _measure(difference, plan.t[planned][known], length)
+    if not arrived:
+        return None, worst
+    last = int(np.flatnonzero(simulation.phase == index)[-1])
+    if passes and known[-1]:
+        last = int(at[-1])
+    difference = simulation.z[[last]] - plan.z[planned[-1:]]
+    return _measure(difference, simulation.t[[last]], length), worst
+
+
+def _measure(difference: Array, t: Array, length: float) -> Deviation:
+    """Largest of differences of z, shape (n, 5), at times `t`; NaN if there are none."""
+    if not len(t):
+        return Deviation(math.nan, math.nan, math.nan)
+    position, angle = (np.abs(part).max(axis=1) for part in np.split(difference, [2], axis=1))
+    when = float(t[np.maximum(position / length, angle).argmax()])
+    return Deviation(float(position.max()), float(angle.max()), when)
+
+
+def _describe_end(events: list[Event], phase: Phase) -> str:
+    """What ends a phase, with the contacts that are released or change their mode."""
+    if not events or not phase.until.is_release:
+        return str(phase.until)
+    what = "release" if events[0].kind is EventKind.RELEASE else "change"
+    return f"{what} of {events[0].contact}"
+
+
+def _describe_torques(problem: Problem, torque: TorqueProfile) -> list[str]:
+    """Sentences on torques beyond their limits."""
+    powers = np.linspace(-1, 1, 9)[:, None] ** np.arange(torque.coefficients.shape[2])
+    peaks = np.abs(torque.coefficients @ powers.T).max(axis=2)
+    texts = []
+    for joint, limit in enumerate(problem.scene.torque_limit):
+        piece = int(peaks[:, joint].argmax())
+        if peaks[piece, joint] > limit * (1 + 1e-6):
+            texts.append(
+                f"tau_{joint + 1} reaches {peaks[piece, joint]:.3g} N m, above its limit "
+                f"{limit:g} N m, near t = {torque.breaks[piece]:.5g} s"
+            )
+    return texts
+
+
+def _balance(problem: Problem, simulation: Simulation) -> EnergyBalance:
+    scene, energies = problem.scene, simulation.energies
+    ends = simulation.z_dot[[0, -1]]
+    kinetic = float(np.diff(0.5 * ends**2 @ scene.mass_diagonal)[0])
+    weight = scene.polygon.mass * scene.gravity
+    potential = float(weight * (simulation.z[-1, 1] - simulation.z[0, 1]))
+    losses = {
+        name: float(getattr(energies, name)[-1]) for name in ("viscous", "dry", "contact", "impact")
+    }
+    work, residual = float(energies.work[-1]), float(energies.residual[-1])
+    scale = abs(work) + abs(kinetic) + abs(potential) + sum(map(abs, losses.values()))
+    relative = abs(residual) / scale if scale > 0 else 0.0
+    return EnergyBalance(
+        work=work,
+        kinetic=kinetic,
+        potential=potential,
+        **losses,
+        residual=residual,
+        relative=relative,
+    )
+
+
+__all__ = ["Report", "verify"]

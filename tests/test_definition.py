@@ -1,0 +1,336 @@
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from plane import finger_gap, place_corners
+from shipped import HEPTAGON
+from wholearm.common.errors import InputError
+from wholearm.geometry.path_guess import load
+from wholearm.problem.definition import End, Problem, build_problem, read_problem
+
+TEXT = HEPTAGON.read_text(encoding="utf-8")
+Edit = Callable[[dict[str, Any]], object]
+
+
+def read_edited(edit: Edit) -> Problem:
+    table = tomllib.loads(TEXT)
+    edit(table)
+    return build_problem(table)
+
+
+def put(path: str, value: object) -> Edit:
+    """An edit that sets a dotted key; numbers index lists."""
+
+    def edit(table: Any) -> None:
+        *parents, last = path.split(".")
+        for key in parents:
+            table = table[int(key)] if isinstance(table, list) else table[key]
+        table[int(last) if isinstance(table, list) else last] = value
+
+    return edit
+
+
+def drop(path: str) -> Edit:
+    def edit(table: Any) -> None:
+        *parents, last = path.split(".")
+        for key in parents:
+            table = table[int(key)] if isinstance(table, list) else table[key]
+        del table[int(last) if isinstance(table, list) else last]
+
+    return edit
+
+
+def test_heptagon_is_read() -> None:
+    problem = read_problem(str(HEPTAGON))
+    scene = problem.scene
+    assert (problem.name, problem.epsilon) == ("heptagon, four contacts", 0.05)
+    assert problem.source == str(HEPTAGON)
+    assert (scene.polygon.mass, scene.gravity, scene.polygon.n_vertices) == (0.2, 9.81, 7)
+    assert np.asarray(scene.fingers[0].base).tolist() == [0.08, -0.01]
+    assert np.asarray(scene.fingers[1].base).tolist() == [-0.08, -0.01]
+    assert [phase.number for phase in problem.phases] == [1, 2, 3, 4, 5]
+    assert problem.phases[2].formation.names == ("v0-palm", "v1-palm", "v3-finger1", "v6-finger2")
+    until = [str(phase.until) for phase in problem.phases]
+    assert until == ["v3-finger1", "v6-finger2", "v0-finger2", "v4-finger1", "phi = -50 deg"]
+    assert problem.phases[4].until.value == pytest.approx(math.radians(-50))
+    names = "v0-palm v1-palm v2-finger1 v5-finger2 v3-finger1 v6-finger2 v0-finger2 v4-finger1"
+    assert " ".join(contact.name for contact in problem.contacts) == names
+
+
+def test_start_is_closed_and_flush() -> None:
+    problem = read_problem(str(HEPTAGON))
+    z = problem.start
+    heights = place_corners(problem.scene, z)[:, 1]
+    np.testing.assert_allclose(heights[:2], 0.0, atol=1e-16)
+    assert z[0] == 0.045 and (heights[2:] > 0.01).all()
+    for finger in (0, 1):
+        assert finger_gap(problem.scene, z[:3], finger, z[3 + finger])[0] == pytest.approx(
+            0.0, abs=1e-15
+        )
+
+
+def test_defaults() -> None:
+    def edit(table: dict[str, Any]) -> None:
+        del table["name"], table["gravity"]
+        for key in ("viscous", "dry"):
+            del table["fingers"]["1"][key]
+
+    problem = read_edited(edit)
+    finger = problem.scene.fingers[0]
+    assert (problem.name, problem.scene.gravity) == ("unnamed", 9.81)
+    assert (finger.viscous, finger.dry, finger.speed_limit) == (0.0, 0.0, math.inf)
+    assert problem.scene.speed_limit.tolist() == [math.inf, math.inf]
+
+
+def test_optional_keys() -> None:
+    def edit(table: dict[str, Any]) -> None:
+        table["object"]["inertia"] = 1e-3
+        table["fingers"]["2"]["speed_limit"] = 3
+        table["phases"][0]["until"] = {"x": 0.02}
+
+    problem = read_edited(edit)
+    assert problem.scene.polygon.inertia == 1e-3
+    assert problem.scene.fingers[1].speed_limit == 3.0
+    assert str(problem.phases[0].until) == "x = 0.02 m"
+
+
+def test_a_contact_slides_unless_it_is_said_to_roll() -> None:
+    problem = read_edited(put("phases.3.contacts", ["v1-palm rolling", "v0-finger2", "v3-finger1"]))
+    phase, before = problem.phases[3].formation, problem.phases[0].formation
+    assert [contact.name for contact in phase.rolling] == ["v1-palm"]
+    assert phase.rolling[0] == before.contacts[1] and before.rolling == ()
+    assert phase.names == ("v1-palm", "v0-finger2", "v3-finger1")
+    assert [c.name for c in problem.contacts].count("v1-palm") == 1
+
+
+def test_a_contact_without_friction_cannot_roll() -> None:
+    def edit(table: dict[str, Any]) -> None:
+        table["friction"]["finger2"] = 0.0
+        table["phases"][3]["contacts"] = ["v1-palm", "v0-finger2 rolling", "v3-finger1"]
+
+    with pytest.raises(InputError, match=r"v0-finger2 cannot roll .* friction\.finger2 is 0"):
+        read_edited(edit)
+
+
+ALLOWED_UNTIL = "allowed are a contact name"
+
+
+@pytest.mark.parametrize(
+    "edit, key, text",
+    [
+        (put("epsilonn", 1), "epsilonn", "did you mean 'epsilon'"),
+        (put("zzz", 1), "zzz", "allowed are epsilon, fingers"),
+        (put("object.mas", 1), "object.mas", "did you mean 'mass'"),
+        (put("fingers.1.torque_limits", 1), "fingers.1.torque_limits", "'torque_limit'"),
+        (put("fingers.3", {}), "fingers.3", "allowed are 1, 2"),
+        (put("friction.finger_1", 0), "friction.finger_1", "'finger1'"),
+        (put("start.phi", 0), "start.phi", "allowed are flush, x"),
+        (put("phases.1.contact", []), "phases[2].contact", "did you mean 'contacts'"),
+        (drop("epsilon"), "epsilon", "is missing"),
+        (drop("phases"), "phases", "is missing"),
+        (drop("object.mass"), "object.mass", "is missing"),
+        (drop("fingers.2"), "fingers.2", "is missing"),
+        (drop("fingers.2.length"), "fingers.2.length", "is missing"),
+        (drop("friction.palm"), "friction.palm", "is missing"),
+        (drop("start.x"), "start.x", "is missing"),
+        (drop("phases.3.until"), "phases[4].until", "is missing"),
+        (put("name", 3), "name", "not a string"),
+        (put("epsilon", "small"), "epsilon", "'small'"),
+        (put("epsilon", -0.1), "epsilon", ">= 0"),
+        (put("epsilon", math.nan), "epsilon", "finite"),
+        (put("epsilon", True), "epsilon", "True"),
+        (put("gravity", -9.81), "gravity", ">= 0"),
+        (put("fingers_collide", 0), "fingers_collide", "0 given; allowed are true and false"),
+        (put("fingers.collide", False), "fingers.collide", "unknown key"),
+        (put("object", 3), "object", "not a table"),
+        (put("object.mass", -0.2), "object.mass", "positive"),
+        (put("object.mass", math.nan), "object.mass", "finite"),
+        (put("object.inertia", 0), "object.inertia", "positive"),
+        (put("object.vertices", [[0, 0], [0, 1], [1, 0]]), "object.vertices", "clockwise"),
+        (put("object.vertices.2", [0, 0]), "object.vertices[2]", "convex"),
+        (put("object.vertices.2.1", math.inf), "object.vertices[2]", "finite"),
+        (put("object.vertices", 3), "object.vertices", "3 or more"),
+        (put("fingers.1", []), "fingers.1", "not a table"),
+        (put("fingers.1.length", 0), "fingers.1.length", "positive"),
+        (put("fingers.2.base", [1]), "fingers.2.base", "2 numbers"),
+        (put("fingers.2.base", [0.09, 0]), "fingers.1.base", "not to the right"),
+        (put("fingers.2.torque_limit", math.inf), "fingers.2.torque_limit", "finite"),
+        (put("fingers.2.speed_limit", -1), "fingers.2.speed_limit", "positive"),
+        (put("friction.palm", -0.1), "friction.palm", ">= 0"),
+        (put("friction", []), "friction", "not a table"),
+        (put("start", 0), "start", "not a table"),
+        (put("start.flush", 7), "start.flush", "0 to 6"),
+        (put("start.flush", -1), "start.flush", "0 to 6"),
+        (put("start.flush", 0.0), "start.flush", "0 to 6"),
+        (put("start.flush", True), "start.flush", "0 to 6"),
+        (put("start.x", "left"), "start.x", "'left'"),
+        (put("start.x", 9.0), "start", "finger 1 is too short"),
+        (put("fingers.2.base", [0.03, 0.02]), "fingers.2.base", "inside the object"),
+        (put("phases", []), "phases", "one or more"),
+        (put("phases", {}), "phases", "one or more"),
+        (put("phases.0", 3), "phases[1]", "not a table"),
+        (put("phases.0.contacts", []), "phases[1].contacts", "contact names"),
+        (put("phases.0.contacts", "v0-palm"), "phases[1].contacts", "contact names"),
+        (put("phases.2.contacts.1", "v7-palm"), "phases[3].contacts", "0 to 6"),
+        (put("phases.2.contacts.1", "thumb"), "phases[3].contacts", "'thumb' is not a contact"),
+        (put("phases.2.contacts.1", 5), "phases[3].contacts", "5 is not a contact"),
+        (put("phases.2.contacts.1", "v0-palm"), "phases[3].contacts", "v0-palm is given twice"),
+        (put("phases.0.contacts.2", "v4-finger1"), "phases[1].contacts", "fingers touch"),
+        (put("start.x", 0.0), "phases[1].contacts", "v3-finger1 v5-finger2"),
+        (put("phases.0.contacts.1", "v1-palm rolling"), "phases[1].contacts", "makes 5"),
+        (put("phases.0.contacts.1", "v1-palm rolls"), "phases[1].contacts", "'v1-palm rolls'"),
+        (put("phases.0.contacts.1", "v1-palm rolls"), "phases[1].contacts", "' rolling' may"),
+        (put("phases.0.contacts.1", "v0-palm rolling"), "phases[1].contacts", "given twice"),
+        (put("phases.3.until", "v0-palm rolling"), "phases[4].until", "not a contact"),
+        (put("phases.3.until", "v0-palmm"), "phases[4].until", "not a contact"),
+        (put("phases.3.until", "v1-palm"), "phases[4].until", "already"),
+        (put("phases.3.until", 3), "phases[4].until", ALLOWED_UNTIL),
+        (put("phases.3.until", {}), "phases[4].until", ALLOWED_UNTIL),
+        (put("phases.3.until", {"phi": 1}), "phases[4].until", ALLOWED_UNTIL),
+        (put("phases.3.until", {"x": 1, "phi_deg": 1}), "phases[4].until", ALLOWED_UNTIL),
+        (put("phases.3.until", {"x": math.nan}), "phases[4].until", "finite"),
+        (put("phases.3.until", {"phi_deg": "1"}), "phases[4].until", "'1'"),
+    ],
+)
+def test_bad_input_names_the_key(edit: Edit, key: str, text: str) -> None:
+    with pytest.raises(InputError) as caught:
+        read_edited(edit)
+    assert caught.value.key == key
+    assert text in caught.value.problem
+
+
+def test_ends_are_read() -> None:
+    def edit(table: dict[str, Any]) -> None:
+        table["phases"][0]["end"], table["phases"][1]["end"] = "impact", "rest"
+
+    ends = [phase.end for phase in read_edited(edit).phases]
+    assert ends == [End.IMPACT, *4 * [End.REST]]
+
+
+@pytest.mark.parametrize(
+    "index, until, end, key, text",
+    [
+        (0, "v3-finger1", "bang", "end", "'bang' given; allowed are 'rest', 'smooth', 'impact'"),
+        (4, {"phi_deg": -50.0}, "impact", "end", "'impact' given, but the last phase ends at rest"),
+        (4, {"phi_deg": -50.0}, "smooth", "end", "'smooth' given, but the last phase ends at rest"),
+        (0, {"x": 0.02}, "impact", "end", "but until is x = 0.02 m, not a contact that is gained"),
+        (0, "v3-palm", "impact", "end", "but phase 2 does not have v3-palm"),
+        (2, "v3-palm", "smooth", "end", "'smooth' given, but phase 4 has v0-finger2 too"),
+        (0, None, "impact", "until", "is missing; only a phase with end = 'smooth' has none"),
+    ],
+)
+def test_bad_ends_name_the_key(index: int, until: object, end: str, key: str, text: str) -> None:
+    def edit(table: dict[str, Any]) -> None:
+        table["phases"][index] |= {"until": until, "end": end}
+        if until is None:
+            del table["phases"][index]["until"]
+
+    with pytest.raises(InputError) as caught:
+        read_edited(edit)
+    assert caught.value.key == f"phases[{index + 1}].{key}"
+    assert text in caught.value.problem and "\n" not in str(caught.value)
+
+
+def test_an_impact_adds_only_the_contact_gained() -> None:
+    def edit(table: dict[str, Any]) -> None:
+        table["phases"][0]["end"] = "impact"
+        table["phases"][1]["contacts"] = ["v0-palm", "v4-finger1", "v3-finger1", "v5-finger2"]
+
+    with pytest.raises(InputError, match="'impact' given, but phase 2 has v4-finger1 too"):
+        read_edited(edit)
+
+
+@pytest.mark.parametrize(
+    "old, new, key, text",
+    [
+        ("mass = 0.2", "mass = nan", "object.mass", "finite"),
+        ("mass = 0.2", "mas = 0.2", "object.mas", "did you mean 'mass'"),
+        ("mass = 0.2", "mass = ", "", "is not TOML"),
+        ("mass = 0.2", "mass = 0.2\nmass = 0.3", "", "is not TOML"),
+        ('"v5-finger2"]\nuntil', '"v9-finger2"]\nuntil', "phases[1].contacts", "does not exist"),
+        (TEXT, "", "epsilon", "is missing"),
+        # Those below need the curves.
+        ('until = "v6-finger2"', 'until = "v2-palm"', "phases[2].until", "never reached"),
+        ('until = "v6-finger2"', "until = { x = -9.0 }", "phases[2].until", "never reached"),
+        ("phi_deg = -50.0", "phi_deg = 50.0", "phases[5].until", "phi = 50 deg is never reached"),
+        ('until = "v3-finger1"', "until = { x = 0.03 }", "phases[2].contacts", "does not touch"),
+        ('["v1-palm", "v3-finger1", "v6-finger2", "v0-finger2"]', '["v1-palm", "v3-finger1"]',
+         "phases[5].contacts", "does not touch at the end of phase 4"),
+    ],
+)  # fmt: skip
+def test_bad_file_names_the_file(tmp_path: Path, old: str, new: str, key: str, text: str) -> None:
+    path = tmp_path / "bad.toml"
+    assert old in TEXT
+    path.write_text(TEXT.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        load(str(path))
+    assert (caught.value.source, caught.value.key) == (str(path), key)
+    assert text in caught.value.problem
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "content", [b"\xff\xfe", b"\x00", b"[[[[", b"a = " + b"9" * 5000, b"a = " + b"[" * 20_000]
+)
+def test_not_toml(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"is not TOML|is nested too deeply"):
+        read_problem(str(path))
+
+
+@pytest.mark.parametrize("name", ["absent.toml", "."])
+def test_unreadable_file(tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError, match="cannot be read") as caught:
+        read_problem(str(tmp_path / name))
+    assert caught.value.source == str(tmp_path / name)
+
+
+def test_never_reached_says_what_stops_it_both_ways(tmp_path: Path) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text(TEXT.replace('until = "v6-finger2"', 'until = "v2-palm"'), encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        load(str(path))
+    assert "v6 touches finger 2 at x = -19.91 mm" in caught.value.problem
+    assert "v2 touches finger 1 at x = 16.68 mm" in caught.value.problem
+
+
+@pytest.mark.parametrize("solid", [None, True, False])
+def test_fingers_may_lie_in_different_planes(solid: bool | None) -> None:
+    problem = read_edited(lambda table: solid is None or put("fingers_collide", solid)(table))
+    assert problem.scene.fingers_collide is (solid is not False)
+
+
+def test_a_hand_that_is_crossed_at_the_start_is_refused() -> None:
+    """Long links close over an object in the middle, unless they pass each other."""
+
+    def cross(table: dict[str, Any]) -> None:
+        table["start"]["x"] = 0.0
+        for finger in table["fingers"].values():
+            finger["length"] = 0.3
+
+    with pytest.raises(InputError, match=r"into each other: their gap is -0\.0") as caught:
+        read_edited(cross)
+    assert caught.value.key == "start.x" and "allowed is 0 or more" in caught.value.problem
+
+    def pass_by(table: dict[str, Any]) -> None:
+        cross(table)
+        table["fingers_collide"] = False
+        table["phases"] = table["phases"][1:2]
+
+    assert read_edited(pass_by).start[0] == 0.0
+
+
+def test_the_first_phase_may_let_go_of_what_touches() -> None:
+    def edit(table: dict[str, Any]) -> None:
+        table["phases"][0]["contacts"].remove("v0-palm")
+
+    first = read_edited(edit).phases[0].formation
+    assert first.names == ("v1-palm", "v2-finger1", "v5-finger2")

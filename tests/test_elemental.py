@@ -1,0 +1,265 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from plane import (
+    cross,
+    make_formation,
+    make_scene,
+    nearest_on_segment,
+    place_corners,
+    place_tips,
+    point_to_segment,
+    rotate,
+)
+from wholearm.common.arrays import Array
+from wholearm.common.errors import InputError
+from wholearm.contacts.elemental import (
+    Contact,
+    build_features,
+    build_geometry,
+    candidate_contacts,
+    parse_contact,
+)
+from wholearm.contacts.limits import build_limits
+from wholearm.problem.definition import Problem
+from wholearm.scene.model import Scene
+
+KITE = [[-0.04, -0.03], [0.02, -0.035], [0.045, 0.01], [0.0, 0.05], [-0.045, 0.02]]
+NAMES = ["v3-palm", "v2-finger1", "v4-finger2", "e1-tip1", "e3-tip2", "v2-tip1", "v4-tip2"]
+STEP = 1e-6
+# Central differences: rounding 1e-16 / STEP, truncation STEP^2.
+DIFFERENCE = 1e-9
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return make_scene(KITE)
+
+
+def configurations(seed: int, count: int = 20) -> Array:
+    """Random z, on no contact's manifold."""
+    rng = np.random.default_rng(seed)
+    low, high = [-0.1, 0.02, -3.0, 0.3, 0.3], [0.1, 0.15, 3.0, 2.8, 2.8]
+    return np.asarray(rng.uniform(low, high, (count, 5)))
+
+
+def measure_gap(scene: Scene, contact: Contact, z: Array) -> tuple[float, Array, Array]:
+    """Signed gap, closest point of the object, and normal into it, by plain geometry."""
+    corners = place_corners(scene, z)
+    corner = corners[contact.index]
+    if contact.finger is None:
+        return float(corner[1]), corner, np.array([0.0, 1.0])
+    link = scene.fingers[contact.finger]
+    base, tip = np.asarray(link.base), place_tips(scene, contact.finger, z[3 + contact.finger])
+    if contact.surface == "finger":
+        axis = (tip - base) / link.length
+        normal = np.array([-axis[1], axis[0]]) * (1 if contact.finger == 0 else -1)
+        # Far ends, so that the foot of the perpendicular is on the segment.
+        distance = float(point_to_segment(corner, base - 9 * axis, tip + 9 * axis))
+        side = np.sign(normal @ (corner - base))
+        return float(side * distance - link.radius), corner, normal
+    if contact.feature == "e":
+        after = corners[(contact.index + 1) % len(corners)]
+        run = after - corner
+        normal = np.array([-run[1], run[0]]) / np.hypot(*run)
+        point = nearest_on_segment(tip, corner - 9 * run, after + 9 * run)
+        side = np.sign(cross(run, corner - tip))
+        return float(side * np.hypot(*(tip - point)) - link.radius), point, normal
+    away = corner - tip
+    return float(np.hypot(*away) - link.radius), corner, away / np.hypot(*away)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gap_is_the_distance_measured(scene: Scene, name: str) -> None:
+    formation = make_formation(scene, name)
+    z = configurations(1)
+    gaps = formation.evaluate(z, z).C[:, 0]
+    measured = [measure_gap(scene, formation.contacts[0], point)[0] for point in z]
+    np.testing.assert_allclose(gaps, measured, atol=1e-14)
+    assert {-1.0, 1.0} >= set(np.sign(gaps)) and np.ptp(gaps) > 0.01
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_rows_are_the_derivatives_of_the_gap(scene: Scene, name: str) -> None:
+    formation = make_formation(scene, name)
+    z = configurations(2)
+    A = formation.evaluate(z, z).A[:, 0]
+    for k, unit in enumerate(STEP * np.eye(5)):
+        rise = formation.evaluate(z + unit, z).C - formation.evaluate(z - unit, z).C
+        np.testing.assert_allclose(A[:, k], rise[:, 0] / (2 * STEP), atol=DIFFERENCE)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_velocities_at_the_contact_point(scene: Scene, name: str) -> None:
+    """A v and A_t v are the relative velocity of two material points, differenced in time."""
+    formation = make_formation(scene, name)
+    contact = formation.contacts[0]
+    rng = np.random.default_rng(3)
+    for z in configurations(3, 8):
+        gap, _, normal = measure_gap(scene, contact, z)
+        z[:2] -= gap * normal
+        gap, point, normal = measure_gap(scene, contact, z)
+        assert abs(gap) < 1e-15
+        v = rng.uniform(-1, 1, 5)
+        on_object = rotate(-z[2], point - z[:2])
+
+        def separate(
+            moved: Array, point: Array = point, start: Array = z, body: Array = on_object
+        ) -> Array:
+            world = moved[:2] + rotate(moved[2], body)
+            if contact.finger is None:
+                return np.asarray(world - point)
+            base = np.asarray(scene.fingers[contact.finger].base)
+            k = 3 + contact.finger
+            return np.asarray(world - base - rotate(moved[k] - start[k], point - base))
+
+        velocity = (separate(z + STEP * v) - separate(z - STEP * v)) / (2 * STEP)
+        kinematics = formation.evaluate(z[None], v[None])
+        tangent = np.array([normal[1], -normal[0]])
+        assert kinematics.A[0, 0] @ v == pytest.approx(normal @ velocity, abs=DIFFERENCE)
+        assert kinematics.A_t[0, 0] @ v == pytest.approx(tangent @ velocity, abs=DIFFERENCE)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_normal_and_point_are_those_measured(scene: Scene, name: str) -> None:
+    contact = parse_contact(name, scene)
+    geometry = build_geometry(contact, scene)
+    function = ca.Function(
+        "g", [build_features(scene).z], [geometry.point, geometry.normal, geometry.gap]
+    )
+    for z in configurations(4, 8):
+        gap, _, normal = measure_gap(scene, contact, z)
+        z[:2] -= gap * normal
+        _, point, normal = measure_gap(scene, contact, z)
+        found = [part.full()[:, 0] for part in function(z)]
+        np.testing.assert_allclose(found[0], point, atol=1e-15)
+        np.testing.assert_allclose(found[1], normal, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_second_derivative_term(scene: Scene, name: str) -> None:
+    formation = make_formation(scene, name)
+    z = configurations(5)
+    v = np.random.default_rng(5).uniform(-1, 1, z.shape)
+    rise = formation.evaluate(z + STEP * v, v).A - formation.evaluate(z - STEP * v, v).A
+    expected = np.einsum("nij,nj->ni", rise / (2 * STEP), v)
+    np.testing.assert_allclose(formation.evaluate(z, v).A_dot_v, expected, atol=DIFFERENCE)
+
+
+def limit_values(scene: Scene, name: str, z: Array) -> dict[str, float]:
+    limits = build_limits(parse_contact(name, scene), scene)
+    function = ca.Function("l", [build_features(scene).z], [ca.vertcat(*(e.value for e in limits))])
+    values = function(z).full()[:, 0]
+    return {limit.text: float(value) for limit, value in zip(limits, values, strict=True)}
+
+
+@pytest.mark.parametrize("finger", [1, 2])
+@pytest.mark.parametrize("run, end", [(0.0, "base"), (0.18, "tip")])
+def test_vertex_at_the_end_of_a_link(scene: Scene, finger: int, run: float, end: str) -> None:
+    angle, side = (1.2, 1) if finger == 1 else (1.9, -1)
+    axis = np.array([np.cos(angle), np.sin(angle)])
+    normal = side * np.array([-axis[1], axis[0]])
+    corner = np.asarray(scene.fingers[finger - 1].base) + run * axis + 0.005 * normal
+    z = np.array([*(corner - rotate(0.4, scene.polygon.vertices[2])), 0.4, angle, angle])
+    values = limit_values(scene, f"v2-finger{finger}", z)
+    assert values.pop(f"v2 runs off finger {finger} at its {end}") == pytest.approx(0, abs=1e-15)
+    assert list(values.values()) == pytest.approx([0.18])
+
+
+@pytest.mark.parametrize("edge, corner", [(1, 1), (1, 2), (4, 4), (4, 0)])
+def test_tip_at_the_end_of_an_edge(scene: Scene, edge: int, corner: int) -> None:
+    tip = place_tips(scene, 1, 1.0)
+    vertices = scene.polygon.vertices
+    run = rotate(0.7, vertices[(edge + 1) % 5] - vertices[edge])
+    outward = np.array([run[1], -run[0]]) / np.hypot(*run)
+    at = tip - 0.005 * outward
+    z = np.array([*(at - rotate(0.7, vertices[corner])), 0.7, 1.0, 1.0])
+    values = limit_values(scene, f"e{edge}-tip2", z)
+    text = f"the tip of finger 2 runs off edge {edge} at v{corner}"
+    assert values.pop(text) == pytest.approx(0, abs=1e-15)
+    assert list(values.values()) == pytest.approx([np.hypot(*run)])
+
+
+@pytest.mark.parametrize(
+    "heading, text",
+    [
+        (np.pi / 2, "v2 leaves the tip of finger 1 for the side of the link"),
+        (None, "edge 1 turns onto the tip of finger 1"),
+        (-1.0, "edge 2 turns onto the tip of finger 1"),
+    ],
+)
+def test_vertex_at_the_ends_of_the_tip_arc(scene: Scene, heading: float | None, text: str) -> None:
+    """Contact at a right angle to the link, or along the normal of an edge beside the vertex."""
+    angle, phi = 1.2, 0.4
+    vertices = scene.polygon.vertices
+    if heading is None or heading < 0:
+        edge = 1 if heading is None else 2
+        run = rotate(phi, vertices[edge + 1] - vertices[edge])
+        away = np.array([-run[1], run[0]]) / np.hypot(*run)
+    else:
+        away = rotate(heading, [np.cos(angle), np.sin(angle)])
+    corner = place_tips(scene, 0, angle) + 0.005 * away
+    z = np.array([*(corner - rotate(phi, vertices[2])), phi, angle, angle])
+    assert limit_values(scene, "v2-tip1", z)[text] == pytest.approx(0, abs=1e-15)
+
+
+def test_palm_has_no_ends(scene: Scene) -> None:
+    assert build_limits(parse_contact("v0-palm", scene), scene) == []
+
+
+def test_names_round_trip(scene: Scene) -> None:
+    contacts = [c for part in (None, 0, 1) for c in candidate_contacts(scene, part)]
+    assert len(set(contacts)) == 5 + 2 * 15
+    assert [parse_contact(contact.name, scene) for contact in contacts] == contacts
+    assert [str(contact) for contact in contacts] == [contact.name for contact in contacts]
+
+
+@pytest.mark.parametrize(
+    "name, corner, part",
+    [
+        ("v3-palm", "v3", "the palm"),
+        ("v3-finger1", "v3", "finger 1"),
+        ("e2-tip2", "e2", "the tip of finger 2"),
+    ],
+)
+def test_words(scene: Scene, name: str, corner: str, part: str) -> None:
+    contact = parse_contact(name, scene)
+    assert (contact.corner, contact.part) == (corner, part)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("v5-palm", "e5-tip1", "e0-palm", "e1-finger1", "v1-finger3", "v1-tip0", "v1", "x1-palm"),
+        *("v1-palm1", "v-1-palm", "V1-palm", " v1-palm", "v1-palm\n", "v\u0661-palm", "v01-palm"),
+        *("v1-finger", "", None, 7, ["v1-palm"], True),
+    ],
+)
+def test_bad_name_lists_what_is_allowed(scene: Scene, name: Any) -> None:
+    with pytest.raises(InputError, match="allowed are vN-palm") as caught:
+        parse_contact(name, scene)
+    assert repr(name) in caught.value.problem and "0 to 4" in caught.value.problem
+
+
+def test_pointed_tip_has_no_arc() -> None:
+    pointed = make_scene(KITE, radius=0.0)
+    assert len(candidate_contacts(pointed, 0)) == 10
+    with pytest.raises(InputError, match=r"fingers\.1\.radius is 0"):
+        parse_contact("v1-tip1", pointed)
+
+
+def test_features_last_as_long_as_their_scene(heptagon: Problem) -> None:
+    first = build_features(heptagon.scene)
+    right, left = heptagon.scene.fingers
+    others = [
+        replace(heptagon.scene, fingers=(replace(right, length=0.1 + k / 500), left))
+        for k in range(60)
+    ]
+    assert len({id(build_features(scene)) for scene in others}) == len(others)
+    assert build_features(heptagon.scene) is first

@@ -1,0 +1,395 @@
+from __future__ import annotations
+
+import copy
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+from crossing import hexagon, measure_fingers
+from plane import finger_gap, make_scene, place_corners, point_to_segment
+from shipped import HEPTAGON
+from wholearm.cli.command import main
+from wholearm.common.arrays import Array
+from wholearm.common.errors import InputError
+from wholearm.contacts.formation import Formation, close_finger
+from wholearm.geometry.closing import close, contact_table, first_contact
+from wholearm.geometry.curve import Curve
+from wholearm.mapping.borders import NOWHERE, Window, label_cells
+from wholearm.mapping.formation_map import CROSSED, Border, FormationMap, build_map
+from wholearm.mapping.route import list_formations
+from wholearm.problem.definition import Problem, build_problem
+from wholearm.scene.model import Scene
+
+TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
+WINDOW = Window((-0.16, 0.16), (np.radians(-75.0), np.radians(30.0)))
+
+
+def change(**edits: Any) -> Problem:
+    """The heptagon's problem with finger keys, or `vertices` and `phases`, replaced."""
+    table = copy.deepcopy(TABLE)
+    for key in ("1", "2"):
+        table["fingers"][key] |= {k: v for k, v in edits.items() if k in table["fingers"][key]}
+    table["object"]["vertices"] = edits.get("vertices", table["object"]["vertices"])
+    table["phases"] = edits.get("phases", table["phases"])
+    return build_problem(table)
+
+
+@pytest.fixture(scope="module")
+def chart(heptagon: Problem) -> FormationMap:
+    return build_map(heptagon, resolution=40, window=WINDOW)
+
+
+@pytest.fixture(scope="module")
+def pointed() -> FormationMap:
+    """Short pointed fingers: tips reach edges, and much of the plane is out of reach."""
+    problem = change(radius=0.0, length=0.12)
+    return build_map(problem, resolution=40, window=WINDOW)
+
+
+@pytest.fixture(scope="module", params=["chart", "pointed"])
+def every(request: pytest.FixtureRequest) -> FormationMap:
+    found: FormationMap = request.getfixturevalue(request.param)
+    return found
+
+
+def gaps(scene: Scene, border_contacts: Any, z: Array) -> Array:
+    return Formation(scene, tuple(border_contacts)).evaluate(z, np.zeros_like(z)).C
+
+
+def distance_to(borders: list[Border], points: Array) -> Array:
+    """Distance of points (x, phi) from the nearest of some borders, phi weighed by 0.05 m."""
+    scale = np.array([1.0, 0.05])
+    starts = np.concatenate([b.points[:-1] for b in borders]) * scale
+    ends = np.concatenate([b.points[1:] for b in borders]) * scale
+    return np.array([point_to_segment(p * scale, starts, ends).min() for p in points])
+
+
+@pytest.mark.parametrize("radius", [0.005, 0.0])
+def test_closing_many_agrees_with_closing_one(radius: float) -> None:
+    points = np.asarray(TABLE["object"]["vertices"])
+    # Joints above the palm, so that they get into the object too.
+    scene = make_scene(points, base=0.06, depth=0.01, length=0.1, radius=radius)
+    rng = np.random.default_rng(1)
+    x, phi = rng.uniform(-0.2, 0.2, 200), rng.uniform(-4.0, 4.0, 200)
+    closed = close(scene, x, phi)
+    seen = set()
+    for row in range(len(x)):
+        for finger in (0, 1):
+            angle, obstacle = closed.z[row, 3 + finger], int(closed.obstacle[row, finger])
+            seen.add(obstacle)
+            if obstacle:
+                words = {1: "too short", 2: "inside the object"}[obstacle]
+                with pytest.raises(InputError, match=words):
+                    close_finger(scene, closed.z[row, :3], finger)
+                assert np.isnan(angle) and closed.touched[row, finger] == -1
+                continue
+            # Sums of a few angles of order 1: rounding.
+            assert angle == pytest.approx(close_finger(scene, closed.z[row, :3], finger), abs=1e-12)
+            contact = contact_table(scene)[closed.touched[row, finger]]
+            assert contact.finger == finger
+            # asin and acos lose half the digits where a vertex is at the joint or the reach ends.
+            assert abs(gaps(scene, [contact], closed.z[[row]])[0, 0]) < 1e-9
+    assert seen == {0, 1, 2}
+    assert contact_table(scene)[first_contact(scene, 1)].name == "v0-finger2"
+
+
+def test_configurations_of_cells_touch_without_overlap(every: FormationMap) -> None:
+    scene = every.problem.scene
+    rng = np.random.default_rng(2)
+    rows, columns = np.nonzero(every.cell >= 0)
+    chosen = rng.choice(len(rows), 300, replace=False)
+    rows, columns = rows[chosen], columns[chosen]
+    z = close(scene, every.x[columns], every.phi[rows]).z
+    lowest = place_corners(scene, z)[..., 1].min(axis=1)
+    np.testing.assert_allclose(lowest, 0.0, rtol=0, atol=1e-15)
+    for finger in (0, 1):
+        # Distances of polygon and segment in plain geometry; rounding only.
+        assert np.abs(finger_gap(scene, z[:, :3], finger, z[:, 3 + finger])).max() < 1e-10
+    cells = every.cell[rows, columns]
+    for cell in np.unique(cells):
+        contacts = every.formations[cell]
+        assert len(contacts) == 3
+        assert np.abs(gaps(scene, contacts, z[cells == cell])).max() < 1e-10
+
+
+def test_cells_that_cannot_be_reached_say_why(every: FormationMap) -> None:
+    scene = every.problem.scene
+    codes = set(np.unique(every.cell[every.cell < 0]).tolist())
+    assert codes == {-1, -2}
+    for code in codes:
+        row, column = np.argwhere(every.cell == code)[0]
+        z = close(scene, every.x[[column]], every.phi[[row]]).z[0]
+        angles = np.linspace(-np.pi, np.pi, 500)
+        # Wherever the finger turns, it stays off the object.
+        assert finger_gap(scene, z[:3], -code - 1, angles).min() > 0
+
+
+def test_borders_have_four_closed_contacts(every: FormationMap) -> None:
+    scene = every.problem.scene
+    for border in every.borders:
+        assert len(border.contacts) == 4
+        assert np.abs(gaps(scene, border.contacts, border.z)).max() < 1e-9
+        np.testing.assert_array_equal(border.z[:, [0, 2]], border.points)
+        coordinate = border.points[:, 0 if border.along == "x" else 1]
+        assert (np.diff(coordinate) > 0).all()
+        if border.flush is None:
+            assert not border.forth.any() and not border.back.any()
+
+
+def test_flush_edges_lie_on_palm_or_link(every: FormationMap) -> None:
+    scene = every.problem.scene
+    for border in every.borders:
+        if border.flush is None:
+            continue
+        finger, edge = border.flush
+        for z in border.z[[0, len(border.z) // 2]]:
+            corners = place_corners(scene, z)
+            run = np.roll(corners, -1, axis=0)[edge] - corners[edge]
+            heading = 0.0 if finger is None else z[3 + finger]
+            across = run @ np.array([-np.sin(heading), np.cos(heading)])
+            assert abs(across) < 1e-9
+
+
+def test_crossings_have_five_closed_contacts(every: FormationMap) -> None:
+    assert sum(len(crossing.flush) >= 2 for crossing in every.crossings) > 5
+    for crossing in every.crossings:
+        assert len(crossing.contacts) >= 5
+        worst = np.abs(gaps(every.problem.scene, crossing.contacts, crossing.z[None])).max()
+        assert worst < 1e-9
+
+
+def test_every_change_of_cell_is_a_border(every: FormationMap) -> None:
+    """Between neighbours of a fine grid that differ, bisection ends on a border."""
+    scene = every.problem.scene
+    rng = np.random.default_rng(3)
+    size = np.array([every.x[-1] - every.x[0], every.phi[-1] - every.phi[0]])
+    starts = np.array([every.x[0], every.phi[0]]) + rng.uniform(0.02, 0.98, (1500, 2)) * size
+    stops = starts + rng.uniform(-0.02, 0.02, (1500, 2)) * size
+    first, last = (label_cells(scene, *points.T) for points in (starts, stops))
+    both = (first[:, 0] != NOWHERE) & (last[:, 0] != NOWHERE) & (first != last).any(axis=1)
+    assert both.sum() > 60
+    low, high, first = starts[both], stops[both], first[both]
+    for _ in range(50):
+        middle = (low + high) / 2
+        labels = label_cells(scene, *middle.T)
+        same = (labels == first).all(axis=1)[:, None]
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    found = label_cells(scene, *high.T)[:, 0] != NOWHERE
+    # Borders are drawn with chords of at most 2 mm or 0.01 rad on curves of radius 50 mm or more.
+    assert distance_to(list(every.borders), low[found]).max() < 2e-5
+
+
+def test_plan_runs_along_borders(chart: FormationMap, curves: tuple[Curve, ...]) -> None:
+    for curve in curves:
+        names = set(curve.formation.names)
+        own = [border for border in chart.borders if set(border.names) == names]
+        points = curve.evaluate(np.linspace(0.0, curve.length, 40)).z[:, [0, 2]]
+        assert distance_to(own, points).max() < 2e-5
+
+
+def test_plan_is_possible_quasistatically_the_way_it_goes(
+    chart: FormationMap, curves: tuple[Curve, ...]
+) -> None:
+    for curve in curves:
+        names = set(curve.formation.names)
+        (border,) = [b for b in chart.borders if set(b.names) == names]
+        index = 0 if border.along == "x" else 1
+        ends = sorted([curve.start[2 * index], curve.end[2 * index]])
+        value = border.points[:, index]
+        used = (value > ends[0]) & (value < ends[1])
+        # Every phase goes left, or turns clockwise.
+        assert curve.end[2 * index] < curve.start[2 * index]
+        assert border.back[used].all()
+
+
+def most_slack(problem: Problem, border: Border, k: int, way: float) -> float | None:
+    """How far all limits can be kept at a border's point, by a linear programme; None: unclear."""
+    scene = problem.scene
+    formation = Formation(scene, border.contacts)
+    part = formation.evaluate(border.z[[k]], np.zeros((1, 5)))
+    # The tangent from neighbouring points, not from A.
+    before, after = border.z[k - 1], border.z[k + 1]
+    slip, turn = part.A_t[0] @ (after - before) * way, (after - before)[3:] * way
+    size = np.abs(after - before).max()
+    if (np.abs(slip) < 2e-3 * size).any() or (np.abs(turn) < 2e-2 * size).any():
+        return None
+    G = part.A[0] - (formation.friction * np.sign(slip))[:, None] * part.A_t[0]
+    # Unknowns c_n (4), tau (2), slack: G^T c_n + S tau = D sigma - g.
+    equal = np.zeros((5, 7))
+    equal[:, :4], equal[[3, 4], [4, 5]] = G.T, 1.0
+    right = -scene.applied_force + np.array([0.0, 0.0, 0.0, *(scene.dry[3:] * np.sign(turn))])
+    above = np.zeros((8, 7))
+    above[:4, :4], above[4:6, 4:6], above[6:, 4:6] = -np.eye(4), np.eye(2), -np.eye(2)
+    above[:, 6] = 1.0
+    bound = np.concatenate([np.full(4, -problem.epsilon), np.tile(scene.torque_limit, 2)])
+    answer = linprog(
+        [0.0] * 6 + [-1.0], above, bound, equal, right, [(None, None)] * 6 + [(None, 10.0)]
+    )
+    assert answer.success
+    return float(answer.x[-1])
+
+
+def test_directions_agree_with_a_linear_programme(every: FormationMap) -> None:
+    rng = np.random.default_rng(4)
+    flush = [b for b in every.borders if b.flush is not None and len(b.z) > 4]
+    seen = []
+    for _ in range(80):
+        border = flush[rng.integers(len(flush))]
+        k = int(rng.integers(1, len(border.z) - 1))
+        for way, answer in ((1.0, border.forth[k]), (-1.0, border.back[k])):
+            slack = most_slack(every.problem, border, k, way)
+            # Neighbours give the tangent to a percent or so; clear cases only.
+            if slack is not None and abs(slack) > 1e-6:
+                assert answer == (slack > 0), (border.names, border.points[k], way)
+                seen.append(bool(answer))
+    assert sum(seen) > 20 and len(seen) - sum(seen) > 10
+
+
+def test_directions_inside_cells_balance(chart: FormationMap) -> None:
+    """Against c_n by least squares and slip by finite differences of closed poses."""
+    scene, problem = chart.problem.scene, chart.problem
+    rng = np.random.default_rng(5)
+    steps = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 20.0], [0.0, -20.0]]) * 1e-7
+    checked = 0
+    for k in rng.choice(len(chart.places), 80, replace=False):
+        place = chart.places[k]
+        z = close(scene, *place[:, None]).z
+        label = label_cells(scene, *place[:, None])[0]
+        contacts = tuple(contact_table(scene)[i] for i in label if i != NOWHERE)
+        formation = Formation(scene, contacts)
+        part = formation.evaluate(z, z)
+        for way, step in enumerate(steps):
+            v = (close(scene, *(place + step)[:, None]).z - z)[0]
+            slip = part.A_t[0] @ v
+            if np.abs(slip).min() < 1e-10 or np.abs(v[3:]).min() < 1e-9:
+                continue
+            G = part.A[0] - (formation.friction * np.sign(slip))[:, None] * part.A_t[0]
+            c_n, *_ = np.linalg.lstsq(G[:, :3].T, -scene.applied_force[:3], rcond=None)
+            tau = scene.dry[3:] * np.sign(v[3:]) - G[:, 3:].T @ c_n
+            slack = min((c_n - problem.epsilon).min(), (scene.torque_limit - abs(tau)).min())
+            if abs(slack) > 1e-6:
+                assert chart.possible[k, way] == (slack > 0)
+                checked += 1
+    assert checked > 200
+
+
+def test_mirrored_problem_has_the_mirrored_map() -> None:
+    window = Window((-0.16, 0.16), (np.radians(-40.0), np.radians(20.0)))
+    other = Window((-0.16, 0.16), (np.radians(-20.0), np.radians(40.0)))
+    corners = TABLE["object"]["vertices"]
+    count = len(corners)
+    table = copy.deepcopy(TABLE)
+    table["object"]["vertices"] = [[-x, y] for x, y in reversed(corners)]
+    # Edge 0 (vertices 0, 1) becomes edge 5 (vertices 5, 6).
+    table["start"] = {"flush": count - 2, "x": -TABLE["start"]["x"]}
+    names = ["v5-palm", "v6-palm", "v1-finger1", "v4-finger2"]
+    table["phases"] = [{"contacts": names, "until": {"x": 0.0}}]
+    one = build_map(change(), 21, window)
+    two = build_map(build_problem(table), 21, other)
+
+    def mirror(contact: Any) -> tuple[Any, ...]:
+        index = count - 1 - contact.index - (contact.feature == "e")
+        finger = None if contact.finger is None else 1 - contact.finger
+        return contact.feature, index % count, contact.surface, finger
+
+    def key(border: Border, mirrored: bool) -> tuple[Any, ...]:
+        names = [
+            mirror(c) if mirrored else (c.feature, c.index, c.surface, c.finger)
+            for c in border.contacts
+        ]
+        return tuple(sorted(names, key=str))
+
+    assert len(one.borders) == len(two.borders) and len(one.crossings) == len(two.crossings)
+    twins = {key(border, False): border for border in two.borders}
+    lengths = []
+    for border in one.borders:
+        twin = twins[key(border, True)]
+        sign = np.array([-1.0, -1.0])
+        ends = sorted((border.points[[0, -1]] * sign).tolist())
+        # Ends are found to rounding, which the reach of a stretched finger turns into 1e-7.
+        np.testing.assert_allclose(ends, sorted(twin.points[[0, -1]].tolist()), atol=1e-6)
+        for mine, its in ((border.forth, twin.back), (border.back, twin.forth)):
+            # Points may be counted from the other end: compare the shares.
+            lengths.append(abs(float(mine.mean()) - float(its.mean())))
+    assert max(lengths) < 0.1
+    np.testing.assert_array_equal(one.cell < 0, two.cell[::-1, ::-1] < 0)
+
+
+@pytest.fixture(scope="module")
+def crossed() -> FormationMap:
+    """Long fingers that meet over the hexagon."""
+    problem = hexagon((0.19, 0.19), -0.085)
+    return build_map(problem, 90, Window((-0.1, 0.1), (np.radians(-30.0), np.radians(30.0))))
+
+
+def test_places_where_the_fingers_overlap_are_marked(crossed: FormationMap) -> None:
+    scene = crossed.problem.scene
+    x, phi = (part.ravel() for part in np.meshgrid(crossed.x, crossed.phi))
+    overlap = (measure_fingers(scene, close(scene, x, phi).z) < 0).reshape(crossed.cell.shape)
+    np.testing.assert_array_equal(crossed.cell == CROSSED, overlap)
+    assert 20 < overlap.sum() < overlap.size / 4
+
+
+def test_borders_end_where_the_fingers_touch(crossed: FormationMap) -> None:
+    scene = crossed.problem.scene
+    gaps = [measure_fingers(scene, border.z) for border in crossed.borders]
+    assert min(gap.min() for gap in gaps) > -1e-9
+    ends = [gap[k] for gap in gaps for k in (0, -1)]
+    assert np.sum(np.abs(ends) < 1e-9) >= 4
+
+
+def test_a_route_into_touching_fingers_says_so() -> None:
+    problem = hexagon((0.19, 0.19), -0.085)
+    with pytest.raises(InputError, match=r"cannot be followed .*: finger 1 touches finger 2"):
+        list_formations(problem, (0.065, 0.0), (-0.05, 0.0))
+    with pytest.raises(InputError, match="finger 1 touches finger 2"):
+        list_formations(problem, (0.02, -0.02), (-0.03, 0.03))
+    free = hexagon((0.19, 0.19), -0.085, solid=False)
+    assert len(list_formations(free, (0.065, 0.0), (-0.05, 0.0))) == 4
+
+
+def test_map_needs_a_sound_grid_and_some_reach(heptagon: Problem) -> None:
+    with pytest.raises(InputError, match="resolution"):
+        build_map(heptagon, resolution=3)
+    with pytest.raises(InputError, match="nowhere"):
+        build_map(heptagon, 20, Window((1.0, 1.2), (0.0, 1.0)))
+    lines: list[str] = []
+    build_map(heptagon, 20, Window((-0.02, 0.02), (0.1, 0.2)), lines.append)
+    assert lines and all(line.startswith("map: ") for line in lines)
+
+
+def test_command_lists_phases(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["map", str(HEPTAGON), "--list", "0.045,-1.98", "-.0637,-1.98"]) == 0
+    assert tomllib.loads(capsys.readouterr().out)["phases"] == TABLE["phases"][:3]
+    assert main(["map", str(HEPTAGON), "--list", "-0.05,-1.98", "0.03,-1.98"]) == 0
+    assert "x = 0.03" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--list", "0.1,2,3", "0,0"], "--list: '0.1,2,3' given; allowed is X,PHI"),
+        (["--list", "a,0", "0,0"], "--list: 'a,0' given"),
+        (["--list", "nan,0", "0,0"], "--list"),
+        (["--list", "0,0"], "route: 1 pose"),
+        (["--phi", "3,2"], "--phi: '3,2' given"),
+        (["-o", "map.txt"], "allowed: .png, .pdf, .svg"),
+        (["--plan", "missing.npz"], "missing.npz: cannot be read"),
+    ],
+)
+def test_command_names_bad_arguments(
+    arguments: list[str],
+    words: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["map", str(HEPTAGON), *arguments]) == 2
+    captured = capsys.readouterr()
+    assert words in captured.err and captured.err.count("\n") == 1
+    assert not list(tmp_path.iterdir())

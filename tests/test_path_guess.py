@@ -1,0 +1,260 @@
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plane import make_formation, measure_gaps, measure_slip, rotate
+from tipping import roll
+from wholearm.common.arrays import Array
+from wholearm.common.errors import InputError
+from wholearm.contacts.elemental import parse_contact
+from wholearm.contacts.formation import Formation
+from wholearm.geometry.curve import Curve
+from wholearm.geometry.explore import close
+from wholearm.geometry.path_guess import (
+    POINTS,
+    RELEASE_AT,
+    Outline,
+    count_freedoms,
+    load,
+    outline_curve,
+    outline_phase,
+)
+from wholearm.geometry.tracing import trace_phase, until_distance
+from wholearm.problem.definition import End, Phase, Problem, Until
+
+HEPTAGON = Path(__file__).parents[1] / "problems" / "heptagon.toml"
+LANDING = "v1-palm v4-finger1 v6-finger2"
+CLOSED = 1e-9
+"""Gap [m] that counts as closed: what a trajectory file promises."""
+
+
+@pytest.fixture(scope="module")
+def landing() -> Problem:
+    return load(str(HEPTAGON))
+
+
+@pytest.fixture(scope="module")
+def outlines(landing: Problem) -> list[list[Outline]]:
+    parts, z = [], landing.start
+    for phase in landing.phases:
+        parts.append(outline_phase(landing, phase, z))
+        z = parts[-1][-1].z[-1]
+    return parts
+
+
+@pytest.fixture(scope="module")
+def released(outlines: list[list[Outline]]) -> Array:
+    """Where the landing is guessed to start."""
+    return np.asarray(outlines[-1][0].z[0])
+
+
+def test_the_problem_has_four_phases_on_curves_and_two_that_are_joined(landing: Problem) -> None:
+    assert [phase.end for phase in landing.phases] == [*4 * [End.REST], End.SMOOTH, End.REST]
+    assert landing.phases[4].until.is_release
+    assert [phase.formation.n_contacts for phase in landing.phases] == [4, 4, 4, 4, 4, 3]
+
+
+def test_every_contact_takes_one_freedom(
+    landing: Problem, curves: tuple[Curve, ...], released: Array
+) -> None:
+    assert count_freedoms(landing.phases[5].formation, released) == 2
+    for phase, curve in zip(landing.phases, curves, strict=False):
+        assert count_freedoms(phase.formation, curve.end) == 1
+        gained = phase.until.contact
+        if gained is not None:
+            held = (*phase.formation.contacts, gained)
+            assert count_freedoms(Formation(landing.scene, held), curve.end) == 0
+        for k in range(4):
+            fewer = phase.formation.contacts[:k] + phase.formation.contacts[k + 1 :]
+            assert count_freedoms(Formation(landing.scene, fewer), curve.end) == 2
+
+
+def test_contacts_that_say_the_same_are_counted_once(landing: Problem) -> None:
+    one = landing.phases[0].formation
+    twice = Formation(landing.scene, (*one.contacts, one.contacts[0]))
+    assert count_freedoms(twice, landing.start) == 1
+
+
+def test_outlines_are_closed_at_every_point(outlines: list[list[Outline]]) -> None:
+    for part in (part for phase in outlines for part in phase):
+        assert len(part.z) == POINTS
+        assert max(np.abs(measure_gaps(part.formation, z)).max() for z in part.z) < CLOSED
+        assert part.formation.evaluate_limits(part.z).min() > -CLOSED
+
+
+def test_outlines_follow_one_another(landing: Problem, outlines: list[list[Outline]]) -> None:
+    z = landing.start
+    for part in (part for phase in outlines for part in phase):
+        np.testing.assert_allclose(part.z[0], z, atol=1e-12)  # Rounding of a curve's polynomials.
+        z = part.z[-1]
+
+
+def test_outlines_end_where_their_phase_does(
+    landing: Problem, outlines: list[list[Outline]]
+) -> None:
+    for phase, parts in zip(landing.phases, outlines, strict=True):
+        if not phase.until.is_release:
+            end = parts[-1].z[-1:]
+            assert abs(until_distance(phase.formation, phase.until, end)[0]) < CLOSED
+
+
+@pytest.mark.parametrize("phase", range(6))
+def test_points_are_spread_evenly(outlines: list[list[Outline]], phase: int) -> None:
+    for part in outlines[phase]:
+        scale = part.formation.scene.polygon.gyration_radius ** np.array([0, 0, 1, 1, 1])
+        steps = np.linalg.norm(np.diff(part.z, axis=0) * scale, axis=1)
+        # Arc length is even on curves; a straight line is pulled onto its contacts afterwards.
+        assert steps.max() < 1.2 * steps.min()
+        assert part.length == pytest.approx(steps.sum(), rel=1e-12)
+
+
+@pytest.mark.parametrize("phase", range(6))
+def test_directions_are_those_of_travel(outlines: list[list[Outline]], phase: int) -> None:
+    for part in outlines[phase]:
+        middle = len(part.z) // 2
+        speed = part.z[middle + 1] - part.z[middle - 1]
+        slip = measure_slip(part.formation, part.z[middle], speed)
+        np.testing.assert_array_equal(np.sign(slip), part.directions.Xi)
+        np.testing.assert_array_equal(np.sign(speed[3:]), part.directions.sigma)
+
+
+def test_curves_are_split_where_something_turns(curves: tuple[Curve, ...]) -> None:
+    for curve in curves:
+        parts = outline_curve(curve)
+        assert len(parts) == len(curve.segments)
+        # Chords are shorter than the arc by the square of a 24th of it.
+        assert sum(part.length for part in parts) == pytest.approx(curve.length, rel=1e-3)
+        assert parts[-1].turns == ()
+        for part, following in pairwise(parts):
+            before, after = (np.concatenate(p.directions) for p in (part, following))
+            assert part.turns == tuple(np.flatnonzero(before != after)) != ()
+            speed = curve.evaluate(np.array([curve.segments[1].start])).z_s[0]
+            rates = [*measure_slip(part.formation, part.z[-1], speed), *speed[3:]]
+            # Rates per metre are about one; reversals are found to rounding.
+            assert np.abs([rates[row] for row in part.turns]).max() < 1e-8
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.7])
+def test_a_share_of_a_curve_is_outlined(curves: tuple[Curve, ...], share: float) -> None:
+    curve = curves[2]
+    parts = outline_curve(curve, share)
+    assert len(parts) == sum(segment.start < share * curve.length for segment in curve.segments)
+    assert sum(part.length for part in parts) == pytest.approx(share * curve.length, rel=1e-3)
+
+
+def test_a_release_is_guessed_before_the_curve_ends(
+    landing: Problem, outlines: list[list[Outline]]
+) -> None:
+    phase = landing.phases[4]
+    whole = trace_phase(landing, phase, outlines[4][0].z[0])
+    length = sum(part.length for part in outlines[4])
+    assert length == pytest.approx(RELEASE_AT * whole.length, rel=1e-3)
+
+
+@pytest.mark.parametrize("row, value", [(0, 0.02), (2, -0.9)])
+def test_a_coordinate_can_be_what_ends_a_phase(
+    landing: Problem, released: Array, row: int, value: float
+) -> None:
+    until = Until(None, "x" if row == 0 else "phi", value)
+    phase = Phase(5, landing.phases[5].formation, until)
+    part = outline_phase(landing, phase, released)[-1]
+    assert part.z[-1, row] == pytest.approx(value, abs=1e-12)
+    assert max(np.abs(measure_gaps(part.formation, z)).max() for z in part.z) < CLOSED
+
+
+def test_closing_moves_as_little_as_possible(landing: Problem, released: Array) -> None:
+    formation = landing.phases[5].formation
+    rng = np.random.default_rng(4)
+    for _ in range(5):
+        away = released + 1e-4 * rng.normal(size=5)
+        z = close(formation, away, np.zeros(0))
+        assert z is not None and np.abs(measure_gaps(formation, z)).max() < 1e-12
+        kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
+        scale = formation.scene.polygon.gyration_radius ** np.array([0, 0, 1, 1, 1])
+        free = np.linalg.svd(kinematics.A[0] / scale)[2][3:]
+        # The step is normal to what the contacts leave free, but for curvature.
+        moved = (z - away) * scale
+        assert np.abs(free @ moved).max() < 1e-2 * np.linalg.norm(moved)
+
+
+def test_closing_keeps_what_has_rolled_by(landing: Problem, released: Array) -> None:
+    formation = roll(landing.phases[5].formation, "v1-palm")
+    vertex = formation.scene.polygon.vertices[1]
+
+    def place(z: Array) -> float:
+        return float(z[0] + rotate(z[2], vertex)[0])
+
+    slip = formation.evaluate_slip(released[None])[0]
+    tipped = released - 0.1 * np.eye(5)[2]
+    z = close(formation, tipped, slip)
+    assert z is not None and np.abs(measure_gaps(formation, z)).max() < 1e-12
+    # The vertex on the palm stays where it was, and the object turns about it.
+    assert place(z) == pytest.approx(place(released), abs=1e-12)
+    assert z[2] < released[2] - 0.01
+    part = outline_phase(landing, Phase(5, formation, landing.phases[5].until), released)[-1]
+    assert max(abs(place(z) - place(released)) for z in part.z) < 1e-12
+
+
+def test_closing_what_cannot_touch_gives_nothing(landing: Problem, released: Array) -> None:
+    assert close(landing.phases[5].formation, released, np.zeros(0), (1, 1.0)) is None
+
+
+@pytest.mark.parametrize(
+    "names, until, key, reason",
+    [
+        (LANDING, Until(None, "x", 2.0), "until", "x = 2 m cannot be reached with these contacts"),
+        (LANDING, Until(None, "phi", 2.0), "until", "cannot be reached"),
+        (LANDING, "v5-palm", "until", "v5-palm cannot be reached .* v. touches the palm first"),
+        (LANDING, Until(), "until", "is missing"),
+        ("v1-palm v4-finger1 v5-finger2", "v2-palm", "contacts", "v5-finger2 does not touch"),
+        ("v1-palm v4-finger1", "v2-palm", "contacts", None),
+    ],
+)
+def test_phases_that_cannot_be_are_named(
+    landing: Problem, released: Array, names: str, until: Until | str, key: str, reason: str | None
+) -> None:
+    if isinstance(until, str):
+        until = Until(parse_contact(until, landing.scene))
+    phase = Phase(5, make_formation(landing.scene, names), until)
+    if reason is None:
+        assert outline_phase(landing, phase, released)
+        return
+    with pytest.raises(InputError, match=reason) as caught:
+        outline_phase(landing, phase, released)
+    assert caught.value.key == f"phases[6].{key}" and caught.value.exit_status == 2
+
+
+def test_five_contacts_leave_nothing_to_plan(landing: Problem, curves: tuple[Curve, ...]) -> None:
+    first = landing.phases[0]
+    assert first.until.contact is not None
+    held = Formation(landing.scene, (*first.formation.contacts, first.until.contact))
+    with pytest.raises(InputError, match="leave no freedom") as caught:
+        outline_phase(landing, Phase(1, held, landing.phases[1].until), curves[0].end)
+    assert caught.value.key == "phases[2].contacts"
+
+
+@pytest.mark.parametrize(
+    "old, new, reason",
+    [
+        ('until = "v2-palm"', 'until = "v5-palm"', r"phases\[6\].until: v5-palm cannot be reached"),
+        ('until = "v2-palm"', "until = { x = 2.0 }", r"phases\[6\].until: x = 2 m cannot be"),
+        ('until = "v4-finger1"', 'until = "v5-palm"', r"phases\[4\].until: v5-palm is never"),
+        (
+            'until = "v4-finger1"',
+            "until = { phi_deg = -15.0 }",
+            r"phases\[5\].contacts: v4-finger1 does not touch at the end of phase 4",
+        ),
+    ],
+)
+def test_load_checks_every_phase(tmp_path: Path, old: str, new: str, reason: str) -> None:
+    path = tmp_path / "bad.toml"
+    text = HEPTAGON.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(InputError, match=reason) as caught:
+        load(str(path))
+    assert caught.value.source == str(path)

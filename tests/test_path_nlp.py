@@ -1,0 +1,365 @@
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.integrate import quad, trapezoid
+from scipy.optimize import brentq
+
+from toys import Toy, constant, inertia
+from wholearm.common.arrays import Array
+from wholearm.geometry.curve import Curve
+from wholearm.planning.options import CHOICES, Objective
+from wholearm.planning.path_domain.data import PhaseData, prepare
+from wholearm.planning.path_domain.motion import PathMotion, Profile, draw_together, make_grid
+from wholearm.planning.path_domain.nlp import (
+    PathNLP,
+    Tightening,
+    Units,
+    build_path_nlp,
+    make_bounds,
+    move_multipliers,
+    pack,
+    parameters,
+    unpack,
+)
+from wholearm.planning.path_domain.plan import guess
+
+EPSILON = 0.05
+INTERVALS = 24
+UNITS = Units(0.04, 0.03, 7.0, np.array([1.7, 0.6]), 1.3, 9.0)
+LIMIT = 2.0
+
+
+@pytest.fixture(scope="module")
+def data(curves: tuple[Curve, ...]) -> PhaseData:
+    """Phase 1 of the heptagon, which has a reversal."""
+    data = prepare(curves[0], EPSILON, make_grid(curves[0], INTERVALS), 1)
+    assert len(data.solid) == INTERVALS - 1
+    return data
+
+
+@pytest.fixture(scope="module")
+def profile(data: PhaseData) -> Profile:
+    """From rest to rest, with jumps of a and squeeze at the reversal."""
+    rng = np.random.default_rng(1)
+    x = data.grid.s / data.curve.length
+    a = 3 * (1 - 2 * x) + 0.2 * rng.uniform(-1, 1, len(x))
+    a -= np.dot(data.grid.steps, a[1:] + a[:-1]) / (2 * data.curve.length)
+    b = np.concatenate([[0.0], np.cumsum(data.grid.steps * (a[1:] + a[:-1]))])
+    b[-1] = 0.0
+    assert (b[1:-1] > 0).all()
+    return Profile(a, b, rng.uniform(1, 6, len(x)))
+
+
+def evaluate(nlp: PathNLP, data: PhaseData, x: Array, time_weight: float = 1.0) -> tuple[Any, ...]:
+    """Objective and constraints of the NLP that the solver holds."""
+    oracle = nlp.solver.function.oracle()
+    f, g = oracle(x, parameters(nlp, data, UNITS, time_weight))
+    return float(f), g.full()[:, 0]
+
+
+@pytest.mark.parametrize("objective", Objective)
+def test_pack_and_unpack(data: PhaseData, profile: Profile, objective: Objective) -> None:
+    nlp = build_path_nlp(4, INTERVALS, objective)
+    x = pack(nlp, profile, UNITS, 0.7)
+    assert x.shape == (nlp.solver.function.size1_in("x0"),)
+    found, margin = unpack(nlp, data.grid, x, UNITS)
+    for one, other in zip(found, profile, strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-13 * np.abs(other).max())
+    chained = objective in (Objective.MARGIN, Objective.RELAX)
+    assert margin == pytest.approx(0.7 if chained else 0.0)
+    assert found.b[0] == found.b[-1] == 0.0
+
+
+def test_unpack_restores_the_integral_of_a(data: PhaseData, profile: Profile) -> None:
+    """What Ipopt leaves of b' = 2 a is taken out, down to rounding."""
+    nlp = build_path_nlp(4, INTERVALS, Objective.TIME)
+    rng = np.random.default_rng(2)
+    x = pack(nlp, profile, UNITS, 0.0)
+    found, _ = unpack(nlp, data.grid, x + 1e-9 * rng.uniform(-1, 1, len(x)), UNITS)
+    rises = data.grid.steps * (found.a[1:] + found.a[:-1])
+    np.testing.assert_allclose(np.diff(found.b), rises, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(found.b, profile.b, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("objective", [Objective(choice) for choice in CHOICES])
+def test_constraints_are_the_limits(
+    data: PhaseData, profile: Profile, objective: Objective
+) -> None:
+    """Distances of the constraints from their bounds are the slacks of the phase."""
+    nlp = build_path_nlp(4, INTERVALS, objective)
+    margin = 0.3 if objective is Objective.MARGIN else 0.0
+    _, g = evaluate(nlp, data, pack(nlp, profile, UNITS, margin))
+    rng = np.random.default_rng(3)
+    tight = rng.uniform(0, 0.1, (len(data.grid.s), 8))
+    tightening = Tightening(tight, np.ones(len(data.grid.s)), 0.5)
+    bounds = make_bounds(nlp, data, UNITS, tightening)
+    assert len(bounds["lbx"]) == len(bounds["ubx"]) == nlp.solver.function.size1_in("x0")
+    assert len(bounds["lbg"]) == len(bounds["ubg"]) == len(g)
+
+    first = nlp.first
+    np.testing.assert_allclose(g[: first - 2], 0.0, atol=1e-13)
+    np.testing.assert_array_equal(bounds["lbg"][:first], bounds["ubg"][:first])
+    ends = [profile.a[1] - profile.a[0], profile.a[-1] - profile.a[-2]]
+    np.testing.assert_allclose(g[first - 2 : first] * UNITS.profile[1], ends, atol=1e-12)
+    rows = slice(first, first + 6 * (INTERVALS + 1))
+    low = (g - bounds["lbg"])[rows].reshape(-1, 6)
+    high = (bounds["ubg"] - g)[rows].reshape(-1, 6)
+    slack = data.slack(data.nodes, profile, margin) - tight
+    np.testing.assert_allclose(low[:, :4] * UNITS.force, slack[:, :4], rtol=0, atol=1e-11)
+    assert np.isposinf(high[:, :4]).all()
+    np.testing.assert_allclose(low[:, 4:] * UNITS.torque, slack[:, 4:6], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(high[:, 4:] * UNITS.torque, slack[:, 6:], rtol=0, atol=1e-12)
+    if objective is Objective.MARGIN:
+        # The sum 2 h / (v + v) of the constraint is T for a constant acceleration only.
+        late = (bounds["ubg"][-1] - g[-1]) * UNITS.time
+        motion = PathMotion(data.curve, data.grid, profile)
+        assert late == pytest.approx(0.5 - motion.duration, rel=0.02)
+
+
+def test_elastic_constraints_give_way(data: PhaseData, profile: Profile) -> None:
+    nlp = build_path_nlp(4, INTERVALS, Objective.ELASTIC)
+    short = np.random.default_rng(4).uniform(0, 1, (len(data.grid.s), 6))
+    _, hard = evaluate(nlp, data, pack(nlp, profile, UNITS, 0.0))
+    _, soft = evaluate(nlp, data, pack(nlp, profile, UNITS, 0.0, short))
+    change = (soft - hard)[INTERVALS + 2 :].reshape(-1, 8)
+    np.testing.assert_allclose(change[:, :4] * UNITS.force, short[:, :4], atol=1e-12)
+    np.testing.assert_allclose(change[:, 4:6] * UNITS.torque, short[:, 4:], atol=1e-12)
+    np.testing.assert_allclose(change[:, 6:] * UNITS.torque, -short[:, 4:], atol=1e-12)
+
+
+def test_objectives_measure_the_motion(data: PhaseData, profile: Profile) -> None:
+    """Up to the rule of each interval and the small weights that choose among equals."""
+    motion = PathMotion(data.curve, data.grid, profile)
+    nlp = build_path_nlp(4, INTERVALS, Objective.TIME)
+    time, _ = evaluate(nlp, data, pack(nlp, profile, UNITS, 0.0))
+    assert time * UNITS.time == pytest.approx(motion.duration, rel=0.02)
+    nlp = build_path_nlp(4, INTERVALS, Objective.EFFORT)
+    x = pack(nlp, profile, UNITS, 0.0)
+    light, heavy = (evaluate(nlp, data, x, weight)[0] for weight in (1.0, 3.0))
+    unit = UNITS.power * UNITS.time
+    assert (heavy - light) / 2 * unit == pytest.approx(motion.duration, rel=0.02)
+    t = np.linspace(0, motion.duration, 4001)
+    squares = trapezoid((motion.evaluate(t).tau ** 2).sum(axis=1), t)
+    assert (light - (heavy - light) / 2) * unit == pytest.approx(squares, rel=0.03)
+    nlp = build_path_nlp(4, INTERVALS, Objective.MARGIN)
+    low, high = (evaluate(nlp, data, pack(nlp, profile, UNITS, m))[0] for m in (0.0, 1.4))
+    assert low - high == pytest.approx(1.4 / UNITS.force, rel=1e-12)
+
+
+def test_tightening_reaches_what_is_slack(data: PhaseData) -> None:
+    nodes = len(data.grid.s)
+    none = Tightening.none(data, 2.0)
+    assert none.limits.shape == (nodes, 8) and not none.limits.any()
+    reach, limits = np.zeros((nodes, 8)), np.zeros((nodes, 8))
+    reach[3, 2], limits[3, 2], limits[4, 2] = 0.5, 0.1, 0.2
+    tight = none.by(reach, limits, np.full(nodes, 0.1), 0.01)
+    assert tight.limits[3, 2] == pytest.approx(0.6) and tight.limits[4, 2] == pytest.approx(0.2)
+    assert np.count_nonzero(tight.limits) == 2 and tight.duration == pytest.approx(1.98)
+    np.testing.assert_allclose(tight.speed_share, 0.9)
+    again = tight.by(reach, limits, np.zeros(nodes), 0.0)
+    assert again.limits[3, 2] == pytest.approx(0.7) and again.limits[4, 2] == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("objective", [Objective(choice) for choice in CHOICES])
+def test_multipliers_move_between_grids(data: PhaseData, objective: Objective) -> None:
+    nlp = build_path_nlp(4, INTERVALS, objective)
+    rng = np.random.default_rng(5)
+    sizes = {
+        "lam_x0": nlp.solver.function.size1_in("x0"),
+        "lam_g0": nlp.solver.function.size1_out("g"),
+    }
+    multipliers = {key: rng.uniform(0.1, 1.0, size) for key, size in sizes.items()}
+    same = move_multipliers(nlp, multipliers, data.grid, data.grid)
+    for key in sizes:
+        np.testing.assert_allclose(same[key], multipliers[key], rtol=0, atol=1e-12)
+    misses = np.zeros(len(data.solid))
+    misses[5] = 16.0
+    new = draw_together(data.grid, data.solid, misses)
+    moved = move_multipliers(nlp, multipliers, data.grid, new)
+    # Those of the two sides of a reversal do not mix, and all stay between their neighbours.
+    on_nodes = slice(nlp.first, nlp.first + 6 * (INTERVALS + 1))
+    for segment in (0, 1):
+        mine = data.grid.segment == segment
+        old = multipliers["lam_g0"][on_nodes].reshape(-1, 6)[mine]
+        now = moved["lam_g0"][on_nodes].reshape(-1, 6)[mine]
+        assert (old.min(axis=0) - 1e-12 <= now).all() and (now <= old.max(axis=0) + 1e-12).all()
+        np.testing.assert_allclose(now[[0, -1]], old[[0, -1]], atol=1e-12)
+    assert all(moved[key].shape == multipliers[key].shape for key in sizes)
+
+
+def test_one_build_serves_every_phase(curves: tuple[Curve, ...]) -> None:
+    nlp = build_path_nlp(4, INTERVALS, Objective.TIME)
+    assert build_path_nlp(4, INTERVALS, Objective.TIME) is nlp
+    assert build_path_nlp(4, INTERVALS, Objective.EFFORT) is not nlp
+    for curve in curves:
+        data = prepare(curve, EPSILON, make_grid(curve, INTERVALS), 1)
+        _, units = guess(data)
+        assert len(parameters(nlp, data, units, 1.0)) == nlp.solver.function.size1_in("p")
+
+
+@pytest.mark.parametrize("objective", Objective)
+def test_building_stays_linear(objective: Objective) -> None:
+    """No unknown in more than a few rows, and no more than one row with many unknowns.
+
+    Otherwise the Jacobian would have to be found one unknown at a time.
+    """
+    x, p = build_path_nlp(4, INTERVALS, objective).solver.function.oracle().sx_in()
+    _, g = build_path_nlp(4, INTERVALS, objective).solver.function.oracle()(x, p)
+    pattern = ca.jacobian(g, x).sparsity()
+    rows, columns = (np.array(part) for part in pattern.get_triplet())
+    assert np.bincount(columns).max() <= 14
+    assert (np.bincount(rows) > 8).sum() <= (objective is Objective.MARGIN)
+
+
+def test_effort_is_not_symbolic_in_the_data() -> None:
+    """The same expression graph for every phase: no number of a scene is built in."""
+    oracle = build_path_nlp(4, INTERVALS, Objective.EFFORT).solver.function.oracle()
+    x, p = oracle.sx_in()
+    free = ca.symvar(ca.vertcat(*oracle(x, p)))
+    assert len(free) == x.numel() + p.numel()
+
+
+# Best motions in closed form: a point driven along a line of 1 m.
+
+
+def observe(toy: Toy, exact: float, **options: Any) -> tuple[Array, float]:
+    """Relative errors over doubled numbers of intervals, and the slope that fits their decay."""
+    counts = np.array([20, 40, 80, 160])
+    values = [toy.plan(intervals=int(n), **options).value for n in counts]
+    errors = np.array(values) / exact - 1
+    return errors, -float(np.polyfit(np.log2(counts), np.log2(np.abs(errors)), 1)[0])
+
+
+@pytest.mark.parametrize("length", [0.03, 1.0, 4.0])
+def test_least_time_is_bang_bang(length: float) -> None:
+    toy = Toy(constant(1.0), length=length)
+    exact = 2 * math.sqrt(length / LIMIT)
+    errors, order = observe(toy, exact)
+    # A switch spread over an interval of width h costs h^2.
+    assert (errors > 0).all() and errors[2] < 1e-4 and 1.8 < order < 2.3
+    plan = toy.plan()
+    t = np.linspace(0, plan.motion.duration, 2001)
+    a = plan.motion.locate(t)[2].a
+    assert (np.abs(np.abs(a) - LIMIT) < 1e-5).mean() > 0.95
+    assert (np.sign(a) == np.sign(exact / 2 - t))[np.abs(t - exact / 2) > 0.03 * exact].all()
+
+
+@pytest.mark.parametrize("weight", [0.1, 3.0, 50.0])
+def test_least_effort_of_a_free_run(weight: float) -> None:
+    """In a fixed time it takes 12 L^2 / T^3; with w T this is least at T^4 = 36 L^2 / w."""
+    toy = Toy(inertia(lambda s, later: np.ones_like(s)), limit=(1e3, 1e3))
+    duration = (36 / weight) ** 0.25
+    errors, order = observe(toy, 4 / 3 * weight * duration, objective="effort", time_weight=weight)
+    # The optimum is flat, so the value converges faster than the motion.
+    assert (errors > -1e-9).all() and errors[2] < 3e-6 and order > 2.5
+    plan = toy.plan(objective="effort", time_weight=weight)
+    assert plan.motion.duration == pytest.approx(duration, rel=3e-4)
+    t = np.linspace(0.1, 0.9, 50) * duration
+    line = 6 / duration**2 * (1 - 2 * t / duration)
+    np.testing.assert_allclose(
+        plan.motion.locate(t)[2].a, line, rtol=0, atol=0.01 * np.abs(line).max()
+    )
+
+
+@pytest.mark.parametrize("speed", [0.3, 0.7, 1.2])
+def test_joint_speed_limit_makes_a_trapezoid(speed: float) -> None:
+    toy = Toy(constant(1.0), speed_limit=(speed, np.inf))
+    exact = 1 / speed + speed / LIMIT
+    errors, order = observe(toy, exact)
+    # Where the switch falls between nodes varies with their number; the decay is that of h^2.
+    assert (errors > 0).all() and errors[2] < 1e-3 and order > 1.5
+    plan = toy.plan()
+    t = np.linspace(0, plan.motion.duration, 4001)
+    b = plan.motion.locate(t)[2].b
+    assert np.sqrt(b.max()) <= speed * (1 + 5e-7)
+    cruise = np.abs(t - exact / 2) < 0.4 * (1 / speed - speed / LIMIT)
+    np.testing.assert_allclose(np.sqrt(b[cruise]), speed, rtol=2e-3)
+
+
+def test_a_speed_limit_out_of_reach_changes_nothing() -> None:
+    free, bounded = (
+        Toy(constant(1.0), speed_limit=(limit, np.inf)).plan().value for limit in (np.inf, 1.6)
+    )
+    assert bounded == pytest.approx(free, rel=1e-6)
+
+
+@pytest.mark.parametrize("duration", [2.5, 3.0, 8.0])
+def test_largest_margin_within_a_duration(duration: float) -> None:
+    """With |a| + c_n <= F, the least largest |a| is 4 L / T^2."""
+    toy = Toy(constant(1.0, 1.0))
+    exact = LIMIT - 4 / duration**2
+    errors, order = observe(toy, exact, objective="margin", duration=duration)
+    assert (errors < 0).all() and errors[2] > -2e-4 and 1.8 < order < 2.3
+    plan = toy.plan(objective="margin", duration=duration)
+    assert plan.motion.duration <= duration * (1 + 5e-7)
+    t = np.linspace(0, plan.motion.duration, 1001)
+    assert plan.motion.locate(t)[2].squeeze.min() == pytest.approx(plan.value, abs=1e-6)
+
+
+def test_inertia_that_steps_at_a_reversal() -> None:
+    """Inertia 1, then 2: the switch at 3/8, and the acceleration jumps at 1/2."""
+    toy = Toy(inertia(lambda s, later: np.where(later, 2.0, 1.0)), breaks=(0.5,))
+    top, at_break = math.sqrt(0.75 * LIMIT), math.sqrt(0.5 * LIMIT)
+    exact = (top + (top - at_break)) / LIMIT + at_break / (LIMIT / 2)
+    errors, order = observe(toy, exact)
+    assert (errors > 0).all() and errors[2] < 2e-4 and order > 1.5
+    motion = toy.plan().motion
+    (gap,) = np.flatnonzero(motion.grid.steps == 0)
+    np.testing.assert_allclose(motion.profile.a[[gap, gap + 1]], [-LIMIT, -LIMIT / 2], atol=1e-5)
+
+
+def test_inertia_that_grows_along_the_way() -> None:
+    """(1 + s) |a| <= F: b is 2 F log(1 + s) from the start, 2 F log(2 / (1 + s)) to the end."""
+    toy = Toy(inertia(lambda s, later: 1.0 + s))
+    switch = math.sqrt(2) - 1
+
+    def slow(u: float, b: float) -> float:
+        return 2 * u / math.sqrt(2 * LIMIT * b)
+
+    exact = quad(lambda u: slow(u, math.log1p(u * u)), 0, math.sqrt(switch))[0]
+    exact += quad(lambda u: slow(u, -math.log1p(-u * u / 2)), 0, math.sqrt(1 - switch))[0]
+    errors, order = observe(toy, exact)
+    assert (errors > 0).all() and errors[2] < 2e-4 and order > 1.5
+
+
+@pytest.mark.parametrize("drag", [0.1, 0.5])
+def test_viscous_joints(drag: float) -> None:
+    """Speeding up v' = F - B v, braking v' = -F - B v."""
+
+    def speeding(t: float) -> float:
+        return LIMIT / drag * (t + math.expm1(-drag * t) / drag)
+
+    def braking(t: float) -> float:
+        return LIMIT / drag * (math.expm1(drag * t) / drag - t)
+
+    def brake_time(t: float) -> float:
+        return math.log(1 - math.expm1(-drag * t)) / drag
+
+    start = brentq(lambda t: speeding(t) + braking(brake_time(t)) - 1, 1e-3, 20)
+    errors, order = observe(Toy(constant(1.0, 0.0, drag)), start + brake_time(start))
+    # Viscous torque grows with the root of s at rest, which linear a meets at the nodes only.
+    assert (errors > 0).all() and errors[2] < 1e-3 and order > 1.5
+
+
+def test_no_speed_comes_out_imaginary(data: PhaseData, profile: Profile) -> None:
+    """Where a motion all but stops, b integrated again from a may fall below zero by rounding."""
+    nlp = build_path_nlp(4, INTERVALS, Objective.TIME)
+    s, steps = data.grid.s, data.grid.steps
+    middle = len(s) // 2
+
+    def integrate(a: Array) -> Array:
+        return np.concatenate([[0.0], np.cumsum(steps * (a[1:] + a[:-1]))])
+
+    # Twice up and down from rest to rest, less a hair in the middle.
+    shapes = np.array([np.sin(4 * np.pi * s / s[-1]), np.ones_like(s), s / s[-1]])
+    reached = np.array([integrate(shape)[[middle, -1]] for shape in shapes])
+    shares = np.linalg.solve(reached[1:].T, [-1e-9, 0.0] - reached[0])
+    a = shapes[0] + shares @ shapes[1:]
+    assert integrate(a)[middle] == pytest.approx(-1e-9, abs=1e-12)
+    found, _ = unpack(nlp, data.grid, pack(nlp, profile._replace(a=a), UNITS, 0.0), UNITS)
+    assert found.b[middle] == 0.0 and found.b.min() == 0.0

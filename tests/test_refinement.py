@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from timed import plan_landing, stages_of, tables
+from wholearm.planning.time_domain.collocation import make_scheme
+from wholearm.planning.time_domain.motion import StageMotion
+from wholearm.planning.time_domain.refinement import (
+    AT_ONCE,
+    DEAR,
+    DEFECT,
+    adopt,
+    count_halvings,
+    halve,
+    settle,
+    watch_broken,
+)
+from wholearm.planning.time_domain.stage import Stage
+
+SCHEME = make_scheme("radau", 3)
+
+
+def make_stages(motions: list[StageMotion]) -> list[Stage]:
+    return [Stage(0, motion.formation, motion.directions, motion.points) for motion in motions]
+
+
+@pytest.fixture(scope="module")
+def stages() -> list[Stage]:
+    """Those of the landing; every direction of friction is that of the motion."""
+    return make_stages(stages_of(plan_landing(time_intervals=6)))
+
+
+def test_a_solution_becomes_the_guess(stages: list[Stage]) -> None:
+    shifted = [stage.guess._replace(duration=2 * stage.guess.duration) for stage in stages]
+    for before, after, guess in zip(stages, adopt(stages, shifted), shifted, strict=True):
+        assert after.guess is guess and after.directions is before.directions
+
+
+def test_only_marked_stages_are_halved(stages: list[Stage]) -> None:
+    times = [np.zeros(stage.intervals, dtype=int) for stage in stages]
+    times[1][:2] = 1, 2
+    finer = halve(stages, SCHEME, times)
+    assert finer[0] is stages[0] and finer[1].intervals == stages[1].intervals + 4
+    assert finer[1].guess.duration == stages[1].guess.duration
+
+
+@pytest.mark.parametrize("name, degree", [("radau", 2), ("radau", 3), ("legendre", 3)])
+def test_defects_that_shrink_with_the_order_need_one_round(name: str, degree: int) -> None:
+    scheme = make_scheme(name, degree)
+    rng = np.random.default_rng(1)
+    sizes = DEFECT * 10 ** rng.uniform(-3, 3, 40)
+    defects = sizes[:, None, None] * rng.uniform(-1, 1, (40, 2, 5))
+    defects[:, 1, 2] = -sizes
+    times = count_halvings(np.zeros(40), defects, scheme)
+    left = sizes * 0.5 ** (scheme.order * times)
+    assert (left <= DEFECT)[times < AT_ONCE].all()
+    # Once less would not have done.
+    assert (left * 2**scheme.order > DEFECT)[times > 0].all()
+    assert set(times[sizes < DEFECT].tolist()) == {0}
+
+
+def test_dearer_misses_are_halved_more_often() -> None:
+    prices = DEAR * np.array([0.0, 0.9, 1.1, 10.0, 100.0, 1e9])
+    times = count_halvings(prices, np.zeros((6, 2, 5)), SCHEME)
+    assert times[:3].tolist() == [0, 0, 1] and times[-1] == AT_ONCE
+    assert (np.diff(times) >= 0).all()
+
+
+def test_halved_intervals_keep_the_shares_that_they_chose(stages: list[Stage]) -> None:
+    loose = [replace(stage, adapts=0.1) for stage in stages]
+    none = [np.zeros(stage.intervals, dtype=int) for stage in stages]
+    for after in (settle(loose), halve(loose, SCHEME, none)):
+        assert [stage.adapts for stage in after] == [0.0] * len(stages)
+        shares = zip(after, loose, strict=True)
+        assert all(one.guess is other.guess for one, other in shares)
+
+
+def test_limits_that_are_broken_are_watched_from_then_on(stages: list[Stage]) -> None:
+    watched = watch_broken(stages) or stages
+    # What is broken already, by less than counts, changes nothing the second time.
+    assert watch_broken(watched) is None
+    low = watched[-1]
+    sunk = low.guess.z.copy()
+    sunk[2, 1, 1] -= 0.001
+    guess = low.guess._replace(z=sunk)
+    changed = watch_broken([*watched[:-1], replace(low, guess=guess)])
+    assert changed is not None
+    more = set(changed[-1].watched) - set(low.watched)
+    values = low.formation.evaluate_limits(sunk[2, 1][None])[0]
+    assert more and all(values[k] < -1e-9 for k in more)
+    assert [stage.watched for stage in changed[:-1]] == [stage.watched for stage in watched[:-1]]
+
+
+def test_halving_by_nothing_keeps_every_table(stages: list[Stage]) -> None:
+    finer = halve(stages, SCHEME, [np.zeros(stage.intervals, dtype=int) for stage in stages])
+    for before, after in zip(stages, finer, strict=True):
+        for one, other in zip(tables(before.guess), tables(after.guess), strict=True):
+            np.testing.assert_array_equal(one, other)

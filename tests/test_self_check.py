@@ -1,0 +1,202 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from planned import change, plan, plan_landing
+from shipped import HEPTAGON, problem_of
+from wholearm.common.arrays import Array
+from wholearm.common.errors import InputError, ReplayError, SolverError
+from wholearm.planning import self_check as selfcheck
+from wholearm.planning.blocks import Planning, plan_blocks
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.phase_plan import PhasePlan
+from wholearm.planning.plan import solve
+from wholearm.planning.self_check import (
+    check_plan,
+    divide_pieces,
+    find_residual,
+    pick_times,
+    replay_plan,
+)
+from wholearm.problem.definition import Problem
+from wholearm.results.torque import TorqueProfile
+from wholearm.results.trajectory import Trajectory
+from wholearm.verification.verdict import Allowance, find_least_force
+from wholearm.verification.verify import verify
+
+
+def brake_less(starts: Array, c: Array) -> Array:
+    c[(starts > 0.3) & (starts < 0.4 - 1e-9)] *= 0.97
+    return c
+
+
+def test_a_plan_that_holds() -> None:
+    problem, trajectory = plan()
+    check = check_plan(problem, trajectory, Allowance())
+    assert check.failure is None and check.residual.size < 1e-9
+    # Every piece is a step; only phases with few pieces are looked at in between.
+    assert check.report.steps < len(trajectory.torque.coefficients) + 150
+
+
+def test_torques_that_do_not_carry_the_motion_are_found() -> None:
+    problem, trajectory = plan()
+    weak = replace(trajectory, torque=change(trajectory.torque, brake_less))
+    check = check_plan(problem, weak, Allowance())
+    assert check.failure is not None and check.failure == (2, verify(problem, weak).reason)
+    # The first phase departs by the braking that it lacks.
+    assert check.find_culprit(problem.scene.scales, Allowance(departure=1e-5), np.zeros(1)) == 1
+
+
+def test_a_phase_that_hardly_stops_is_found_by_where_the_next_one_ends() -> None:
+    """What departs is the second phase, by the speed that the first one leaves."""
+    problem, trajectory = plan()
+    check = check_plan(
+        problem, replace(trajectory, torque=change(trajectory.torque, brake_less)), Allowance()
+    )
+    first, *others = check.report.phases
+    speed, least = 1e-3, Allowance(departure=1.0, rest_speed=1.0)
+    report = replace(check.report, phases=(replace(first, end_speed=speed), *others))
+    left = check._replace(report=report)
+    lasts = np.array([1.0, 2.0 * least.departure * problem.scene.scales.length / speed])
+    assert left.find_culprit(problem.scene.scales, least, lasts) == 1
+    assert left.find_culprit(problem.scene.scales, least, lasts / 4) == 2
+
+
+def test_friction_the_wrong_way_is_found_by_the_residual() -> None:
+    problem, trajectory = plan()
+    tau, rows = trajectory.tau.copy(), np.flatnonzero(trajectory.phase == 2)[90:100]
+    dry = problem.scene.dry[4]
+    tau[rows, 1] -= 2 * dry * np.sign(trajectory.theta_dot[rows, 1])
+    wrong = replace(trajectory, tau=tau)
+    found = find_residual(problem, wrong)
+    assert found.phase == 3
+    assert found.size == pytest.approx(2 * dry / problem.scene.scales.torque, rel=1e-6)
+    assert "finger 2" in found.text and "as joint 2 moves against the sense" in found.text
+    times = [f"at t = {t:.5g} s, phase 3" for t in trajectory.t[rows]]
+    assert any(found.text.endswith(time) for time in times)
+    failure = check_plan(problem, wrong, Allowance()).failure
+    assert failure == (3, found.text)
+
+
+def test_few_instants() -> None:
+    torque = TorqueProfile(np.array([0.0, 0.1, 0.11, 1.0]), np.zeros((3, 2, 1)))
+    times = divide_pieces(torque, np.array([0.0, 0.11, 1.0]), np.array([0.02, 0.5]))
+    inner = np.array([0.1 * k / 6 for k in range(1, 6)])
+    np.testing.assert_allclose(times, [*inner, 0.11 + 0.89 / 2])
+    _, trajectory = plan()
+    few = pick_times(trajectory)
+    assert np.isin(trajectory.phase_starts, few).all() and len(few) < len(trajectory.t) / 10
+
+
+class Spoiled:
+    """Planning in which the torques of one phase are weak until it is refined often enough."""
+
+    def __init__(self, problem: Problem, phase: int, cured: int) -> None:
+        self.problem, self.phase, self.cured = problem, phase, cured
+        self.refined: list[int] = []
+        options = PlanOptions(intervals=20)
+        self.planning = plan_blocks(problem, options, lambda _: None)
+
+    def build(self, planning: Planning) -> Trajectory:
+        from wholearm.planning.plan import _assemble
+
+        if planning.blocks[self.phase].finer >= self.cured:
+            return _assemble(planning)
+        block = planning.blocks[self.phase]
+        (own,) = block.plans
+        coefficients = own.torque.coefficients.copy()
+        coefficients[len(coefficients) // 2 :] *= 0.9
+        weak: PhasePlan[Any] = own._replace(torque=TorqueProfile(own.torque.breaks, coefficients))
+        blocks = list(planning.blocks)
+        blocks[self.phase] = replace(block, plans=[weak])
+        return _assemble(replace(planning, blocks=tuple(blocks)))
+
+    def run(self) -> tuple[Planning, Trajectory, dict[str, Any]]:
+        first = self.build(self.planning)
+        return replay_plan(self.planning, first, self.build, lambda _: None)
+
+
+@pytest.fixture(scope="module")
+def slide(heptagon: Problem) -> Problem:
+    """The heptagon's first three phases."""
+    return replace(heptagon, phases=heptagon.phases[:3])
+
+
+@pytest.mark.parametrize("cured", [0, 2])
+def test_only_what_does_not_hold_is_refined(slide: Problem, cured: int) -> None:
+    spoiled = Spoiled(slide, 1, cured)
+    planning, trajectory, figures = spoiled.run()
+    assert [block.finer for block in planning.blocks] == [0, cured, 0]
+    assert figures["refinements"] == [0, cured, 0]
+    for k in 0, 2:
+        assert planning.blocks[k] is spoiled.planning.blocks[k]
+    assert verify(slide, trajectory).ok
+    # Twice the intervals, but for those of no length where a direction reverses.
+    pieces = [len(block.plans[0].torque.coefficients) for block in planning.blocks]
+    assert pieces[1] >= 2**cured * 20 - 2
+
+
+def test_refining_is_bounded_and_the_error_says_where(slide: Problem) -> None:
+    spoiled = Spoiled(slide, 1, 99)
+    with pytest.raises(ReplayError) as caught:
+        spoiled.run()
+    text = str(caught.value)
+    assert caught.value.exit_status == 1
+    assert text.startswith("the plan of phase 2 does not hold in its replay, with 8 times the ")
+    assert ", phase " in text and " at t = " in text and "--no-replay" in text
+
+
+def test_a_finer_plan_that_is_not_found_leaves_the_error(
+    slide: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> Planning:
+        raise SolverError("no plan")
+
+    spoiled = Spoiled(slide, 1, 1)
+    monkeypatch.setattr(selfcheck, "refine_block", fail)
+    with pytest.raises(ReplayError, match="the plan of phase 2 does not hold in its replay: "):
+        spoiled.run()
+
+
+def test_meta_keeps_the_figures(heptagon: Problem, trajectory: Trajectory) -> None:
+    figures = trajectory.meta["replay"]
+    report = verify(heptagon, trajectory)
+    margins = [(c.least, c.contact, p.number) for p in report.phases for c in p.contacts]
+    assert figures["least_c_n"]["value"] == pytest.approx(min(margins)[0], abs=1e-6)
+    assert (figures["least_c_n"]["contact"], figures["least_c_n"]["phase"]) in [
+        margin[1:] for margin in margins if margin[0] < min(margins)[0] + 1e-6
+    ]
+    for own, phase in zip(figures["phases"], report.phases, strict=True):
+        assert own["arrival"] == pytest.approx(phase.arrival, abs=1e-9)
+        assert max(own["end_deviation"].values()) < 1e-9
+        assert max(own["deviation"].values()) < 1e-9 and own["end_speed"] < 1e-6
+    assert figures["residual"] < 1e-11 and figures["refinements"] == [0] * 5
+
+
+def test_a_contact_that_is_let_go_is_not_the_least() -> None:
+    problem, trajectory = plan_landing()
+    report = verify(problem, trajectory)
+    phase = report.phases[0]
+    assert phase.until == "release of v3-finger1"
+    gone = next(margin for margin in phase.contacts if margin.contact == "v3-finger1")
+    others = [margin.least for margin in phase.contacts if margin is not gone]
+    found = find_least_force(phase)
+    assert found is not None and phase.arrival is not None
+    if abs(gone.time - phase.arrival) < 1e-6:
+        assert found.least == min(others)
+    late = replace(gone, least=-1.0, time=phase.arrival)
+    early = replace(gone, least=-1.0, time=phase.arrival - 0.01)
+    kept = [margin for margin in phase.contacts if margin is not gone]
+    assert find_least_force(replace(phase, contacts=(*kept, late))).least == min(others)  # type: ignore[union-attr]
+    assert find_least_force(replace(phase, contacts=(*kept, early))) is early
+
+
+def test_without_a_replay() -> None:
+    meta = solve(problem_of(HEPTAGON), intervals=20, replay=False).meta
+    assert meta["replay"] is None
+    with pytest.raises(InputError, match="replay: 'no' given"):
+        PlanOptions(replay="no")  # type: ignore[arg-type]

@@ -1,0 +1,210 @@
+from __future__ import annotations
+
+import copy
+import tomllib
+from typing import Any
+
+import numpy as np
+import pytest
+
+from plane import measure_gaps, measure_slip, unbalance
+from shipped import IMPACTS, plan_of, problem_of
+from wholearm.common.arrays import Array
+from wholearm.common.errors import InfeasibleError
+from wholearm.geometry.tracing import trace_phases
+from wholearm.mechanics.impact import strike
+from wholearm.mechanics.metric import metric_weights
+from wholearm.planning.path_domain.impact_sequence import make_chain
+from wholearm.planning.path_domain.sequence_plan import add_up
+from wholearm.planning.plan import solve
+from wholearm.problem.definition import Problem, build_problem
+from wholearm.results.trajectory import Samples, Trajectory, load_trajectory
+from wholearm.verification.verify import verify
+
+OBJECTIVES = ["time", "effort", "margin"]
+LIMIT = 2.0
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    return problem_of(IMPACTS)
+
+
+@pytest.fixture(scope="module")
+def plans() -> dict[str, Trajectory]:
+    return {objective: plan_of(IMPACTS, objective) for objective in OBJECTIVES}
+
+
+def edited(*stops: int) -> Problem:
+    """The problem with a stop at the end of the given phases."""
+    table: dict[str, Any] = copy.deepcopy(tomllib.loads(IMPACTS.read_text(encoding="utf-8")))
+    for number in stops:
+        table["phases"][number - 1]["end"] = "rest"
+    return build_problem(table)
+
+
+def ends_of(trajectory: Trajectory, phase: int) -> tuple[Samples, Samples]:
+    """The last sample of a phase and the first one of the next."""
+    before, after = trajectory.motions[phase], trajectory.motions[phase + 1]
+    return before.evaluate(np.array([before.duration])), after.evaluate(np.zeros(1))
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_velocities_jump_by_the_impact_law(
+    problem: Problem, plans: dict[str, Trajectory], objective: str
+) -> None:
+    trajectory = plans[objective]
+    for k, row in enumerate(trajectory.meta["transitions"][:2]):
+        before, after = (phase.formation for phase in problem.phases[k : k + 2])
+        end, start = ends_of(trajectory, k)
+        impact = strike(before, after, end.z[0], end.z_dot[0])
+        np.testing.assert_allclose(start.z, end.z, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(start.z_dot[0], impact.v, rtol=0, atol=1e-9)
+        assert impact.p.min() > 0
+        speed = np.sqrt(end.z_dot[0] ** 2 @ metric_weights(problem.scene))
+        assert row["speed"] == pytest.approx(speed) and speed > 0.1
+        name, impulse = impact.least
+        assert name == row["least_impulse_contact"]
+        assert impulse == pytest.approx(row["least_impulse"] * speed)
+        later = np.sqrt(start.z_dot[0] ** 2 @ metric_weights(problem.scene))
+        assert row["velocity_ratio"] == pytest.approx(later / speed)
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_it_stops_where_no_impact_is_possible(plans: dict[str, Trajectory], objective: str) -> None:
+    trajectory = plans[objective]
+    rows = trajectory.meta["transitions"]
+    assert [(row["phase"], row["possible"]) for row in rows] == [
+        (1, True), (2, True), (3, False), (4, False)
+    ]  # fmt: skip
+    for k, row in enumerate(rows[2:], start=2):
+        for samples in ends_of(trajectory, k):
+            assert np.abs(samples.z_dot).max() < 1e-6
+        assert (row["speed"], row["saves"]) == (0.0, None)
+        contact = row["least_impulse_contact"]
+        assert row["reason"].startswith(f"impulse on {contact} would be -0.")
+        assert row["reason"].endswith(" N s per m/s") and row["least_impulse"] < 0
+    assert [row["reason"] for row in rows[:2]] == ["", ""]
+    assert [row["gained"] for row in rows] == "v3-finger1 v6-finger2 v0-finger2 v4-finger1".split()
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_every_sample_obeys_newton_and_euler(
+    problem: Problem, plans: dict[str, Trajectory], objective: str
+) -> None:
+    trajectory = plans[objective]
+    starts = trajectory.phase_starts
+    for t in np.random.default_rng(1).uniform(0, trajectory.duration, 100):
+        phase = int(np.searchsorted(starts, t, side="right")) - 1
+        formation = problem.phases[phase].formation
+        own = trajectory.motions[phase].evaluate(np.array([t - starts[phase]]))
+        row = Samples(*(part[0] for part in own))
+        residual, size = unbalance(formation, row, np.sign(row.z_dot[3:]))
+        assert (np.abs(residual) < 1e-8 * size).all()
+        assert np.abs(measure_gaps(formation, row.z)).max() < 1e-9
+        slip = measure_slip(formation, row.z, row.z_dot)
+        law = -formation.friction * np.sign(slip) * row.c_n
+        moving = np.abs(slip) > 1e-9
+        np.testing.assert_allclose(row.c_t[moving], law[moving], rtol=1e-12)
+        assert row.c_n.min() >= problem.epsilon - 1e-6
+        assert np.abs(row.tau).max() <= LIMIT + 1e-6
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_the_simulator_follows(
+    problem: Problem, plans: dict[str, Trajectory], objective: str
+) -> None:
+    report = verify(problem, plans[objective])
+    assert report.ok and abs(report.missed_by) < 1e-5
+    for phase in report.phases:
+        assert phase.end_deviation is not None
+        # What is asked of a phase: 1e-5.
+        assert max(phase.end_deviation.position, phase.end_deviation.angle) < 1e-5
+    impulses = [phase.impact.impulse for phase in report.phases if phase.impact is not None]
+    assert len(impulses) == 2 and min(impulses) > 0
+
+
+def test_what_an_impact_saves_is_what_a_stop_costs(plans: dict[str, Trajectory]) -> None:
+    objective = "effort"
+    value = plans[objective].meta["value"]
+    for row in plans[objective].meta["transitions"][:2]:
+        stopped = solve(edited(row["phase"]), objective)
+        assert row["saves"] == pytest.approx(stopped.meta["value"] - value, abs=1e-9)
+        assert row["saves"] > 0.01
+
+
+def test_an_impact_raises_the_margin(plans: dict[str, Trajectory]) -> None:
+    """Over twice the least time, which stops share in proportion to their own least times."""
+    trajectory = plans["margin"]
+    allowed = 2 * sum(plans["time"].meta["phase_durations"][:3])
+    for row in trajectory.meta["transitions"][:2]:
+        table: dict[str, Any] = copy.deepcopy(dict(edited(row["phase"], 3).table))
+        table["phases"] = table["phases"][:3]
+        stopped = solve(build_problem(table), "margin", duration=allowed)
+        gained = min(trajectory.meta["phase_values"][:3]) - stopped.meta["value"]
+        assert row["saves"] == pytest.approx(gained, abs=1e-6) and gained > 0.01
+
+
+def test_no_plan_with_a_stop_leaves_the_saving_open(
+    problem: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is short at rest need not be at speed."""
+
+    def fail(*_: object) -> None:
+        raise InfeasibleError("nothing holds at rest")
+
+    monkeypatch.setattr("wholearm.planning.path_domain.sequence_plan.plan_chain", fail)
+    rows = solve(problem, intervals=20).meta["transitions"]
+    assert [row["saves"] for row in rows] == 4 * [None]
+    assert [row["speed"] > 0 for row in rows] == [True, True, False, False]
+
+
+def test_without_an_impact_the_plan_is_that_of_stops(heptagon: Problem) -> None:
+    """Where friction is low, none is possible."""
+    table: dict[str, Any] = copy.deepcopy(dict(heptagon.table))
+    for phase in table["phases"][:-1]:
+        phase["end"] = "impact"
+    trajectory = solve(build_problem(table), intervals=40)
+    plain = solve(heptagon, intervals=40)
+    assert not any(row["possible"] for row in trajectory.meta["transitions"])
+    assert trajectory.meta["phase_durations"] == plain.meta["phase_durations"]
+    assert plain.meta["transitions"] == []
+    np.testing.assert_array_equal(trajectory.tau, plain.tau)
+
+
+def test_transitions_survive_their_file(plans: dict[str, Trajectory], tmp_path: Any) -> None:
+    trajectory = plans["time"]
+    trajectory.save(tmp_path / "plan.npz")
+    assert load_trajectory(tmp_path / "plan.npz").meta == trajectory.meta
+
+
+def test_progress_tells_what_is_planned(problem: Problem) -> None:
+    told: list[str] = []
+    solve(problem, intervals=20, progress=told.append)
+    assert told == [
+        "tracing the phases",
+        "phase 1-2-3-4-5 of 5: time",
+        "replaying the plan",
+        "phase 1: what its impact saves",
+        "phase 2: what its impact saves",
+    ]
+
+
+def test_durations_add_up(problem: Problem) -> None:
+    chain = make_chain(problem.phases, trace_phases(problem)).split()[0]
+    assert add_up(chain.phases, [0.1, 0.2, 0.3, 9.0, 9.0]) == pytest.approx(0.6)
+    assert add_up(chain.phases, [None] * 5) is None
+
+
+def unit(values: Array) -> Array:
+    return np.asarray(values / np.linalg.norm(values))
+
+
+def test_the_torque_steps_at_an_impact(plans: dict[str, Trajectory]) -> None:
+    trajectory, hair = plans["time"], 1e-9
+    for k, start in enumerate(trajectory.phase_starts[1:3]):
+        around = trajectory.torque.at(np.array([start - hair, start + hair]))
+        end, begin = ends_of(trajectory, k)
+        np.testing.assert_allclose(around, [end.tau[0], begin.tau[0]], rtol=0, atol=1e-4)
+        assert start in trajectory.torque.breaks
+        assert not np.allclose(unit(end.z_dot[0]), unit(begin.z_dot[0]), atol=1e-2)

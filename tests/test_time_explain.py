@@ -1,0 +1,215 @@
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from once import once
+from thrown import shove
+from tipping import box
+from wholearm.common.errors import InfeasibleError, SolverError
+from wholearm.geometry.curve import Curve
+from wholearm.geometry.tracing import trace_phases
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.path_domain.plan import plan_path
+from wholearm.planning.phase_plan import PhasePlan
+from wholearm.planning.time_domain import explain as timeexplain
+from wholearm.planning.time_domain.collocation import make_scheme
+from wholearm.planning.time_domain.explain import change_limit, ease, explain, list_shortfalls
+from wholearm.planning.time_domain.motion import TimeMotion
+from wholearm.planning.time_domain.plan import plan_phases
+from wholearm.planning.time_domain.search import Search
+from wholearm.planning.time_domain.stage import Stage
+from wholearm.planning.time_domain.staging import outline_stages
+from wholearm.problem.definition import Problem
+
+SCHEME = make_scheme("radau", 3)
+COARSE = PlanOptions(time_intervals=4)
+LEAST = 0.35 * 0.2 * 9.81
+"""Least c_n of the shoved square [N]: friction shifts 0.15 of its weight to the vertex ahead."""
+
+
+def plan_all(problem: Problem, **options: Any) -> list[PhasePlan[TimeMotion]]:
+    return plan_phases(problem, problem.phases, problem.start, COARSE, **options)
+
+
+@once
+def why_not_shoved(index: int, value: float) -> str:
+    """Why the square is not shoved with another value of a limit, and what is advised."""
+    return why_not(lambda: plan_all(change_limit(shove()[0], index, value)))
+
+
+def why_not(plan: Callable[[], object]) -> str:
+    with pytest.raises(InfeasibleError) as caught:
+        plan()
+    return str(caught.value)
+
+
+def search(problem: Problem) -> Search:
+    return Search.of(problem, COARSE)
+
+
+def outline(problem: Problem, index: int = 0) -> Stage:
+    """The first stage of a phase as it is guessed, but with c_n = 1 N, no c_t and no torques."""
+    start = trace_phases(problem)[index - 1].end if index else problem.start
+    stage = outline_stages(problem, problem.phases[index : index + 1], start, SCHEME, 4, 2.0)[0]
+    forces = np.zeros_like(stage.guess.forces)
+    forces[..., : stage.formation.n_contacts] = 1 / problem.scene.scales.force
+    tau = np.zeros_like(stage.guess.tau)
+    return replace(stage, guess=stage.guess._replace(forces=forces, tau=tau))
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Advice takes the time that it needs, however slow the machine is."""
+    monkeypatch.setattr(timeexplain, "ADVICE", np.inf)
+
+
+def test_a_force_that_weight_limits_has_its_closed_form() -> None:
+    text = why_not_shoved(2, 1.0)
+    found = re.fullmatch(
+        r"phases 1 and 2 are infeasible: c_n of v1-palm >= epsilon = 1 N is (\S+) N short at "
+        r"t = \S+ s, phase 2; feasible with epsilon = (\S+) N instead of 1",
+        text,
+    )
+    assert found, text
+    # Pushed hard enough it begins; what it weighs there is all that presses while it slows down.
+    assert float(found[1]) == pytest.approx(1 - LEAST, rel=1e-3)
+    # Advice is meant to be within 2 % of what is needed.
+    assert 0.98 * LEAST < float(found[2]) < LEAST
+
+
+@pytest.mark.parametrize(
+    "index, value, name",
+    [(2, 1.0, "epsilon"), (0, 0.3, "torque limit of finger 1")],
+    ids=["epsilon", "torque limit"],
+)
+def test_there_is_a_plan_with_what_is_advised_and_none_with_less(
+    index: int, value: float, name: str
+) -> None:
+    problem, text = shove()[0], why_not_shoved(index, value)
+    advised = re.search(rf"; feasible with {name} = (\S+) N( m)? instead of {value:g}$", text)
+    assert advised, text
+    enough = float(advised[1])
+    assert (enough < value) == (index == 2)
+    eased = change_limit(problem, index, enough)
+    for plan in plan_all(eased, explained=False, patient=False):
+        t = np.linspace(0.0, plan.motion.duration, 101)
+        samples = plan.motion.evaluate(t)
+        assert samples.c_n.min() > eased.epsilon - 1e-6
+        assert (np.abs(samples.tau) < eased.scene.torque_limit + 1e-6).all()
+    # Advice is meant to be within 2 % of what is needed.
+    nearer = enough * (1.03 if index == 2 else 0.97)
+    closer = change_limit(problem, index, nearer)
+    short = why_not(lambda: plan_all(closer, explained=False, patient=False))
+    assert " short at t = " in short and "feasible with" not in short
+
+
+def test_advice_is_that_along_the_curve(heptagon: Problem, curves: tuple[Curve, ...]) -> None:
+    """Two formulations with different unknowns, one of them convex but for viscous friction."""
+    problem, phase = change_limit(heptagon, 2, 1.0), heptagon.phases[1]
+    start = curves[0].end
+    options, coarse = PlanOptions(time_intervals=6), PlanOptions(intervals=40)
+    texts = [
+        why_not(lambda: plan_phases(problem, (problem.phases[1],), start, options)),
+        why_not(lambda: plan_path(curves[1], problem.epsilon, coarse, phase.number)),
+    ]
+    shape = r"phase 2 is infeasible: .*c_n of v1-palm >= epsilon = 1 N is \S+ N short at "
+    assert all(re.match(shape, text) for text in texts), texts
+    within, along = (float(text.split("epsilon = ")[-1].split()[0]) for text in texts)
+    assert within == pytest.approx(along, rel=0.02)
+    assert [text.count("instead of") for text in texts] == [1, 1]
+
+
+def test_shortfalls_are_measured_where_they_are_worst() -> None:
+    """In a motion that is made up: c_n = 1 N but for single points, and single torques."""
+    problem = change_limit(shove()[0], 2, 0.9)
+    stage = outline(problem)
+    forces, tau = stage.guess.forces.copy(), stage.guess.tau.copy()
+    scales = problem.scene.scales
+    forces[1, 0, 0], forces[3, 2, 0] = 0.4 / scales.force, 0.85 / scales.force
+    forces[2, 1, 2] = 0.9 / scales.force - 5e-5
+    tau[0, 1, 1], tau[2, 0, 1] = 2.25 / scales.torque, -2.75 / scales.torque
+    guess = stage.guess._replace(forces=forces, tau=tau, duration=0.8 / scales.time)
+    stage = replace(stage, guess=guess)
+    first, second = list_shortfalls(problem, [stage])
+    name = stage.formation.names[0]
+    # In the second and third of four even intervals; what is below 1e-4 of the weight is left out.
+    assert str(first) == f"c_n of {name} >= epsilon = 0.9 N is 0.5 N short at t = 0.3000 s, phase 1"
+    limit = "torque limit of finger 2 = 2 N m"
+    assert str(second) == f"{limit} is 0.75 N m short at t = 0.5000 s, phase 1"
+    # Another stage counts on from there, and only the worse place is kept.
+    later = replace(stage, phase=1, guess=guess._replace(forces=forces - 0.1 / scales.force))
+    worse, same = list_shortfalls(problem, [stage, later])[:2]
+    assert worse.amount == pytest.approx(0.6) and worse.where == "t = 1.1000 s, phase 2"
+    assert same == second
+    assert list_shortfalls(change_limit(problem, 2, 0.0), [outline(problem)]) == []
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_cones_of_rolling_contacts_can_be_short(side: float) -> None:
+    problem = box()
+    stage = outline(problem, 1)
+    formation = stage.formation
+    (row,) = formation.rolling_rows
+    forces = stage.guess.forces.copy()
+    forces[2, 1, formation.n_contacts] = 0.7 * side / problem.scene.scales.force
+    stage = replace(stage, guess=stage.guess._replace(forces=forces))
+    (found,) = list_shortfalls(problem, [stage])
+    mu = formation.friction[row]
+    cone = f"|c_t| <= {mu:g} (c_n - {problem.epsilon:g} N),"
+    assert found.limit == f"friction cone of {formation.names[row]}, {cone}"
+    assert found.amount == pytest.approx(0.7 - mu * (1 - problem.epsilon)) and found.unit == "N"
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_a_changed_limit_is_the_only_change(index: int) -> None:
+    problem = box()
+    changed = change_limit(problem, index, 0.123)
+    limits = np.append(problem.scene.torque_limit, problem.epsilon)
+    limits[index] = 0.123
+    np.testing.assert_array_equal(np.append(changed.scene.torque_limit, changed.epsilon), limits)
+    for before, after in zip(problem.phases, changed.phases, strict=True):
+        assert after.formation.scene is changed.scene
+        assert after.formation.contacts == before.formation.contacts
+        assert after.formation.rolling == before.formation.rolling
+        assert (after.index, after.until, after.end) == (before.index, before.until, before.end)
+    np.testing.assert_array_equal(changed.start, problem.start)
+    for name in ("mass_diagonal", "viscous", "dry", "speed_limit", "applied_force"):
+        np.testing.assert_array_equal(getattr(changed.scene, name), getattr(problem.scene, name))
+
+
+def test_failures_that_no_limit_explains_are_the_solvers() -> None:
+    problem, _ = shove()
+    failed = explain(search(problem), problem, problem.phases, [], "Restoration_Failed", None)
+    assert isinstance(failed, SolverError)
+    text = str(failed)
+    assert text.startswith("no plan for phases 1 and 2 (") and "Restoration_Failed" in text
+    assert all(name in text for name in problem.phases[0].formation.names)
+    assert text.endswith("; try other time_intervals") and "\n" not in text
+
+
+def test_the_motion_that_is_short_of_least_is_described() -> None:
+    problem = change_limit(shove()[0], 2, 1.2)
+    near, far = outline(problem), outline(problem)
+    far = replace(far, guess=far.guess._replace(forces=0.5 * far.guess.forces))
+    for short in ([far], [near]), ([near], [far]):
+        error = explain(search(problem), problem, problem.phases[:1], short, "", None)
+        assert isinstance(error, InfeasibleError) and error.exit_status == 1
+        assert str(error).startswith("phase 1 is infeasible: c_n of ")
+        assert str(error).count(" is 0.2 N short at t = ") == 3 == str(error).count(" short ")
+
+
+def test_easing_leaves_what_is_feasible_as_it_is() -> None:
+    problem, _ = shove()
+    stages = outline_stages(problem, problem.phases, problem.start, SCHEME, 4, 2.0)
+    eased = ease(search(problem), stages)
+    assert eased is not None and list_shortfalls(problem, eased) == []
+    weaker = ease(search(change_limit(problem, 2, 0.8)), stages)
+    assert weaker is not None
+    shortfalls = list_shortfalls(change_limit(problem, 2, 0.8), weaker)
+    assert sum(short.amount for short in shortfalls) == pytest.approx(0.8 - LEAST, abs=5e-3)

@@ -1,0 +1,165 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from once import once
+from plane import measure_gaps
+from shipped import IMPACTS, LANDING, plan_of, problem_of
+from wholearm.cli.summary import summarise
+from wholearm.common.arrays import Array
+from wholearm.contacts.formation import Formation
+from wholearm.geometry.tracing import trace_phases
+from wholearm.mechanics.impact import strike
+from wholearm.mechanics.metric import metric_weights
+from wholearm.planning.plan import solve
+from wholearm.problem.definition import End, Problem
+from wholearm.results.trajectory import Samples, Trajectory
+from wholearm.verification.verify import verify
+
+PARTS = {"time": (0, 3), "effort": (1, 4)}
+"""Phases that are planned: two impacts; one, and a stop where no impact is possible."""
+
+
+@cache
+def problem(objective: str) -> Problem:
+    first, last = PARTS[objective]
+    whole = problem_of(IMPACTS)
+    phases = [replace(phase, index=k) for k, phase in enumerate(whole.phases[first:last])]
+    phases[-1] = replace(phases[-1], end=End.REST)
+    start = trace_phases(whole)[first - 1].end if first else whole.start
+    return replace(whole, start=start, phases=tuple(phases))
+
+
+@once
+def planned(objective: str) -> Trajectory:
+    """Plans on few intervals, whose replay is a test of its own."""
+    options: dict[str, Any] = {"time_intervals": 6, "replay": False}
+    return solve(problem(objective), objective, transcription="time", **options)
+
+
+@cache
+def along(objective: str) -> Trajectory:
+    return solve(problem(objective), objective, intervals=40)
+
+
+def ends_of(trajectory: Trajectory, phase: int) -> tuple[Samples, Samples]:
+    """The last sample of a phase and the first one of the next."""
+    before, after = trajectory.motions[phase], trajectory.motions[phase + 1]
+    return before.evaluate(np.array([before.duration])), after.evaluate(np.zeros(1))
+
+
+def find_impulses(formation: Formation, z: Array, v: Array, v_next: Array) -> Array:
+    """Impulses on sliding contacts that explain a jump of z', by least squares: M5 dv = G^T p."""
+    kinematics = formation.evaluate(z[None], v_next[None])
+    slip = kinematics.A_t[0] @ v_next
+    G = kinematics.A[0] - (formation.friction * np.sign(slip))[:, None] * kinematics.A_t[0]
+    right = formation.scene.mass_diagonal * (v_next - v)
+    p, *_ = np.linalg.lstsq(G.T, right, rcond=None)
+    np.testing.assert_allclose(G.T @ p, right, rtol=0, atol=1e-6 * np.abs(right).max())
+    return np.asarray(p)
+
+
+def test_least_times_with_impacts_agree_with_those_along_the_curves() -> None:
+    within, expected = planned("time"), plan_of(IMPACTS).meta["phase_durations"][:3]
+    # The planner along curves passes impacts by a condition on speeds alone.
+    assert 0 < within.duration / sum(expected) - 1 < 3e-3
+    np.testing.assert_allclose(within.meta["phase_durations"], expected, rtol=5e-3)
+    report = verify(problem("time"), within)
+    assert report.ok, report.to_text()
+    impulses = [phase.impact.impulse for phase in report.phases if phase.impact is not None]
+    assert len(impulses) == 2 and min(impulses) > 0
+
+
+@pytest.mark.parametrize("objective", ["time", "effort"])
+def test_transitions_agree_with_those_along_the_curves(objective: str) -> None:
+    rows, others = (plan(objective).meta["transitions"] for plan in (planned, along))
+    assert [row["phase"] for row in rows] == [1, 2]
+    for row, other in zip(rows, others, strict=True):
+        for key in ("phase", "gained", "possible", "least_impulse_contact"):
+            assert row[key] == other[key]
+        assert abs(row["velocity_ratio"]) == pytest.approx(abs(other["velocity_ratio"]), rel=1e-5)
+        assert row["least_impulse"] == pytest.approx(other["least_impulse"], rel=1e-4)
+        assert row["speed"] == pytest.approx(other["speed"], rel=1e-2)
+        if row["possible"]:
+            # Both find it as the difference of two plans, each a bit slower than possible.
+            assert row["saves"] == pytest.approx(other["saves"], rel=2e-2)
+        else:
+            assert row["saves"] is None and row["reason"] == other["reason"]
+
+
+@pytest.mark.parametrize("objective", ["time", "effort"])
+def test_velocities_jump_by_the_impact_law(objective: str) -> None:
+    plan, own = planned(objective), problem(objective)
+    metric = metric_weights(own.scene)
+    for k, row in enumerate(plan.meta["transitions"]):
+        if not row["possible"]:
+            continue
+        before, after = (phase.formation for phase in own.phases[k : k + 2])
+        end, start = ends_of(plan, k)
+        z, v, v_next = end.z[0], end.z_dot[0], start.z_dot[0]
+        np.testing.assert_allclose(start.z[0], z, rtol=0, atol=1e-7)
+        p = find_impulses(after, z, v, v_next)
+        assert p.min() > 0
+        speed = np.sqrt(metric @ v**2)
+        assert speed > 0.1 and row["speed"] == pytest.approx(speed)
+        assert p.min() == pytest.approx(row["least_impulse"] * speed, rel=1e-4)
+        assert np.sqrt(metric @ v_next**2) == pytest.approx(row["velocity_ratio"] * speed, rel=1e-5)
+        np.testing.assert_allclose(v_next, strike(before, after, z, v).v, rtol=0, atol=1e-5)
+        # The contacts of the next formation neither part nor press into one another.
+        assert np.abs(measure_gaps(after, z)).max() < 1e-8
+        assert np.abs(after.evaluate(z[None], v_next[None]).A[0] @ v_next).max() < 1e-5
+        energies = [0.5 * own.scene.mass_diagonal @ u**2 for u in (v, v_next)]
+        assert energies[1] < energies[0]
+
+
+def test_it_stops_where_no_impact_is_possible() -> None:
+    plan = planned("effort")
+    struck, row = plan.meta["transitions"]
+    assert struck["possible"] and not row["possible"] and row["speed"] == 0.0
+    assert row["reason"].startswith("impulse on v") and row["reason"].endswith("per m/s")
+    for samples in ends_of(plan, row["phase"] - 1):
+        assert np.abs(samples.z_dot).max() < 1e-5
+
+
+def test_impacts_are_listed() -> None:
+    lines = summarise(planned("time"), "a.npz").splitlines()
+    (head,) = (k for k, line in enumerate(lines) if "least impulse [N s per m/s]" in line)
+    for line, row in zip(
+        lines[head + 1 : head + 3], planned("time").meta["transitions"], strict=True
+    ):
+        phase, ratio, impulse, contact, speed, saves = line.split()
+        assert (int(phase), contact) == (row["phase"], row["least_impulse_contact"])
+        figures = (row[key] for key in ("velocity_ratio", "least_impulse", "speed", "saves"))
+        np.testing.assert_allclose(
+            [float(text) for text in (ratio, impulse, speed, saves)], list(figures), atol=5e-7
+        )
+    assert lines[head + 3] == ""
+
+
+def test_least_effort_with_impacts_is_near_that_along_the_curves() -> None:
+    within = planned("effort")
+    # Torques that are linear in a sixth of a phase cannot be as gentle.
+    assert 0 < within.meta["value"] / along("effort").meta["value"] - 1 < 1e-2
+    report = verify(problem("effort"), within)
+    assert report.ok, report.to_text()
+
+
+def test_an_impact_that_is_not_possible_next_to_a_landing_is_a_stop() -> None:
+    """The heptagon's landing and the phase before it."""
+    whole, expected = problem_of(LANDING), plan_of(LANDING).meta["phase_durations"][3:]
+    phases = [replace(phase, index=k) for k, phase in enumerate(whole.phases[3:])]
+    phases[0] = replace(phases[0], end=End.IMPACT)
+    one = replace(whole, start=trace_phases(whole)[2].end, phases=tuple(phases))
+    struck = solve(one, time_intervals=8, replay=False)
+    (row,) = struck.meta["transitions"]
+    assert (row["phase"], row["possible"], row["gained"]) == (1, False, "v4-finger1")
+    assert row["least_impulse"] < 0 and row["least_impulse_contact"] in row["reason"]
+    # That phase is planned in the time domain then, and what follows is what it was.
+    got = struck.meta["phase_durations"]
+    assert 0 < got[0] / expected[0] - 1 < 1e-2
+    assert sum(got[1:]) == pytest.approx(sum(expected[1:]), rel=1e-3)

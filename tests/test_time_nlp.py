@@ -1,0 +1,367 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from plane import make_formation, measure_gaps, with_speed_limit
+from planned import CosineMotion
+from shipped import HEPTAGON
+from timed import drive
+from tipping import roll
+from wholearm.common.arrays import Array
+from wholearm.contacts.formation import Formation
+from wholearm.geometry.curve import Curve, tangent_basis
+from wholearm.geometry.path_guess import load
+from wholearm.geometry.tracing import trace_phases
+from wholearm.mechanics.dynamics import Directions
+from wholearm.mechanics.metric import metric_weights
+from wholearm.planning.options import CLEARANCE, OPENING, Objective
+from wholearm.planning.time_domain.between import Limits, raise_bounds
+from wholearm.planning.time_domain.collocation import Scheme, make_scheme
+from wholearm.planning.time_domain.layout import MARGIN, V, pack
+from wholearm.planning.time_domain.nlp import (
+    SHORTEST,
+    SLIDING,
+    TimeNLP,
+    bound_unknowns,
+    build_time_nlp,
+    least_rates,
+)
+from wholearm.planning.time_domain.stage import Stage, StagePoints
+
+PHASE = 3
+"""Of the heptagon, without a reversal."""
+SCHEMES = [("radau", 2), ("radau", 3), ("legendre", 2), ("legendre", 3)]
+EXACT = 1e-7
+"""What the reference leaves of rows that are about one: it differentiates contacts by differences
+over a microsecond."""
+DURATION = 0.06
+
+
+@lru_cache(maxsize=1)
+def curve() -> Curve:
+    return trace_phases(load(str(HEPTAGON)))[PHASE]
+
+
+@lru_cache(maxsize=32)
+def driven(name: str, degree: int, count: int, contacts: int = 4) -> Stage:
+    """A motion from rest under torques that are linear in time, by plain Newton and Euler."""
+    formation, segment = curve().formation, curve().segments[0]
+    start = CosineMotion(curve(), 0.2, 15.0).evaluate(np.zeros(1))
+    formation = Formation(formation.scene, formation.contacts[:contacts])
+    directions = Directions(segment.Xi[:contacts], segment.sigma)
+    tau = np.stack([start.tau[0], 0.9 * start.tau[0]])
+    sample = drive(formation, start.z[0], tau, directions, DURATION)
+    return Stage(PHASE, formation, directions, sample(make_scheme(name, degree), count))
+
+
+def build(
+    stages: list[Stage], scheme: Scheme, objective: Objective = Objective.TIME, weight: float = 3.0
+) -> TimeNLP:
+    return build_time_nlp(stages, scheme, objective, weight, 1)
+
+
+def call(nlp: TimeNLP, part: str, x: Array) -> Array:
+    values: Any = nlp.solver.function.get_function(part)(x, [])
+    return np.asarray(values.full()[:, 0])
+
+
+def packed(nlp: TimeNLP, stages: list[Stage], margin: float = 0.0) -> Array:
+    return pack([stage.guess for stage in stages], nlp.layouts, margin)
+
+
+def misses(nlp: TimeNLP, x: Array) -> tuple[Array, Array]:
+    """What equations and inequalities miss; inequalities are negative where they hold."""
+    low, high = nlp.rows.bounds
+    values = call(nlp, "nlp_g", x)
+    miss = np.maximum(low - values, values - high)
+    return np.where(low == high, np.abs(miss), 0.0), np.where(low == high, -np.inf, miss)
+
+
+def collocation(name: str, degree: int, count: int, contacts: int) -> tuple[Array, Array]:
+    """What collocation misses at inner points and at the ends of intervals."""
+    scheme, stage = make_scheme(name, degree), driven(name, degree, count, contacts)
+    nlp = build([stage], scheme)
+    equations, _ = misses(nlp, packed(nlp, [stage]))
+    rows = nlp.rows_of[0]
+    n_p = stage.formation.n_constraints
+    free, rungs = 5 - n_p, degree + (not scheme.ends)
+    width = 2 * rungs * free
+    own = equations[rows.states[:, 10 : 10 + width]].reshape(count, 2, rungs, free)
+    # Everything else holds at once: nodes, contacts, balances, and contacts at the ends.
+    rest = rows.states[:, np.r_[:10, 10 + width : rows.states.shape[1]]]
+    assert equations[rest].max() < EXACT and equations[rows.points].max() < EXACT
+    return own[:, :, :-1].max(), own[:, :, -1].max()
+
+
+@pytest.mark.parametrize("contacts", [4, 3])
+@pytest.mark.parametrize("name, degree", SCHEMES)
+def test_a_known_motion_satisfies_the_equations_to_the_schemes_order(
+    name: str, degree: int, contacts: int
+) -> None:
+    scheme = make_scheme(name, degree)
+    # Three contacts let the object go astray ever faster, so intervals have to be shorter, but
+    # not so short that the reference's own 1e-11 counts.
+    short = (8, 16) if scheme.order == 6 else (16, 32)
+    counts = short if contacts == 3 else (4, 8) if degree == 2 else (2, 4)
+    coarse, fine = (collocation(name, degree, count, contacts) for count in counts)
+    inner, ends = np.log2(np.array(coarse) / np.array(fine))
+    # To inner points integrals are exact for degree d - 1, to the end for that of the order.
+    assert inner == pytest.approx(degree + 1, abs=0.4)
+    assert ends == pytest.approx(scheme.order + 1, abs=0.5)
+    assert max(fine) < 1e-3
+
+
+@pytest.mark.parametrize("name, degree", SCHEMES)
+def test_a_known_motion_keeps_the_limits(name: str, degree: int) -> None:
+    scheme, stage = make_scheme(name, degree), driven(name, degree, 8)
+    nlp = build([stage], scheme)
+    x = packed(nlp, [stage])
+    low_x, high_x = bound_unknowns(nlp, [stage], scheme)
+    low, _ = raise_bounds(nlp, [stage], [Limits.none(stage)], 0.05, (low_x, high_x))
+    nlp.rows.bounds[0][:] = low
+    _, inequalities = misses(nlp, x)
+    # Slip and joint speeds start from nothing.
+    assert inequalities.max() < 1e-9 and (x > low_x - 1e-9).all() and (x < high_x + 1e-9).all()
+
+
+@pytest.mark.parametrize("change, least", [("tau", 0.5), ("forces", 0.1), ("z", 1e-2), ("v", 1e-3)])
+@pytest.mark.parametrize("name", ["radau", "legendre"])
+def test_every_unknown_matters(name: str, change: str, least: float) -> None:
+    scheme, stage = make_scheme(name, 3), driven(name, 3, 8)
+    nlp = build([stage], scheme)
+    rest = misses(nlp, packed(nlp, [stage]))[0]
+    off = stage.guess._replace(**{change: getattr(stage.guess, change) + 1.0})
+    equations, _ = misses(nlp, pack([off], nlp.layouts, 0.0))
+    assert (equations - rest).max() > least
+
+
+@pytest.mark.parametrize("row", range(6))
+def test_friction_the_wrong_way_breaks_a_limit(row: int) -> None:
+    scheme, stage = make_scheme("radau", 3), driven("radau", 3, 8)
+    signs = np.concatenate(stage.directions)
+    signs[row] *= -1
+    wrong = replace(stage, directions=Directions(signs[:4], signs[4:]))
+    nlp = build([wrong], scheme)
+    x = packed(nlp, [wrong])
+    low, high = bound_unknowns(nlp, [wrong], scheme)
+    worst = max(misses(nlp, x)[1].max(), (low - x).max(), (x - high).max())
+    assert worst > 0.02
+
+
+@pytest.mark.parametrize("name", ["radau", "legendre"])
+def test_raised_limits_are_missed_by_as_much(name: str) -> None:
+    scheme, stage = make_scheme(name, 3), driven(name, 3, 8)
+    nlp = build([stage], scheme)
+    x = packed(nlp, [stage])
+    low_x, high_x = bound_unknowns(nlp, [stage], scheme)
+    limits = Limits.none(stage)
+    least = stage.guess.forces[3, :, 1].min()
+    limits.c_n[3, 1] = least + 0.25 - 0.05
+    low, _ = raise_bounds(nlp, [stage], [limits], 0.05, (low_x, high_x))
+    pressed = nlp.rows_of[0].limits.presses[3, :, 1]
+    values = call(nlp, "nlp_g", x)
+    assert (low_x - x).max() == pytest.approx(0.25, abs=1e-12)
+    # Where torques may step, c_n is that of the polynomial through the points.
+    at = [0.0] if scheme.ends else [0.0, 1.0]
+    between = np.polyval(np.polyfit(scheme.points, stage.guess.forces[3, :, 1], 2), at)
+    np.testing.assert_allclose((low - values)[pressed], least + 0.25 - between, atol=1e-10)
+    others = np.setdiff1d(nlp.rows_of[0].limits.presses, pressed)
+    assert (low - values)[others].max() < 0
+
+
+@pytest.mark.parametrize("objective", [Objective.TIME, Objective.EFFORT, Objective.MARGIN])
+def test_what_is_made_least(objective: Objective) -> None:
+    scheme, stage = make_scheme("radau", 3), driven("radau", 3, 8)
+    nlp = build([stage], scheme, objective)
+    cost = call(nlp, "nlp_f", packed(nlp, [stage], 0.7))[0]
+    first, last = stage.guess.tau[0, 0], stage.guess.tau[-1, 1]
+    squares = DURATION / 3 * (first @ first + first @ last + last @ last)
+    least = {
+        Objective.TIME: DURATION,
+        Objective.EFFORT: squares + 3.0 * DURATION,
+        Objective.MARGIN: -0.7,
+    }
+    assert cost == pytest.approx(least[objective], rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["radau", "legendre"])
+def test_the_margin_raises_what_forces_have_to_exceed(name: str) -> None:
+    scheme, stage = make_scheme(name, 3), driven(name, 3, 8)
+    nlp = build([stage], scheme, Objective.MARGIN)
+    low_x, high_x = bound_unknowns(nlp, [stage], scheme)
+    low, _ = raise_bounds(nlp, [stage], [Limits.none(stage)], 0.05, (low_x, high_x))
+    assert not np.isfinite(low_x[nlp.layouts[0].forces]).any()
+    # The polynomial through the points may pass a little below them at the ends of an interval.
+    room = stage.guess.forces.min() - 0.05
+    for extra, kept in ((0.9 * room, True), (1.02 * room, False)):
+        values = call(nlp, "nlp_g", packed(nlp, [stage], extra))
+        assert bool((values - low)[nlp.rows_of[0].limits.presses].min() > 0) is kept
+
+
+def cut(stage: Stage, count: int) -> list[Stage]:
+    """Two stages, the first one of `count` intervals."""
+    part, K = stage.guess, stage.intervals
+    halves = []
+    for own, nodes in ((slice(None, count), slice(None, count + 1)), (slice(count, None),) * 2):
+        share = float(part.fractions[own].sum())
+        guess = StagePoints(
+            part.duration * share,
+            part.fractions[own] / share,
+            part.nodes[nodes],
+            part.z[own],
+            part.v[own],
+            part.a[own],
+            part.forces[own],
+            part.tau[own],
+            np.zeros(0),
+        )
+        halves.append(replace(stage, guess=guess))
+    assert sum(half.intervals for half in halves) == K
+    return halves
+
+
+@pytest.mark.parametrize("strikes", [False, True])
+@pytest.mark.parametrize("objective", [Objective.TIME, Objective.MARGIN])
+def test_stages_that_follow_share_their_state(objective: Objective, strikes: bool) -> None:
+    scheme = make_scheme("radau", 3)
+    first, second = cut(driven("radau", 3, 8), 3)
+    if strikes:
+        # An impact without impulses changes nothing.
+        still = np.zeros(first.formation.n_constraints)
+        first = replace(first, strikes=True, guess=first.guess._replace(impulses=still))
+    stages = [first, second]
+    nlp = build(stages, scheme, objective)
+    assert first.guess.duration != pytest.approx(second.guess.duration)
+    x = packed(nlp, stages, 0.3)
+    plain, _ = misses(nlp, x)
+    # All but the end at rest and collocation holds.
+    assert np.delete(plain, [*range(len(plain) - 1, len(plain))]).max() < 1e-3
+    node = nlp.layouts[1].nodes[0]
+    for change, least in ((node[0], 1e-3), (node[V][2], 1e-3), (nlp.layouts[1].h[0], 1e-3)):
+        moved = x.copy()
+        moved[change] += 1e-3
+        assert (misses(nlp, moved)[0] - plain).max() > 0.3 * least
+    if objective is Objective.MARGIN:
+        moved = x.copy()
+        moved[node[MARGIN]] += 1e-3
+        assert (misses(nlp, moved)[0] - plain).max() > 0.9e-3
+        assert call(nlp, "nlp_g", x)[nlp.lasts] == pytest.approx(DURATION, rel=1e-12)
+
+
+def test_derivatives_of_the_whole_are_its_differences() -> None:
+    scheme = make_scheme("legendre", 2)
+    first, second = cut(driven("legendre", 2, 6), 3)
+    rolling = roll(first.formation, first.formation.names[0])
+    table = np.zeros((*first.guess.forces.shape[:2], 5))
+    table[..., :4] = first.guess.forces
+    first = replace(first, formation=rolling, guess=first.guess._replace(forces=table))
+    nlp = build([first, second], scheme, Objective.MARGIN)
+    rng = np.random.default_rng(4)
+    x = packed(nlp, [first, second], 0.1)
+    step = rng.normal(size=len(x))
+    jacobian: Any = nlp.solver.function.get_function("nlp_jac_g")
+    hessian: Any = nlp.solver.function.get_function("nlp_hess_l")
+    lam = rng.normal(size=len(nlp.rows.bounds[0]))
+
+    def slope(x: Array) -> Any:
+        return jacobian(x, [])[1].sparse()
+
+    h = 1e-6
+    exact = slope(x) @ step
+    change = (call(nlp, "nlp_g", x + h * step) - call(nlp, "nlp_g", x - h * step)) / (2 * h)
+    np.testing.assert_allclose(change, exact, atol=1e-6 * np.abs(exact).max())
+    upper = hessian(x, [], 1.0, lam).full()
+    bend = (upper + np.triu(upper, 1).T) @ step
+    change = (slope(x + h * step).T @ lam - slope(x - h * step).T @ lam) / (2 * h)
+    np.testing.assert_allclose(change, bend, atol=1e-6 * np.abs(bend).max())
+
+
+@pytest.mark.parametrize("scheme_name", ["radau", "legendre"])
+def test_unknowns_are_bounded(scheme_name: str) -> None:
+    scheme = make_scheme(scheme_name, 3)
+    first, second = cut(driven(scheme_name, 3, 8), 3)
+    first = replace(
+        first, strikes=True, guess=first.guess._replace(impulses=np.zeros(4)), turns=(5,)
+    )
+    stages = [first, second]
+    nlp = build(stages, scheme)
+    low, high = bound_unknowns(nlp, stages, scheme)
+    limit = np.tile(curve().formation.scene.torque_limit, 2)
+    for stage, layout in zip(stages, nlp.layouts, strict=True):
+        np.testing.assert_array_equal(low[layout.h], SHORTEST)
+        assert not np.isfinite(high[layout.h]).any()
+        for k in range(stage.intervals):
+            np.testing.assert_array_equal(low[layout.tau[k]], -limit)
+            np.testing.assert_array_equal(high[layout.tau[k]], limit)
+        assert not np.isfinite(low[layout.z]).any() and not np.isfinite(high[layout.a]).any()
+        for joint, sigma in enumerate(stage.directions.sigma):
+            free = np.isinf(low[layout.v[..., 3 + joint]]) & np.isinf(
+                high[layout.v[..., 3 + joint]]
+            )
+            # What stands still at a point has no sense there: at the end of the motion, or turning.
+            still = scheme.ends and (stage is second or joint == 1)
+            assert free.sum() == int(still) and bool(free[-1, -1]) == still
+            one = (low if sigma > 0 else high)[layout.v[0, 0, 3 + joint]]
+            assert one == 0.0
+    np.testing.assert_array_equal(low[nlp.layouts[0].impulses], 0.0)
+
+
+def test_what_two_freedoms_leave_must_not_stand_still() -> None:
+    scheme = make_scheme("radau", 3)
+    one, two = driven("radau", 3, 8, 4), driven("radau", 3, 8, 3)
+    assert not least_rates(one, one.guess.places(scheme.points)).any()
+    rates = least_rates(two, two.guess.places(scheme.points))
+    assert rates.max() == SLIDING and rates[-1, -1] == 0.0 and (rates.ravel()[:-1] > 0).all()
+    # Even in time, from both ends.
+    places = two.guess.places(scheme.points)
+    np.testing.assert_allclose(rates, SLIDING * np.clip(8 * np.minimum(places, 1 - places), 0, 1))
+
+
+def test_speed_limits_hold_at_every_point() -> None:
+    scheme, stage = make_scheme("radau", 3), driven("radau", 3, 8)
+    fastest = np.abs(stage.guess.v[..., 3:]).max(axis=(0, 1))
+    for share, kept in ((1.01, True), (0.99, False)):
+        slow = with_speed_limit(curve(), (share * fastest[0], np.inf)).formation
+        limited = replace(stage, formation=slow)
+        nlp = build([limited], scheme)
+        x, (low, high) = packed(nlp, [stage]), bound_unknowns(nlp, [limited], scheme)
+        assert bool(max((low - x).max(), (x - high).max()) < 1e-9) is kept
+
+
+@pytest.mark.parametrize("name", ["radau", "legendre"])
+def test_released_contacts_open_and_stay_clear(name: str) -> None:
+    scheme = make_scheme(name, 3)
+    stage = driven(name, 3, 9, 3)
+    formation = stage.formation
+    gained = [limit.gained.name if limit.gained else "" for limit in formation.limits]
+    released = gained.index("v0-finger2")
+    opens = replace(stage, watched=(released,), released=(released,), opens=True)
+    nlp = build([opens], scheme)
+    low, _ = nlp.rows.bounds
+    rows = nlp.rows_of[0].watches
+    later = opens.guess.places(scheme.points) > 1 / 3
+    np.testing.assert_allclose(low[rows[..., 0]], np.where(later, CLEARANCE, 0.0))
+    values = call(nlp, "nlp_g", packed(nlp, [opens]))[rows[..., 0]]
+    gaps = make_formation(formation.scene, "v0-finger2")
+    expected = [measure_gaps(gaps, z)[0] for z in stage.guess.z.reshape(-1, 5)]
+    np.testing.assert_allclose(values.ravel(), expected, atol=1e-14)
+    more = len(low) - len(build([replace(opens, opens=False)], scheme).rows.bounds[0])
+    assert more == scheme.degree and (low == OPENING).sum() == scheme.degree
+
+
+@pytest.mark.parametrize("contacts", [4, 3])
+def test_the_tangent_basis_is_what_contacts_leave_free(contacts: int) -> None:
+    stage = driven("radau", 3, 8, contacts)
+    z, formation = stage.guess.nodes[0, 0], stage.formation
+    N = tangent_basis(formation, z)
+    assert N.shape == (5, 5 - contacts)
+    P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
+    # Along the columns of N over the metric contacts stay closed; N^T are coordinates along them.
+    metric = metric_weights(formation.scene)[:, None] / formation.scene.polygon.gyration_radius**2
+    np.testing.assert_allclose(P @ (N / metric), 0.0, atol=1e-13)
+    np.testing.assert_allclose(N.T @ (N / metric), np.eye(5 - contacts), atol=1e-13)

@@ -1,0 +1,390 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from once import once
+from plane import make_formation, measure_gaps, measure_slip
+from shipped import HEPTAGON, LANDING, plan_of, problem_of
+from thrown import heave, lift, shove
+from timed import (
+    fastest_landing,
+    instants,
+    integrate,
+    landing,
+    plan_landing,
+    stages_of,
+    tables,
+    total,
+)
+from tipping import box, tip, tipped
+from wholearm.common.errors import InfeasibleError
+from wholearm.contacts.elemental import parse_contact
+from wholearm.contacts.formation import Formation
+from wholearm.geometry.curve import Curve
+from wholearm.geometry.tracing import trace_phases
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.phase_plan import PhasePlan
+from wholearm.planning.plan import solve
+from wholearm.planning.time_domain.motion import StageMotion, TimeMotion
+from wholearm.planning.time_domain.plan import plan_phases
+from wholearm.problem.definition import Problem
+from wholearm.results.trajectory import Trajectory
+from wholearm.verification.verify import verify
+
+SLACK = 1e-6
+"""What a limit may be missed by between the places that the planner looks at [N or N m]."""
+COARSE = 6
+"""Intervals where only what a plan is for is looked at, not how good it is."""
+SCHEMES = [("radau", 2), ("radau", 5), ("legendre", 2), ("legendre", 3)]
+
+
+@pytest.fixture(scope="module")
+def motions() -> list[TimeMotion]:
+    return fastest_landing()
+
+
+@pytest.fixture(scope="module")
+def stages(motions: list[TimeMotion]) -> list[StageMotion]:
+    return [stage for motion in motions for stage in motion.stages]
+
+
+@pytest.fixture(scope="module")
+def coarse() -> list[PhasePlan[TimeMotion]]:
+    return plan_landing(time_intervals=COARSE)
+
+
+@pytest.fixture(scope="module")
+def gentle() -> Trajectory:
+    return plan_of(LANDING, "effort")
+
+
+@once
+def in_time() -> Trajectory:
+    """The heptagon's last slide and its flip, which curves are for, in the time domain."""
+    return solve(turning(), transcription="time", time_intervals=16, replay=False)
+
+
+@cache
+def turning() -> Problem:
+    whole = problem_of(HEPTAGON)
+    phases = tuple(replace(phase, index=k) for k, phase in enumerate(whole.phases[2:]))
+    return replace(whole, start=trace_phases(whole)[1].end, phases=phases)
+
+
+@cache
+def thrown(
+    throw: Callable[[], tuple[Problem, float]], objective: str = "time"
+) -> tuple[Problem, Trajectory, float]:
+    """A problem of one and two contacts, its plan, and the time that its second phase takes."""
+    problem, expected = throw()
+    return problem, solve(problem, objective, time_intervals=8), expected
+
+
+def effort(stages: list[StageMotion]) -> float:
+    """Integral of tau^T tau plus the duration, by the midpoint rule."""
+    squares = [(stage.evaluate(instants(stage, 100)).tau ** 2).sum(axis=1) for stage in stages]
+    weights = [np.repeat(stage.points.fractions, 100) / 100 for stage in stages]
+    parts = zip(stages, squares, weights, strict=True)
+    return sum(stage.duration * (1.0 + float(own @ share)) for stage, own, share in parts)
+
+
+def landing_of(plan: Trajectory) -> list[StageMotion]:
+    """The stages of the heptagon's last two phases, joined smoothly."""
+    motions = [motion for motion in plan.motions if isinstance(motion, TimeMotion)]
+    assert len(motions) == 2
+    return [stage for motion in motions for stage in motion.stages]
+
+
+@pytest.mark.parametrize("phase", range(2, 5))
+def test_least_times_agree_with_those_along_the_curve(
+    curves: tuple[Curve, ...], trajectory: Trajectory, phase: int
+) -> None:
+    plan = in_time()
+    motion, expected = plan.motions[phase - 2], trajectory.meta["phase_durations"][phase]
+    assert isinstance(motion, TimeMotion)
+    # Two discretisations of one problem: torques are linear over a 16th of the phase here, or half
+    # of that where they switch, so that it takes longer.
+    assert -1e-4 < motion.duration / expected - 1 < 1e-3
+    end = motion.stages[-1].points.nodes[-1]
+    np.testing.assert_allclose(end[0], curves[phase].end, atol=1e-8)
+    np.testing.assert_allclose(end[1], 0.0, atol=1e-6)
+    for stage, segment in zip(motion.stages, curves[phase].segments, strict=True):
+        np.testing.assert_array_equal(stage.directions.Xi, segment.Xi)
+        np.testing.assert_array_equal(stage.directions.sigma, segment.sigma)
+
+
+def test_a_problem_planned_in_the_time_domain_is_carried_out() -> None:
+    plan = in_time()
+    assert plan.meta["transcription"] == "time"
+    report = verify(turning(), plan)
+    assert report.ok, report.to_text()
+    assert np.nanmin(plan.c_n) > turning().epsilon - SLACK
+    assert np.abs(plan.tau).max() < 2.0 + SLACK
+
+
+@pytest.mark.parametrize("name, degree", SCHEMES)
+def test_schemes_and_degrees_agree(
+    heptagon: Problem, curves: tuple[Curve, ...], trajectory: Trajectory, name: str, degree: int
+) -> None:
+    options = PlanOptions(scheme=name, degree=degree, time_intervals=16)
+    plans = plan_phases(heptagon, (heptagon.phases[3],), curves[2].end, options)
+    # Intervals end where torques switch; what is left is that these are linear in between.
+    above = total(plans) / trajectory.meta["phase_durations"][3] - 1
+    assert -1e-5 < above < 1e-3
+    stage = plans[0].motion.stages[0]
+    z, _ = integrate(stage, *stage.points.nodes[0])
+    error = np.abs(z - stage.points.nodes[-1, 0]).max()
+    # What collocation misses over the phase [m, rad], falling with the order.
+    assert error < {3: 1e-4, 4: 1e-5}.get(stage.scheme.order, 1e-6)
+
+
+def test_landings_of_another_scheme_take_as_long(coarse: list[PhasePlan[TimeMotion]]) -> None:
+    plans = plan_landing(scheme="legendre", degree=2, time_intervals=COARSE)
+    # Whatever the points are, intervals end where torques switch.
+    assert total(plans) == pytest.approx(total(coarse), rel=1e-3)
+
+
+def test_rolling_contacts_are_planned_like_along_the_curve() -> None:
+    """The phase in which the box tips over a vertex."""
+    phase = replace(box().phases[1], index=0)
+    problem = replace(box(), start=tip().start, phases=(phase,))
+    within = solve(problem, transcription="time", time_intervals=16)
+    # Measured 0.77 % on 32 intervals, half of that on 64.
+    assert -1e-4 < within.duration / tipped().meta["phase_durations"][1] - 1 < 1e-2
+    rolls = phase.formation.rolling
+    (motion,) = within.motions
+    assert isinstance(motion, TimeMotion) and len(rolls) == 1
+    for stage in motion.stages:
+        samples = stage.evaluate(instants(stage, 9))
+        for k, contact in enumerate(stage.formation.contacts):
+            if contact in rolls:
+                grip = 0.5 * (samples.c_n[:, k] - problem.epsilon) - np.abs(samples.c_t[:, k])
+                assert grip.min() > -SLACK
+                slip = measure_slip(stage.formation, samples.z, samples.z_dot)
+                assert np.abs(slip[:, k]).max() < 1e-12
+    assert verify(problem, within).ok
+
+
+def test_margins_with_rolling_contacts_are_those_along_the_curve() -> None:
+    problem = box()
+    along = solve(problem, "margin", duration=1.0, replay=False)
+    phase, allowed = problem.phases[1], along.meta["phase_durations"][1]
+    assert phase.formation.rolling
+    start = along.motions[1].evaluate(np.zeros(1)).z[0]
+    options = PlanOptions("margin", time_intervals=8)
+    (within,) = plan_phases(problem, (phase,), start, options, allowed)
+    # Forces on an eighth of the phase cannot follow as closely.
+    assert within.value == pytest.approx(along.meta["phase_values"][1], rel=2e-2)
+    assert within.value < along.meta["phase_values"][1] * (1 + 1e-3)
+
+
+@pytest.mark.parametrize(
+    "throw, name",
+    [(shove, "radau"), (heave, "radau"), (heave, "legendre"), (lift, "radau")],
+)
+def test_what_moves_by_itself_takes_its_time(
+    throw: Callable[[], tuple[Problem, float]], name: str
+) -> None:
+    problem, plan, expected = thrown(throw)
+    if name != "radau":
+        plan = solve(problem, time_intervals=8, scheme=name)
+    # One or two contacts are left, and with them four or three freedoms.
+    formation = problem.phases[1].formation
+    assert formation.n_constraints == 2 - (throw is lift)
+    # Collocation misses a falling body by powers of an eighth of its time; a sliding one, whose
+    # acceleration is constant, not at all.
+    accuracy = 1e-12 if throw is shove else 2e-8
+    assert plan.meta["phase_durations"][1] == pytest.approx(expected, rel=accuracy)
+    report = verify(problem, plan)
+    assert report.ok, report.to_text()
+    motion = plan.motions[1]
+    samples = motion.evaluate(np.linspace(0.0, motion.duration, 50))
+    y, phi = samples.z[:, 1], samples.z[:, 2]
+    if throw is shove:
+        # Weight and friction, whose moment the two forces share: closed form.
+        weight = problem.scene.polygon.mass * 9.81
+        lean = 0.3 * 0.03 / 0.06
+        shares = np.array([0.5 + lean, 0.5 - lean]) * weight
+        np.testing.assert_allclose(samples.c_n, np.tile(shares, (50, 1)), rtol=1e-9)
+        np.testing.assert_allclose(samples.z_ddot[:, 0], 0.3 * 9.81, rtol=1e-9)
+    else:
+        body = problem.scene.polygon
+        rates = samples.z_dot[:, :3]
+        kinetic = 0.5 * rates**2 @ np.array([body.mass, body.mass, body.inertia or 0.0])
+        energy = kinetic + body.mass * 9.81 * y
+        # Nothing takes energy away; the potential energy changes by millijoules.
+        assert np.ptp(energy) < 1e-7
+        if throw is lift:
+            np.testing.assert_allclose(rates[:, 0], 0.0, atol=1e-7)
+        assert phi[-1] == pytest.approx(problem.phases[1].until.value, abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    "throw, objective",
+    [(shove, "margin"), (heave, "effort")],
+)
+def test_one_and_two_contacts_are_planned_for_every_objective(
+    throw: Callable[[], tuple[Problem, float]], objective: str
+) -> None:
+    problem, fastest, expected = thrown(throw)
+    plan = thrown(throw, objective)[1]
+    # The second phase has no choice; the first one has.
+    assert plan.meta["phase_durations"][1] == pytest.approx(expected, rel=1e-6)
+    assert plan.meta["phase_durations"][0] > fastest.meta["phase_durations"][0]
+    least = [float(np.nanmin(trajectory.c_n)) for trajectory in (fastest, plan)]
+    assert min(least) > problem.epsilon - SLACK
+    if objective == "margin":
+        # Phases without a choice may limit both.
+        assert least[1] > least[0] - SLACK
+
+
+def test_friction_never_pushes_the_wrong_way(stages: list[StageMotion]) -> None:
+    for stage in stages:
+        samples = stage.evaluate(instants(stage, 12))
+        slip = measure_slip(stage.formation, samples.z, samples.z_dot)
+        joints = samples.z_dot[:, 3:]
+        # At a reversal, slip between points is known to the error of collocation.
+        assert (slip * stage.directions.Xi).min() > -1e-4 * np.abs(slip).max()
+        assert (joints * stage.directions.sigma).min() > -1e-4 * np.abs(joints).max()
+
+
+def test_forces_and_torques_keep_their_limits_between_points(stages: list[StageMotion]) -> None:
+    problem = landing()
+    for stage in stages:
+        samples = stage.evaluate(instants(stage, 41))
+        assert samples.c_n.min() > problem.epsilon - SLACK
+        assert (np.abs(samples.tau) < problem.scene.torque_limit + SLACK).all()
+
+
+def test_formations_stay_valid_between_points(stages: list[StageMotion]) -> None:
+    for stage in stages:
+        limits = stage.formation.evaluate_limits(stage.evaluate(instants(stage, 12)).z)
+        # What is gained or released is right on its limit at one end [m].
+        assert limits.min() > -1e-7
+
+
+def test_some_limit_is_used_all_along(stages: list[StageMotion]) -> None:
+    problem = landing()
+    used = []
+    for stage in stages:
+        samples = stage.evaluate(instants(stage, 12))
+        room = np.abs(problem.scene.torque_limit - np.abs(samples.tau)).min(axis=1)
+        used.append(np.minimum(room, samples.c_n.min(axis=1) - problem.epsilon))
+    # Least time: the torque or the force of one finger is near its limit nearly everywhere.
+    assert np.mean(np.concatenate(used) < 0.05) > 0.75
+
+
+def test_the_released_contact_opens(motions: list[TimeMotion]) -> None:
+    gaps = make_formation(landing().scene, "v3-finger1")
+    before, after = motions
+    t = np.linspace(0.0, after.duration, 200)
+    opening = measure_gaps(gaps, after.evaluate(t).z)[:, 0]
+    assert abs(opening[0]) < 1e-9 and opening.min() > -1e-9
+    assert opening[-1] > 1e-4
+    # Held before, so it opens from zero speed, and it does not touch again.
+    assert (opening[100:] > 1e-5).all() and (opening[20:] > 1e-7).all()
+    held = measure_gaps(gaps, before.evaluate(np.linspace(0, before.duration, 9)).z)
+    assert np.abs(held).max() < 1e-9
+
+
+def test_the_object_lands_at_rest_on_its_next_edge(motions: list[TimeMotion]) -> None:
+    problem, (z, v) = landing(), motions[-1].stages[-1].points.nodes[-1]
+    scene = problem.scene
+    edge = Formation(scene, tuple(parse_contact(f"v{k}-palm", scene) for k in (1, 2)))
+    assert np.abs(measure_gaps(edge, z)).max() < 1e-9
+    assert z[2] == pytest.approx(scene.polygon.flush_angle(1), abs=1e-8)
+    # The solver's tolerance of 1e-8, of speeds of up to 20 rad/s.
+    np.testing.assert_allclose(v, 0.0, atol=1e-6)
+    last = motions[-1].evaluate(motions[-1].duration - np.array([2e-3, 1e-3, 0.0]))
+    heights = measure_gaps(edge, last.z)[:, 1]
+    assert heights[0] > heights[1] > 0
+
+
+def test_phases_are_joined_while_moving(motions: list[TimeMotion]) -> None:
+    before, after = (motion.stages for motion in motions)
+    end, start = before[-1].points.nodes[-1], after[0].points.nodes[0]
+    np.testing.assert_allclose(start, end, atol=1e-7)
+    assert np.abs(end[1]).max() > 1.0
+
+
+def test_the_torques_alone_carry_the_object_to_its_goal(stages: list[StageMotion]) -> None:
+    z, v = stages[0].points.nodes[0]
+    for stage in stages:
+        z, v = integrate(stage, z, v)
+        # The error of every stage so far, for a motion that nothing holds to its plan [m, rad].
+        np.testing.assert_allclose(z, stage.points.nodes[-1, 0], atol=1e-5)
+    np.testing.assert_allclose(v, 0.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("which", ["time", "effort", "margin"])
+def test_values_are_those_of_the_objective(
+    coarse: list[PhasePlan[TimeMotion]], gentle: Trajectory, which: str
+) -> None:
+    if which == "time":
+        assert [plan.value for plan in coarse] == [plan.motion.duration for plan in coarse]
+        return
+    if which == "effort":
+        assert sum(gentle.meta["phase_values"][4:]) == pytest.approx(
+            effort(landing_of(gentle)), rel=1e-4
+        )
+        return
+    allowed = 2.0 * total(coarse)
+    plans = plan_landing(objective="margin", time_intervals=COARSE, duration=allowed)
+    assert total(plans) < allowed * (1 + 1e-8)
+    samples = [stage.evaluate(instants(stage, 12)) for stage in stages_of(plans)]
+    least = min(part.c_n.min() for part in samples)
+    assert plans[0].value == plans[1].value
+    # Forces keep to it between points too, where limits are tightened a little too much.
+    assert plans[0].value < least + SLACK
+    assert plans[0].value == pytest.approx(least, rel=2e-3)
+    assert plans[0].value > 0.5
+
+
+def test_the_effort_of_a_gentle_plan_is_least(
+    coarse: list[PhasePlan[TimeMotion]], gentle: Trajectory
+) -> None:
+    stages = landing_of(gentle)
+    assert effort(stages) < 0.9 * effort(stages_of(coarse))
+    assert total(coarse) < sum(stage.duration for stage in stages)
+    least = min(stage.evaluate(instants(stage, 12)).c_n.min() for stage in stages)
+    assert least > landing().epsilon - SLACK
+
+
+def test_plans_are_the_same_every_time() -> None:
+    """Nothing is left of what was planned before, nor of what was planned in between."""
+    (problem, _), (other, _) = shove(), heave()
+    plans = [
+        plan_phases(each, each.phases, each.start, PlanOptions(time_intervals=COARSE))
+        for each in (problem, other, problem)
+    ]
+    for one, again in zip(stages_of(plans[0]), stages_of(plans[2]), strict=True):
+        for before, after in zip(tables(one.points), tables(again.points), strict=True):
+            size = np.abs(before).max(initial=0.0)
+            np.testing.assert_allclose(after, before, rtol=0, atol=1e-9 * size)
+
+
+def test_a_motion_that_limits_forbid_is_no_plan() -> None:
+    problem, _ = shove()
+    weak = [replace(link, torque_limit=0.3) for link in problem.scene.fingers]
+    scene = replace(problem.scene, fingers=(weak[0], weak[1]))
+    phases = [
+        replace(phase, formation=Formation(scene, phase.formation.contacts))
+        for phase in problem.phases
+    ]
+    feeble = replace(problem, scene=scene, phases=tuple(phases))
+    with pytest.raises(InfeasibleError, match=r"phases 1 and 2 are infeasible: .* short"):
+        options = PlanOptions(time_intervals=COARSE)
+        plan_phases(feeble, phases, feeble.start, options, explained=False)
+
+
+def test_guesses_in_the_time_domain_start_where_curves_end() -> None:
+    problem = landing()
+    start = trace_phases(problem)[-1].end
+    plans = plan_landing(time_intervals=COARSE)
+    np.testing.assert_allclose(plans[0].motion.stages[0].points.nodes[0, 0], start, atol=1e-9)
+    np.testing.assert_allclose(plans[0].motion.stages[0].points.nodes[0, 1], 0.0, atol=1e-9)

@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from timed import landing
+from wholearm.geometry.tracing import trace_phases
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.time_domain.collocation import make_scheme
+from wholearm.planning.time_domain.own_units import in_own_units
+from wholearm.planning.time_domain.refinement import halve
+from wholearm.planning.time_domain.search import Search, Solution
+from wholearm.planning.time_domain.staging import outline_stages
+from wholearm.planning.time_domain.warm_start import carry_multipliers, first_multipliers
+
+SCHEME = make_scheme("radau", 3)
+
+
+def search_for(objective: str) -> Search:
+    return Search.of(landing(), PlanOptions(objective=objective))
+
+
+@lru_cache(maxsize=2)
+def coarse(objective: str) -> Solution:
+    """The heptagon's landing on few intervals, from its outlines."""
+    problem = landing()
+    start = trace_phases(problem)[-1].end
+    stages = outline_stages(problem, problem.phases[4:], start, SCHEME, 8, 2.0)
+    solution = search_for(objective).solve(stages)
+    assert solution.success
+    return solution
+
+
+@pytest.mark.parametrize("objective", ["time", "effort"])
+def test_halved_intervals_start_from_the_multipliers_before(objective: str) -> None:
+    solution = coarse(objective)
+    every = [np.ones(stage.intervals, dtype=int) for stage in solution.stages]
+    finer = halve(solution.stages, SCHEME, every)
+    costs = []
+    for before in (solution, None):
+        answer = search_for(objective).solve(finer, before)
+        assert answer.success
+        costs.append(answer.cost)
+    # The problem is not convex, and both answers need not be one.
+    assert costs[0] == pytest.approx(costs[1], rel=0.03)
+
+
+def test_first_multipliers_push_away_from_the_bounds_there_are() -> None:
+    low, high = np.array([-np.inf, 0.0, -np.inf, -1.0]), np.array([np.inf, np.inf, 2.0, 1.0])
+    low_g, high_g = np.array([0.0, 0.0]), np.array([0.0, np.inf])
+    start = first_multipliers((low, high), (low_g, high_g))
+    # Of a lower bound negative, of an upper one positive, and of both none.
+    assert np.sign(start["lam_x0"]).tolist() == [0, -1, 1, 0]
+    assert np.sign(start["lam_g0"]).tolist() == [0, -1]
+
+
+def test_multipliers_are_shared_among_the_intervals_that_replace_one() -> None:
+    solution = coarse("time")
+    marked = [(np.arange(stage.intervals) + 1) % 2 for stage in solution.stages]
+    stages = halve(solution.stages, SCHEME, marked)
+    search = search_for("time")
+    nlp = search.build(stages)
+    rng = np.random.default_rng(2)
+    given = {key: rng.normal(size=len(table)) for key, table in solution.multipliers.items()}
+    carried = carry_multipliers(given, solution.nlp, nlp, solution.stages, stages)
+    assert len(carried["lam_g0"]) == len(nlp.rows.bounds[0])
+    for k, own in enumerate(marked):
+        parent = np.repeat(np.arange(len(own)), 1 + own)
+        for layouts, key, name in (
+            ((solution.nlp.layouts, nlp.layouts), "lam_x0", "forces"),
+            ((solution.nlp.layouts, nlp.layouts), "lam_x0", "tau"),
+            ((solution.nlp.rows_of, nlp.rows_of), "lam_g0", "points"),
+        ):
+            old, new = (getattr(part[k], name) for part in layouts)
+            before, after = given[key][old], carried[key][new]
+            total = np.zeros_like(before)
+            np.add.at(total, parent, after)
+            np.testing.assert_allclose(total, before, rtol=1e-12)
+
+
+def test_multipliers_of_a_solution_are_those_of_its_limits() -> None:
+    solution = coarse("time")
+    pressing = 0
+    for stage, layout in zip(solution.stages, solution.nlp.layouts, strict=True):
+        lam, c_n = solution.multipliers["lam_x0"][layout.forces], stage.guess.forces
+        # A bound pushes only where it is reached, to the tolerance of the solver.
+        least = in_own_units(landing()).epsilon
+        assert (np.abs(lam * (c_n - least)) < 1e-6).all() and lam.max() < 1e-7
+        pressing += int((lam < -1e-6).sum())
+    assert pressing > 10

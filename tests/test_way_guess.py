@@ -1,0 +1,112 @@
+from __future__ import annotations
+
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from shipped import HEPTAGON
+from wholearm.benchmark.stress.slow_motion import fast_margin
+from wholearm.benchmark.stress.tracing import weights
+from wholearm.geometry.path_guess import connect, outline_phase
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.time_domain.plan import plan_phases
+from wholearm.planning.time_domain.way_guess import AMPLE, list_goals, list_ways, split_way
+from wholearm.planning.time_domain.way_pace import WayForces
+from wholearm.problem.definition import Problem, build_problem, read_problem
+
+
+@cache
+def tipping() -> Problem:
+    """The heptagon tips over its left vertex; to do so, it has to slide."""
+    table = dict(read_problem(str(HEPTAGON)).table)
+    contacts = ["v0-palm", "v2-finger1", "v5-finger2"]
+    return build_problem({**table, "phases": [{"contacts": contacts, "until": {"phi_deg": 9.5}}]})
+
+
+def test_ends_beside_the_nearest_are_ends_too() -> None:
+    problem = tipping()
+    (phase,) = problem.phases
+    (nearest,) = outline_phase(problem, phase, problem.start)
+    goals = np.array(list_goals(phase, problem.start, nearest.z[-1]))
+    assert len(goals) > 5 and np.ptp(goals[:, 0]) > 0.01
+    assert np.abs(np.degrees(goals[:, 2]) - 9.5).max() < 1e-6
+    assert np.abs(phase.formation.evaluate(goals, goals).C).max() < 1e-9
+
+
+def test_stretches_of_a_way_keep_their_senses() -> None:
+    problem = tipping()
+    (phase,) = problem.phases
+    (nearest,) = outline_phase(problem, phase, problem.start)
+    for goal in list_goals(phase, problem.start, nearest.z[-1]):
+        way = split_way(connect(phase.formation, problem.start, goal))
+        assert (way[0].z[0] == problem.start).all()
+        for part, coming in pairwise(way):
+            assert (part.z[-1] == coming.z[0]).all() and part.turns
+        for part in way:
+            steps, middles = np.diff(part.z, axis=0), (part.z[1:] + part.z[:-1]) / 2
+            A_t = phase.formation.evaluate(middles, steps).A_t
+            along = np.hstack([np.einsum("nij,nj->ni", A_t, steps), steps[:, 3:]])
+            signs = np.concatenate(part.directions)
+            # But for stretches too short to count.
+            assert ((along * signs).sum(axis=0) > 0).all()
+
+
+def test_margins_are_those_of_newton_and_euler() -> None:
+    problem = tipping()
+    (phase,) = problem.phases
+    best, *_ = list_ways(problem, phase, problem.start, 3)
+    assert best.margin > AMPLE
+    part = best.stretches[0]
+    s = np.append(0.0, np.cumsum(np.sqrt(np.diff(part.z, axis=0) ** 2 @ weights(problem.scene))))
+    course = s, part.z, np.gradient(part.z, s, axis=0, edge_order=2)
+    own = WayForces([part], problem.epsilon).find_margin()
+    other = fast_margin(problem.scene, phase, problem.epsilon, course)
+    # One looks at the middles of the intervals, the other one at their ends.
+    assert other - 0.02 < own < other + 0.1
+    # What epsilon takes of all normal forces, it takes of the margin at most.
+    more = problem.epsilon + 0.05 * problem.scene.scales.force
+    assert own - 0.05 - 1e-9 <= WayForces([part], more).find_margin() <= own + 1e-9
+
+
+def test_a_brisk_motion_keeps_half_the_margin_and_ends_at_rest() -> None:
+    problem = tipping()
+    best, *_ = list_ways(problem, problem.phases[0], problem.start, 1)
+    pace = best.pace
+    assert pace is not None and pace.t[0] == 0.0 and pace.s[-1] == pytest.approx(1.0)
+    assert (np.diff(pace.t) > 0).all() and (np.diff(pace.s) > 0).all()
+    speeds = np.diff(pace.s) / np.diff(pace.t)
+    assert speeds[[0, -1]].max() < speeds.max()
+    # No faster than gravity and the torques allow; no slower than a few falls over its length.
+    length = sum(part.length for part in best.stretches)
+    assert 0.1 < pace.t[-1] / np.sqrt(length / problem.scene.gravity) < 20.0
+
+
+def test_ways_bend_to_one_side_and_to_the_other() -> None:
+    problem = tipping()
+    (phase,) = problem.phases
+    start, formation = problem.start, phase.formation
+    (nearest,) = outline_phase(problem, phase, start)
+    goal, straight = nearest.z[-1], connect(formation, start, nearest.z[-1]).z
+    sides = [connect(formation, start, goal, (bend, 0.0)).z for bend in (0.3, -0.3)]
+    for z in sides:
+        assert (z[0] == start).all() and np.abs(z[-1] - goal).max() < 1e-9
+        assert np.abs(formation.evaluate(z, z).C).max() < 1e-9
+    off = [(z - straight)[len(z) // 2] * np.sqrt(weights(problem.scene)) for z in sides]
+    assert off[0] @ off[1] < 0 and np.linalg.norm(off[0]) > 0.1 * nearest.length
+
+
+def test_a_way_that_slides_while_it_tips_is_planned() -> None:
+    problem = tipping()
+    (plan,) = plan_phases(
+        problem, problem.phases, problem.start, PlanOptions(time_intervals=5), explained=False
+    )
+    motion = plan.motion
+    samples = motion.evaluate(np.linspace(0.0, motion.duration, 50))
+    assert np.degrees(samples.z[-1, 2]) == pytest.approx(9.5, abs=1e-5)
+    assert samples.c_n.min() > problem.epsilon - 1e-6
+
+
+def test_a_release_and_one_freedom_have_no_ways(heptagon: Problem) -> None:
+    assert not list_ways(heptagon, heptagon.phases[0], heptagon.start, 3)
