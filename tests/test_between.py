@@ -18,10 +18,10 @@ from wholearm.planning.time_domain.between import (
     GRAZE,
     MISS,
     Limits,
+    check_between,
     find_misses,
-    look_between,
+    monitor_missed,
     raise_bounds,
-    watch_missed,
 )
 from wholearm.planning.time_domain.collocation import make_scheme
 from wholearm.planning.time_domain.motion import StageMotion, TimeMotion, make_motions
@@ -30,7 +30,7 @@ from wholearm.planning.time_domain.own_units import to_si
 from wholearm.planning.time_domain.plan import plan_phases
 from wholearm.planning.time_domain.search import Search, Solution
 from wholearm.planning.time_domain.stage import Stage
-from wholearm.planning.time_domain.staging import outline_stages
+from wholearm.planning.time_domain.staging import guess_stages
 from wholearm.results.trajectory import Trajectory
 
 EPSILON = 0.05
@@ -43,7 +43,7 @@ def as_stage(motion: StageMotion, **fields: object) -> Stage:
 
 
 def look(stage: Stage, motion: StageMotion, *least: float) -> Limits:
-    return find_misses(stage, look_between(stage, motion), *least)
+    return find_misses(stage, check_between(stage, motion), *least)
 
 
 @lru_cache(maxsize=1)
@@ -129,7 +129,7 @@ def test_released_contacts_have_to_be_clear_in_the_second_half() -> None:
 
 def test_limits_rise_by_more_than_they_are_missed() -> None:
     motion = heaved()
-    stage = as_stage(motion, watched=(0, 1))
+    stage = as_stage(motion, monitored=(0, 1))
     plain = Limits.none(stage)
     assert [table.shape[1] for table in plain] == [2, 1, 2, 4] and plain.worst == 0.0
     missed = Limits(*(table + k * 1e-3 for k, table in enumerate(plain)))
@@ -143,7 +143,7 @@ def test_tightening_holds_limits_that_points_alone_do_not() -> None:
     search = Search.of(problem, PlanOptions())
     plans = plan_landing(time_intervals=6)
     start = plans[0].motion.stages[0].points.nodes[0, 0]
-    stages = outline_stages(problem, problem.phases[4:], start, SCHEME, 6, 2.0)
+    stages = guess_stages(problem, problem.phases[4:], start, SCHEME, 6, 2.0)
     loose = search.solve(stages)
     held = search.hold(loose)
     assert loose.success and held.success
@@ -163,7 +163,7 @@ def solve_at_points() -> Solution:
     """The heptagon's landing on few intervals, with limits at the points alone."""
     problem = landing()
     start = plan_landing(time_intervals=6)[0].motion.stages[0].points.nodes[0, 0]
-    stages = outline_stages(problem, problem.phases[4:], start, SCHEME, 6, 2.0)
+    stages = guess_stages(problem, problem.phases[4:], start, SCHEME, 6, 2.0)
     solution = Search.of(problem, PlanOptions()).solve(stages)
     assert solution.success
     return solution
@@ -173,7 +173,7 @@ def test_rates_against_the_directions_of_a_stage_are_missed() -> None:
     solution = solve_at_points()
     motions = make_motions(solution.stages, SCHEME)
     for stage, motion in zip(solution.stages, motions, strict=True):
-        seen, formation = look_between(stage, motion), stage.formation
+        seen, formation = check_between(stage, motion), stage.formation
         z, v = seen.samples.z, seen.samples.z_dot
         slip = np.einsum("nij,nj->ni", formation.evaluate(z, v).A_t, v)
         rates = np.hstack([slip / formation.scene.scales.length, v[:, 3:]])
@@ -232,26 +232,26 @@ def test_what_is_broken_between_points_is_watched() -> None:
     """In the plan of fingers that pass each other the gap is, in the other nothing."""
     formation = make_way(solid=True).phases[0].formation
     (gap,) = [k for k, limit in enumerate(formation.limits) if limit.text == FINGERS_TOUCH]
-    for plan, watched in zip(make_way_twice(), ((gap,), ()), strict=True):
+    for plan, monitored in zip(make_way_twice(), ((gap,), ()), strict=True):
         (whole,) = plan.motions
         assert isinstance(whole, TimeMotion)
         motions = [replace(part, formation=formation) for part in whole.stages]
         stages = [as_stage(part) for part in motions]
-        looks = [look_between(*pair) for pair in zip(stages, motions, strict=True)]
-        found = watch_missed(stages, looks)
-        assert {k for stage in found or stages for k in stage.watched} == set(watched)
-        assert (found is None) == (watched == ())
+        looks = [check_between(*pair) for pair in zip(stages, motions, strict=True)]
+        found = monitor_missed(stages, looks)
+        assert {k for stage in found or stages for k in stage.monitored} == set(monitored)
+        assert (found is None) == (monitored == ())
 
 
 def test_what_is_short_where_a_stage_starts_is_no_miss_of_its_own() -> None:
     solution = solve_at_points()
     stage, motion = solution.stages[0], make_motions(solution.stages, SCHEME)[0]
-    seen = look_between(stage, motion)
+    seen = check_between(stage, motion)
     deep = 10 * GRAZE * stage.formation.scene.scales.length
     lower = np.full_like(seen.limits, deep)
     lower[0] = -deep
-    row = (0, *stage.watched)[-1]
-    watching = replace(stage, watched=(row,), released=())
-    assert find_misses(watching, seen._replace(limits=lower), EPSILON).gap.max() == 0.0
+    row = (0, *stage.monitored)[-1]
+    monitoring = replace(stage, monitored=(row,), released=())
+    assert find_misses(monitoring, seen._replace(limits=lower), EPSILON).gap.max() == 0.0
     lower[5] = -4 * deep
-    assert find_misses(watching, seen._replace(limits=lower), EPSILON).gap.max() > 2 * deep
+    assert find_misses(monitoring, seen._replace(limits=lower), EPSILON).gap.max() > 2 * deep

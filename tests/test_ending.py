@@ -13,7 +13,7 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.time_domain.ending import GAIN, choose_end, keep_apart
 from wholearm.planning.time_domain.search import Search, Solution
-from wholearm.planning.time_domain.staging import outline_stages
+from wholearm.planning.time_domain.staging import guess_stages
 
 
 @lru_cache(maxsize=1)
@@ -22,7 +22,7 @@ def landed() -> tuple[Search, Solution]:
     problem = landing()
     search = Search.of(problem, PlanOptions())
     start = trace_phases(problem)[-1].end
-    stages = outline_stages(problem, problem.phases[4:], start, search.scheme, 6, 2.0)
+    stages = guess_stages(problem, problem.phases[4:], start, search.scheme, 6, 2.0)
     return search, search.solve(stages)
 
 
@@ -57,5 +57,5 @@ def test_a_stage_ends_clear_of_what_comes_next() -> None:
     open_limits = [limit for limit in stage.formation.limits if limit.gained is not None]
     kept = keep_apart(stage, open_limits[0].gained)
     row = next(k for k, limit in enumerate(stage.formation.limits) if limit is open_limits[0])
-    least = kept.list_clearances(np.array([0.1, 0.9]), after=1 / 3)[:, kept.watched.index(row)]
+    least = kept.list_clearances(np.array([0.1, 0.9]), after=1 / 3)[:, kept.monitored.index(row)]
     assert least.tolist() == [0.0, pytest.approx(kept.clearance)]

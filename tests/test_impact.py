@@ -14,31 +14,31 @@ from wholearm.common.arrays import Array
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.path_guess import load
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.impact import Impact, Obstacle, strike, transfer
-from wholearm.planning.path_domain.impact_sequence import Chain, make_chain
+from wholearm.mechanics.impact import Impact, ViolationKind, compute_impact, solve_impulses
+from wholearm.planning.path_domain.impact_sequence import ImpactSequence, make_sequence
 from wholearm.scene.model import Friction, Scene
 
 MASS = 0.2
 
 
-def chain_of(path: Path) -> Chain:
+def chain_of(path: Path) -> ImpactSequence:
     problem = load(str(path))
-    return make_chain(problem.phases, trace_phases(problem))
+    return make_sequence(problem.phases, trace_phases(problem))
 
 
 @pytest.fixture(scope="module")
-def rough() -> Chain:
+def rough() -> ImpactSequence:
     """With a rough right finger: two impacts that are possible, and two that are not."""
     return chain_of(IMPACTS)
 
 
 @pytest.fixture(scope="module")
-def tipping() -> Chain:
+def tipping() -> ImpactSequence:
     """With four that are not."""
     return chain_of(HEPTAGON)
 
 
-def arrivals(chain: Chain) -> list[tuple[Formation, Formation, Array, Array]]:
+def arrivals(chain: ImpactSequence) -> list[tuple[Formation, Formation, Array, Array]]:
     """Formations before and after every impact, configuration, and velocity before."""
     found = []
     for before, after in zip(chain.curves[:-1], chain.curves[1:], strict=True):
@@ -82,17 +82,17 @@ def energy_of(scene: Scene, v: Array) -> float:
     return float(0.5 * v**2 @ scene.mass_diagonal)
 
 
-def test_each_body_takes_its_impulses(rough: Chain, tipping: Chain) -> None:
+def test_each_body_takes_its_impulses(rough: ImpactSequence, tipping: ImpactSequence) -> None:
     for chain in (rough, tipping):
-        for join, (before, after, z, v) in zip(chain.joins, arrivals(chain), strict=True):
-            impact = strike(before, after, z, v)
+        for join, (before, after, z, v) in zip(chain.impacts, arrivals(chain), strict=True):
+            impact = compute_impact(before, after, z, v)
             np.testing.assert_array_equal(impact.v, join.impact.v)
             check_momenta(impact, z, v)
 
 
-def test_every_contact_is_kept_afterwards(rough: Chain) -> None:
+def test_every_contact_is_kept_afterwards(rough: ImpactSequence) -> None:
     for before, after, z, v in arrivals(rough):
-        v_after, h = strike(before, after, z, v).v, 1e-6
+        v_after, h = compute_impact(before, after, z, v).v, 1e-6
         rates = (measure_gaps(after, z + h * v_after) - measure_gaps(after, z - h * v_after)) / h
         assert np.abs(rates).max() < 1e-8
         arriving = measure_gaps(after, z + h * v) - measure_gaps(after, z - h * v)
@@ -100,13 +100,15 @@ def test_every_contact_is_kept_afterwards(rough: Chain) -> None:
 
 
 @pytest.mark.parametrize("index", range(4))
-def test_complementarity_gives_the_same(rough: Chain, tipping: Chain, index: int) -> None:
+def test_complementarity_gives_the_same(
+    rough: ImpactSequence, tipping: ImpactSequence, index: int
+) -> None:
     """Moreau's law, which assumes neither what presses nor what slides which way."""
     for chain in (rough, tipping):
         before, after, z, v = arrivals(chain)[index]
         released = [c for c in before.contacts if c not in after.contacts]
         every = Formation(after.scene, (*after.contacts, *released))
-        collision, impact = collide(every, z, v), strike(before, after, z, v)
+        collision, impact = collide(every, z, v), compute_impact(before, after, z, v)
         assert impact.possible == (chain is rough and index < 2)
         kept, parting = np.split(collision.rates, [after.n_contacts])
         if impact.possible:
@@ -119,19 +121,21 @@ def test_complementarity_gives_the_same(rough: Chain, tipping: Chain, index: int
             assert not np.allclose(collision.v, impact.v, atol=0.1)
 
 
-def test_what_would_have_to_pull_is_named(tipping: Chain) -> None:
-    impact = tipping.joins[0].impact
+def test_what_would_have_to_pull_is_named(tipping: ImpactSequence) -> None:
+    impact = tipping.impacts[0].impact
     assert impact.least == ("v1-palm", float(impact.p[1]))
-    first = impact.hindrances[0]
-    assert (first.kind, first.name, first.value) == (Obstacle.PULL, *impact.least)
-    assert tipping.joins[0].reason == "impulse on v1-palm would be -0.0414 N s per m/s"
+    first = impact.violations[0]
+    assert (first.kind, first.name, first.value) == (ViolationKind.PULL, *impact.least)
+    assert tipping.impacts[0].reason == "impulse on v1-palm would be -0.0414 N s per m/s"
     assert first.describe() == "impulse on v1-palm would be -0.0414 N s"
 
 
-def test_energy_goes_into_the_jump_and_into_sliding(rough: Chain, tipping: Chain) -> None:
+def test_energy_goes_into_the_jump_and_into_sliding(
+    rough: ImpactSequence, tipping: ImpactSequence
+) -> None:
     for chain in (rough, tipping):
         for before, after, z, v in arrivals(chain):
-            impact = strike(before, after, z, v)
+            impact = compute_impact(before, after, z, v)
             jump = energy_of(after.scene, impact.v - v)
             slid = after.friction * impact.p @ np.abs(measure_slip(after, z, impact.v))
             lost = energy_of(after.scene, v) - energy_of(after.scene, impact.v)
@@ -149,8 +153,8 @@ def test_random_impacts_never_gain_energy() -> None:
         formation = formations[number % len(formations)]
         z = np.array([0.0, 0.03, 0.0, 1.2, 1.9]) + rng.normal(scale=0.02, size=5)
         v = rng.normal(size=5) * [0.3, 0.3, 3.0, 3.0, 3.0]
-        impact = strike(formation, formation, z, v)
-        sound = not {h.kind for h in impact.hindrances} & {Obstacle.JAM, Obstacle.HELD}
+        impact = compute_impact(formation, formation, z, v)
+        sound = not {h.kind for h in impact.violations} & {ViolationKind.JAM, ViolationKind.HELD}
         if sound:
             check_momenta(impact, z, v)
             slips = measure_slip(formation, z, impact.v)
@@ -161,10 +165,10 @@ def test_random_impacts_never_gain_energy() -> None:
     assert possible > 5
 
 
-def test_without_friction_it_is_the_nearest_velocity(rough: Chain) -> None:
+def test_without_friction_it_is_the_nearest_velocity(rough: ImpactSequence) -> None:
     rng = np.random.default_rng(8)
     for before, after, z, v in arrivals(rough):
-        impact = strike(before, frictionless(after), z, v)
+        impact = compute_impact(before, frictionless(after), z, v)
         A = after.evaluate(z[None], v[None]).A[0]
         tangents = np.linalg.svd(A)[2][len(A) :].T
         root = np.sqrt(after.scene.mass_diagonal)
@@ -176,12 +180,12 @@ def test_without_friction_it_is_the_nearest_velocity(rough: Chain) -> None:
             assert energy_of(after.scene, other - v) > least
 
 
-def test_impulses_grow_with_the_speed(rough: Chain) -> None:
+def test_impulses_grow_with_the_speed(rough: ImpactSequence) -> None:
     for before, after, z, v in arrivals(rough):
-        one, three = (strike(before, after, z, speed * v) for speed in (1.0, 3.0))
+        one, three = (compute_impact(before, after, z, speed * v) for speed in (1.0, 3.0))
         np.testing.assert_allclose(three.v, 3 * one.v, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(three.p, 3 * one.p, rtol=1e-12, atol=1e-12)
-        kinds = [[(h.kind, h.name) for h in impact.hindrances] for impact in (one, three)]
+        kinds = [[(h.kind, h.name) for h in impact.violations] for impact in (one, three)]
         assert kinds[0] == kinds[1]
 
 
@@ -196,7 +200,7 @@ def drop(v: Array, friction: float, lean: float = 0.3) -> tuple[Impact, Array, S
     formation = make_formation(scene, "v1-palm")
     z = np.array([0.0, -r[1], lean, 0.5, 2.6])
     assert abs(measure_gaps(formation, z)[0]) < 1e-16
-    return strike(formation, formation, z, v), r, scene
+    return compute_impact(formation, formation, z, v), r, scene
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.2, 0.5])
@@ -220,7 +224,7 @@ def test_a_corner_dropped_on_the_palm(friction: float, slide: float) -> None:
 def test_friction_that_would_hold_is_no_sliding() -> None:
     impact, _, _ = drop(np.array([0.01, -0.4, 0.0, 0.0, 0.0]), 0.8, lean=0.7)
     assert not impact.possible
-    assert impact.hindrances[0].describe() == "friction would hold v1-palm"
+    assert impact.violations[0].describe() == "friction would hold v1-palm"
     formation, z = impact.formation, np.array([0.0, 0.0, 0.7, 0.5, 2.6])
     collision = collide(formation, z, np.array([0.01, -0.4, 0.0, 0.0, 0.0]))
     assert abs(collision.slips[0]) < 1e-12 and collision.normal[0] > 0
@@ -234,7 +238,7 @@ def test_a_corner_that_rolls(friction: float) -> None:
     sliding = make_formation(scene, "v1-palm")
     rolling = Formation(scene, sliding.contacts, sliding.contacts)
     z = np.array([0.0, -r[1], lean, 0.5, 2.6])
-    impact = strike(sliding, rolling, z, v)
+    impact = compute_impact(sliding, rolling, z, v)
     inertia = scene.polygon.inertia
     assert inertia is not None
     spin = -MASS * float(cross(r, v[:2])) / (inertia + MASS * r @ r)
@@ -250,7 +254,7 @@ def test_a_corner_that_rolls(friction: float) -> None:
     else:
         assert abs(collision.slips[0]) > 1e-3
         text = f"v1-palm would slip, {beyond:.3g} N s beyond its friction cone"
-        assert impact.hindrances[0].describe() == text
+        assert impact.violations[0].describe() == text
 
 
 def test_jamming_is_named() -> None:
@@ -260,9 +264,9 @@ def test_jamming_is_named() -> None:
     ratio = 1 + r[0] * 10.0 * r[1] / scene.polygon.inertia / (
         1 / MASS + r[0] ** 2 / scene.polygon.inertia
     )
-    assert ratio < 0 and impact.hindrances[0].kind is Obstacle.JAM
-    assert impact.hindrances[0].value == pytest.approx(ratio)
-    assert impact.hindrances[0].describe().startswith("v1-palm would jam, with -")
+    assert ratio < 0 and impact.violations[0].kind is ViolationKind.JAM
+    assert impact.violations[0].value == pytest.approx(ratio)
+    assert impact.violations[0].describe().startswith("v1-palm would jam, with -")
     assert np.isnan(impact.v).all() and np.isnan(impact.p).all()
 
 
@@ -272,29 +276,29 @@ def test_what_touches_must_not_be_driven_into() -> None:
     flush, corner = make_formation(scene, "v0-palm v1-palm"), make_formation(scene, "v1-palm")
     z = np.array([0.0, 0.03, 0.0, 0.5, 2.6])
     for spin in (-2.0, 2.0):
-        impact = strike(flush, corner, z, np.array([0.5, -0.03 * spin, spin, 0.0, 0.0]))
+        impact = compute_impact(flush, corner, z, np.array([0.5, -0.03 * spin, spin, 0.0, 0.0]))
         rate = float(measure_gaps(flush, z + 1e-6 * impact.v)[0]) / 1e-6
-        closing = [h for h in impact.hindrances if h.kind is Obstacle.CLOSING]
+        closing = [h for h in impact.violations if h.kind is ViolationKind.CLOSING]
         assert impact.possible == (spin < 0) == (rate > 0)
         if spin > 0:
             # Given up by name, or found among the formation's limits.
             assert [h.value for h in closing] == pytest.approx([rate], rel=1e-4)
             assert closing[0].describe().startswith("v0-palm would not part, at ")
-            again = strike(corner, corner, z, np.array([0.5, -0.03 * spin, spin, 0.0, 0.0]))
-            assert again.hindrances[0].describe() == "v0 touches the palm, at 0.12 m/s"
+            again = compute_impact(corner, corner, z, np.array([0.5, -0.03 * spin, spin, 0.0, 0.0]))
+            assert again.violations[0].describe() == "v0 touches the palm, at 0.12 m/s"
 
 
-def test_the_sliding_directions_are_found_among_all(rough: Chain) -> None:
+def test_the_sliding_directions_are_found_among_all(rough: ImpactSequence) -> None:
     """Every choice by brute force: the one taken is consistent, and no other one only presses."""
     for before, after, z, v in arrivals(rough):
         A, A_t = (part[0] for part in after.evaluate(z[None], v[None])[1:3])
         found = []
         for signs in product((1.0, -1.0), repeat=4):
             G = A - (after.friction * np.array(signs))[:, None] * A_t
-            v_after, p = transfer(after.scene.mass_diagonal, A, G, v)
+            v_after, p = solve_impulses(after.scene.mass_diagonal, A, G, v)
             if (np.array(signs) * (A_t @ v_after) >= 0).all():
                 found.append((signs, p))
-        impact = strike(before, after, z, v)
+        impact = compute_impact(before, after, z, v)
         assert tuple(impact.Xi) in [signs for signs, _ in found]
         assert len([p for _, p in found if p.min() >= 0]) == impact.possible
 
@@ -302,37 +306,39 @@ def test_the_sliding_directions_are_found_among_all(rough: Chain) -> None:
 # Curves that impacts join.
 
 
-def test_a_chain_ends_where_an_impact_is_not_possible(rough: Chain) -> None:
-    assert [join.possible for join in rough.joins] == [True, True, False, False]
+def test_a_chain_ends_where_an_impact_is_not_possible(rough: ImpactSequence) -> None:
+    assert [join.possible for join in rough.impacts] == [True, True, False, False]
     parts = rough.split()
     assert [[phase.number for phase in part.phases] for part in parts] == [[1, 2, 3], [4], [5]]
-    assert [len(part.joins) for part in parts] == [2, 0, 0]
+    assert [len(part.impacts) for part in parts] == [2, 0, 0]
     assert all(len(part.curves) == len(part.phases) for part in parts)
 
 
-def test_paces_make_the_speed_continuous(rough: Chain) -> None:
+def test_paces_make_the_speed_continuous(rough: ImpactSequence) -> None:
     """A velocity of z_s on one curve becomes z_s on the next."""
     part = rough.split()[0]
-    paced = part.paced
-    assert paced[0].pace == 1.0
-    for join, before, after in zip(part.joins, paced[:-1], paced[1:], strict=True):
+    continuous_curves = part.continuous_curves
+    assert continuous_curves[0].pace == 1.0
+    for join, before, after in zip(
+        part.impacts, continuous_curves[:-1], continuous_curves[1:], strict=True
+    ):
         v = before.evaluate(np.array([before.length])).z_s[0]
         v_after = after.evaluate(np.zeros(1)).z_s[0]
         check_momenta(replace(join.impact, v=v_after, p=before.pace * join.impact.p), before.end, v)
 
 
-def test_backwards_is_not_possible(rough: Chain) -> None:
+def test_backwards_is_not_possible(rough: ImpactSequence) -> None:
     """Run the other way, the second curve is left as it was come to."""
     one, two = rough.curves[1], rough.curves[2]
-    join = make_chain(rough.phases[1:3], (one, two)).joins[0]
+    join = make_sequence(rough.phases[1:3], (one, two)).impacts[0]
     turned = replace(join, ratio=-join.ratio)
     assert join.possible and not turned.possible
     assert turned.reason == "phase 3 would be run backwards" and join.reason == ""
 
 
-def test_a_curve_at_another_pace(rough: Chain) -> None:
+def test_a_curve_at_another_pace(rough: ImpactSequence) -> None:
     curve = rough.curves[2]
-    fast = curve.at_pace(2.5)
+    fast = curve.with_speed_ratio(2.5)
     assert fast.length == pytest.approx(curve.length / 2.5, rel=1e-15)
     np.testing.assert_allclose(fast.end, curve.end, rtol=0, atol=1e-15)
     assert [g.stop for g in fast.segments] == pytest.approx([g.stop / 2.5 for g in curve.segments])
@@ -341,4 +347,4 @@ def test_a_curve_at_another_pace(rough: Chain) -> None:
     scale = 2.5 / curve.formation.scene.polygon.gyration_radius
     np.testing.assert_allclose((after.z - before.z) / (2 * h), here.z_s, atol=1e-6 * scale)
     np.testing.assert_allclose((after.z_s - before.z_s) / (2 * h), here.z_ss, atol=1e-5 * scale**2)
-    assert fast.at_pace(1.0).length == pytest.approx(curve.length, rel=1e-15)
+    assert fast.with_speed_ratio(1.0).length == pytest.approx(curve.length, rel=1e-15)

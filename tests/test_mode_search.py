@@ -21,7 +21,7 @@ from wholearm.planning.time_domain.motion import TimeMotion
 from wholearm.planning.time_domain.plan import plan_phases
 from wholearm.planning.time_domain.search import MOST, Search
 from wholearm.planning.time_domain.stage import Stage
-from wholearm.planning.time_domain.staging import outline_stages
+from wholearm.planning.time_domain.staging import guess_stages
 from wholearm.problem.definition import End, Problem, Until
 from wholearm.verification.verdict import DEPARTURE
 from wholearm.verification.verify import verify
@@ -32,7 +32,7 @@ OPTIONS = PlanOptions(time_intervals=10)
 def outlined(problem: Problem, count: int = 10) -> tuple[Search, list[Stage]]:
     search = Search.of(problem, OPTIONS)
     start = problem.start
-    return search, outline_stages(problem, problem.phases, start, search.scheme, count, 2.0)
+    return search, guess_stages(problem, problem.phases, start, search.scheme, count, 2.0)
 
 
 def turn_joint(stages: list[Stage], joint: int) -> list[Stage]:
@@ -63,7 +63,7 @@ def test_plans_are_the_same_whichever_way_a_joint_is_guessed(
     problem = raised()
 
     def guess_wrong(*given: object, **named: object) -> list[Stage]:
-        return turn_joint(outline_stages(*given, **named), 1)  # type: ignore[arg-type]
+        return turn_joint(guess_stages(*given, **named), 1)  # type: ignore[arg-type]
 
     (right,) = plan_phases(problem, problem.phases, problem.start, OPTIONS)
     monkeypatch.setattr(timeplan, "outline_stages", guess_wrong)

@@ -17,7 +17,7 @@ from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.data import (
     PhaseData,
     Places,
-    choose_fineness,
+    choose_sampling,
     fit_torque,
     prepare,
 )
@@ -36,8 +36,8 @@ def direct_forces(curve: Curve, s: Array, segment: NDArray[np.int64]) -> PathFor
 
 def spots(data: PhaseData, fractions: Array) -> tuple[Array, NDArray[np.int64]]:
     """Arc lengths and segments of `fractions` of every solid interval."""
-    s = data.grid.s[data.solid, None] + fractions * data.grid.steps[data.solid, None]
-    return s.ravel(), np.repeat(data.grid.segment[data.solid], len(fractions))
+    s = data.grid.s[data.nonempty, None] + fractions * data.grid.steps[data.nonempty, None]
+    return s.ravel(), np.repeat(data.grid.segment[data.nonempty], len(fractions))
 
 
 def random_profile(data: PhaseData, seed: int) -> Profile:
@@ -56,7 +56,10 @@ def test_forces_between_nodes_are_carried_there(
     curves: tuple[Curve, ...], phase: int, intervals: int
 ) -> None:
     data = prepare(curves[phase], EPSILON, make_grid(curves[phase], intervals), 1)
-    for places, fractions in ((data.knots, data.fine.knots), (data.looks, data.fine.looks)):
+    for places, fractions in (
+        (data.knots, data.sampling.knots),
+        (data.checks, data.sampling.checks),
+    ):
         s, segment = spots(data, fractions)
         expected = direct_forces(curves[phase], s, segment)
         for found, exact in zip(places.forces, expected, strict=True):
@@ -71,11 +74,11 @@ def test_forces_between_nodes_are_carried_there(
 def test_looks_are_dense_enough(curves: tuple[Curve, ...]) -> None:
     for intervals, least in ((10, 33), (40, 33), (80, 15), (800, 15)):
         data = prepare(curves[0], EPSILON, make_grid(curves[0], intervals), 1)
-        angles = np.arccos(1 - 2 * data.fine.looks) / np.pi
-        for places in (data.fine.knots, angles):
+        angles = np.arccos(1 - 2 * data.sampling.checks) / np.pi
+        for places in (data.sampling.knots, angles):
             assert places[0] == 0.0 and places[-1] == pytest.approx(1.0)
             np.testing.assert_allclose(np.diff(places), 1 / (len(places) - 1), rtol=1e-12)
-        assert len(data.fine.looks) >= least
+        assert len(data.sampling.checks) >= least
 
 
 def test_least_values_between_looks() -> None:
@@ -112,13 +115,13 @@ def test_a_planted_miss_is_found(
     data = prepare(curves[phase], EPSILON, motion.grid, 1)
     short, speeding = data.misses(motion.profile, 0.0)
     assert short.max() <= 5e-7 and speeding.max() == 0.0
-    row = min(row, len(data.looks.rates) - 1)
-    here = data.slack(data.looks, data.spread(motion.profile, data.fine.looks))[row, contact]
-    C0 = data.looks.forces.C0.copy()
+    row = min(row, len(data.checks.rates) - 1)
+    here = data.slack(data.checks, data.spread(motion.profile, data.sampling.checks))[row, contact]
+    C0 = data.checks.forces.C0.copy()
     C0[row, contact] -= here + 0.25
-    planted = data._replace(looks=Places(data.looks.forces._replace(C0=C0), data.looks.rates))
+    planted = data._replace(checks=Places(data.checks.forces._replace(C0=C0), data.checks.rates))
     short, _ = planted.misses(motion.profile, 0.0)
-    interval = row // len(data.fine.looks)
+    interval = row // len(data.sampling.checks)
     # A parabola through the place and its neighbours may dip a little beyond it.
     assert 0.25 - 1e-9 <= short[interval, contact] <= 0.25 + 0.04
     short[:, contact] = 0.0
@@ -133,15 +136,15 @@ def test_misses_of_the_margin_and_of_torques(curves: tuple[Curve, ...]) -> None:
     assert both.any()
     np.testing.assert_allclose((high - low)[:, :4][both], 10.0, rtol=1e-12)
     np.testing.assert_array_equal(low[:, 4:], high[:, 4:])
-    looks = data.slack(data.looks, data.spread(profile, data.fine.looks))
-    worst = np.maximum(-looks, 0).reshape(len(data.solid), -1, 8).max(axis=1)
+    checks = data.slack(data.checks, data.spread(profile, data.sampling.checks))
+    worst = np.maximum(-checks, 0).reshape(len(data.nonempty), -1, 8).max(axis=1)
     assert (low >= worst).all()
     np.testing.assert_allclose(low, worst, rtol=0, atol=1e-4)
 
 
 def test_spread_is_exact_at_nodes_and_between(curves: tuple[Curve, ...]) -> None:
     data = prepare(curves[0], EPSILON, make_grid(curves[0], 30), 1)
-    profile, k, h = random_profile(data, 3), data.solid, data.grid.steps[data.solid]
+    profile, k, h = random_profile(data, 3), data.nonempty, data.grid.steps[data.nonempty]
     ends = data.spread(profile, np.array([0.0, 1.0]))
     # b' = 2 a has been integrated with the same rule.
     for found, exact in zip(ends, profile, strict=True):
@@ -156,10 +159,10 @@ def test_spread_is_exact_at_nodes_and_between(curves: tuple[Curve, ...]) -> None
 
 def test_beside_takes_the_larger_neighbour(curves: tuple[Curve, ...]) -> None:
     data = prepare(curves[0], EPSILON, make_grid(curves[0], 30), 1)
-    inside = np.random.default_rng(4).uniform(0, 1, (len(data.solid), 3))
-    nodes = data.beside(inside)
+    inside = np.random.default_rng(4).uniform(0, 1, (len(data.nonempty), 3))
+    nodes = data.spread_to_nodes(inside)
     for node in range(len(data.grid.s)):
-        near = [inside[i] for i, k in enumerate(data.solid) if node in (k, k + 1)]
+        near = [inside[i] for i, k in enumerate(data.nonempty) if node in (k, k + 1)]
         np.testing.assert_array_equal(nodes[node], np.max(near, axis=0))
 
 
@@ -171,8 +174,8 @@ def test_speed_limits_bound_b(curves: tuple[Curve, ...]) -> None:
     np.testing.assert_allclose(np.abs(data.nodes.rates[:, 0]) * np.sqrt(largest), 1.5, rtol=1e-12)
     profile = random_profile(data, 5)
     _, speeding = data.misses(profile, 0.0)
-    b = data.spread(profile, data.fine.looks).b.reshape(len(data.solid), -1)
-    rates = data.looks.rates[:, 0].reshape(b.shape)
+    b = data.spread(profile, data.sampling.checks).b.reshape(len(data.nonempty), -1)
+    rates = data.checks.rates[:, 0].reshape(b.shape)
     over = np.maximum(b * rates**2 / 1.5**2 - 1, 0.0).max(axis=1)
     # Parabolas see a little more than places do.
     np.testing.assert_allclose(speeding, over, rtol=0, atol=1e-6)
@@ -219,7 +222,7 @@ def test_jamming_is_named(curves: tuple[Curve, ...]) -> None:
 @pytest.mark.parametrize("deepest", [3e-3, 0.01, 0.05])
 def test_dips_next_to_rest_are_found(nodes: int, deepest: float) -> None:
     """Viscous friction goes with the root of the way: x - 2 sqrt(deepest x) is least there."""
-    x = choose_fineness(nodes).looks
+    x = choose_sampling(nodes).checks
     values = x - 2 * np.sqrt(deepest * x)
     for sampled in (values, values[::-1]):
         least = find_least(sampled[None, :, None])[0, 0]

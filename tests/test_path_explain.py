@@ -18,10 +18,10 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.data import prepare
 from wholearm.planning.path_domain.explain import with_limit
-from wholearm.planning.path_domain.impact_sequence import make_chain
+from wholearm.planning.path_domain.impact_sequence import make_sequence
 from wholearm.planning.path_domain.motion import make_grid
 from wholearm.planning.path_domain.plan import plan_curves, plan_path
-from wholearm.planning.path_domain.sequence_plan import plan_chain
+from wholearm.planning.path_domain.sequence_plan import plan_sequence
 from wholearm.planning.plan import solve
 from wholearm.problem.definition import Problem, build_problem
 
@@ -218,16 +218,16 @@ def test_whole_problems_are_advised() -> None:
 
 def test_phases_that_impacts_join_are_advised_together() -> None:
     problem = load(str(HEPTAGON.with_name("heptagon_impact.toml")))
-    chain = make_chain(problem.phases, trace_phases(problem)).split()[0]
+    chain = make_sequence(problem.phases, trace_phases(problem)).split()[0]
     with pytest.raises(InfeasibleError, match=r"^phases 1 to 3 are infeasible: ") as caught:
-        plan_chain(chain, 1.0, OPTIONS)
+        plan_sequence(chain, 1.0, OPTIONS)
     (value,) = read_advice(str(caught.value)).values()
-    assert all(plan.motion.duration > 0 for plan in plan_chain(chain, value, OPTIONS))
+    assert all(plan.motion.duration > 0 for plan in plan_sequence(chain, value, OPTIONS))
     with pytest.raises(InfeasibleError):
-        plan_chain(chain, 1.03 * value, OPTIONS)
+        plan_sequence(chain, 1.03 * value, OPTIONS)
     # Where only the fact counts, no time is spent on advice.
     with pytest.raises(SolverError, match=r"^phases 1 to 3: Ipopt stopped with "):
-        plan_chain(chain, 1.0, OPTIONS, explained=False)
+        plan_sequence(chain, 1.0, OPTIONS, explained=False)
 
 
 @pytest.mark.parametrize("duration", [0.05, 0.1])

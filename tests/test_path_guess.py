@@ -17,11 +17,11 @@ from wholearm.geometry.explore import close
 from wholearm.geometry.path_guess import (
     POINTS,
     RELEASE_AT,
-    Outline,
+    PathGuess,
     count_freedoms,
+    guess_curve,
+    guess_phase,
     load,
-    outline_curve,
-    outline_phase,
 )
 from wholearm.geometry.tracing import trace_phase, until_distance
 from wholearm.problem.definition import End, Phase, Problem, Until
@@ -38,16 +38,16 @@ def landing() -> Problem:
 
 
 @pytest.fixture(scope="module")
-def outlines(landing: Problem) -> list[list[Outline]]:
+def outlines(landing: Problem) -> list[list[PathGuess]]:
     parts, z = [], landing.start
     for phase in landing.phases:
-        parts.append(outline_phase(landing, phase, z))
+        parts.append(guess_phase(landing, phase, z))
         z = parts[-1][-1].z[-1]
     return parts
 
 
 @pytest.fixture(scope="module")
-def released(outlines: list[list[Outline]]) -> Array:
+def released(outlines: list[list[PathGuess]]) -> Array:
     """Where the landing is guessed to start."""
     return np.asarray(outlines[-1][0].z[0])
 
@@ -79,14 +79,14 @@ def test_contacts_that_say_the_same_are_counted_once(landing: Problem) -> None:
     assert count_freedoms(twice, landing.start) == 1
 
 
-def test_outlines_are_closed_at_every_point(outlines: list[list[Outline]]) -> None:
+def test_outlines_are_closed_at_every_point(outlines: list[list[PathGuess]]) -> None:
     for part in (part for phase in outlines for part in phase):
         assert len(part.z) == POINTS
         assert max(np.abs(measure_gaps(part.formation, z)).max() for z in part.z) < CLOSED
         assert part.formation.evaluate_limits(part.z).min() > -CLOSED
 
 
-def test_outlines_follow_one_another(landing: Problem, outlines: list[list[Outline]]) -> None:
+def test_outlines_follow_one_another(landing: Problem, outlines: list[list[PathGuess]]) -> None:
     z = landing.start
     for part in (part for phase in outlines for part in phase):
         np.testing.assert_allclose(part.z[0], z, atol=1e-12)  # Rounding of a curve's polynomials.
@@ -94,7 +94,7 @@ def test_outlines_follow_one_another(landing: Problem, outlines: list[list[Outli
 
 
 def test_outlines_end_where_their_phase_does(
-    landing: Problem, outlines: list[list[Outline]]
+    landing: Problem, outlines: list[list[PathGuess]]
 ) -> None:
     for phase, parts in zip(landing.phases, outlines, strict=True):
         if not phase.until.is_release:
@@ -103,7 +103,7 @@ def test_outlines_end_where_their_phase_does(
 
 
 @pytest.mark.parametrize("phase", range(6))
-def test_points_are_spread_evenly(outlines: list[list[Outline]], phase: int) -> None:
+def test_points_are_spread_evenly(outlines: list[list[PathGuess]], phase: int) -> None:
     for part in outlines[phase]:
         scale = part.formation.scene.polygon.gyration_radius ** np.array([0, 0, 1, 1, 1])
         steps = np.linalg.norm(np.diff(part.z, axis=0) * scale, axis=1)
@@ -113,7 +113,7 @@ def test_points_are_spread_evenly(outlines: list[list[Outline]], phase: int) -> 
 
 
 @pytest.mark.parametrize("phase", range(6))
-def test_directions_are_those_of_travel(outlines: list[list[Outline]], phase: int) -> None:
+def test_directions_are_those_of_travel(outlines: list[list[PathGuess]], phase: int) -> None:
     for part in outlines[phase]:
         middle = len(part.z) // 2
         speed = part.z[middle + 1] - part.z[middle - 1]
@@ -124,7 +124,7 @@ def test_directions_are_those_of_travel(outlines: list[list[Outline]], phase: in
 
 def test_curves_are_split_where_something_turns(curves: tuple[Curve, ...]) -> None:
     for curve in curves:
-        parts = outline_curve(curve)
+        parts = guess_curve(curve)
         assert len(parts) == len(curve.segments)
         # Chords are shorter than the arc by the square of a 24th of it.
         assert sum(part.length for part in parts) == pytest.approx(curve.length, rel=1e-3)
@@ -141,13 +141,13 @@ def test_curves_are_split_where_something_turns(curves: tuple[Curve, ...]) -> No
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.7])
 def test_a_share_of_a_curve_is_outlined(curves: tuple[Curve, ...], share: float) -> None:
     curve = curves[2]
-    parts = outline_curve(curve, share)
+    parts = guess_curve(curve, share)
     assert len(parts) == sum(segment.start < share * curve.length for segment in curve.segments)
     assert sum(part.length for part in parts) == pytest.approx(share * curve.length, rel=1e-3)
 
 
 def test_a_release_is_guessed_before_the_curve_ends(
-    landing: Problem, outlines: list[list[Outline]]
+    landing: Problem, outlines: list[list[PathGuess]]
 ) -> None:
     phase = landing.phases[4]
     whole = trace_phase(landing, phase, outlines[4][0].z[0])
@@ -161,7 +161,7 @@ def test_a_coordinate_can_be_what_ends_a_phase(
 ) -> None:
     until = Until(None, "x" if row == 0 else "phi", value)
     phase = Phase(5, landing.phases[5].formation, until)
-    part = outline_phase(landing, phase, released)[-1]
+    part = guess_phase(landing, phase, released)[-1]
     assert part.z[-1, row] == pytest.approx(value, abs=1e-12)
     assert max(np.abs(measure_gaps(part.formation, z)).max() for z in part.z) < CLOSED
 
@@ -195,7 +195,7 @@ def test_closing_keeps_what_has_rolled_by(landing: Problem, released: Array) -> 
     # The vertex on the palm stays where it was, and the object turns about it.
     assert place(z) == pytest.approx(place(released), abs=1e-12)
     assert z[2] < released[2] - 0.01
-    part = outline_phase(landing, Phase(5, formation, landing.phases[5].until), released)[-1]
+    part = guess_phase(landing, Phase(5, formation, landing.phases[5].until), released)[-1]
     assert max(abs(place(z) - place(released)) for z in part.z) < 1e-12
 
 
@@ -221,10 +221,10 @@ def test_phases_that_cannot_be_are_named(
         until = Until(parse_contact(until, landing.scene))
     phase = Phase(5, make_formation(landing.scene, names), until)
     if reason is None:
-        assert outline_phase(landing, phase, released)
+        assert guess_phase(landing, phase, released)
         return
     with pytest.raises(InputError, match=reason) as caught:
-        outline_phase(landing, phase, released)
+        guess_phase(landing, phase, released)
     assert caught.value.key == f"phases[6].{key}" and caught.value.exit_status == 2
 
 
@@ -233,7 +233,7 @@ def test_five_contacts_leave_nothing_to_plan(landing: Problem, curves: tuple[Cur
     assert first.until.contact is not None
     held = Formation(landing.scene, (*first.formation.contacts, first.until.contact))
     with pytest.raises(InputError, match="leave no freedom") as caught:
-        outline_phase(landing, Phase(1, held, landing.phases[1].until), curves[0].end)
+        guess_phase(landing, Phase(1, held, landing.phases[1].until), curves[0].end)
     assert caught.value.key == "phases[2].contacts"
 
 

@@ -19,8 +19,8 @@ from wholearm.planning.path_domain.motion import (
     _arctanh_ratio,
     _cosh_ratio,
     _sinh_ratio,
-    draw_together,
     make_grid,
+    redistribute_nodes,
 )
 
 SEEDS = range(6)
@@ -221,12 +221,12 @@ def test_grid_is_fine_towards_the_ends() -> None:
 def test_nodes_are_drawn_to_where_misses_are() -> None:
     curve = stub_curve(1.0, [0.4])
     grid = make_grid(curve, 60)
-    solid = np.flatnonzero(grid.steps > 0)
-    misses = np.zeros(len(solid))
-    middle = (grid.s[solid] + grid.s[solid + 1]) / 2
+    nonempty = np.flatnonzero(grid.steps > 0)
+    misses = np.zeros(len(nonempty))
+    middle = (grid.s[nonempty] + grid.s[nonempty + 1]) / 2
     bad = np.abs(middle - 0.7) < 0.05
     misses[bad] = 9.0
-    drawn = draw_together(grid, solid, misses)
+    drawn = redistribute_nodes(grid, nonempty, misses)
     np.testing.assert_array_equal(drawn.segment, grid.segment)
     for segment in (0, 1):
         mine = grid.segment == segment
@@ -241,11 +241,11 @@ def test_nodes_are_drawn_to_where_misses_are() -> None:
 
 def test_drawing_together_is_capped_and_leaves_even_misses_alone() -> None:
     grid = make_grid(stub_curve(1.0, []), 40)
-    solid = np.arange(40)
-    even = draw_together(grid, solid, np.full(40, 7.0))
+    nonempty = np.arange(40)
+    even = redistribute_nodes(grid, nonempty, np.full(40, 7.0))
     np.testing.assert_allclose(even.s, grid.s, rtol=0, atol=1e-15)
     spike, beyond = np.zeros(40), np.zeros(40)
     spike[20], beyond[20] = 16.0, 1e9
     np.testing.assert_array_equal(
-        draw_together(grid, solid, spike).s, draw_together(grid, solid, beyond).s
+        redistribute_nodes(grid, nonempty, spike).s, redistribute_nodes(grid, nonempty, beyond).s
     )

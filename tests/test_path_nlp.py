@@ -14,7 +14,7 @@ from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve
 from wholearm.planning.options import CHOICES, Objective
 from wholearm.planning.path_domain.data import PhaseData, prepare
-from wholearm.planning.path_domain.motion import PathMotion, Profile, draw_together, make_grid
+from wholearm.planning.path_domain.motion import PathMotion, Profile, make_grid, redistribute_nodes
 from wholearm.planning.path_domain.nlp import (
     PathNLP,
     Tightening,
@@ -38,7 +38,7 @@ LIMIT = 2.0
 def data(curves: tuple[Curve, ...]) -> PhaseData:
     """Phase 1 of the heptagon, which has a reversal."""
     data = prepare(curves[0], EPSILON, make_grid(curves[0], INTERVALS), 1)
-    assert len(data.solid) == INTERVALS - 1
+    assert len(data.nonempty) == INTERVALS - 1
     return data
 
 
@@ -177,9 +177,9 @@ def test_multipliers_move_between_grids(data: PhaseData, objective: Objective) -
     same = move_multipliers(nlp, multipliers, data.grid, data.grid)
     for key in sizes:
         np.testing.assert_allclose(same[key], multipliers[key], rtol=0, atol=1e-12)
-    misses = np.zeros(len(data.solid))
+    misses = np.zeros(len(data.nonempty))
     misses[5] = 16.0
-    new = draw_together(data.grid, data.solid, misses)
+    new = redistribute_nodes(data.grid, data.nonempty, misses)
     moved = move_multipliers(nlp, multipliers, data.grid, new)
     # Those of the two sides of a reversal do not mix, and all stay between their neighbours.
     on_nodes = slice(nlp.first, nlp.first + 6 * (INTERVALS + 1))

@@ -24,11 +24,11 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import inverse
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain import plan as pathplan
-from wholearm.planning.path_domain.impact_sequence import Chain, make_chain
+from wholearm.planning.path_domain.impact_sequence import ImpactSequence, make_sequence
 from wholearm.planning.path_domain.motion import PathMotion, directions_of
 from wholearm.planning.path_domain.nlp import PathNLP, build_path_nlp
 from wholearm.planning.path_domain.plan import plan_curves, plan_path
-from wholearm.planning.path_domain.sequence_plan import plan_chain
+from wholearm.planning.path_domain.sequence_plan import plan_sequence
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.problem.definition import Problem, build_problem
@@ -106,21 +106,23 @@ def test_a_phase_that_only_a_quick_motion_carries(curves: tuple[Curve, ...]) -> 
 
 
 @pytest.fixture(scope="module")
-def chain() -> Chain:
+def chain() -> ImpactSequence:
     """Three phases that impacts join."""
     problem = problem_of(IMPACTS)
-    return make_chain(problem.phases, trace_phases(problem)).split()[0]
+    return make_sequence(problem.phases, trace_phases(problem)).split()[0]
 
 
 @cache
-def plan_joined(chain: Chain, objective: str, intervals: int) -> list[PhasePlan[PathMotion]]:
+def plan_joined(
+    chain: ImpactSequence, objective: str, intervals: int
+) -> list[PhasePlan[PathMotion]]:
     options = PlanOptions(objective=objective, intervals=intervals)
-    return plan_chain(chain, EPSILON, options, 0.5 if objective == "margin" else None)
+    return plan_sequence(chain, EPSILON, options, 0.5 if objective == "margin" else None)
 
 
 @pytest.mark.parametrize("intervals", [12, 80])
 @pytest.mark.parametrize("objective", OBJECTIVES)
-def test_limits_hold_along_a_chain(chain: Chain, objective: str, intervals: int) -> None:
+def test_limits_hold_along_a_chain(chain: ImpactSequence, objective: str, intervals: int) -> None:
     plans = plan_joined(chain, objective, intervals)
     fractions = np.random.default_rng(6).uniform(0, 1, 50)
     for chosen in plans:
@@ -133,7 +135,7 @@ def test_limits_hold_along_a_chain(chain: Chain, objective: str, intervals: int)
         assert sum(chosen.motion.duration for chosen in plans) <= 0.5 * (1 + 1e-6)
 
 
-def test_a_chain_is_one_problem(chain: Chain) -> None:
+def test_a_chain_is_one_problem(chain: ImpactSequence) -> None:
     plans = plan_joined(chain, "time", 80)
     assert [plan.solves > 0 for plan in plans] == [True, False, False]
     assert all(plan.value == plan.motion.duration for plan in plans)
@@ -147,8 +149,10 @@ def test_a_chain_is_one_problem(chain: Chain) -> None:
         np.testing.assert_allclose(start.z, end.z, rtol=0, atol=1e-12)
 
 
-def test_least_time_of_a_chain_agrees_with_the_phase_plane(chain: Chain) -> None:
-    coarse, fine = (PhasePlane(chain.paced, EPSILON, n).least_time() for n in (150, 300))
+def test_least_time_of_a_chain_agrees_with_the_phase_plane(chain: ImpactSequence) -> None:
+    coarse, fine = (
+        PhasePlane(chain.continuous_curves, EPSILON, n).least_time() for n in (150, 300)
+    )
     planned = sum(plan.value for plan in plan_joined(chain, "time", 320))
     assert planned == pytest.approx(2 * fine - coarse, rel=2e-4)
     assert sum(plan.value for plan in plan_joined(chain, "time", 80)) == pytest.approx(
@@ -171,9 +175,9 @@ def test_two_halves_are_one_whole(objective: str) -> None:
     assert np.sqrt(parts[0].motion.profile.b[-1]) == pytest.approx(middle, rel=1e-2)
 
 
-def test_a_chain_without_a_plan_names_the_phase(chain: Chain) -> None:
+def test_a_chain_without_a_plan_names_the_phase(chain: ImpactSequence) -> None:
     with pytest.raises(InfeasibleError) as caught:
-        plan_chain(chain, 1.0, PlanOptions(intervals=20))
+        plan_sequence(chain, 1.0, PlanOptions(intervals=20))
     found = re.match(
         r"phases 1 to 3 are infeasible: c_n of (\S+) >= epsilon = 1 N is \S+ N short at "
         r"t = \d\.\d{4} s \(x = .*? mm, phi = .*? deg\), phase ([123])",

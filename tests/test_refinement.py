@@ -13,10 +13,10 @@ from wholearm.planning.time_domain.refinement import (
     DEAR,
     DEFECT,
     adopt,
+    bisect_intervals,
     count_halvings,
-    halve,
+    monitor_violated,
     settle,
-    watch_broken,
 )
 from wholearm.planning.time_domain.stage import Stage
 
@@ -42,7 +42,7 @@ def test_a_solution_becomes_the_guess(stages: list[Stage]) -> None:
 def test_only_marked_stages_are_halved(stages: list[Stage]) -> None:
     times = [np.zeros(stage.intervals, dtype=int) for stage in stages]
     times[1][:2] = 1, 2
-    finer = halve(stages, SCHEME, times)
+    finer = bisect_intervals(stages, SCHEME, times)
     assert finer[0] is stages[0] and finer[1].intervals == stages[1].intervals + 4
     assert finer[1].guess.duration == stages[1].guess.duration
 
@@ -72,30 +72,34 @@ def test_dearer_misses_are_halved_more_often() -> None:
 def test_halved_intervals_keep_the_shares_that_they_chose(stages: list[Stage]) -> None:
     loose = [replace(stage, adapts=0.1) for stage in stages]
     none = [np.zeros(stage.intervals, dtype=int) for stage in stages]
-    for after in (settle(loose), halve(loose, SCHEME, none)):
+    for after in (settle(loose), bisect_intervals(loose, SCHEME, none)):
         assert [stage.adapts for stage in after] == [0.0] * len(stages)
         shares = zip(after, loose, strict=True)
         assert all(one.guess is other.guess for one, other in shares)
 
 
 def test_limits_that_are_broken_are_watched_from_then_on(stages: list[Stage]) -> None:
-    watched = watch_broken(stages) or stages
+    monitored = monitor_violated(stages) or stages
     # What is broken already, by less than counts, changes nothing the second time.
-    assert watch_broken(watched) is None
-    low = watched[-1]
+    assert monitor_violated(monitored) is None
+    low = monitored[-1]
     sunk = low.guess.z.copy()
     sunk[2, 1, 1] -= 0.001
     guess = low.guess._replace(z=sunk)
-    changed = watch_broken([*watched[:-1], replace(low, guess=guess)])
+    changed = monitor_violated([*monitored[:-1], replace(low, guess=guess)])
     assert changed is not None
-    more = set(changed[-1].watched) - set(low.watched)
+    more = set(changed[-1].monitored) - set(low.monitored)
     values = low.formation.evaluate_limits(sunk[2, 1][None])[0]
     assert more and all(values[k] < -1e-9 for k in more)
-    assert [stage.watched for stage in changed[:-1]] == [stage.watched for stage in watched[:-1]]
+    assert [stage.monitored for stage in changed[:-1]] == [
+        stage.monitored for stage in monitored[:-1]
+    ]
 
 
 def test_halving_by_nothing_keeps_every_table(stages: list[Stage]) -> None:
-    finer = halve(stages, SCHEME, [np.zeros(stage.intervals, dtype=int) for stage in stages])
+    finer = bisect_intervals(
+        stages, SCHEME, [np.zeros(stage.intervals, dtype=int) for stage in stages]
+    )
     for before, after in zip(stages, finer, strict=True):
         for one, other in zip(tables(before.guess), tables(after.guess), strict=True):
             np.testing.assert_array_equal(one, other)

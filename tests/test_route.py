@@ -14,7 +14,7 @@ from shipped import HEPTAGON
 from wholearm.benchmark.stress.scenes import random_route, random_scene
 from wholearm.common.errors import InputError
 from wholearm.geometry.curve import Curve
-from wholearm.geometry.path_guess import outline_phase
+from wholearm.geometry.path_guess import guess_phase
 from wholearm.mapping.route import Route, format_route, list_formations
 from wholearm.problem.definition import Problem, build_problem
 
@@ -249,7 +249,7 @@ def test_list_goes_on_where_loading_ends_a_phase(heptagon: Problem, tmp_path: Pa
         gaps = phase.formation.evaluate(z[None], z[None]).C[0]
         assert np.abs(gaps).max() < 1e-9
         assert phase.formation.evaluate_limits(z[None]).min() > -1e-9
-        z = outline_phase(problem, phase, z)[-1].z[-1]
+        z = guess_phase(problem, phase, z)[-1].z[-1]
 
 
 @pytest.mark.parametrize("seed", range(2))

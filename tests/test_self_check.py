@@ -61,9 +61,9 @@ def test_a_phase_that_hardly_stops_is_found_by_where_the_next_one_ends() -> None
     speed, least = 1e-3, Allowance(departure=1.0, rest_speed=1.0)
     report = replace(check.report, phases=(replace(first, end_speed=speed), *others))
     left = check._replace(report=report)
-    lasts = np.array([1.0, 2.0 * least.departure * problem.scene.scales.length / speed])
-    assert left.find_culprit(problem.scene.scales, least, lasts) == 1
-    assert left.find_culprit(problem.scene.scales, least, lasts / 4) == 2
+    duration_row = np.array([1.0, 2.0 * least.departure * problem.scene.scales.length / speed])
+    assert left.find_culprit(problem.scene.scales, least, duration_row) == 1
+    assert left.find_culprit(problem.scene.scales, least, duration_row / 4) == 2
 
 
 def test_friction_the_wrong_way_is_found_by_the_residual() -> None:

@@ -12,9 +12,9 @@ from shipped import IMPACTS, plan_of, problem_of
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.impact import strike
+from wholearm.mechanics.impact import compute_impact
 from wholearm.mechanics.metric import metric_weights
-from wholearm.planning.path_domain.impact_sequence import make_chain
+from wholearm.planning.path_domain.impact_sequence import make_sequence
 from wholearm.planning.path_domain.sequence_plan import add_up
 from wholearm.planning.plan import solve
 from wholearm.problem.definition import Problem, build_problem
@@ -57,7 +57,7 @@ def test_velocities_jump_by_the_impact_law(
     for k, row in enumerate(trajectory.meta["transitions"][:2]):
         before, after = (phase.formation for phase in problem.phases[k : k + 2])
         end, start = ends_of(trajectory, k)
-        impact = strike(before, after, end.z[0], end.z_dot[0])
+        impact = compute_impact(before, after, end.z[0], end.z_dot[0])
         np.testing.assert_allclose(start.z, end.z, rtol=0, atol=1e-12)
         np.testing.assert_allclose(start.z_dot[0], impact.v, rtol=0, atol=1e-9)
         assert impact.p.min() > 0
@@ -191,7 +191,7 @@ def test_progress_tells_what_is_planned(problem: Problem) -> None:
 
 
 def test_durations_add_up(problem: Problem) -> None:
-    chain = make_chain(problem.phases, trace_phases(problem)).split()[0]
+    chain = make_sequence(problem.phases, trace_phases(problem)).split()[0]
     assert add_up(chain.phases, [0.1, 0.2, 0.3, 9.0, 9.0]) == pytest.approx(0.6)
     assert add_up(chain.phases, [None] * 5) is None
 

@@ -19,7 +19,7 @@ from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import energy
-from wholearm.mechanics.impact import strike
+from wholearm.mechanics.impact import compute_impact
 from wholearm.problem.definition import End, Phase, Problem, build_problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Trajectory
@@ -94,7 +94,7 @@ def test_each_impact_is_that_of_the_law(problem: Problem, replayed: Simulation) 
         last, first = joints(replayed, event.phase)
         assert replayed.t[last] == replayed.t[first] == event.time
         before, after = (p.formation for p in problem.phases[event.phase : event.phase + 2])
-        impact = strike(before, after, replayed.z[first], replayed.z_dot[last])
+        impact = compute_impact(before, after, replayed.z[first], replayed.z_dot[last])
         np.testing.assert_allclose(replayed.z_dot[first], impact.v, rtol=0, atol=1e-9)
         name, least = impact.least
         assert event.contact == name and event.value == pytest.approx(least)
@@ -225,7 +225,7 @@ def test_an_impact_that_comes_early(problem: Problem, planned: Trajectory, scale
     assert 2e-6 < ends - first.time < 5e-3
     last, after = joints(simulation, 0)
     before, formation = (p.formation for p in problem.phases[:2])
-    impact = strike(before, formation, simulation.z[after], simulation.z_dot[last])
+    impact = compute_impact(before, formation, simulation.z[after], simulation.z_dot[last])
     np.testing.assert_allclose(simulation.z_dot[after], impact.v, rtol=0, atol=1e-9)
     assert np.abs(simulation.energies.residual).max() < 1e-8 * simulation.energies.work.max()
 

@@ -10,13 +10,13 @@ from plane import measure_gaps
 from thrown import lift
 from timed import landing
 from tipping import roll, tilting
-from wholearm.geometry.path_guess import outline_phase
+from wholearm.geometry.path_guess import guess_phase
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.time_domain.collocation import make_scheme
 from wholearm.planning.time_domain.modes import LEAST_INTERVALS
 from wholearm.planning.time_domain.own_units import in_own_units
 from wholearm.planning.time_domain.stage import Stage
-from wholearm.planning.time_domain.staging import outline_stages
+from wholearm.planning.time_domain.staging import guess_stages
 from wholearm.problem.definition import End, Until
 
 SCHEME = make_scheme("radau", 3)
@@ -27,14 +27,14 @@ def stages() -> list[Stage]:
     """Of the flip's last formation and the landing."""
     problem = landing()
     start = trace_phases(problem)[-1].end
-    return outline_stages(problem, problem.phases[4:], start, SCHEME, 12, 2.0)
+    return guess_stages(problem, problem.phases[4:], start, SCHEME, 12, 2.0)
 
 
 def test_stages_are_those_of_the_outlines(stages: list[Stage]) -> None:
     problem = landing()
     z, phases = trace_phases(problem)[-1].end, []
     for phase in problem.phases[4:]:
-        for outline in outline_phase(problem, phase, z):
+        for outline in guess_phase(problem, phase, z):
             phases.append(phase.index)
             z = outline.z[-1]
     # What slides the other way after the release has to turn on its way, in one stage more.
@@ -83,10 +83,10 @@ def test_guesses_follow_the_outlines_in_one_sweep(stages: list[Stage]) -> None:
 def test_the_duration_is_that_of_a_fall_times_the_pace(pace: float) -> None:
     problem = landing()
     start, phases = trace_phases(problem)[-1].end, problem.phases[4:]
-    stages = outline_stages(problem, phases, start, SCHEME, 12, pace)
+    stages = guess_stages(problem, phases, start, SCHEME, 12, pace)
     z, length = start, 0.0
     for phase in phases:
-        for outline in outline_phase(problem, phase, z):
+        for outline in guess_phase(problem, phase, z):
             length += outline.length
             z = outline.z[-1]
     whole = sum(stage.guess.duration for stage in stages) * problem.scene.scales.time
@@ -99,17 +99,17 @@ def test_releases_open_contacts_in_the_next_phase(stages: list[Stage]) -> None:
     names = [limit.gained.name if limit.gained else "" for limit in limits]
     released = names.index("v3-finger1")
     for stage in stages[2:]:
-        assert stage.released == (released,) and released in stage.watched
+        assert stage.released == (released,) and released in stage.monitored
     assert [stage.opens for stage in stages] == [False, False, True, False]
     assert all(not stage.released for stage in stages[:2])
     # What ends the landing is watched, so that it is not passed before.
-    assert all(names.index("v2-palm") in stage.watched for stage in stages[2:])
-    assert all(stage.gained is None and not stage.strikes for stage in stages)
+    assert all(names.index("v2-palm") in stage.monitored for stage in stages[2:])
+    assert all(stage.gained is None and not stage.ends_in_impact for stage in stages)
 
 
 def test_joints_that_turn_after_a_release_have_stages_of_their_own() -> None:
     problem, _ = lift()
-    stages = outline_stages(problem, problem.phases, problem.start, SCHEME, 8, 2.0)
+    stages = guess_stages(problem, problem.phases, problem.start, SCHEME, 8, 2.0)
     assert [stage.phase for stage in stages] == [0, 1, 1]
     # The outline of one contact moves finger 2 on, that before turns it back.
     assert stages[1].turns == (2,)
@@ -122,9 +122,9 @@ def test_what_has_rolled_slides_the_way_of_its_own_outline() -> None:
     before = replace(phase, formation=roll(phase.formation, "v1-palm"), until=Until())
     phases = (replace(before, end=End.SMOOTH), replace(phase, index=1))
     problem = replace(sliding, phases=phases)
-    stages = outline_stages(problem, phases, problem.start, SCHEME, 6, 2.0)
+    stages = guess_stages(problem, phases, problem.start, SCHEME, 6, 2.0)
     assert [stage.phase for stage in stages] == [0, 1]
     # A direction of zero would leave it without friction.
     assert np.abs(stages[1].directions.Xi).min() == 1.0
-    alone = outline_stages(sliding, sliding.phases, sliding.start, SCHEME, 6, 2.0)
+    alone = guess_stages(sliding, sliding.phases, sliding.start, SCHEME, 6, 2.0)
     np.testing.assert_array_equal(stages[1].directions.Xi, alone[0].directions.Xi)

@@ -19,12 +19,17 @@ from wholearm.planning.path_domain.plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.time_domain import explain as timeexplain
 from wholearm.planning.time_domain.collocation import make_scheme
-from wholearm.planning.time_domain.explain import change_limit, ease, explain, list_shortfalls
+from wholearm.planning.time_domain.explain import (
+    change_limit,
+    explain,
+    list_shortfalls,
+    solve_elastic,
+)
 from wholearm.planning.time_domain.motion import TimeMotion
 from wholearm.planning.time_domain.plan import plan_phases
 from wholearm.planning.time_domain.search import Search
 from wholearm.planning.time_domain.stage import Stage
-from wholearm.planning.time_domain.staging import outline_stages
+from wholearm.planning.time_domain.staging import guess_stages
 from wholearm.problem.definition import Problem
 
 SCHEME = make_scheme("radau", 3)
@@ -56,7 +61,7 @@ def search(problem: Problem) -> Search:
 def outline(problem: Problem, index: int = 0) -> Stage:
     """The first stage of a phase as it is guessed, but with c_n = 1 N, no c_t and no torques."""
     start = trace_phases(problem)[index - 1].end if index else problem.start
-    stage = outline_stages(problem, problem.phases[index : index + 1], start, SCHEME, 4, 2.0)[0]
+    stage = guess_stages(problem, problem.phases[index : index + 1], start, SCHEME, 4, 2.0)[0]
     forces = np.zeros_like(stage.guess.forces)
     forces[..., : stage.formation.n_contacts] = 1 / problem.scene.scales.force
     tau = np.zeros_like(stage.guess.tau)
@@ -96,12 +101,12 @@ def test_there_is_a_plan_with_what_is_advised_and_none_with_less(
     assert advised, text
     enough = float(advised[1])
     assert (enough < value) == (index == 2)
-    eased = change_limit(problem, index, enough)
-    for plan in plan_all(eased, explained=False, patient=False):
+    elastic = change_limit(problem, index, enough)
+    for plan in plan_all(elastic, explained=False, patient=False):
         t = np.linspace(0.0, plan.motion.duration, 101)
         samples = plan.motion.evaluate(t)
-        assert samples.c_n.min() > eased.epsilon - 1e-6
-        assert (np.abs(samples.tau) < eased.scene.torque_limit + 1e-6).all()
+        assert samples.c_n.min() > elastic.epsilon - 1e-6
+        assert (np.abs(samples.tau) < elastic.scene.torque_limit + 1e-6).all()
     # Advice is meant to be within 2 % of what is needed.
     nearer = enough * (1.03 if index == 2 else 0.97)
     closer = change_limit(problem, index, nearer)
@@ -206,10 +211,10 @@ def test_the_motion_that_is_short_of_least_is_described() -> None:
 
 def test_easing_leaves_what_is_feasible_as_it_is() -> None:
     problem, _ = shove()
-    stages = outline_stages(problem, problem.phases, problem.start, SCHEME, 4, 2.0)
-    eased = ease(search(problem), stages)
-    assert eased is not None and list_shortfalls(problem, eased) == []
-    weaker = ease(search(change_limit(problem, 2, 0.8)), stages)
+    stages = guess_stages(problem, problem.phases, problem.start, SCHEME, 4, 2.0)
+    elastic = solve_elastic(search(problem), stages)
+    assert elastic is not None and list_shortfalls(problem, elastic) == []
+    weaker = solve_elastic(search(change_limit(problem, 2, 0.8)), stages)
     assert weaker is not None
     shortfalls = list_shortfalls(change_limit(problem, 2, 0.8), weaker)
     assert sum(short.amount for short in shortfalls) == pytest.approx(0.8 - LEAST, abs=5e-3)

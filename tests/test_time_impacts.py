@@ -14,7 +14,7 @@ from wholearm.cli.summary import summarise
 from wholearm.common.arrays import Array
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phases
-from wholearm.mechanics.impact import strike
+from wholearm.mechanics.impact import compute_impact
 from wholearm.mechanics.metric import metric_weights
 from wholearm.planning.plan import solve
 from wholearm.problem.definition import End, Problem
@@ -109,7 +109,7 @@ def test_velocities_jump_by_the_impact_law(objective: str) -> None:
         assert speed > 0.1 and row["speed"] == pytest.approx(speed)
         assert p.min() == pytest.approx(row["least_impulse"] * speed, rel=1e-4)
         assert np.sqrt(metric @ v_next**2) == pytest.approx(row["velocity_ratio"] * speed, rel=1e-5)
-        np.testing.assert_allclose(v_next, strike(before, after, z, v).v, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(v_next, compute_impact(before, after, z, v).v, rtol=0, atol=1e-5)
         # The contacts of the next formation neither part nor press into one another.
         assert np.abs(measure_gaps(after, z)).max() < 1e-8
         assert np.abs(after.evaluate(z[None], v_next[None]).A[0] @ v_next).max() < 1e-5

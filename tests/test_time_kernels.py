@@ -22,11 +22,11 @@ from wholearm.planning.time_domain.kernels import (
     find_leaving,
     goal_kernel,
     impact_kernel,
+    monitor_kernel,
     new_rows,
     opening_kernel,
     point_kernel,
     stretch_kernel,
-    watch_kernel,
 )
 from wholearm.problem.definition import Until
 from wholearm.results.trajectory import Samples
@@ -186,10 +186,10 @@ def test_limits_are_watched() -> None:
     rng = np.random.default_rng(6)
     formation = make_formation(landing().scene, "v1-palm v4-finger1 v6-finger2")
     texts = [limit.gained.name if limit.gained else "" for limit in formation.limits]
-    watched = tuple(texts.index(name) for name in ("v2-palm", "v0-palm", "v3-finger1"))
+    monitored = tuple(texts.index(name) for name in ("v2-palm", "v0-palm", "v3-finger1"))
     gaps = make_formation(formation.scene, "v2-palm v0-palm v3-finger1")
     z, _, _ = draw(rng)
-    got = call(watch_kernel(formation, watched), [z])
+    got = call(monitor_kernel(formation, monitored), [z])
     np.testing.assert_allclose(got, measure_gaps(gaps, z), atol=1e-15)
 
 
@@ -277,4 +277,4 @@ def test_kernels_have_a_row_for_each_condition(formation: Formation) -> None:
 def test_kernels_of_a_formation_are_built_once(curves: tuple[Curve, ...]) -> None:
     formation = curves[0].formation
     assert point_kernel(formation) is point_kernel(formation)
-    assert watch_kernel(formation, (0, 1)) is not watch_kernel(formation, (1, 0))
+    assert monitor_kernel(formation, (0, 1)) is not monitor_kernel(formation, (1, 0))

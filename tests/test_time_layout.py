@@ -44,7 +44,7 @@ def random_points(
     )
 
 
-def make_stages(name: str, degree: int, strikes: bool) -> list[Stage]:
+def make_stages(name: str, degree: int, ends_in_impact: bool) -> list[Stage]:
     """Three stages on different formations, one with a rolling contact."""
     rng = np.random.default_rng(degree)
     scene = landing().scene
@@ -55,14 +55,14 @@ def make_stages(name: str, degree: int, strikes: bool) -> list[Stage]:
     ]
     stages = []
     for k, (formation, count) in enumerate(zip(formations, (3, 4, 5), strict=True)):
-        hits = strikes and k == 0
+        hits = ends_in_impact and k == 0
         n_p = formations[1].n_constraints if hits else 0
         guess = random_points(rng, count, degree, formation.n_constraints, n_p)
         if make_scheme(name, degree).ends:
             # The last point of an interval and the node after it are one instant.
             guess.nodes[1:] = np.stack([guess.z[:, -1], guess.v[:, -1]], axis=1)
         directions = Directions(np.ones(formation.n_contacts), np.ones(2))
-        stages.append(Stage(k, formation, directions, guess, strikes=hits))
+        stages.append(Stage(k, formation, directions, guess, ends_in_impact=hits))
     return stages
 
 
@@ -83,13 +83,13 @@ def owners(layouts: Sequence[StageLayout]) -> Array:
 @pytest.mark.parametrize("strikes", [False, True])
 @pytest.mark.parametrize("name, degree", SCHEMES)
 def test_every_unknown_has_one_place(
-    name: str, degree: int, strikes: bool, with_margin: bool, elastic: bool
+    name: str, degree: int, ends_in_impact: bool, with_margin: bool, elastic: bool
 ) -> None:
     scheme = make_scheme(name, degree)
-    layouts = lay_out(make_stages(name, degree, strikes), scheme, with_margin, elastic)
+    layouts = lay_out(make_stages(name, degree, ends_in_impact), scheme, with_margin, elastic)
     np.testing.assert_array_equal(owners(layouts), 1.0)
     assert layouts[0].nodes.shape == (4, 11 if with_margin else 10)
-    assert [len(layout.impulses) for layout in layouts] == [3 if strikes else 0, 0, 0]
+    assert [len(layout.impulses) for layout in layouts] == [3 if ends_in_impact else 0, 0, 0]
     assert [layout.short.shape[1] for layout in layouts] == ([6, 5, 3] if elastic else [0] * 3)
 
 
@@ -108,9 +108,9 @@ def test_unknowns_are_in_the_order_of_time(name: str, degree: int) -> None:
 @pytest.mark.parametrize("strikes", [False, True])
 @pytest.mark.parametrize("name, degree", SCHEMES)
 def test_points_are_packed_and_unpacked(
-    name: str, degree: int, strikes: bool, with_margin: bool
+    name: str, degree: int, ends_in_impact: bool, with_margin: bool
 ) -> None:
-    stages = make_stages(name, degree, strikes)
+    stages = make_stages(name, degree, ends_in_impact)
     layouts = lay_out(stages, make_scheme(name, degree), with_margin)
     given = [stage.guess for stage in stages]
     x = pack(given, layouts, 0.7)

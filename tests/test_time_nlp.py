@@ -227,13 +227,13 @@ def cut(stage: Stage, count: int) -> list[Stage]:
 
 @pytest.mark.parametrize("strikes", [False, True])
 @pytest.mark.parametrize("objective", [Objective.TIME, Objective.MARGIN])
-def test_stages_that_follow_share_their_state(objective: Objective, strikes: bool) -> None:
+def test_stages_that_follow_share_their_state(objective: Objective, ends_in_impact: bool) -> None:
     scheme = make_scheme("radau", 3)
     first, second = cut(driven("radau", 3, 8), 3)
-    if strikes:
+    if ends_in_impact:
         # An impact without impulses changes nothing.
         still = np.zeros(first.formation.n_constraints)
-        first = replace(first, strikes=True, guess=first.guess._replace(impulses=still))
+        first = replace(first, ends_in_impact=True, guess=first.guess._replace(impulses=still))
     stages = [first, second]
     nlp = build(stages, scheme, objective)
     assert first.guess.duration != pytest.approx(second.guess.duration)
@@ -250,7 +250,7 @@ def test_stages_that_follow_share_their_state(objective: Objective, strikes: boo
         moved = x.copy()
         moved[node[MARGIN]] += 1e-3
         assert (misses(nlp, moved)[0] - plain).max() > 0.9e-3
-        assert call(nlp, "nlp_g", x)[nlp.lasts] == pytest.approx(DURATION, rel=1e-12)
+        assert call(nlp, "nlp_g", x)[nlp.duration_row] == pytest.approx(DURATION, rel=1e-12)
 
 
 def test_derivatives_of_the_whole_are_its_differences() -> None:
@@ -286,7 +286,7 @@ def test_unknowns_are_bounded(scheme_name: str) -> None:
     scheme = make_scheme(scheme_name, 3)
     first, second = cut(driven(scheme_name, 3, 8), 3)
     first = replace(
-        first, strikes=True, guess=first.guess._replace(impulses=np.zeros(4)), turns=(5,)
+        first, ends_in_impact=True, guess=first.guess._replace(impulses=np.zeros(4)), turns=(5,)
     )
     stages = [first, second]
     nlp = build(stages, scheme)
@@ -340,10 +340,10 @@ def test_released_contacts_open_and_stay_clear(name: str) -> None:
     formation = stage.formation
     gained = [limit.gained.name if limit.gained else "" for limit in formation.limits]
     released = gained.index("v0-finger2")
-    opens = replace(stage, watched=(released,), released=(released,), opens=True)
+    opens = replace(stage, monitored=(released,), released=(released,), opens=True)
     nlp = build([opens], scheme)
     low, _ = nlp.rows.bounds
-    rows = nlp.rows_of[0].watches
+    rows = nlp.rows_of[0].monitor_rows
     later = opens.guess.places(scheme.points) > 1 / 3
     np.testing.assert_allclose(low[rows[..., 0]], np.where(later, CLEARANCE, 0.0))
     values = call(nlp, "nlp_g", packed(nlp, [opens]))[rows[..., 0]]

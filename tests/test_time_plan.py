@@ -85,7 +85,7 @@ def thrown(
     return problem, solve(problem, objective, time_intervals=8), expected
 
 
-def effort(stages: list[StageMotion]) -> float:
+def statistics(stages: list[StageMotion]) -> float:
     """Integral of tau^T tau plus the duration, by the midpoint rule."""
     squares = [(stage.evaluate(instants(stage, 100)).tau ** 2).sum(axis=1) for stage in stages]
     weights = [np.repeat(stage.points.fractions, 100) / 100 for stage in stages]
@@ -330,7 +330,7 @@ def test_values_are_those_of_the_objective(
         return
     if which == "effort":
         assert sum(gentle.meta["phase_values"][4:]) == pytest.approx(
-            effort(landing_of(gentle)), rel=1e-4
+            statistics(landing_of(gentle)), rel=1e-4
         )
         return
     allowed = 2.0 * total(coarse)
@@ -349,7 +349,7 @@ def test_the_effort_of_a_gentle_plan_is_least(
     coarse: list[PhasePlan[TimeMotion]], gentle: Trajectory
 ) -> None:
     stages = landing_of(gentle)
-    assert effort(stages) < 0.9 * effort(stages_of(coarse))
+    assert statistics(stages) < 0.9 * statistics(stages_of(coarse))
     assert total(coarse) < sum(stage.duration for stage in stages)
     least = min(stage.evaluate(instants(stage, 12)).c_n.min() for stage in stages)
     assert least > landing().epsilon - SLACK

@@ -34,8 +34,8 @@ def test_rows_are_equations_unless_bounds_are_given() -> None:
 def test_entries_are_spread_over_rows_and_columns() -> None:
     rows = Rows()
     own = rows.linear(2, 3)
-    rows.put(own, np.array([[7], [8]]), [1.0, 2.0, 3.0])
-    rows.put(own[1], 9, -1.0)
+    rows.add_entries(own, np.array([[7], [8]]), [1.0, 2.0, 3.0])
+    rows.add_entries(own[1], 9, -1.0)
     dense = np.zeros((6, 10))
     np.add.at(dense, (rows.triplets.rows, rows.triplets.columns), rows.triplets.values)
     expected = np.zeros((6, 10))
@@ -48,9 +48,9 @@ def test_kernels_are_repeated_and_charged() -> None:
     rows, kernel = Rows(), product()
     columns, given = np.array([[0, 1], [2, 3]]), np.array([[2.0], [3.0]])
     own = rows.nonlinear(2, 1)
-    rows.repeat(kernel, columns, own, given)
-    rows.charge(kernel, columns, given)
-    rows.repeat(kernel, columns[:1], rows.nonlinear(1, 1))
+    rows.add_copies(kernel, columns, own, given)
+    rows.add_cost(kernel, columns, given)
+    rows.add_copies(kernel, columns[:1], rows.nonlinear(1, 1))
     repeated, charged, plain = rows.blocks
     np.testing.assert_array_equal(repeated.rows, own)
     np.testing.assert_array_equal(repeated.parameters, given)

@@ -10,9 +10,9 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.time_domain.collocation import make_scheme
 from wholearm.planning.time_domain.own_units import in_own_units
-from wholearm.planning.time_domain.refinement import halve
+from wholearm.planning.time_domain.refinement import bisect_intervals
 from wholearm.planning.time_domain.search import Search, Solution
-from wholearm.planning.time_domain.staging import outline_stages
+from wholearm.planning.time_domain.staging import guess_stages
 from wholearm.planning.time_domain.warm_start import carry_multipliers, first_multipliers
 
 SCHEME = make_scheme("radau", 3)
@@ -27,7 +27,7 @@ def coarse(objective: str) -> Solution:
     """The heptagon's landing on few intervals, from its outlines."""
     problem = landing()
     start = trace_phases(problem)[-1].end
-    stages = outline_stages(problem, problem.phases[4:], start, SCHEME, 8, 2.0)
+    stages = guess_stages(problem, problem.phases[4:], start, SCHEME, 8, 2.0)
     solution = search_for(objective).solve(stages)
     assert solution.success
     return solution
@@ -37,7 +37,7 @@ def coarse(objective: str) -> Solution:
 def test_halved_intervals_start_from_the_multipliers_before(objective: str) -> None:
     solution = coarse(objective)
     every = [np.ones(stage.intervals, dtype=int) for stage in solution.stages]
-    finer = halve(solution.stages, SCHEME, every)
+    finer = bisect_intervals(solution.stages, SCHEME, every)
     costs = []
     for before in (solution, None):
         answer = search_for(objective).solve(finer, before)
@@ -59,7 +59,7 @@ def test_first_multipliers_push_away_from_the_bounds_there_are() -> None:
 def test_multipliers_are_shared_among_the_intervals_that_replace_one() -> None:
     solution = coarse("time")
     marked = [(np.arange(stage.intervals) + 1) % 2 for stage in solution.stages]
-    stages = halve(solution.stages, SCHEME, marked)
+    stages = bisect_intervals(solution.stages, SCHEME, marked)
     search = search_for("time")
     nlp = search.build(stages)
     rng = np.random.default_rng(2)

@@ -17,7 +17,7 @@ from ..planning.time_domain.motion import TimeMotion, make_motions
 from ..planning.time_domain.own_units import to_si
 from ..planning.time_domain.plan import plan_phases
 from ..planning.time_domain.search import Search
-from ..planning.time_domain.staging import outline_stages
+from ..planning.time_domain.staging import guess_stages
 from ..problem.definition import Phase, Problem
 from ..simulation.simulate import simulate
 from .report import Row
@@ -72,7 +72,7 @@ def _isolate(problem: Problem, index: int, z: Array) -> Problem:
 def _find_end_error(problem: Problem, name: str, degree: int, intervals: int) -> float:
     scheme = make_scheme(name, degree)
     search = Search.of(problem, PlanOptions(Objective.EFFORT, scheme=name, degree=degree))
-    stages = outline_stages(problem, problem.phases, problem.start, scheme, intervals, _PACE)
+    stages = guess_stages(problem, problem.phases, problem.start, scheme, intervals, _PACE)
     found = [to_si(stage, problem) for stage in search.solve(stages).stages]
     torque = TimeMotion(make_motions(found, scheme)).torque
     simulation = simulate(problem, torque, tolerance=1e-13, times=torque.breaks[-1:])

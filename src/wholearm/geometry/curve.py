@@ -135,7 +135,7 @@ class Curve:
                 z[mine], tangent[mine] = panel.interpolate(s[mine])
         return z, tangent
 
-    def at_pace(self, pace: float) -> Curve:
+    def with_speed_ratio(self, pace: float) -> Curve:
         """Return the same curve with a parameter that runs through it at another pace."""
         share = self.pace / pace
         panels = tuple(Panel(share * panel.s, panel.z, panel.z_s) for panel in self.panels)

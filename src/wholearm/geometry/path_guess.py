@@ -58,11 +58,11 @@ def require_phases(problem: Problem) -> None:
         if runs_on_curve(phase):
             z = trace_phase(problem, phase, z).end
         else:
-            z = outline_phase(problem, phase, z)[-1].z[-1]
+            z = guess_phase(problem, phase, z)[-1].z[-1]
 
 
 @dataclass(frozen=True, eq=False)
-class Outline:
+class PathGuess:
     """A stretch of a phase without a reversal, as configurations along it.
 
     Attributes
@@ -87,7 +87,7 @@ class Outline:
         return float(np.sqrt(steps**2 @ metric_weights(self.formation.scene)).sum())
 
 
-def outline_curve(curve: Curve, share: float = 1.0) -> list[Outline]:
+def guess_curve(curve: Curve, share: float = 1.0) -> list[PathGuess]:
     """Outline a curve, or the first `share` of it, split at its reversals."""
     stop = share * curve.length
     parts = [part for part in curve.segments if part.start < stop]
@@ -100,13 +100,13 @@ def outline_curve(curve: Curve, share: float = 1.0) -> list[Outline]:
             flips = signs != np.concatenate([following.Xi, following.sigma])
             turns = tuple(np.flatnonzero(flips).tolist())
         directions = Directions(part.Xi, part.sigma)
-        outlines.append(Outline(curve.formation, curve.evaluate(s).z, directions, turns))
+        outlines.append(PathGuess(curve.formation, curve.evaluate(s).z, directions, turns))
     return outlines
 
 
-def outline_phase(
+def guess_phase(
     problem: Problem, phase: Phase, z: Array, release_at: float = RELEASE_AT
-) -> list[Outline]:
+) -> list[PathGuess]:
     """Outline a phase from `z`, shape (5,), to its end; a release is at a share of the curve.
 
     Raises
@@ -122,7 +122,7 @@ def outline_phase(
         raise InputError(problem.source, key, "the contacts leave no freedom to move")
     if freedoms == 1:
         curve = trace_phase(problem, phase, z)
-        return outline_curve(curve, release_at if phase.until.is_release else 1.0)
+        return guess_curve(curve, release_at if phase.until.is_release else 1.0)
     goal = _find_goal(problem, phase, z)
     return [connect(formation, z, goal)]
 
@@ -194,7 +194,7 @@ def _settle(end: Ending, z: Array, slip: Array) -> tuple[Array | None, str]:
     return None, reason
 
 
-def outline_onwards(phase: Phase, before: Outline) -> list[Outline]:
+def guess_onwards(phase: Phase, before: PathGuess) -> list[PathGuess]:
     """Outline a phase that goes on from another outline, to ends that lie ahead of it.
 
     Where a contact may be gained in many places, the nearest is often beside the motion so far:
@@ -241,7 +241,7 @@ def _look_around(formation: Formation, ending: Formation, z: Array, slip: Array)
 
 def connect(
     formation: Formation, start: Array, goal: Array, bends: tuple[float, float] = (0.0, 0.0)
-) -> Outline:
+) -> PathGuess:
     """A straight line, pulled onto the contacts, with the directions of its middle.
 
     Parameters
@@ -262,7 +262,7 @@ def connect(
     slip = np.einsum("nij,nj->ni", formation.evaluate(z, speed).A_t, speed)
     rates = np.hstack([slip, speed[:, 3:]]).sum(axis=0)
     signs = np.where(rates < 0, -1.0, 1.0)
-    return Outline(formation, z, Directions(signs[:-2], signs[-2:]))
+    return PathGuess(formation, z, Directions(signs[:-2], signs[-2:]))
 
 
 def _find_side(formation: Formation, start: Array, goal: Array) -> Array:

@@ -14,7 +14,7 @@ from ..common.errors import InputError
 from ..common.sharing import exclusive
 from ..contacts.elemental import Contact
 from ..contacts.formation import close_finger, place_flush
-from ..geometry.path_guess import outline_phase
+from ..geometry.path_guess import guess_phase
 from ..geometry.tracing import trace_phases
 from ..problem.definition import Problem, Until
 from .borders import Window
@@ -189,7 +189,7 @@ def trace_problem(problem: Problem) -> list[Array]:
             paths.append(curve.evaluate(np.linspace(0.0, curve.length, 60)).z[:, [0, 2]])
             z = curve.end
         for phase in problem.phases[len(paths) :]:
-            parts = [part.z for part in outline_phase(problem, phase, z)]
+            parts = [part.z for part in guess_phase(problem, phase, z)]
             paths.append(np.concatenate(parts)[:, [0, 2]])
             z = parts[-1][-1]
     except InputError:

@@ -35,7 +35,7 @@ _STEP = 1e-5
 """Step of the difference quotient of limits, in radii of gyration or radians."""
 
 
-class Obstacle(Enum):
+class ViolationKind(Enum):
     """What keeps an impact from throwing the velocity onto a formation."""
 
     JAM = "jam"
@@ -50,12 +50,12 @@ class Obstacle(Enum):
     """Something that touches, but is not in the formation, would be driven into."""
 
 
-class Hindrance(NamedTuple):
+class ImpactViolation(NamedTuple):
     """One reason why an impact is not possible.
 
     Attributes
     ----------
-    kind : Obstacle
+    kind : ViolationKind
     name : str
         The contact, or what would happen.
     value : float
@@ -63,19 +63,19 @@ class Hindrance(NamedTuple):
         without friction.
     """
 
-    kind: Obstacle
+    kind: ViolationKind
     name: str
     value: float
 
     def describe(self, per: str = "") -> str:
         """Say it in words; `per` is what the numbers are for, if not for the velocity itself."""
-        if self.kind is Obstacle.PULL:
+        if self.kind is ViolationKind.PULL:
             return f"impulse on {self.name} would be {self.value:.3g} N s{per}"
-        if self.kind is Obstacle.SLIP:
+        if self.kind is ViolationKind.SLIP:
             return f"{self.name} would slip, {-self.value:.3g} N s{per} beyond its friction cone"
-        if self.kind is Obstacle.CLOSING:
+        if self.kind is ViolationKind.CLOSING:
             return f"{self.name}, at {-self.value:.3g} m/s{per}"
-        if self.kind is Obstacle.HELD:
+        if self.kind is ViolationKind.HELD:
             return f"friction would hold {self.name}"
         return f"{self.name} would jam, with {self.value:.3g} of the reduced inertia"
 
@@ -94,7 +94,7 @@ class Impact:
         Impulses of the contacts: normal, then tangential of rolling ones. NaN likewise.
     Xi : ndarray, shape (n_c,)
         Sliding directions that friction assumes, zero for rolling contacts.
-    hindrances : tuple of Hindrance
+    violations : tuple of ImpactViolation
         Why it is not possible, the worst first; empty if it is.
     """
 
@@ -102,12 +102,12 @@ class Impact:
     v: Array
     p: Array
     Xi: Array
-    hindrances: tuple[Hindrance, ...]
+    violations: tuple[ImpactViolation, ...]
 
     @property
     def possible(self) -> bool:
         """Whether the motion goes on in the new formation."""
-        return not self.hindrances
+        return not self.violations
 
     @property
     def least(self) -> tuple[str, float]:
@@ -116,7 +116,7 @@ class Impact:
         return self.formation.names[k], float(self.p[k])
 
 
-def strike(before: Formation, after: Formation, z: Array, v: Array) -> Impact:
+def compute_impact(before: Formation, after: Formation, z: Array, v: Array) -> Impact:
     """Throw a velocity onto a formation.
 
     Parameters
@@ -135,43 +135,45 @@ def strike(before: Formation, after: Formation, z: Array, v: Array) -> Impact:
         return tuple(slides * np.where(A_t @ velocity < 0, -1.0, 1.0))
 
     # Try the sliding of the frictionless impact, then that of each answer; rarely any other.
-    likely = directions(transfer(after.scene.mass_diagonal, P, P, v)[0])
+    likely = directions(solve_impulses(after.scene.mass_diagonal, P, P, v)[0])
     others = product(*((1.0, -1.0) if one else (0.0,) for one in slides))
     tried: dict[tuple[float, ...], Impact] = {}
     for choice in (likely, *others):
         Xi = choice
         while Xi not in tried:
-            tried[Xi] = impact = _strike(before, after, z, v, np.array(Xi))
+            tried[Xi] = impact = _compute_impact(before, after, z, v, np.array(Xi))
             if _is_sound(impact):
                 return impact
             Xi = directions(impact.v)
     return tried[likely]
 
 
-def _strike(before: Formation, after: Formation, z: Array, v: Array, Xi: Array) -> Impact:
+def _compute_impact(before: Formation, after: Formation, z: Array, v: Array, Xi: Array) -> Impact:
     """Throw a velocity onto a formation with given sliding directions."""
     kinematics = after.evaluate(z[None], v[None])
     P, mass = kinematics.P[0], after.scene.mass_diagonal
     directions = Directions(Xi, np.ones(2))
     ratio = float(reduced_inertia(after, kinematics, directions)[0])
     if ratio <= 0:
-        jam = Hindrance(Obstacle.JAM, " ".join(after.names), ratio)
+        jam = ImpactViolation(ViolationKind.JAM, " ".join(after.names), ratio)
         return Impact(after, np.full(5, np.nan), np.full(len(P), np.nan), Xi, (jam,))
-    v_after, p = transfer(mass, P, force_rows(after, kinematics, directions)[0], v)
+    v_after, p = solve_impulses(mass, P, force_rows(after, kinematics, directions)[0], v)
     speed = measure_speed(after.scene, v)
     momentum = float(np.abs(mass * v / np.sqrt(metric_weights(after.scene))).max())
     rolls = [after.names[row] for row in after.rolling_rows]
     normal, cones = np.split(hold_rows(after) @ p, [after.n_contacts])
     found = [
-        *_list(Obstacle.HELD, after.names, Xi * (kinematics.A_t[0] @ v_after), ROUNDING * speed),
-        *_list(Obstacle.PULL, after.names, normal, ROUNDING * momentum),
-        *_list(Obstacle.SLIP, [*rolls, *rolls], cones, ROUNDING * momentum),
-        *_list(Obstacle.CLOSING, *_rates(before, after, z, v_after), ROUNDING * speed),
+        *_list(
+            ViolationKind.HELD, after.names, Xi * (kinematics.A_t[0] @ v_after), ROUNDING * speed
+        ),
+        *_list(ViolationKind.PULL, after.names, normal, ROUNDING * momentum),
+        *_list(ViolationKind.SLIP, [*rolls, *rolls], cones, ROUNDING * momentum),
+        *_list(ViolationKind.CLOSING, *_rates(before, after, z, v_after), ROUNDING * speed),
     ]
     return Impact(after, v_after, p, Xi, tuple(found))
 
 
-def transfer(mass: Array, rows: Array, force_rows: Array, v: Array) -> tuple[Array, Array]:
+def solve_impulses(mass: Array, rows: Array, force_rows: Array, v: Array) -> tuple[Array, Array]:
     """Velocity and impulses p of the jump M5 (v+ - v) = force_rows^T p with rows v+ = 0.
 
     Parameters
@@ -190,13 +192,15 @@ def transfer(mass: Array, rows: Array, force_rows: Array, v: Array) -> tuple[Arr
 
 def _is_sound(impact: Impact) -> bool:
     """Whether the sliding directions are those of the velocity they give."""
-    return all(h.kind not in (Obstacle.JAM, Obstacle.HELD) for h in impact.hindrances)
+    return all(h.kind not in (ViolationKind.JAM, ViolationKind.HELD) for h in impact.violations)
 
 
-def _list(kind: Obstacle, names: Sequence[str], values: Array, rounding: float) -> list[Hindrance]:
+def _list(
+    kind: ViolationKind, names: Sequence[str], values: Array, rounding: float
+) -> list[ImpactViolation]:
     """Those of the values that are below zero, the least first."""
     return [
-        Hindrance(kind, names[k], float(values[k]))
+        ImpactViolation(kind, names[k], float(values[k]))
         for k in np.argsort(values)
         if values[k] < -rounding
     ]

@@ -21,8 +21,8 @@ from ..problem.definition import End, Phase, Problem
 from ..results.trajectory import Motion
 from ..scene.model import Scene
 from .options import Objective, PlanOptions
-from .path_domain.impact_sequence import Chain, make_chain
-from .path_domain.sequence_plan import add_up, plan_chain
+from .path_domain.impact_sequence import ImpactSequence, make_sequence
+from .path_domain.sequence_plan import add_up, plan_sequence
 from .phase_plan import PhasePlan
 
 PLAIN = -1
@@ -54,7 +54,7 @@ class BlockPlan:
         Plans of least duration from this start, if they were made for it.
     plans : list of PhasePlan
         One for each of its phases.
-    chain : Chain or None
+    chain : ImpactSequence or None
         Its curves; None if it is planned in the time domain.
     """
 
@@ -64,7 +64,7 @@ class BlockPlan:
     duration: float | None
     fastest: Plans
     plans: Plans
-    chain: Chain | None
+    chain: ImpactSequence | None
 
     @property
     def end(self) -> Array:
@@ -118,7 +118,7 @@ class Planning:
         return [plan for block in self.blocks for plan in block.plans]
 
     @property
-    def chains(self) -> list[Chain]:
+    def sequences(self) -> list[ImpactSequence]:
         """The curves of the blocks that are planned along them."""
         return [block.chain for block in self.blocks if block.chain is not None]
 
@@ -223,23 +223,23 @@ def _plan_block(
     options: PlanOptions,
     allowed: Sequence[float | None] | None,
     to_go: CostToGo | None = None,
-) -> tuple[Plans, Chain | None]:
+) -> tuple[Plans, ImpactSequence | None]:
     """Plan a block from `z`, along its curves or in the time domain; also its curves."""
     plans: Plans = []
     allowed = [None] * len(problem.phases) if allowed is None else allowed
     if not runs_along_curves(block, options):
-        from .time_domain.impacts import plan_struck
+        from .time_domain.impacts import plan_with_impacts
 
-        plans += plan_struck(problem, block, z, options, add_up(block, allowed), to_go)
+        plans += plan_with_impacts(problem, block, z, options, add_up(block, allowed), to_go)
         return plans, None
     curves, known = [], trace_phases(problem)
     for phase in block:
         traced = phase.index < len(known)
         curves.append(known[phase.index] if traced else trace_phase(problem, phase, z))
         z = curves[-1].end
-    chain = make_chain(block, curves)
+    chain = make_sequence(block, curves)
     for part in chain.split():
-        plans += plan_chain(part, problem.epsilon, options, add_up(part.phases, allowed))
+        plans += plan_sequence(part, problem.epsilon, options, add_up(part.phases, allowed))
     return plans, chain
 
 

@@ -89,9 +89,9 @@ def solve_with(
         planning, trajectory, figures = replay_plan(planning, trajectory, _assemble, report)
     replayed = time.perf_counter()
     transitions = assess(
-        planning.chains, planning.plans, problem.epsilon, options, planning.allowed, report
+        planning.sequences, planning.plans, problem.epsilon, options, planning.allowed, report
     )
-    transitions += _assess_struck(planning, report)
+    transitions += _assess_time_impacts(planning, report)
     transitions.sort(key=lambda transition: transition.phase)
     every = [*planning.least, *planning.plans]
     meta = _describe(planning) | {
@@ -161,15 +161,15 @@ def _describe(planning: Planning) -> dict[str, Any]:
     }
 
 
-def _assess_struck(planning: Planning, report: Callable[[str], None]) -> list[Transition]:
+def _assess_time_impacts(planning: Planning, report: Callable[[str], None]) -> list[Transition]:
     """Assess the impacts of blocks that were planned in the time domain."""
     found: list[Transition] = []
     for block in planning.blocks:
         if len(block.phases) > 1 and block.chain is None:
-            from .time_domain.impacts import assess_struck
+            from .time_domain.impacts import assess_time_impacts
 
             report(f"phase {block.phases[0].number}: what impacts save")
-            found += assess_struck(
+            found += assess_time_impacts(
                 planning.problem, block.phases, block.plans, planning.options, block.duration
             )
     return found

@@ -179,7 +179,7 @@ class Touching:
 
 
 @dataclass(frozen=True, eq=False)
-class Pattern:
+class ModeChoice:
     """A choice of directions; quantities at rest are rows @ (1, tau_1, tau_2).
 
     Attributes
@@ -256,7 +256,7 @@ class Pattern:
 
 def find_patterns(
     formation: Formation, z: Array, near: NDArray[np.bool_], held: bool
-) -> Iterator[Pattern]:
+) -> Iterator[ModeChoice]:
     """Yield every choice of directions at a configuration at rest; contacts that roll have none.
 
     Parameters
@@ -296,7 +296,7 @@ def respond_at_rest(mode: Mode, signs: Array, kinematics: Kinematics) -> Respons
 
 def _build_pattern(
     mode: Mode, signs: Array, kinematics: Kinematics, touching: Touching
-) -> Pattern | None:
+) -> ModeChoice | None:
     formation, count = mode.formation, mode.formation.n_contacts
     response = respond_at_rest(mode, signs, kinematics)
     if response is None:
@@ -314,7 +314,7 @@ def _build_pattern(
         holds=ROUNDING_FORCE * units,
         openings=np.full(len(touching.gradient), tolerances.closing),
     )
-    return Pattern(
+    return ModeChoice(
         directions=Directions(signs[:count], signs[count:]),
         mass=formation.scene.mass_diagonal,
         acceleration=response.acceleration,

@@ -10,7 +10,7 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import JammingError, SimulationError
 from ..contacts.formation import Formation
-from ..mechanics.impact import Obstacle, strike, transfer
+from ..mechanics.impact import ViolationKind, compute_impact, solve_impulses
 from ..problem.definition import End, Phase
 from .choosing import measure_rates
 from .closing import close_contacts
@@ -23,10 +23,10 @@ from .stepper import open_limits
 from .tolerances import REACHED, STANDING, is_slower, measure_until
 
 _OUTCOMES = {
-    Obstacle.PULL: OutcomeKind.CONTACT_LOST,
-    Obstacle.SLIP: OutcomeKind.SLIPS,
-    Obstacle.CLOSING: OutcomeKind.LIMIT_REACHED,
-    Obstacle.HELD: OutcomeKind.HELD,
+    ViolationKind.PULL: OutcomeKind.CONTACT_LOST,
+    ViolationKind.SLIP: OutcomeKind.SLIPS,
+    ViolationKind.CLOSING: OutcomeKind.LIMIT_REACHED,
+    ViolationKind.HELD: OutcomeKind.HELD,
 }
 
 
@@ -64,16 +64,16 @@ def _close(run: Replay, formation: Formation) -> Array:
 def collide(run: Replay, following: Phase) -> Outcome | None:
     """Throw the velocity onto the next formation; what ends the motion if that is not possible."""
     z = _close(run, following.formation)
-    impact = strike(run.phase.formation, following.formation, z, run.y[5:10])
+    impact = compute_impact(run.phase.formation, following.formation, z, run.y[5:10])
     name, least = impact.least
     names = following.formation.names
     normal = impact.p[: len(names)]
     impulses = ", ".join(f"{p:.4g} on {n}" for n, p in zip(names, normal, strict=True))
     run.note(EventKind.IMPACT, f"impact {run.when()}, in N s {impulses}", name, least)
-    if impact.hindrances:
-        worst = impact.hindrances[0]
+    if impact.violations:
+        worst = impact.violations[0]
         text = f"{worst.describe()} in the impact {run.when()}"
-        if worst.kind is Obstacle.JAM:
+        if worst.kind is ViolationKind.JAM:
             raise JammingError(text)
         return Outcome(_OUTCOMES[worst.kind], text)
     before = run.stored
@@ -107,7 +107,7 @@ def find_switching(phase: Phase, following: Phase | None) -> tuple[frozenset[int
 def project_velocity(formation: Formation, z: Array, v: Array) -> Array:
     """Velocity nearest to `v` in the metric M5 that keeps every constraint, shape (5,)."""
     P = formation.evaluate(z[None], v[None]).P[0]
-    return transfer(formation.scene.mass_diagonal, P, P, v)[0]
+    return solve_impulses(formation.scene.mass_diagonal, P, P, v)[0]
 
 
 def set_off(run: Replay, departure: Departure) -> None:

@@ -165,7 +165,7 @@ def measure_departure(deviation: Deviation, length: float) -> float:
     return max((size for size in sizes if not math.isnan(size)), default=0.0)
 
 
-def describe_thin(
+def describe_thin_margins(
     problem: Problem, phases: Sequence[PhaseReport], simulation: Simulation, allowance: Allowance
 ) -> list[Failure]:
     """Sentences on the normal forces below epsilon, but for contacts where they were lost.

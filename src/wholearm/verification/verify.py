@@ -31,7 +31,7 @@ from .verdict import (
     describe_departures,
     describe_overlap,
     describe_stops,
-    describe_thin,
+    describe_thin_margins,
     judge_end,
     measure_speed,
 )
@@ -106,7 +106,7 @@ def inspect(
     failures += describe_stops(problem, simulation, allowance)
     gap = find_finger_gap(problem.scene, simulation, torque.breaks)
     failures += describe_overlap(problem.scene, phases, gap) if reached else []
-    thin = describe_thin(problem, phases, simulation, allowance)
+    thin = describe_thin_margins(problem, phases, simulation, allowance)
     warnings = _describe_torques(problem, torque)
     if plan is not None:
         failures += thin + describe_departures(problem, phases, allowance)

@@ -27,11 +27,11 @@ PLACES = 9
 """Places that they go through where that is exceeded."""
 
 
-class Fineness(NamedTuple):
+class Sampling(NamedTuple):
     """Where in an interval forces are evaluated and limits looked at, its ends included."""
 
     knots: Array
-    looks: Array
+    checks: Array
 
 
 class Places(NamedTuple):
@@ -53,14 +53,14 @@ class Relaxation(NamedTuple):
 
     Attributes
     ----------
-    worth : ndarray, shape (n_h + 3,), [N, N m, 1]
+    weights : ndarray, shape (n_h + 3,), [N, N m, 1]
         By how much H c >= least and |tau| <= limit give way per unit of it, and the square of a
         speed limit, relative to that square.
     finger : int or None
         Whose speed limit that is.
     """
 
-    worth: Array
+    weights: Array
     finger: int | None = None
 
 
@@ -75,12 +75,12 @@ class PhaseData(NamedTuple):
     grid : Grid
     nodes : Places
         At the nodes.
-    fine : Fineness
+    sampling : Sampling
     knots : Places
         At the knots of every solid interval, interval by interval.
-    looks : Places
+    checks : Places
         At the looks of every solid interval, interval by interval.
-    solid : ndarray of int
+    nonempty : ndarray of int
         The intervals that have a length.
     """
 
@@ -88,10 +88,10 @@ class PhaseData(NamedTuple):
     epsilon: float
     grid: Grid
     nodes: Places
-    fine: Fineness
+    sampling: Sampling
     knots: Places
-    looks: Places
-    solid: NDArray[np.int64]
+    checks: Places
+    nonempty: NDArray[np.int64]
 
     @property
     def least(self) -> Array:
@@ -142,7 +142,7 @@ class PhaseData(NamedTuple):
 
     def spread(self, profile: Profile, fractions: Array) -> Profile:
         """The profile at `fractions` of every solid interval, interval by interval."""
-        k, x, h = self.solid, fractions, self.grid.steps[self.solid, None]
+        k, x, h = self.nonempty, fractions, self.grid.steps[self.nonempty, None]
         a, rise = profile.a[k, None], (profile.a[k + 1] - profile.a[k])[:, None]
         b = profile.b[k, None] + h * x * (2 * a + x * rise)
         squeeze = profile.squeeze[k, None] * (1 - x) + profile.squeeze[k + 1, None] * x
@@ -153,27 +153,27 @@ class PhaseData(NamedTuple):
 
         And how far b is beyond what the speed limits allow, shape (n_solid,), relative.
         """
-        here = self.spread(profile, self.fine.looks)
-        speed_slack = 1 - here.b / self.largest_b(self.looks)
-        slack = np.column_stack([self.slack(self.looks, here, margin), speed_slack])
-        least = find_least(slack.reshape(len(self.solid), len(self.fine.looks), -1))
+        here = self.spread(profile, self.sampling.checks)
+        speed_slack = 1 - here.b / self.largest_b(self.checks)
+        slack = np.column_stack([self.slack(self.checks, here, margin), speed_slack])
+        least = find_least(slack.reshape(len(self.nonempty), len(self.sampling.checks), -1))
         short = np.maximum(-least, 0.0)
         return short[:, :-1], short[:, -1]
 
-    def slack_beside(self, profile: Profile, margin: float, short: Array) -> Array:
+    def slack_at_neighbours(self, profile: Profile, margin: float, short: Array) -> Array:
         """The lesser slack of the two nodes of each solid interval, shape (n_solid, n_h + 4).
 
         Zero where nothing is `short` in the interval.
         """
         slack = self.slack(self.nodes, profile, margin)
-        least = np.minimum(slack[self.solid], slack[self.solid + 1])
+        least = np.minimum(slack[self.nonempty], slack[self.nonempty + 1])
         return np.where(short > 0, np.maximum(least, 0.0), 0.0)
 
-    def beside(self, inside: Array) -> Array:
+    def spread_to_nodes(self, inside: Array) -> Array:
         """The larger value of the two solid intervals beside each node, shape (N + 1, ...)."""
         table = np.zeros((len(self.grid.s), *inside.shape[1:]))
-        table[self.solid] = inside
-        table[self.solid + 1] = np.maximum(table[self.solid + 1], inside)
+        table[self.nonempty] = inside
+        table[self.nonempty + 1] = np.maximum(table[self.nonempty + 1], inside)
         return table
 
 
@@ -185,12 +185,12 @@ def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
     JammingError
         If friction makes the reduced inertia vanish or turn negative anywhere.
     """
-    solid = np.flatnonzero(grid.steps > 0)
-    fine = choose_fineness(len(grid.s))
-    inner = fine.knots[1:-1]
-    between = (grid.s[solid, None] + inner * grid.steps[solid, None]).ravel()
+    nonempty = np.flatnonzero(grid.steps > 0)
+    sampling = choose_sampling(len(grid.s))
+    inner = sampling.knots[1:-1]
+    between = (grid.s[nonempty, None] + inner * grid.steps[nonempty, None]).ravel()
     s = np.concatenate([grid.s, between])
-    segment = np.concatenate([grid.segment, np.repeat(grid.segment[solid], len(inner))])
+    segment = np.concatenate([grid.segment, np.repeat(grid.segment[nonempty], len(inner))])
     point = curve.evaluate(s)
     formation, directions = curve.formation, directions_of(curve, segment)
     inertia = reduced_inertia(formation, point.kinematics, directions)
@@ -202,24 +202,24 @@ def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
         )
     forces = inverse(formation, *point[:3], directions, point.kinematics)
     if formation.rolling:
-        forces = forces.press(hold_rows(formation))
+        forces = forces.apply_rows(hold_rows(formation))
     every = Places(forces, point.z_s[:, 3:])
-    own = len(grid.s) + np.arange(len(between)).reshape(len(solid), -1)
-    order = np.hstack([solid[:, None], own, solid[:, None] + 1])
+    own = len(grid.s) + np.arange(len(between)).reshape(len(nonempty), -1)
+    order = np.hstack([nonempty[:, None], own, nonempty[:, None] + 1])
     knots = every.pick(order.ravel())
 
-    powers = np.arange(len(fine.knots))
+    powers = np.arange(len(sampling.knots))
     # Powers on [-1, 1]: on [0, 1] thirteen knots would cost nine digits.
-    looks_x, knots_x = 2 * fine.looks - 1, 2 * fine.knots - 1
+    looks_x, knots_x = 2 * sampling.checks - 1, 2 * sampling.knots - 1
     carrier = looks_x[:, None] ** powers @ np.linalg.inv(knots_x[:, None] ** powers)
 
     def carry(values: Array) -> Array:
-        table = values.reshape(len(solid), len(fine.knots), -1)
-        return (carrier @ table).reshape(len(solid) * len(fine.looks), -1)
+        table = values.reshape(len(nonempty), len(sampling.knots), -1)
+        return (carrier @ table).reshape(len(nonempty) * len(sampling.checks), -1)
 
-    looks = Places(PathForces(*(carry(part) for part in knots.forces)), carry(knots.rates))
+    checks = Places(PathForces(*(carry(part) for part in knots.forces)), carry(knots.rates))
     nodes = every.pick(slice(None, len(grid.s)))
-    return PhaseData(curve, epsilon, grid, nodes, fine, knots, looks, solid)
+    return PhaseData(curve, epsilon, grid, nodes, sampling, knots, checks, nonempty)
 
 
 def join(parts: Sequence[PhaseData]) -> PhaseData:
@@ -247,8 +247,8 @@ def join(parts: Sequence[PhaseData]) -> PhaseData:
         ),
         nodes=stack([part.nodes for part in parts]),
         knots=stack([part.knots for part in parts]),
-        looks=stack([part.looks for part in parts]),
-        solid=chain((part.solid for part in parts), nodes),
+        checks=stack([part.checks for part in parts]),
+        nonempty=chain((part.nonempty for part in parts), nodes),
     )
 
 
@@ -267,15 +267,15 @@ def cut(parts: Sequence[PhaseData], profile: Profile) -> list[Profile]:
     return [Profile(*own) for own in zip(*columns, strict=True)]
 
 
-def choose_fineness(nodes: int) -> Fineness:
+def choose_sampling(nodes: int) -> Sampling:
     """Choose more knots and looks where intervals are long.
 
     Looks are as the cosine of evenly spaced angles: near rest the speed, and with it viscous
     friction, goes with the root of the way.
     """
-    knots, looks = (5, 25) if nodes > 64 else (13, 97)
-    angles = np.linspace(0.0, np.pi, looks)
-    return Fineness(np.linspace(0.0, 1.0, knots), (1 - np.cos(angles)) / 2)
+    knots, checks = (5, 25) if nodes > 64 else (13, 97)
+    angles = np.linspace(0.0, np.pi, checks)
+    return Sampling(np.linspace(0.0, 1.0, knots), (1 - np.cos(angles)) / 2)
 
 
 def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, float]:
@@ -289,22 +289,22 @@ def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, floa
     SolverError
         If the motion takes no time, or for ever, between two nodes.
     """
-    knots, looks = data.fine
+    knots, checks = data.sampling
     torque = _fit(data, motion, data.knots, knots)
-    times = motion.times[data.solid, None] + motion.durations(looks)[data.solid]
-    wanted = data.looks.forces.tau(*data.spread(motion.profile, looks))
-    inner = np.tile((looks > 0) & (looks < 1), len(data.solid))
+    times = motion.times[data.nonempty, None] + motion.durations(checks)[data.nonempty]
+    wanted = data.checks.forces.tau(*data.spread(motion.profile, checks))
+    inner = np.tile((checks > 0) & (checks < 1), len(data.nonempty))
     misfit = torque.at(times.ravel()[inner]) - wanted[inner]
     if np.abs(misfit / data.torque_limit).max() > TORQUE_ERROR and len(knots) < PLACES:
-        every = (len(looks) - 1) // (PLACES - 1)
-        rows = np.tile(np.arange(len(looks)) % every == 0, len(data.solid))
-        torque = _fit(data, motion, data.looks.pick(rows), looks[::every])
+        every = (len(checks) - 1) // (PLACES - 1)
+        rows = np.tile(np.arange(len(checks)) % every == 0, len(data.nonempty))
+        torque = _fit(data, motion, data.checks.pick(rows), checks[::every])
     return torque, torque.integrate_squares()
 
 
 def _fit(data: PhaseData, motion: PathMotion, places: Places, fractions: Array) -> TorqueProfile:
     """Polynomials through the torques at `fractions` of every solid interval."""
-    k = data.solid
+    k = data.nonempty
     values = places.forces.tau(*data.spread(motion.profile, fractions))
     spans = motion.durations(fractions)[k]
     if not (np.isfinite(spans).all() and (np.diff(spans, axis=1) > 0).all()):

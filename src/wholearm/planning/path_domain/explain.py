@@ -241,8 +241,8 @@ def _relax(
     formation = data.curve.formation
     intervals, n_c = len(data.grid.s) - 1, formation.n_contacts
     nlp = build_path_nlp(n_c, intervals, Objective.RELAX, formation.n_rolling)
-    short, worth = _shortfalls(data, profile).max(axis=0), relaxation.worth[:-1]
-    needed = np.divide(short, worth, out=np.zeros_like(short), where=worth > 0)
+    short, weights = _shortfalls(data, profile).max(axis=0), relaxation.weights[:-1]
+    needed = np.divide(short, weights, out=np.zeros_like(short), where=weights > 0)
     result = nlp.solver(
         x0=pack(nlp, profile, units, max(1.0, 1.5 * float(needed.max()))),
         p=parameters(nlp, data, units, 1.0, relaxation),

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...geometry.curve import Curve
-from ...mechanics.impact import Impact, strike
+from ...mechanics.impact import Impact, compute_impact
 from ...mechanics.metric import metric_weights
 from ...problem.definition import Phase
 
@@ -24,7 +24,7 @@ PER_SPEED = " per m/s"
 
 
 @dataclass(frozen=True, eq=False)
-class Join:
+class CurveImpact:
     """An impact between two curves, for unit speed along the first one.
 
     Attributes
@@ -49,22 +49,22 @@ class Join:
     @property
     def reason(self) -> str:
         """Why it cannot, empty if it can."""
-        if self.impact.hindrances:
-            return self.impact.hindrances[0].describe(PER_SPEED)
+        if self.impact.violations:
+            return self.impact.violations[0].describe(PER_SPEED)
         return "" if self.possible else f"phase {self.phase.number + 1} would be run backwards"
 
 
-def meet(phase: Phase, before: Curve, after: Curve) -> Join:
+def compute_curve_impact(phase: Phase, before: Curve, after: Curve) -> CurveImpact:
     """The impact at the end of a phase, from its curve to the next one's."""
     v = before.evaluate(np.array([before.length])).z_s[0] / before.pace
-    impact = strike(before.formation, after.formation, after.start, v)
+    impact = compute_impact(before.formation, after.formation, after.start, v)
     heading = after.evaluate(np.zeros(1)).z_s[0] / after.pace
     ratio = float(impact.v * metric_weights(after.formation.scene) @ heading)
-    return Join(phase, impact, ratio)
+    return CurveImpact(phase, impact, ratio)
 
 
 @dataclass(frozen=True, eq=False)
-class Chain:
+class ImpactSequence:
     """One-freedom phases, each but the last ended by an impact.
 
     Attributes
@@ -72,35 +72,39 @@ class Chain:
     phases : tuple of Phase
     curves : tuple of Curve
         Parametrised by arc length.
-    joins : tuple of Join
+    impacts : tuple of CurveImpact
         Between one curve and the next.
     """
 
     phases: tuple[Phase, ...]
     curves: tuple[Curve, ...]
-    joins: tuple[Join, ...]
+    impacts: tuple[CurveImpact, ...]
 
-    def part(self, start: int, stop: int) -> Chain:
+    def part(self, start: int, stop: int) -> ImpactSequence:
         """Phases `start` to `stop`, without the latter."""
-        return Chain(self.phases[start:stop], self.curves[start:stop], self.joins[start : stop - 1])
+        return ImpactSequence(
+            self.phases[start:stop], self.curves[start:stop], self.impacts[start : stop - 1]
+        )
 
-    def split(self) -> list[Chain]:
+    def split(self) -> list[ImpactSequence]:
         """Split where an impact is not possible."""
-        ends = [k + 1 for k, join in enumerate(self.joins) if not join.possible]
+        ends = [k + 1 for k, join in enumerate(self.impacts) if not join.possible]
         bounds = zip([0, *ends], [*ends, len(self.phases)], strict=True)
         return [self.part(start, stop) for start, stop in bounds]
 
     @property
-    def paced(self) -> tuple[Curve, ...]:
+    def continuous_curves(self) -> tuple[Curve, ...]:
         """The curves at such paces that the speed is the same on both sides of a join."""
-        paces = np.cumprod([1.0, *(join.ratio for join in self.joins)])
+        paces = np.cumprod([1.0, *(join.ratio for join in self.impacts)])
         return tuple(
-            curve.at_pace(float(pace)) if pace != 1 else curve
+            curve.with_speed_ratio(float(pace)) if pace != 1 else curve
             for curve, pace in zip(self.curves, paces, strict=True)
         )
 
 
-def make_chain(phases: Sequence[Phase], curves: Sequence[Curve]) -> Chain:
+def make_sequence(phases: Sequence[Phase], curves: Sequence[Curve]) -> ImpactSequence:
     """Chain phases along their curves."""
     pairs = zip(phases[:-1], curves[:-1], curves[1:], strict=True)
-    return Chain(tuple(phases), tuple(curves), tuple(meet(*pair) for pair in pairs))
+    return ImpactSequence(
+        tuple(phases), tuple(curves), tuple(compute_curve_impact(*pair) for pair in pairs)
+    )

@@ -97,8 +97,8 @@ class PathMotion:
 
     def locate(self, t: Array) -> tuple[Array, NDArray[np.int64], Profile]:
         """Arc length [m], segment and profile at times `t`, each of shape (n,)."""
-        solid = np.flatnonzero(self.grid.steps > 0)
-        k = solid[np.clip(np.searchsorted(self.times[solid], t, side="right") - 1, 0, None)]
+        nonempty = np.flatnonzero(self.grid.steps > 0)
+        k = nonempty[np.clip(np.searchsorted(self.times[nonempty], t, side="right") - 1, 0, None)]
         h, a, b, squeeze = self.grid.steps[k], *self.profile
         local = np.clip(t, 0.0, self.duration) - self.times[k]
         slope = (a[k + 1] - a[k]) / h
@@ -145,11 +145,11 @@ def make_grid(curve: Curve, intervals: int) -> Grid:
     """
     ends = np.array([0.0, *(segment.stop for segment in curve.segments)])
     angles = np.arccos(1 - 2 * np.clip(ends / curve.length, 0.0, 1.0))
-    solid = intervals - (len(ends) - 2)
+    nonempty = intervals - (len(ends) - 2)
     # Halves go up whatever their last bit is.
-    counts = np.maximum(1, np.floor(np.diff(angles) / np.pi * solid + 0.5 + 1e-6).astype(int))
-    while counts.sum() != solid:
-        counts[np.argmax(counts)] += np.sign(solid - counts.sum())
+    counts = np.maximum(1, np.floor(np.diff(angles) / np.pi * nonempty + 0.5 + 1e-6).astype(int))
+    while counts.sum() != nonempty:
+        counts[np.argmax(counts)] += np.sign(nonempty - counts.sum())
     nodes = []
     for index, count in enumerate(counts):
         angle = np.linspace(angles[index], angles[index + 1], count + 1)
@@ -159,14 +159,14 @@ def make_grid(curve: Curve, intervals: int) -> Grid:
     return Grid(np.concatenate(nodes), np.repeat(np.arange(len(counts)), counts + 1))
 
 
-def draw_together(grid: Grid, solid: NDArray[np.int64], misses: Array) -> Grid:
+def redistribute_nodes(grid: Grid, nonempty: NDArray[np.int64], misses: Array) -> Grid:
     """Move nodes into the solid intervals whose `misses` exceed 1, keeping those of each segment.
 
     A miss falls with the square of the interval, so its root says how many parts are wanted; four
     are enough, as the limits are tightened afterwards.
     """
     wanted = np.ones(len(grid.steps))
-    wanted[solid] = np.clip(np.sqrt(misses), 1.0, 4.0)
+    wanted[nonempty] = np.clip(np.sqrt(misses), 1.0, 4.0)
     s = grid.s.copy()
     for segment in range(int(grid.segment[-1]) + 1):
         mine = np.flatnonzero(grid.segment == segment)

@@ -184,7 +184,7 @@ def parameters(
     if relaxation is not None:
         rows = np.concatenate([np.full(nlp.n_held, force), torque, [1.0]])
         rates = data.relative_rates(data.nodes, relaxation.finger)
-        blocks += [relaxation.worth / rows, rates**2 * b_unit]
+        blocks += [relaxation.weights / rows, rates**2 * b_unit]
     steps, weight = data.grid.steps / units.length, time_weight / units.power
     scalars = [weight, force / units.press]
     return np.concatenate([[0.0, 0.0], steps, scalars, *(b.ravel("F") for b in blocks)])

@@ -20,7 +20,7 @@ from ...geometry.curve import Curve
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
 from .data import PhaseData, cut, fit_torque, join, name_phases, prepare
-from .motion import Grid, PathMotion, Profile, draw_together, make_grid
+from .motion import Grid, PathMotion, Profile, make_grid, redistribute_nodes
 from .nlp import (
     PathNLP,
     Tightening,
@@ -253,9 +253,9 @@ def _plan(
         coarse = _weigh(data, short, speeding, units)
         if solves == 1 and coarse.max() > 1:
             old = data.grid
-            shares = np.split(coarse, np.cumsum([len(part.solid) for part in parts])[:-1])
+            shares = np.split(coarse, np.cumsum([len(part.nonempty) for part in parts])[:-1])
             parts = prepare_all(
-                draw_together(part.grid, part.solid, share)
+                redistribute_nodes(part.grid, part.nonempty, share)
                 for part, share in zip(parts, shares, strict=True)
             )
             data = join(parts)
@@ -264,8 +264,8 @@ def _plan(
                 multipliers=move_multipliers(nlp, solution.multipliers, old, data.grid),
             )
         else:
-            reach = data.beside(data.slack_beside(profile, margin, short))
-            short, speeding = data.beside(short), data.beside(speeding)
+            reach = data.spread_to_nodes(data.slack_at_neighbours(profile, margin, short))
+            short, speeding = data.spread_to_nodes(short), data.spread_to_nodes(speeding)
             tightening = tightening.by(reach, _OVER * short, _OVER * speeding, _OVER * late)
     else:
         worst = int((short / data.spans).max(axis=0).argmax())

@@ -16,13 +16,13 @@ from ...results.trajectory import Motion
 from ...results.transition import Transition
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
-from .impact_sequence import Chain, Join
+from .impact_sequence import CurveImpact, ImpactSequence
 from .motion import PathMotion
 from .plan import plan_curves
 
 
-def plan_chain(
-    chain: Chain,
+def plan_sequence(
+    chain: ImpactSequence,
     epsilon: float,
     options: PlanOptions,
     duration: float | None = None,
@@ -32,7 +32,7 @@ def plan_chain(
 
     Parameters
     ----------
-    chain : Chain
+    chain : ImpactSequence
     epsilon : float, [N]
     options : PlanOptions
     duration : float, optional, [s]
@@ -41,7 +41,7 @@ def plan_chain(
         Whether to find out why there is no plan.
     """
     phases = [phase.number for phase in chain.phases]
-    return plan_curves(chain.paced, epsilon, options, phases, duration, explained)
+    return plan_curves(chain.continuous_curves, epsilon, options, phases, duration, explained)
 
 
 def add_up(phases: Sequence[Phase], allowed: Sequence[float | None]) -> float | None:
@@ -56,7 +56,7 @@ def combine(goal: Objective, values: Sequence[float]) -> float:
 
 
 def assess(
-    chains: Sequence[Chain],
+    sequences: Sequence[ImpactSequence],
     plans: Sequence[PhasePlan[Motion]],
     epsilon: float,
     options: PlanOptions,
@@ -67,7 +67,7 @@ def assess(
 
     Parameters
     ----------
-    chains : sequence of Chain
+    sequences : sequence of ImpactSequence
         As asked for, with the impacts that are not possible.
     plans : sequence of PhasePlan
         Of all phases of the problem.
@@ -79,12 +79,12 @@ def assess(
         Told in a few words what is being done.
     """
     found = []
-    for chain in chains:
-        found += [_describe(join, 0.0, math.nan) for join in chain.joins if not join.possible]
+    for chain in sequences:
+        found += [_describe(join, 0.0, math.nan) for join in chain.impacts if not join.possible]
         for part in chain.split():
             own = [plans[phase.index] for phase in part.phases]
             value = combine(options.goal, [plan.value for plan in own])
-            for k, join in enumerate(part.joins):
+            for k, join in enumerate(part.impacts):
                 report(f"phase {join.phase.number}: what its impact saves")
                 limit = add_up(part.phases, allowed)
                 try:
@@ -96,7 +96,7 @@ def assess(
     return found
 
 
-def _describe(join: Join, speed: float, saves: float) -> Transition:
+def _describe(join: CurveImpact, speed: float, saves: float) -> Transition:
     contact, impulse = join.impact.least
     possible, until = join.possible, str(join.phase.until)
     return Transition(
@@ -111,7 +111,7 @@ def _speed_at_end(curve: Curve, motion: Motion) -> float:
 
 
 def _plan_stop(
-    chain: Chain, at: int, epsilon: float, options: PlanOptions, duration: float | None
+    chain: ImpactSequence, at: int, epsilon: float, options: PlanOptions, duration: float | None
 ) -> float:
     """Value of a chain whose motion stops before its phase `at`; NaN if it cannot in `duration`."""
     halves = chain.part(0, at), chain.part(at, len(chain.phases))
@@ -119,7 +119,7 @@ def _plan_stop(
     if options.goal is Objective.MARGIN and duration is not None:
         fastest = replace(options, objective=Objective.TIME, duration=None)
         times = [
-            sum(plan.value for plan in plan_chain(half, epsilon, fastest, None, False))
+            sum(plan.value for plan in plan_sequence(half, epsilon, fastest, None, False))
             for half in halves
         ]
         if duration <= sum(times):
@@ -128,6 +128,6 @@ def _plan_stop(
     plans = [
         plan
         for half, limit in zip(halves, limits, strict=True)
-        for plan in plan_chain(half, epsilon, options, limit, False)
+        for plan in plan_sequence(half, epsilon, options, limit, False)
     ]
     return combine(options.goal, [plan.value for plan in plans])

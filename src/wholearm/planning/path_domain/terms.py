@@ -113,9 +113,9 @@ def write_terms(
         link_costs += 1e-4 * interval_times
         short = extra
     else:
-        worth, Rb = ca.SX.sym("worth", 1, m + 1), ca.SX.sym("Rb", n)
-        coefficients += [worth, Rb]
-        short = extra @ worth
+        weights, Rb = ca.SX.sym("worth", 1, m + 1), ca.SX.sym("Rb", n)
+        coefficients += [weights, Rb]
+        short = extra @ weights
         node_costs[0] += extra[0]
         link_costs += 1e-5 * interval_times
     if objective in (Objective.ELASTIC, Objective.RELAX):

@@ -51,7 +51,7 @@ class Limits(NamedTuple):
         """Nothing is raised."""
         formation = stage.formation
         n_c = formation.n_contacts
-        widths = (n_c, formation.n_rolling, len(stage.watched), n_c + 2)
+        widths = (n_c, formation.n_rolling, len(stage.monitored), n_c + 2)
         return Limits(*(np.zeros((stage.intervals, width)) for width in widths))
 
     def raised(self, misses: Limits) -> Limits:
@@ -65,7 +65,7 @@ class Limits(NamedTuple):
         return max(float(t.max(initial=0.0)) / a for t, a in zip(self, allowed, strict=True))
 
 
-class Look(NamedTuple):
+class Check(NamedTuple):
     """A stage at `LOOKS` places of each of its K intervals, one after the other.
 
     Attributes
@@ -83,14 +83,14 @@ class Look(NamedTuple):
     limits: Array
 
 
-def look_between(stage: Stage, motion: StageMotion) -> Look:
+def check_between(stage: Stage, motion: StageMotion) -> Check:
     """Look at a stage between its points."""
     places = stage.guess.places(np.linspace(1e-9, 1 - 1e-9, LOOKS)).ravel()
     samples = motion.evaluate(places * motion.duration)
-    return Look(places, samples, stage.formation.evaluate_limits(samples.z))
+    return Check(places, samples, stage.formation.evaluate_limits(samples.z))
 
 
-def find_misses(stage: Stage, look: Look, epsilon: float, margin: float = 0.0) -> Limits:
+def find_misses(stage: Stage, look: Check, epsilon: float, margin: float = 0.0) -> Limits:
     """By how much limits are missed in each interval, at worst.
 
     Parameters
@@ -102,7 +102,7 @@ def find_misses(stage: Stage, look: Look, epsilon: float, margin: float = 0.0) -
     grip = slip_margins(stage.formation, samples.c_n - epsilon, samples.c_t)
     clear = stage.list_clearances(look.places, after=1 / 2) / 2
     # What a stage is short of where it starts, no bound within it can mend.
-    values = look.limits[:, list(stage.watched)]
+    values = look.limits[:, list(stage.monitored)]
     values = values - np.minimum(values[:1], 0.0)
     tables = (
         samples.c_n - (epsilon + margin),
@@ -122,15 +122,15 @@ def _measure_senses(stage: Stage, samples: Samples) -> Array:
     return senses
 
 
-def watch_missed(stages: Sequence[Stage], looks: Sequence[Look]) -> list[Stage] | None:
+def monitor_missed(stages: Sequence[Stage], looks: Sequence[Check]) -> list[Stage] | None:
     """Stages that also watch the limits which are broken between points; None if none is."""
     changed = []
     for stage, look in zip(stages, looks, strict=True):
         values = look.limits.reshape(stage.intervals, LOOKS, -1)
         deepest = -GRAZE * stage.formation.scene.scales.length
         broken = np.flatnonzero(find_least(values).min(axis=0) < deepest).tolist()
-        changed.append(replace(stage, watched=tuple(sorted({*stage.watched, *broken}))))
-    news = [one.watched != other.watched for one, other in zip(changed, stages, strict=True)]
+        changed.append(replace(stage, monitored=tuple(sorted({*stage.monitored, *broken}))))
+    news = [one.monitored != other.monitored for one, other in zip(changed, stages, strict=True)]
     return changed if any(news) else None
 
 
@@ -160,7 +160,7 @@ def raise_bounds(
         low[own.limits.presses] = floor[:, None]
         cushion = hold_least(formation, epsilon)[formation.n_contacts :]
         low[own.limits.cones] = cushion + np.tile(raised.cone, 2)[:, None]
-        low[own.watches] += raised.gap[:, None]
+        low[own.monitor_rows] += raised.gap[:, None]
         sliding = [i for i in range(formation.n_contacts) if i not in formation.rolling_rows]
         senses = own.points[:, :, own.points.shape[2] - len(sliding) :]
         low[senses] += raised.sense[:, None, sliding]

@@ -43,4 +43,4 @@ def choose_end(search: Search, solution: Solution) -> tuple[Search, Solution]:
 def keep_apart(stage: Stage, contact: Contact | None) -> Stage:
     """The stage, clear of the contact that ends what comes next: that has a way to go."""
     own = [k for k, limit in enumerate(stage.formation.limits) if limit.gains(contact)]
-    return replace(stage, apart=tuple(own), watched=tuple(sorted({*stage.watched, *own})))
+    return replace(stage, apart=tuple(own), monitored=tuple(sorted({*stage.monitored, *own})))

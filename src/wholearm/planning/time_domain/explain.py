@@ -15,7 +15,7 @@ from ...geometry.path_guess import count_freedoms
 from ...problem.definition import Phase, Problem
 from ..advice import Limit, Shortfall, describe_changes, find_changes, rank_shortfalls
 from ..options import Objective
-from .limits import Give
+from .limits import LimitRelaxation
 from .own_units import to_si
 from .search import Search
 from .stage import Stage
@@ -32,7 +32,7 @@ Replan = Callable[[Problem], object]
 """Plans the same phases of another problem; raises if there is no plan."""
 
 
-def ease(search: Search, stages: Sequence[Stage]) -> list[Stage] | None:
+def solve_elastic(search: Search, stages: Sequence[Stage]) -> list[Stage] | None:
     """The motion with the least shortfalls when every limit is soft, or None."""
     solution = search.aiming(Objective.ELASTIC).solve(list(stages), seconds=LONGEST)
     return solution.stages if solution.success else None
@@ -104,7 +104,7 @@ def explain(
         In SI units.
     phases : sequence of Phase
     short : sequence of list of Stage
-        What `ease` found from different guesses, where that is short of something.
+        What `solve_elastic` found from different guesses, where that is short of something.
     status : str
         How the solver ended, in words.
     replan : callable, optional
@@ -121,16 +121,22 @@ def explain(
     def sum_up(stages: list[Stage]) -> float:
         return sum(shortfall.amount for shortfall in list_shortfalls(problem, stages))
 
-    eased = min(short, key=sum_up)
-    shortfalls = list_shortfalls(problem, eased)
+    elastic = min(short, key=sum_up)
+    shortfalls = list_shortfalls(problem, elastic)
     are = "are" if len(phases) > 1 else "is"
     text = f"{what} {are} infeasible: {rank_shortfalls(shortfalls)}"
-    gives = [Give(0.0, (1.0, 0.0)), Give(0.0, (0.0, 1.0)), Give(1.0)]
+    relaxations = [
+        LimitRelaxation(0.0, (1.0, 0.0)),
+        LimitRelaxation(0.0, (0.0, 1.0)),
+        LimitRelaxation(1.0),
+    ]
     units = [scales.torque, scales.torque, scales.force]
     limits, undecided = _list_limits(problem), list[int]()
 
     def find_least(index: int) -> float | None:
-        solution = search.aiming(Objective.RELAX, gives[index]).solve(eased, seconds=LONGEST)
+        solution = search.aiming(Objective.RELAX, relaxations[index]).solve(
+            elastic, seconds=LONGEST
+        )
         # A limit that may be tighter is not what keeps the others from being kept.
         if not solution.success or solution.cost < 0.0:
             undecided.append(index)

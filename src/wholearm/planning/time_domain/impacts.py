@@ -15,7 +15,7 @@ import numpy as np
 from ...common.arrays import Array
 from ...common.errors import InfeasibleError, SolverError
 from ...geometry.cost_to_go import CostToGo
-from ...mechanics.impact import Impact, strike
+from ...mechanics.impact import Impact, compute_impact
 from ...mechanics.metric import measure_speed
 from ...problem.definition import End, Phase, Problem
 from ...results.trajectory import Motion
@@ -31,7 +31,7 @@ AT_REST = 1e-4
 """Speed below which an impact counts as a stop, in the scene's own units."""
 
 
-def plan_struck(
+def plan_with_impacts(
     problem: Problem,
     block: Sequence[Phase],
     z: Array,
@@ -62,7 +62,7 @@ def plan_struck(
         return plan_phases(problem, block, z, options, duration, to_go=to_go)
     stopped = _plan_stops(problem, block, z, options, duration, ends)
     blocked = [
-        k for k in ends if _strike_at_stop(block[k - 1], block[k], stopped[k - 1]).hindrances
+        k for k in ends if _strike_at_stop(block[k - 1], block[k], stopped[k - 1]).violations
     ]
     if len(blocked) == len(ends):
         return stopped
@@ -97,10 +97,10 @@ def _strike_at_stop(phase: Phase, following: Phase, plan: PhasePlan[Motion]) -> 
     z = _last_state(plan)[0]
     v = plan.motion.evaluate(np.array([duration * (1 - 1e-3)])).z_dot[0]
     v = v / measure_speed(phase.formation.scene, v)
-    return strike(phase.formation, following.formation, z, v)
+    return compute_impact(phase.formation, following.formation, z, v)
 
 
-def assess_struck(
+def assess_time_impacts(
     problem: Problem,
     block: Sequence[Phase],
     plans: Sequence[PhasePlan[Motion]],
@@ -129,7 +129,7 @@ def assess_struck(
             found.append(_describe_stop(phase, following, plans[k - 1]))
             continue
         z, v = _last_state(plans[k - 1])
-        impact = strike(phase.formation, following.formation, z, v / speeds[k])
+        impact = compute_impact(phase.formation, following.formation, z, v / speeds[k])
         contact, impulse = impact.least
         ratio = measure_speed(problem.scene, impact.v)
         begin = max((stop for stop in stops if stop < k), default=0)
@@ -147,8 +147,8 @@ def _describe_stop(phase: Phase, following: Phase, plan: PhasePlan[Motion]) -> T
     impact = _strike_at_stop(phase, following, plan)
     contact, impulse = impact.least
     reason = "no plan passes it at speed"
-    if impact.hindrances:
-        reason = impact.hindrances[0].describe(PER_SPEED)
+    if impact.violations:
+        reason = impact.violations[0].describe(PER_SPEED)
     ratio = measure_speed(phase.formation.scene, impact.v)
     until = str(phase.until)
     return Transition(phase.number, until, False, reason, ratio, impulse, contact, 0.0, math.nan)

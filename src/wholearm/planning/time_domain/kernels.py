@@ -82,9 +82,9 @@ def collocation_kernel(name: str, degree: int, freedoms: int) -> Kernel:
 
 
 @lru_cache(maxsize=64)
-def watch_kernel(formation: Formation, watched: tuple[int, ...]) -> Kernel:
+def monitor_kernel(formation: Formation, monitored: tuple[int, ...]) -> Kernel:
     """Limits of a formation, of x = z."""
-    values = ca.vertcat(*(formation.limits[k].value for k in watched))
+    values = ca.vertcat(*(formation.limits[k].value for k in monitored))
     return build_kernel(build_features(formation.scene).z, NOTHING, values)
 
 

@@ -86,8 +86,8 @@ def lay_out(
             points[:, -1, :10] if scheme.ends else starts[1:, None] - n_short - 10 + np.arange(10)
         )
         nodes = starts[:, None] + np.arange(state)
-        strikes = coming is not None and stage.strikes
-        extra = coming.formation.n_constraints if coming is not None and strikes else 0
+        ends_in_impact = coming is not None and stage.ends_in_impact
+        extra = coming.formation.n_constraints if coming is not None and ends_in_impact else 0
         z, v, a, forces = np.split(points, [5, 10, 15], axis=2)
         h = starts[:-1] + state
         tau = h[:, None] + 1 + np.arange(4)

@@ -13,7 +13,7 @@ from .rows import Rows
 from .stage import Stage
 
 
-class Give(NamedTuple):
+class LimitRelaxation(NamedTuple):
     """Which limits give way by a common amount, and how much of it each.
 
     Attributes
@@ -45,13 +45,17 @@ class LimitRows(NamedTuple):
 
 
 def add_limits(
-    rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, give: Give | None
+    rows: Rows,
+    stage: Stage,
+    layout: StageLayout,
+    scheme: Scheme,
+    relaxation: LimitRelaxation | None,
 ) -> LimitRows:
     """Add rows for the limits of a stage.
 
     Parameters
     ----------
-    give : Give, optional
+    relaxation : LimitRelaxation, optional
         What gives way by the unknown that every node has a copy of.
     """
     formation = stage.formation
@@ -59,24 +63,24 @@ def add_limits(
     K, n_c = len(c_n), formation.n_contacts
     soft = layout.short.size > 0
     places = np.zeros(1) if scheme.ends else np.array([0.0, 1.0])
-    if soft or (give is not None and give.c_n):
+    if soft or (relaxation is not None and relaxation.c_n):
         places = np.append(places, scheme.points)
     presses = rows.linear(K, len(places), n_c, high=np.inf)
     for i, row in enumerate(scheme.interpolate(places)):
         for j in np.flatnonzero(np.abs(row) > 1e-12):
-            rows.put(presses[:, i], c_n[:, j], row[j])
+            rows.add_entries(presses[:, i], c_n[:, j], row[j])
     cones = _add_cones(rows, stage, layout)
     if soft:
         short_c, short_tau, short_cone = np.split(layout.short, [n_c, n_c + 2], axis=1)
-        rows.put(presses, short_c[:, None], 1.0)
-        rows.put(cones, np.tile(short_cone, 2)[:, None], 1.0)
+        rows.add_entries(presses, short_c[:, None], 1.0)
+        rows.add_entries(cones, np.tile(short_cone, 2)[:, None], 1.0)
         _soften_torques(rows, stage, layout, short_tau, (1.0, 1.0))
-    elif give is not None:
+    elif relaxation is not None:
         extra = layout.nodes[:-1, MARGIN]
-        if give.c_n:
-            rows.put(presses, extra[:, None, None], give.c_n)
-        if any(give.tau):
-            _soften_torques(rows, stage, layout, np.column_stack([extra, extra]), give.tau)
+        if relaxation.c_n:
+            rows.add_entries(presses, extra[:, None, None], relaxation.c_n)
+        if any(relaxation.tau):
+            _soften_torques(rows, stage, layout, np.column_stack([extra, extra]), relaxation.tau)
     return LimitRows(presses, cones)
 
 
@@ -86,19 +90,21 @@ def _add_cones(rows: Rows, stage: Stage, layout: StageLayout) -> Indices:
     cones = rows.linear(K, d, 2 * R, high=np.inf)
     if R:
         c_n, c_t = layout.forces[..., rolling], layout.forces[..., formation.n_contacts :]
-        rows.put(cones, np.concatenate([c_n, c_n], axis=2), np.tile(formation.friction[rolling], 2))
-        rows.put(cones, np.concatenate([c_t, c_t], axis=2), np.repeat([-1.0, 1.0], R))
+        rows.add_entries(
+            cones, np.concatenate([c_n, c_n], axis=2), np.tile(formation.friction[rolling], 2)
+        )
+        rows.add_entries(cones, np.concatenate([c_t, c_t], axis=2), np.repeat([-1.0, 1.0], R))
     return cones
 
 
 def _soften_torques(
-    rows: Rows, stage: Stage, layout: StageLayout, short: Indices, worth: tuple[float, float]
+    rows: Rows, stage: Stage, layout: StageLayout, short: Indices, weights: tuple[float, float]
 ) -> None:
     """Torque limits that `short`, shape (K, 2), is added to; bounds of tau do for the others."""
     tau = layout.tau.reshape(-1, 2, 2)
-    for joint in np.flatnonzero(worth):
+    for joint in np.flatnonzero(weights):
         limit = stage.formation.scene.torque_limit[joint]
         for sign in (1.0, -1.0):
             own = rows.linear(len(tau), 2, low=-limit, high=np.inf)
-            rows.put(own, tau[..., joint], sign)
-            rows.put(own, short[:, joint, None], worth[joint])
+            rows.add_entries(own, tau[..., joint], sign)
+            rows.add_entries(own, short[:, joint, None], weights[joint])

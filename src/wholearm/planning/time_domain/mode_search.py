@@ -31,7 +31,7 @@ def improve(search: Search, solution: Solution) -> Solution:
             continue
         known.add(signs)
         other = search.solve(moved, most=PATIENCE)
-        search.effort.sequences += 1
+        search.statistics.sequences += 1
         if not other.success:
             continue
         gain = solution.cost - other.cost

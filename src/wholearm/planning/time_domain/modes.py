@@ -85,7 +85,7 @@ def link(stages: Sequence[Stage]) -> list[Stage]:
     for stage, coming in zip(stages, [*stages[1:], None], strict=True):
         turns: tuple[int, ...] = ()
         gained = None
-        if coming is not None and not stage.strikes:
+        if coming is not None and not stage.ends_in_impact:
             turns = find_turns(stage, coming)
             fresh = new_rows(stage.formation, coming.formation)
             gained = coming.formation if fresh else None
@@ -116,9 +116,9 @@ def split(stage: Stage, scheme: Scheme, begin: int, stop: int, mode: Mode) -> li
         if last > first:
             guess = _cut(stage.guess, scheme, first, last)
             opens = stage.opens and not pieces
-            piece = replace(stage, guess=guess, until=None, strikes=False, opens=opens)
+            piece = replace(stage, guess=guess, until=None, ends_in_impact=False, opens=opens)
             pieces.append(in_mode(piece, signs))
-    pieces[-1] = replace(pieces[-1], until=stage.until, strikes=stage.strikes)
+    pieces[-1] = replace(pieces[-1], until=stage.until, ends_in_impact=stage.ends_in_impact)
     return pieces
 
 
@@ -130,9 +130,9 @@ def merge(stages: Sequence[Stage]) -> list[Stage]:
         if (before.phase, mode_of(before)) != (stage.phase, mode_of(stage)):
             merged.append(stage)
             continue
-        watched = tuple(sorted({*before.watched, *stage.watched}))
+        monitored = tuple(sorted({*before.monitored, *stage.monitored}))
         guess = _join(before.guess, stage.guess)
-        merged[-1] = replace(stage, guess=guess, opens=before.opens, watched=watched)
+        merged[-1] = replace(stage, guess=guess, opens=before.opens, monitored=monitored)
     return merged
 
 
@@ -155,7 +155,7 @@ def release_earlier(stages: Sequence[Stage], index: int) -> list[Stage] | None:
     Xi, sigma = stage.directions
     guess = stage.guess._replace(forces=stage.guess.forces[..., rows])
     directions = Directions(Xi[rows], sigma)
-    moved = replace(coming, directions=directions, guess=guess, until=None, strikes=False)
+    moved = replace(coming, directions=directions, guess=guess, until=None, ends_in_impact=False)
     return [*stages[:index], moved, replace(coming, opens=False), *stages[index + 2 :]]
 
 
@@ -172,7 +172,9 @@ def drop(stages: Sequence[Stage], index: int) -> list[Stage] | None:
         # The last one of its phase: the one before ends the phase.
         impulses = stage.guess.impulses
         guess = stages[index - 1].guess._replace(impulses=impulses)
-        before = replace(stages[index - 1], guess=guess, until=stage.until, strikes=stage.strikes)
+        before = replace(
+            stages[index - 1], guess=guess, until=stage.until, ends_in_impact=stage.ends_in_impact
+        )
         left[index - 1] = before
     del left[index]
     return left

@@ -44,13 +44,13 @@ from .kernels import (
     end_kernel,
     goal_kernel,
     impact_kernel,
+    monitor_kernel,
     opening_kernel,
     point_kernel,
     stretch_kernel,
-    watch_kernel,
 )
 from .layout import MARGIN, StageLayout, V, Z, lay_out
-from .limits import Give, LimitRows, add_limits
+from .limits import LimitRelaxation, LimitRows, add_limits
 from .rows import Rows
 from .stage import Stage
 
@@ -80,19 +80,19 @@ class StageRows:
     points : ndarray of int, shape (K, d, m)
         What holds at the points.
     limits : LimitRows
-    watches : ndarray of int, shape (K, d, m)
+    monitor_rows : ndarray of int, shape (K, d, m)
         Limits of the formation.
     """
 
     states: Indices
     points: Indices
     limits: LimitRows
-    watches: Indices
+    monitor_rows: Indices
 
     @property
     def groups(self) -> tuple[Indices, ...]:
         """All of them."""
-        return (self.states, self.points, *self.limits, self.watches)
+        return (self.states, self.points, *self.limits, self.monitor_rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ class TimeNLP:
     layouts : list of StageLayout
     rows : Rows
     rows_of : list of StageRows
-    lasts : int
+    duration_row : int
         Row of the whole duration, if something gives way; otherwise -1.
     soft : ndarray of bool, shape (2,)
         Which torque limits are rows and not bounds.
@@ -122,7 +122,7 @@ class TimeNLP:
     layouts: list[StageLayout]
     rows: Rows
     rows_of: list[StageRows]
-    lasts: int
+    duration_row: int
     soft: NDArray[np.bool_]
     build_time: float
 
@@ -154,7 +154,7 @@ def build_time_nlp(
     objective: Objective,
     time_weight: float,
     max_iter: int,
-    give: Give | None = None,
+    relaxation: LimitRelaxation | None = None,
     seconds: float = LONGEST,
     price: Array | None = None,
 ) -> TimeNLP:
@@ -169,7 +169,7 @@ def build_time_nlp(
         For `effort`.
     max_iter : int
         Most iterations of the solver.
-    give : Give, optional
+    relaxation : LimitRelaxation, optional
         Which limits give way, for `relax`; for `margin` it is every c_n.
     seconds : float, [s]
         Most processor time of the solver.
@@ -178,43 +178,46 @@ def build_time_nlp(
     """
     started = time.perf_counter()
     if objective is Objective.MARGIN:
-        give = Give(-1.0)
-    layouts = lay_out(stages, scheme, give is not None, objective is Objective.ELASTIC)
+        relaxation = LimitRelaxation(-1.0)
+    layouts = lay_out(stages, scheme, relaxation is not None, objective is Objective.ELASTIC)
     rows, cost = Rows(), np.zeros(layouts[-1].stop)
     own = rows.linear(
         10, low=stages[0].guess.nodes[0].ravel(), high=stages[0].guess.nodes[0].ravel()
     )
-    rows.put(own, layouts[0].nodes[0, :10], 1.0)
+    rows.add_entries(own, layouts[0].nodes[0, :10], 1.0)
     weights = {Objective.TIME: 1.0, Objective.EFFORT: time_weight, Objective.ELASTIC: _HURRY}
     rows_of = []
     for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True)):
-        rows_of.append(_add_stage(rows, stage, layout, scheme, stage is stages[-1], give))
+        rows_of.append(_add_stage(rows, stage, layout, scheme, stage is stages[-1], relaxation))
         if k + 1 < len(stages):
             _join(rows, stage, stages[k + 1], layout, layouts[k + 1].nodes[0])
         if objective is Objective.EFFORT:
             columns = np.hstack([layout.tau, layout.h[:, None]])
-            rows.charge(effort_kernel(), columns, np.zeros((len(columns), 0)))
+            rows.add_cost(effort_kernel(), columns, np.zeros((len(columns), 0)))
         if stage.adapts:
             lengths = stage.guess.duration * stage.guess.fractions
             parameters = np.column_stack([np.full(len(lengths), stage.adapts), lengths])
-            rows.charge(stretch_kernel(), layout.h[:, None], parameters)
+            rows.add_cost(stretch_kernel(), layout.h[:, None], parameters)
         cost[layout.h] = weights.get(objective, 0.0)
         cost[layout.short] = 1 / stage.intervals
-    lasts, last, end = -1, stages[-1], layouts[-1].nodes[-1]
-    if give is not None:
+    duration_row, last, end = -1, stages[-1], layouts[-1].nodes[-1]
+    if relaxation is not None:
         cost[end[MARGIN]] = -1.0 if objective is Objective.MARGIN else 1.0
         total = rows.linear(1, high=np.inf)
-        rows.put(total, np.concatenate([layout.h for layout in layouts]), 1.0)
-        lasts = int(total[0])
+        rows.add_entries(total, np.concatenate([layout.h for layout in layouts]), 1.0)
+        duration_row = int(total[0])
     if price is not None:
         cost[end[Z]] = price
     N = tangent_basis(last.formation, last.guess.nodes[-1, 0])
     rest = rows.linear(N.shape[1])
-    rows.put(rest[:, None], end[V], N.T)
+    rows.add_entries(rest[:, None], end[V], N.T)
     built = assemble_nlp(len(cost), rows.triplets, rows.linear_rows, rows.blocks, cost)
-    soft = np.array(give.tau if give else (0.0, 0.0)) + (objective is Objective.ELASTIC) > 0
+    soft = (
+        np.array(relaxation.tau if relaxation else (0.0, 0.0)) + (objective is Objective.ELASTIC)
+        > 0
+    )
     build_time = time.perf_counter() - started
-    return TimeNLP(built, max_iter, seconds, layouts, rows, rows_of, lasts, soft, build_time)
+    return TimeNLP(built, max_iter, seconds, layouts, rows, rows_of, duration_row, soft, build_time)
 
 
 def _add_stage(
@@ -223,15 +226,15 @@ def _add_stage(
     layout: StageLayout,
     scheme: Scheme,
     last: bool,
-    give: Give | None,
+    relaxation: LimitRelaxation | None,
 ) -> StageRows:
     """What holds in a stage."""
     formation = stage.formation
     node, coming = layout.nodes[:-1], layout.nodes[1:]
     chain = rows.linear(*node.shape)
-    rows.put(chain, coming, 1.0)
-    rows.put(chain[:, :MARGIN], layout.ends, -1.0)
-    rows.put(chain[:, MARGIN:], node[:, MARGIN:], -1.0)
+    rows.add_entries(chain, coming, 1.0)
+    rows.add_entries(chain[:, :MARGIN], layout.ends, -1.0)
+    rows.add_entries(chain[:, MARGIN:], node[:, MARGIN:], -1.0)
     states = np.hstack([chain, _collocate(rows, stage, layout, scheme)])
     _share(rows, stage, layout)
     points = _balance(rows, stage, layout, scheme, last)
@@ -239,19 +242,19 @@ def _add_stage(
         first = node[:, Z] if formation.rolling else node[:, :0]
         kernel = end_kernel(formation)
         own = rows.nonlinear(stage.intervals, kernel.outputs)
-        rows.repeat(kernel, np.hstack([layout.ends, first]), own)
+        rows.add_copies(kernel, np.hstack([layout.ends, first]), own)
         states = np.hstack([states, own])
-    watches = _watch(rows, stage, layout, scheme)
+    monitor_rows = _add_monitor_rows(rows, stage, layout, scheme)
     gained = [formation.limits[k].gained for k in stage.released]
     for contact in [c for c in gained if c is not None and stage.opens]:
         columns = [layout.z[0], layout.v[0], layout.a[0]]
         own = rows.nonlinear(scheme.degree, 1, low=stage.opening, high=np.inf)
-        rows.repeat(opening_kernel(formation, contact), np.hstack(columns), own)
+        rows.add_copies(opening_kernel(formation, contact), np.hstack(columns), own)
     goal = goal_kernel(formation, stage.until, stage.turns, stage.gained)
     if goal is not None:
-        rows.repeat(goal, layout.nodes[-1:, :MARGIN], rows.nonlinear(1, goal.outputs))
-    limits = add_limits(rows, stage, layout, scheme, give)
-    return StageRows(states, points, limits, watches)
+        rows.add_copies(goal, layout.nodes[-1:, :MARGIN], rows.nonlinear(1, goal.outputs))
+    limits = add_limits(rows, stage, layout, scheme, relaxation)
+    return StageRows(states, points, limits, monitor_rows)
 
 
 def _collocate(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
@@ -268,7 +271,7 @@ def _collocate(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) ->
         columns += [] if scheme.ends else [layout.ends[:, part]]
         columns += [rate.reshape(K, -1), layout.h[:, None]]
         own = rows.nonlinear(K, kernel.outputs)
-        rows.repeat(kernel, np.hstack(columns), own, parameters)
+        rows.add_copies(kernel, np.hstack(columns), own, parameters)
         collected.append(own)
     return np.hstack(collected)
 
@@ -280,13 +283,13 @@ def _share(rows: Rows, stage: Stage, layout: StageLayout) -> None:
         own = rows.linear(len(before))
         # In shares of an even interval, rows are of the size of others.
         shares = stage.intervals * stage.guess.fractions
-        rows.put(own, before, shares[1:])
-        rows.put(own, after, -shares[:-1])
+        rows.add_entries(own, before, shares[1:])
+        rows.add_entries(own, after, -shares[:-1])
         return
     for shorter, longer in ((before, after), (after, before)):
         own = rows.linear(len(before), high=np.inf)
-        rows.put(own, shorter, 1.0)
-        rows.put(own, longer, -EVEN)
+        rows.add_entries(own, shorter, 1.0)
+        rows.add_entries(own, longer, -EVEN)
 
 
 def _balance(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool) -> Indices:
@@ -314,7 +317,7 @@ def _balance(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last
     own = rows.nonlinear(*shape, kernel.outputs, low=low, high=high)
     count = shape[0] * shape[1]
     table = np.concatenate(columns, axis=2).reshape(count, -1)
-    rows.repeat(kernel, table, own.reshape(count, -1), parameters.reshape(count, -1))
+    rows.add_copies(kernel, table, own.reshape(count, -1), parameters.reshape(count, -1))
     return own
 
 
@@ -337,36 +340,40 @@ def find_still(stage: Stage, last: bool) -> set[int]:
     return {*stage.turns, *rolls}
 
 
-def _watch(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
+def _add_monitor_rows(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
     """Keep limits positive, but for the one that is reached at the end, shape (K, d, m)."""
     formation, (K, d) = stage.formation, layout.z.shape[:2]
-    if not stage.watched:
+    if not stage.monitored:
         return np.zeros((K, d, 0), dtype=np.int64)
     places = stage.guess.places(scheme.points).ravel()
     low = stage.list_clearances(places, after=1 / 3).reshape(K, d, -1)
     goal = None if stage.until is None else stage.until.contact
-    reached = [formation.limits[k].gains(goal) for k in stage.watched]
+    reached = [formation.limits[k].gains(goal) for k in stage.monitored]
     if scheme.ends:
         low[-1, -1, reached] = -np.inf
-    own = rows.nonlinear(K, d, len(stage.watched), low=low, high=np.inf)
-    kernel = watch_kernel(formation, stage.watched)
-    rows.repeat(kernel, layout.z.reshape(K * d, 5), own.reshape(K * d, -1))
+    own = rows.nonlinear(K, d, len(stage.monitored), low=low, high=np.inf)
+    kernel = monitor_kernel(formation, stage.monitored)
+    rows.add_copies(kernel, layout.z.reshape(K * d, 5), own.reshape(K * d, -1))
     return own
 
 
 def _join(rows: Rows, stage: Stage, coming: Stage, layout: StageLayout, first: Indices) -> None:
     """Position and velocity go on from one stage to the next; an impact changes the velocity."""
     last = layout.nodes[-1]
-    same = np.setdiff1d(np.arange(len(first)), np.arange(5, 10)) if stage.strikes else slice(None)
+    same = (
+        np.setdiff1d(np.arange(len(first)), np.arange(5, 10))
+        if stage.ends_in_impact
+        else slice(None)
+    )
     own = rows.linear(len(first[same]))
-    rows.put(own, first[same], 1.0)
-    rows.put(own, last[same], -1.0)
-    if stage.strikes:
+    rows.add_entries(own, first[same], 1.0)
+    rows.add_entries(own, last[same], -1.0)
+    if stage.ends_in_impact:
         kernel = impact_kernel(stage.formation, coming.formation)
         equal = np.arange(kernel.outputs) < 5 + coming.formation.n_constraints
         own = rows.nonlinear(1, kernel.outputs, high=np.where(equal, 0.0, np.inf))
         columns = [first[V], last[V], last[Z], layout.impulses]
-        rows.repeat(kernel, np.concatenate(columns)[None], own, coming.directions.Xi[None])
+        rows.add_copies(kernel, np.concatenate(columns)[None], own, coming.directions.Xi[None])
 
 
 def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tuple[Array, Array]:
@@ -390,6 +397,6 @@ def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tup
             slow = np.where(ends, -fastest[joint], rate)
             low[own] = np.where(sigma > 0, slow, -fastest[joint])
             high[own] = np.where(sigma > 0, fastest[joint], -slow)
-        if coming is not None and stage.strikes:
+        if coming is not None and stage.ends_in_impact:
             low[layout.impulses[: coming.formation.n_contacts]] = 0.0
     return low, high

@@ -29,10 +29,10 @@ from .mode_search import adapt, improve
 from .motion import TimeMotion, make_motions
 from .nlp import LONGEST
 from .own_units import to_si, unit_of
-from .refinement import halve
+from .refinement import bisect_intervals
 from .search import Search, Solution
 from .stage import Stage
-from .staging import outline_stages
+from .staging import guess_stages
 from .way_guess import PacedWay, list_ways
 
 FIRST = 10
@@ -98,7 +98,7 @@ def plan_phases(
         times: int, pace: float, onwards: bool = False, way: PacedWay | None = None
     ) -> list[Stage]:
         count = math.ceil(wanted / 2**times)
-        stages = outline_stages(problem, phases, z, search.scheme, count, pace, onwards, way=way)
+        stages = guess_stages(problem, phases, z, search.scheme, count, pace, onwards, way=way)
         opening, clearance = options.opening, options.clearance
         stages = [replace(stage, opening=opening, clearance=clearance) for stage in stages]
         if to_go is not None:
@@ -156,7 +156,7 @@ def _try_guesses(
     times : (float, float), [s]
         Most processor time of the first run from a guess, and when to begin no other one.
     """
-    from .explain import ease, list_shortfalls
+    from .explain import list_shortfalls, solve_elastic
 
     attempt, stop = times
     # What is far from keeping limits along any way shows at once what is short.
@@ -167,20 +167,22 @@ def _try_guesses(
         tried[name] = None
         if guess is not first and not far:
             solution = _solve(search, guess, halvings, attempt)
-        eased = None
+        elastic = None
         if not solution.success:
             # What coarse intervals are not short of, finer ones may be.
-            eased = ease(search, _halve(search, solution.stages) if solution.is_lost else guess)
-        if not solution.is_lost and eased is not None and not list_shortfalls(problem, eased):
-            solution = _solve(search, eased, halvings, attempt)
-            eased = None if solution.success else ease(search, _halve(search, eased))
-        if eased is not None and list_shortfalls(problem, eased):
-            short.append(eased)
+            elastic = solve_elastic(
+                search, _halve(search, solution.stages) if solution.is_lost else guess
+            )
+        if not solution.is_lost and elastic is not None and not list_shortfalls(problem, elastic):
+            solution = _solve(search, elastic, halvings, attempt)
+            elastic = None if solution.success else solve_elastic(search, _halve(search, elastic))
+        if elastic is not None and list_shortfalls(problem, elastic):
+            short.append(elastic)
         late = time.thread_time() > stop
         if solution.success or late or len(short) == (1 if far else CONVINCING):
             break
-    if not solution.success and not short and (eased := ease(search, first)) is not None:
-        short = [eased] if list_shortfalls(problem, eased) else []
+    if not solution.success and not short and (elastic := solve_elastic(search, first)) is not None:
+        short = [elastic] if list_shortfalls(problem, elastic) else []
     return _Found(solution, short, list(tried))
 
 
@@ -241,14 +243,14 @@ def _solve(
 def _halve(search: Search, stages: list[Stage]) -> list[Stage]:
     """Stages with all intervals halved."""
     every = [np.ones(stage.intervals, dtype=int) for stage in stages]
-    return halve(stages, search.scheme, every)
+    return bisect_intervals(stages, search.scheme, every)
 
 
 def _summarise(
     problem: Problem, search: Search, phases: Sequence[Phase], solution: Solution
 ) -> list[PhasePlan[TimeMotion]]:
     """The plan of each phase; what solving has cost counts for the first."""
-    plans, effort = [], search.effort
+    plans, statistics = [], search.statistics
     unit, margin = unit_of(search.goal, problem.scene.scales), solution.margin
     weight = search.options.time_weight * problem.scene.scales.torque**2
     solved = [to_si(stage, problem) for stage in solution.stages]
@@ -264,10 +266,10 @@ def _summarise(
         }[search.goal]
         plans.append(PhasePlan(motion, torque, value, 0, 0, 0.0, 0.0))
     plans[0] = plans[0]._replace(
-        iterations=effort.iterations,
-        solves=effort.solves,
-        build_time=effort.build_time,
-        solve_time=effort.solve_time,
-        sequences=effort.sequences,
+        iterations=statistics.iterations,
+        solves=statistics.solves,
+        build_time=statistics.build_time,
+        solve_time=statistics.solve_time,
+        sequences=statistics.sequences,
     )
     return plans

@@ -30,7 +30,7 @@ def adopt(stages: Sequence[Stage], points: Sequence[StagePoints]) -> list[Stage]
     return [replace(stage, guess=part) for stage, part in zip(stages, points, strict=True)]
 
 
-def halve(
+def bisect_intervals(
     stages: Sequence[Stage], scheme: Scheme, times: Sequence[NDArray[np.int64]]
 ) -> list[Stage]:
     """Stages with intervals halved so many times, each of shape (K,), which keep their shares."""
@@ -65,13 +65,13 @@ def settle(stages: Sequence[Stage]) -> list[Stage]:
     return [replace(stage, adapts=0.0) if stage.adapts else stage for stage in stages]
 
 
-def watch_broken(stages: Sequence[Stage]) -> list[Stage] | None:
+def monitor_violated(stages: Sequence[Stage]) -> list[Stage] | None:
     """Stages that also watch the limits which their guesses break, or None if they break none."""
     changed = []
     for stage in stages:
         values = stage.formation.evaluate_limits(stage.guess.z.reshape(-1, 5))
         rho = stage.formation.scene.polygon.gyration_radius
         broken = np.flatnonzero(values.min(axis=0) < -_BROKEN * rho).tolist()
-        changed.append(replace(stage, watched=tuple(sorted({*stage.watched, *broken}))))
-    watched = [stage.watched for stage in stages]
-    return changed if [stage.watched for stage in changed] != watched else None
+        changed.append(replace(stage, monitored=tuple(sorted({*stage.monitored, *broken}))))
+    monitored = [stage.monitored for stage in stages]
+    return changed if [stage.monitored for stage in changed] != monitored else None

@@ -174,7 +174,7 @@ class _Programme:
         still = np.hstack([rates[signs == 0], np.zeros((int((signs == 0).sum()), self.size - f))])
         self.equal = np.vstack([self.equal, still])
         self.equal_to = np.append(self.equal_to, np.zeros(len(still)))
-        rows, most, gives = [], [], []
+        rows, most, relaxations = [], [], []
         for k, contact in enumerate(sticks.tolist()):
             for side in (1.0, -1.0):
                 row = np.zeros(self.size)
@@ -182,7 +182,7 @@ class _Programme:
                 row[f + contact] = -mu[contact]
                 rows.append(row)
                 most.append(-mu[contact] * epsilon)
-                gives.append(mu[contact])
+                relaxations.append(mu[contact])
         moving = signs != 0
         self.speed = np.zeros(self.size)
         self.speed[:f] = (signs[moving, None] * rates[moving]).sum(axis=0)
@@ -194,7 +194,7 @@ class _Programme:
             most.append(0.0)
         self.rows, self.most = np.array(rows), np.array(most)
         # What epsilon adds to each row.
-        self.gives = np.append(gives, np.zeros(len(self.rows) - len(gives)))
+        self.relaxations = np.append(relaxations, np.zeros(len(self.rows) - len(relaxations)))
         free: tuple[float | None, float | None] = (None, None)
         limits = [free] * f + [(epsilon, None)] * n_c + [free] * len(sticks)
         limits += [(-float(scene.dry[3 + k]), float(scene.dry[3 + k])) for k in held]
@@ -228,8 +228,8 @@ class _Programme:
         """The least torque limit of a finger, or the largest epsilon, with which things move."""
         if index == EPSILON:
             own = slice(self.f, self.f + self.n_c)
-            wide = np.column_stack([self.rows, self.gives])
-            most = self.most + self.gives * self.epsilon
+            wide = np.column_stack([self.rows, self.relaxations])
+            most = self.most + self.relaxations * self.epsilon
             answer = self._minimise(-1.0, wide, most, self._press(1.0, 0.0), own)
         else:
             at = self.size - 2 + index

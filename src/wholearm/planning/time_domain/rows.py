@@ -35,19 +35,19 @@ class Rows:
         self._linear.append(own.ravel())
         return own
 
-    def put(self, rows: Any, columns: Any, values: Any) -> None:
+    def add_entries(self, rows: Any, columns: Any, values: Any) -> None:
         """Add entries to linear rows; the three are broadcast against one another."""
         parts = np.broadcast_arrays(rows, columns, np.asarray(values, dtype=float))
         self._entries.append((parts[0].ravel(), parts[1].ravel(), parts[2].ravel()))
 
-    def repeat(
+    def add_copies(
         self, kernel: Kernel, columns: Indices, rows: Indices, parameters: Array | None = None
     ) -> None:
         """Say which rows are copies of a kernel, one per row of `columns`."""
         given = np.zeros((len(columns), 0)) if parameters is None else parameters
         self.blocks.append(Block(kernel, columns, rows, given))
 
-    def charge(self, kernel: Kernel, columns: Indices, parameters: Array) -> None:
+    def add_cost(self, kernel: Kernel, columns: Indices, parameters: Array) -> None:
         """Add copies of a kernel to the cost."""
         nothing = np.zeros((len(columns), 0), dtype=np.int64)
         self.blocks.append(Block(kernel, columns, nothing, parameters))

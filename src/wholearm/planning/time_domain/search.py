@@ -12,14 +12,14 @@ from ...common.arrays import Array
 from ...geometry.cost_to_go import CostToGo
 from ...problem.definition import Problem
 from ..options import Objective, PlanOptions
-from .between import Limits, find_misses, look_between, raise_bounds, watch_missed
+from .between import Limits, check_between, find_misses, monitor_missed, raise_bounds
 from .collocation import Scheme, make_scheme
 from .layout import pack, unpack
-from .limits import Give
+from .limits import LimitRelaxation
 from .motion import make_motions
 from .nlp import LONGEST, TimeNLP, bound_unknowns, build_time_nlp
 from .own_units import in_own_units, scale_options, unit_lengths, unit_of
-from .refinement import adopt, count_halvings, halve, settle, watch_broken
+from .refinement import adopt, bisect_intervals, count_halvings, monitor_violated, settle
 from .stage import Stage
 from .warm_start import FIRST_SIZE, Multipliers, carry_multipliers, first_multipliers
 
@@ -40,7 +40,7 @@ _COARSE = 0.1
 
 
 @dataclass
-class Effort:
+class SolverStatistics:
     """What solving has cost so far; `sequences` counts the sequences of modes that were tried."""
 
     iterations: int = 0
@@ -95,9 +95,9 @@ class Solution(NamedTuple):
         return not self.success and not self.status.startswith("Ipopt")
 
     @property
-    def watched(self) -> list[tuple[int, ...]]:
+    def monitored(self) -> list[tuple[int, ...]]:
         """Limits that each stage watches."""
-        return [stage.watched for stage in self.stages]
+        return [stage.monitored for stage in self.stages]
 
 
 @dataclass
@@ -114,12 +114,12 @@ class Search:
     duration : float or None
         Longest duration, for the objective `margin`.
     goal : Objective
-    give : Give or None
+    relaxation : LimitRelaxation or None
         Which limits give way, for the objective `relax`.
     to_go : callable or None
         What follows costs from where stages end, and its gradient, each by the objective.
     price : Price or None
-    effort : Effort
+    statistics : SolverStatistics
     """
 
     problem: Problem
@@ -127,10 +127,10 @@ class Search:
     scheme: Scheme
     duration: float | None
     goal: Objective
-    give: Give | None = None
+    relaxation: LimitRelaxation | None = None
     to_go: Callable[[Array], tuple[float, Array]] | None = None
     price: Price | None = None
-    effort: Effort = field(default_factory=Effort)
+    statistics: SolverStatistics = field(default_factory=SolverStatistics)
 
     @staticmethod
     def of(
@@ -157,9 +157,11 @@ class Search:
             to_go=expand if to_go else None,
         )
 
-    def aiming(self, goal: Objective, give: Give | None = None) -> Search:
+    def aiming(self, goal: Objective, relaxation: LimitRelaxation | None = None) -> Search:
         """The same search with another objective."""
-        return replace(self, goal=goal, give=give, duration=None, to_go=None, price=None)
+        return replace(
+            self, goal=goal, relaxation=relaxation, duration=None, to_go=None, price=None
+        )
 
     def charge(self, z: Array) -> float:
         """What it costs to end at `z`, shape (5,)."""
@@ -184,26 +186,26 @@ class Search:
         while True:
             nlp = self.build(stages, most, seconds)
             multipliers = None
-            if before is not None and before.watched == [stage.watched for stage in stages]:
+            if before is not None and before.monitored == [stage.monitored for stage in stages]:
                 multipliers = carry_multipliers(
                     before.multipliers, before.nlp, nlp, before.stages, stages
                 )
             plain = [Limits.none(stage) for stage in stages]
             margin = before.margin if before else 0.0
             solution = self.run(nlp, stages, plain, multipliers, margin)
-            watching = watch_broken(solution.stages) if solution.success else None
-            if watching is None:
+            monitoring = monitor_violated(solution.stages) if solution.success else None
+            if monitoring is None:
                 return solution
-            stages = watching
+            stages = monitoring
 
     def build(self, stages: Sequence[Stage], most: int = 150, seconds: float = LONGEST) -> TimeNLP:
         """Build the NLP."""
         weight, limit = self.options.time_weight, _ITERATIONS.get(self.goal, most)
         gradient = self.price.gradient if self.price else None
         nlp = build_time_nlp(
-            stages, self.scheme, self.goal, weight, limit, self.give, seconds, gradient
+            stages, self.scheme, self.goal, weight, limit, self.relaxation, seconds, gradient
         )
-        self.effort.build_time += nlp.build_time
+        self.statistics.build_time += nlp.build_time
         return nlp
 
     def run(
@@ -217,8 +219,8 @@ class Search:
         """Run the solver once."""
         low, high = bound_unknowns(nlp, stages, self.scheme)
         low_g, high_g = raise_bounds(nlp, stages, limits, self.problem.epsilon, (low, high))
-        if self.duration is not None and nlp.lasts >= 0:
-            high_g[nlp.lasts] = self.duration
+        if self.duration is not None and nlp.duration_row >= 0:
+            high_g[nlp.duration_row] = self.duration
         solver = nlp.first_solver if multipliers is None else nlp.solver
         result = solver(
             x0=pack([stage.guess for stage in stages], nlp.layouts, margin),
@@ -229,9 +231,9 @@ class Search:
             **(multipliers or first_multipliers((low, high), (low_g, high_g), FIRST_SIZE)),
         )
         stats = solver.stats()
-        self.effort.iterations += stats["iter_count"]
-        self.effort.solves += 1
-        self.effort.solve_time += stats["t_wall_total"]
+        self.statistics.iterations += stats["iter_count"]
+        self.statistics.solves += 1
+        self.statistics.solve_time += stats["t_wall_total"]
         x, cost = result["x"].full()[:, 0], float(result["f"])
         cost -= float(self.price.gradient @ self.price.origin) if self.price else 0.0
         return Solution(
@@ -265,12 +267,12 @@ class Search:
         for _ in range(ROUNDS):
             motions = make_motions(solution.stages, self.scheme)
             looks = [
-                look_between(stage, motion)
+                check_between(stage, motion)
                 for stage, motion in zip(solution.stages, motions, strict=True)
             ]
-            watching = watch_missed(solution.stages, looks)
-            if watching is not None:
-                solution = self.solve(watching, solution)
+            monitoring = monitor_missed(solution.stages, looks)
+            if monitoring is not None:
+                solution = self.solve(monitoring, solution)
                 if not solution.success:
                     return solution
                 limits = [Limits.none(stage) for stage in solution.stages]
@@ -290,7 +292,7 @@ class Search:
             if few and refined < REFINEMENTS and any(mine.any() for mine in times):
                 refined += 1
                 finer = self.solve(
-                    halve(solution.stages, self.scheme, times), solution, most=_PATIENCE
+                    bisect_intervals(solution.stages, self.scheme, times), solution, most=_PATIENCE
                 )
                 if finer.success:
                     if finer.cost - first > _COARSE * abs(first):

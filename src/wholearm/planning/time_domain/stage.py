@@ -74,9 +74,9 @@ class Stage:
         Rows of (contacts, joints) whose rate is zero at the end.
     gained : Formation or None
         The next stage's formation where that has a constraint more, which is gained softly.
-    strikes : bool
+    ends_in_impact : bool
         Whether an impact leads to the next stage.
-    watched : tuple of int
+    monitored : tuple of int
         Limits of the formation that are kept positive at every point.
     released : tuple of int
         Limits of the contacts that were let go where the phase began.
@@ -99,8 +99,8 @@ class Stage:
     until: Until | None = None
     turns: tuple[int, ...] = ()
     gained: Formation | None = None
-    strikes: bool = False
-    watched: tuple[int, ...] = ()
+    ends_in_impact: bool = False
+    monitored: tuple[int, ...] = ()
     released: tuple[int, ...] = ()
     opens: bool = False
     opening: float = OPENING
@@ -119,7 +119,7 @@ class Stage:
         From the share `after` of the stage on, but for contacts that were let go before it.
         """
         late = (places > after)[:, None]
-        released, apart = (np.isin(self.watched, own) for own in (self.released, self.apart))
+        released, apart = (np.isin(self.monitored, own) for own in (self.released, self.apart))
         return np.asarray(self.clearance * (released & (late | (not self.opens)) | apart & late))
 
     def measure_senses(self, z: Array, v: Array) -> Array:

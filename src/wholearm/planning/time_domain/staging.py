@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from ...common.arrays import Array
-from ...geometry.path_guess import RELEASE_AT, Outline, outline_onwards, outline_phase
+from ...geometry.path_guess import RELEASE_AT, PathGuess, guess_onwards, guess_phase
 from ...mechanics.dynamics import Directions, force_rows
 from ...problem.definition import End, Phase, Problem
 from .collocation import Scheme
@@ -27,7 +27,7 @@ _TOUCHES = 1e-5
 """Gap over the radius of gyration below which a contact touches that a phase lets go."""
 
 
-def outline_stages(
+def guess_stages(
     problem: Problem,
     phases: Sequence[Phase],
     z: Array,
@@ -45,9 +45,9 @@ def outline_stages(
     A phase that ends by a release is guessed to do so at the share `release_at` of its curve.
     A single phase may be guessed to go a way of its own instead, at the pace of that.
     """
-    parts: list[tuple[Phase, Outline, bool]] = []
+    parts: list[tuple[Phase, PathGuess, bool]] = []
     for phase in phases:
-        outlines = list(way.stretches if way else outline_phase(problem, phase, z, release_at))
+        outlines = list(way.stretches if way else guess_phase(problem, phase, z, release_at))
         if parts and parts[-1][0].end is End.SMOOTH:
             outlines = [*_turn_first(outlines[0], parts[-1][1]), *outlines[1:]]
             if onwards:
@@ -84,10 +84,10 @@ def outline_stages(
     for k, (phase, outline, last) in enumerate(parts):
         count = max(LEAST_INTERVALS, round(lengths[k] / longest[phase.index] * intervals))
         following = own.phases[phase.index + 1] if phase is not phases[-1] and last else None
-        strikes = following is not None and phase.end is End.IMPACT
+        ends_in_impact = following is not None and phase.end is End.IMPACT
         clocks, spans = (clock[k], clock[k + 1]), (ends[k], ends[k + 1])
         guess = _guess(outline, scheme, count, clocks, spans, total, own_pace)
-        if strikes and following is not None:
+        if ends_in_impact and following is not None:
             guess = guess._replace(impulses=np.zeros(following.formation.n_constraints))
         opens = k > 0 and parts[k - 1][0] is not phase
         if opens:
@@ -100,8 +100,8 @@ def outline_stages(
                 outline.directions,
                 guess,
                 until=phase.until if last and not phase.until.is_release else None,
-                strikes=strikes,
-                watched=tuple(sorted({*_choose_watched(phase, outline), *released})),
+                ends_in_impact=ends_in_impact,
+                monitored=tuple(sorted({*_choose_watched(phase, outline), *released})),
                 released=released,
                 opens=opens,
             )
@@ -110,7 +110,7 @@ def outline_stages(
 
 
 def _guess(
-    outline: Outline,
+    outline: PathGuess,
     scheme: Scheme,
     count: int,
     clock: tuple[float, float],
@@ -178,7 +178,7 @@ def _run_at(pace: Pace, passed: Array) -> tuple[Array, Array, Array]:
     return place, rate, gain
 
 
-def _balance(outline: Outline, z: Array, v: Array, a: Array) -> tuple[Array, Array]:
+def _balance(outline: PathGuess, z: Array, v: Array, a: Array) -> tuple[Array, Array]:
     """Forces of a motion, shape (K, d, n_c + R), and torques, shape (K, 2, 2), within limits.
 
     The object's equations of motion leave forces of which the ones nearest to a light press are
@@ -205,13 +205,13 @@ def _balance(outline: Outline, z: Array, v: Array, a: Array) -> tuple[Array, Arr
     return c.reshape(count, degree, -1), np.stack([tau[:, 0], tau[:, -1]], axis=1)
 
 
-def _go_straight(phase: Phase, nearest: list[Outline], before: Outline) -> list[Outline]:
+def _go_straight(phase: Phase, nearest: list[PathGuess], before: PathGuess) -> list[PathGuess]:
     """Of outlines to the nearest end and to ends ahead, those with the fewest reversals."""
-    ahead = [_turn_first(other, before) for other in outline_onwards(phase, before)]
+    ahead = [_turn_first(other, before) for other in guess_onwards(phase, before)]
     return min([nearest, *ahead], key=lambda way: (len(way), sum(part.length for part in way)))
 
 
-def _turn_first(outline: Outline, before: Outline) -> list[Outline]:
+def _turn_first(outline: PathGuess, before: PathGuess) -> list[PathGuess]:
     """Split an outline so that it starts with the directions of the one that it goes on from.
 
     Velocities are continuous, so what slides the other way in the outline has to turn on the way.
@@ -241,7 +241,7 @@ def _turn_first(outline: Outline, before: Outline) -> list[Outline]:
     return pieces
 
 
-def _choose_watched(phase: Phase, outline: Outline) -> tuple[int, ...]:
+def _choose_watched(phase: Phase, outline: PathGuess) -> tuple[int, ...]:
     """Limits that are near zero along the outline, and the phase's own end."""
     values = outline.formation.evaluate_limits(outline.z)
     near = values.min(axis=0) < _NEAR

@@ -16,7 +16,7 @@ import numpy as np
 from ...common.arrays import Array
 from ...geometry.curve import tangent_basis
 from ...geometry.explore import close, is_inside
-from ...geometry.path_guess import Outline, connect, list_ends, outline_phase
+from ...geometry.path_guess import PathGuess, connect, guess_phase, list_ends
 from ...mechanics.dynamics import Directions
 from ...mechanics.metric import metric_weights
 from ...problem.definition import Phase, Problem
@@ -44,7 +44,7 @@ _SHORTEST = 2
 AMPLE = 1e-3
 """Margin from which a motion surely keeps its limits."""
 
-Way = list[Outline]
+Way = list[PathGuess]
 
 
 class PacedWay(NamedTuple):
@@ -87,7 +87,7 @@ def list_ways(problem: Problem, phase: Phase, z: Array, most: int) -> list[Paced
     formation = phase.formation
     if phase.until.is_release or tangent_basis(formation, z).shape[1] != 2:
         return []
-    (nearest,) = outline_phase(problem, phase, z)
+    (nearest,) = guess_phase(problem, phase, z)
     found: list[_Bent] = []
 
     def look(goal: Array, bends: tuple[float, float]) -> None:
@@ -163,7 +163,7 @@ def list_goals(phase: Phase, z: Array, nearest: Array) -> list[Array]:
     return goals
 
 
-def split_way(outline: Outline) -> Way:
+def split_way(outline: PathGuess) -> Way:
     """A way as stretches without a reversal."""
     z, formation = outline.z, outline.formation
     steps, middles = np.diff(z, axis=0), (z[1:] + z[:-1]) / 2
@@ -179,12 +179,12 @@ def split_way(outline: Outline) -> Way:
                 cuts.append(k)
     if len(signs) - cuts[-1] < _SHORTEST and len(cuts) > 1:
         signs[cuts.pop() :] = signs[cuts[-1]]
-    n_c, way = formation.n_contacts, list[Outline]()
+    n_c, way = formation.n_contacts, list[PathGuess]()
     for begin, stop in pairwise([*cuts, len(signs)]):
         own = signs[begin]
         turns: tuple[int, ...] = ()
         if stop < len(signs):
             turns = tuple(np.flatnonzero(own != signs[stop]).tolist())
         directions = Directions(own[:n_c].copy(), own[n_c:].copy())
-        way.append(Outline(formation, z[begin : stop + 1], directions, turns))
+        way.append(PathGuess(formation, z[begin : stop + 1], directions, turns))
     return way

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...common.arrays import Array
-from ...geometry.path_guess import Outline
+from ...geometry.path_guess import PathGuess
 from ...mechanics.dynamics import force_rows
 from ...mechanics.metric import metric_weights
 
@@ -51,7 +51,7 @@ class Pace(NamedTuple):
 class WayForces:
     """The linear programme of one way: x = (b at nodes, c in intervals, margin), over scales."""
 
-    def __init__(self, way: Sequence[Outline], epsilon: float) -> None:
+    def __init__(self, way: Sequence[PathGuess], epsilon: float) -> None:
         formation, scene = way[0].formation, way[0].formation.scene
         z = np.concatenate([way[0].z[:1], *(part.z[1:] for part in way)])
         dz = np.diff(z, axis=0)
