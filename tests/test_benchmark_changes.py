@@ -5,21 +5,21 @@ from dataclasses import replace
 import pytest
 
 from shipped import HEPTAGON
-from wholearm.benchmark import changes as benchstress
+from wholearm.benchmark import changes
 from wholearm.benchmark.changes import measure_stress
 from wholearm.geometry.path_guess import load
 
 
 def test_small_changes_leave_a_plan(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(benchstress, "TRIALS", 2)
-    monkeypatch.setattr(benchstress, "SPREADS", (0.05,))
+    monkeypatch.setattr(changes, "TRIALS", 2)
+    monkeypatch.setattr(changes, "SPREADS", (0.05,))
     (row,) = measure_stress(load(str(HEPTAGON)))
     assert row.error == 0.0 and row.note == "2 of 2 planned and verified"
 
 
 def test_what_has_no_plan_is_counted_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(benchstress, "TRIALS", 1)
-    monkeypatch.setattr(benchstress, "SPREADS", (0.05,))
+    monkeypatch.setattr(changes, "TRIALS", 1)
+    monkeypatch.setattr(changes, "SPREADS", (0.05,))
     (row,) = measure_stress(load(str(HEPTAGON)).with_(epsilon=50.0))
     assert row.error == 1.0 and row.note.startswith("0 of 1 planned and verified; time: phase ")
 

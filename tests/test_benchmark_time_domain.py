@@ -8,7 +8,7 @@ import pytest
 
 from thrown import shove
 from timed import flip
-from wholearm.benchmark import time_domain as benchtime
+from wholearm.benchmark import time_domain
 from wholearm.benchmark.report import Row, format_markdown
 from wholearm.benchmark.time_domain import measure_blocks, measure_order, measure_transcriptions
 from wholearm.planning.plan import solve
@@ -17,8 +17,8 @@ ORDERS = {("radau", 3): 5, ("legendre", 3): 6}
 
 
 def test_collocation_converges_with_the_order_of_theory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(benchtime, "SCHEMES", tuple(ORDERS))
-    monkeypatch.setattr(benchtime, "ORDER_INTERVALS", (8, 16, 32))
+    monkeypatch.setattr(time_domain, "SCHEMES", tuple(ORDERS))
+    monkeypatch.setattr(time_domain, "ORDER_INTERVALS", (8, 16, 32))
     rows = measure_order(flip())
     assert [row.study for row in rows] == 6 * ["time domain: order"]
     assert [row.method for row in rows] == 3 * ["radau 3"] + 3 * ["legendre 3"]
@@ -35,9 +35,9 @@ def test_collocation_converges_with_the_order_of_theory(monkeypatch: pytest.Monk
 def test_replays_that_end_early_have_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """Errors that are not known leave no order, neither theirs nor the next one's."""
     errors = iter([np.nan, 1e-3, 1e-4])
-    monkeypatch.setattr(benchtime, "SCHEMES", (("radau", 2),))
-    monkeypatch.setattr(benchtime, "ORDER_INTERVALS", (4, 8, 16))
-    monkeypatch.setattr(benchtime, "_find_end_error", lambda *_: next(errors))
+    monkeypatch.setattr(time_domain, "SCHEMES", (("radau", 2),))
+    monkeypatch.setattr(time_domain, "ORDER_INTERVALS", (4, 8, 16))
+    monkeypatch.setattr(time_domain, "_find_end_error", lambda *_: next(errors))
     rows = measure_order(flip())
     assert [row.error for row in rows] == [None, 1e-3, 1e-4]
     assert [row.note for row in rows] == [
@@ -48,7 +48,7 @@ def test_replays_that_end_early_have_no_error(monkeypatch: pytest.MonkeyPatch) -
 def test_least_times_are_compared_with_those_along_the_curve(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(benchtime, "TIME_INTERVALS", (4, 16))
+    monkeypatch.setattr(time_domain, "TIME_INTERVALS", (4, 16))
     rows = measure_transcriptions(flip())
     assert [(row.method, row.setting) for row in rows] == [
         ("phase 1", f"{count} intervals") for count in (4, 16)

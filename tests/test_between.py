@@ -107,7 +107,7 @@ def test_released_contacts_have_to_be_clear_in_the_second_half() -> None:
     names = [limit.gained.name if limit.gained else "" for limit in formation.limits]
     k = names.index("v3-finger1")
     gaps = make_formation(formation.scene, "v3-finger1")
-    fields = {"watched": (k,), "released": (k,), "opens": True}
+    fields = {"monitored": (k,), "released": (k,), "opens": True}
     stage = as_stage(motion, **fields)
     assert look(stage, motion, EPSILON).gap.max() <= GRAZE
     # Played backwards it is clear at first, and touches at the end.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shipped import HEPTAGON
-from wholearm.benchmark.stress import cell_curves as cellcurves
+from wholearm.benchmark.stress import cell_curves
 from wholearm.benchmark.stress.cell_curves import best_end, find_best, list_ends
 from wholearm.benchmark.stress.slow_motion import slow_margin
 from wholearm.common.arrays import Array
@@ -47,7 +47,7 @@ def test_the_best_curve_is_one_that_a_slow_motion_can_take() -> None:
 
 def test_no_curve_takes_a_hand_that_is_too_weak(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, few in (("DRAWN", 40), ("TRIED", 5), ("BENT", (2, 3))):
-        monkeypatch.setattr(cellcurves, name, few)
+        monkeypatch.setattr(cell_curves, name, few)
     weak = tipping().with_({f"fingers.{k}.torque_limit": 0.01 for k in (1, 2)})
     (phase,), ends = weak.phases, _ends()[:1]
     best = find_best(weak.scene, phase, weak.epsilon, weak.start, ends)

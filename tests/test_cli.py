@@ -521,7 +521,7 @@ def test_interrupting_leaves_nothing(
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("wholearm.planning.blocks.plan_chain", interrupt)
+    monkeypatch.setattr("wholearm.planning.blocks.plan_sequence", interrupt)
     assert main(["solve", str(HEPTAGON)]) == 130
     assert capsys.readouterr().err == "wholearm: interrupted\n"
     assert list(folder.iterdir()) == []

@@ -148,8 +148,8 @@ def test_a_command_in_another_thread_leaves_signals_alone() -> None:
 
 SWALLOWS = """
 import sys, tempfile, time
-from wholearm.files import write_whole
-from wholearm.interrupts import guard
+from wholearm.common.files import write_whole
+from wholearm.common.interrupts import guard
 
 def write(stream):
     stream.write(b"half")

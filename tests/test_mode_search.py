@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import wholearm.planning.time_domain.plan as timeplan
+import wholearm.planning.time_domain.plan as time_plan
 from plane import make_formation, measure_gaps, measure_slip
 from thrown import parting, raised
 from timed import instants, landing, plan_landing, total
@@ -66,7 +66,7 @@ def test_plans_are_the_same_whichever_way_a_joint_is_guessed(
         return turn_joint(guess_stages(*given, **named), 1)  # type: ignore[arg-type]
 
     (right,) = plan_phases(problem, problem.phases, problem.start, OPTIONS)
-    monkeypatch.setattr(timeplan, "outline_stages", guess_wrong)
+    monkeypatch.setattr(time_plan, "guess_stages", guess_wrong)
     (plan,) = plan_phases(problem, problem.phases, problem.start, OPTIONS)
     assert plan.sequences > 1
     assert plan.motion.duration == pytest.approx(right.motion.duration, rel=1e-3)
@@ -133,7 +133,7 @@ def test_a_contact_rolls_in_one_phase_and_slides_in_the_other(rolls_first: bool)
     first = replace(phase, formation=formations[0], until=Until(), end=End.SMOOTH)
     last = replace(phase, index=1, formation=formations[1])
     problem = replace(sliding, phases=(first, last))
-    plan = solve(problem, time_intervals=6)
+    plan = solve(problem, time_intervals=4)
     report = verify(problem, plan)
     assert report.ok, report.to_text()
     assert report.phases[0].until == "change of v1-palm"

@@ -89,7 +89,6 @@ def is_feasible(limits: dict[str, float], phase: int, **others: float) -> bool:
     "phase, limits, wanted",
     [
         (1, {"epsilon": 1.0}, ["epsilon"]),
-        (4, {"torque limit of finger 1": 0.3}, ["torque limit of finger 1"]),
         (
             3,
             {"epsilon": 0.6, "speed limit of finger 1": 0.3},
@@ -185,7 +184,6 @@ def relax_by_linear_program(curve: Curve, epsilon: float, name: str) -> float | 
     [
         (1, {"epsilon": 1.0}),
         (4, {"torque limit of finger 1": 0.3}),
-        (4, {"torque limit of finger 2": 0.05}),
         (4, {"torque limit of finger 1": 0.7, "epsilon": 0.4}),
         (4, {"torque limit of finger 1": 0.3, "torque limit of finger 2": 0.05}),
     ],

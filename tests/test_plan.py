@@ -19,8 +19,8 @@ from wholearm.planning.blocks import plan_blocks
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
-from wholearm.planning.time_domain import impacts as timeimpacts
-from wholearm.planning.time_domain import plan as timeplan
+from wholearm.planning.time_domain import impacts as time_impacts
+from wholearm.planning.time_domain import plan as time_plan
 from wholearm.planning.time_domain.motion import TimeMotion
 from wholearm.problem.definition import Problem
 from wholearm.results.trajectory import Samples, Trajectory, load_trajectory
@@ -316,7 +316,7 @@ def test_a_block_that_starts_elsewhere_gets_another_share() -> None:
 @pytest.mark.parametrize("low", [1, 2])
 def test_a_phase_without_margin_is_named(monkeypatch: pytest.MonkeyPatch, low: int) -> None:
     problem, _ = shove()
-    plan_phases = timeplan.plan_phases
+    plan_phases = time_plan.plan_phases
 
     def plan_tightly(*arguments: Any, **options: Any) -> list[PhasePlan[TimeMotion]]:
         plans = plan_phases(*arguments, **options)
@@ -324,7 +324,7 @@ def test_a_phase_without_margin_is_named(monkeypatch: pytest.MonkeyPatch, low: i
             plans[low - 1] = plans[low - 1]._replace(value=0.031)
         return plans
 
-    monkeypatch.setattr(timeimpacts, "plan_phases", plan_tightly)
+    monkeypatch.setattr(time_impacts, "plan_phases", plan_tightly)
     least = solve(problem, time_intervals=4).meta["phase_durations"][low - 1]
     with pytest.raises(InfeasibleError) as caught:
         solve(problem, "margin", time_intervals=4)

@@ -5,25 +5,25 @@ import numpy as np
 import pytest
 
 from planned import plan
-from wholearm.simulation import runge_kutta as rungekutta
+from wholearm.simulation import runge_kutta
 from wholearm.simulation.layout import STATE
 from wholearm.simulation.stepper import build_stepper
 
 
 def test_rows_sum_to_nodes() -> None:
-    sums = [sum(row.values()) for row in rungekutta._ROWS]
+    sums = [sum(row.values()) for row in runge_kutta._ROWS]
     # The coefficients are rounded to 16 digits and reach 44.
-    assert np.allclose(sums, rungekutta._NODES, atol=2e-14, rtol=0)
+    assert np.allclose(sums, runge_kutta._NODES, atol=2e-14, rtol=0)
 
 
 @pytest.mark.parametrize("power", range(8))
 def test_weights_integrate_polynomials(power: int) -> None:
-    nodes = np.array(rungekutta._NODES)
-    total = sum(w * nodes[j] ** power for j, w in rungekutta._WEIGHTS.items())
+    nodes = np.array(runge_kutta._NODES)
+    total = sum(w * nodes[j] ** power for j, w in runge_kutta._WEIGHTS.items())
     assert total == pytest.approx(1 / (power + 1), abs=1e-14)
 
 
-@pytest.mark.parametrize("weights", [rungekutta._ERROR_5, rungekutta._ERROR_3])
+@pytest.mark.parametrize("weights", [runge_kutta._ERROR_5, runge_kutta._ERROR_3])
 def test_error_weights_cancel(weights: dict[int, float]) -> None:
     assert sum(weights.values()) == pytest.approx(0, abs=1e-14)
 
@@ -34,7 +34,7 @@ def test_order_on_a_known_solution() -> None:
     def rate(state: ca.SX, time: ca.SX) -> ca.SX:
         return ca.vertcat(state[1], -state[0] * (1 + 0 * time)) * ca.cos(time)
 
-    step = ca.Function("step", [y, t, h], [rungekutta.build_step(rate, y, t, h)[0]])
+    step = ca.Function("step", [y, t, h], [runge_kutta.build_step(rate, y, t, h)[0]])
     errors = []
     for count in (8, 16):
         state = np.array([0.0, 1.0])
@@ -47,9 +47,9 @@ def test_order_on_a_known_solution() -> None:
 
 def test_error_estimate_bounds_the_error() -> None:
     y, t, h = ca.SX.sym("y", 1), ca.SX.sym("t"), ca.SX.sym("h")
-    end, fifth, third = rungekutta.build_step(lambda s, _: -s, y, t, h)
+    end, fifth, third = runge_kutta.build_step(lambda s, _: -s, y, t, h)
     tolerance = 1e-6
-    error = rungekutta.build_error(fifth, third, y, 1.0, tolerance)
+    error = runge_kutta.build_error(fifth, third, y, 1.0, tolerance)
     step = ca.Function("step", [y, t, h], [end, error])
     for length in (0.2, 0.5, 1.0):
         state, estimate = (float(value) for value in step(1.0, 0.0, length))

@@ -10,7 +10,7 @@ from planned import change, plan, plan_landing
 from shipped import HEPTAGON, problem_of
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, ReplayError, SolverError
-from wholearm.planning import self_check as selfcheck
+from wholearm.planning import self_check
 from wholearm.planning.blocks import Planning, plan_blocks
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.phase_plan import PhasePlan
@@ -157,7 +157,7 @@ def test_a_finer_plan_that_is_not_found_leaves_the_error(
         raise SolverError("no plan")
 
     spoiled = Spoiled(slide, 1, 1)
-    monkeypatch.setattr(selfcheck, "refine_block", fail)
+    monkeypatch.setattr(self_check, "refine_block", fail)
     with pytest.raises(ReplayError, match="the plan of phase 2 does not hold in its replay: "):
         spoiled.run()
 

@@ -153,7 +153,7 @@ def test_no_plan_with_a_stop_leaves_the_saving_open(
     def fail(*_: object) -> None:
         raise InfeasibleError("nothing holds at rest")
 
-    monkeypatch.setattr("wholearm.planning.path_domain.sequence_plan.plan_chain", fail)
+    monkeypatch.setattr("wholearm.planning.path_domain.sequence_plan.plan_sequence", fail)
     rows = solve(problem, intervals=20).meta["transitions"]
     assert [row["saves"] for row in rows] == 4 * [None]
     assert [row["speed"] > 0 for row in rows] == [True, True, False, False]

@@ -31,7 +31,7 @@ IN_THREADS = """
 import gc, sys, threading, time
 import tomllib
 import wholearm
-from wholearm.problem import build_problem
+from wholearm.problem.definition import build_problem
 
 path, shared = sys.argv[1], sys.argv[2] == "shared"
 failures, values, running = [], {}, True

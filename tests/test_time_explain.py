@@ -17,7 +17,7 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
-from wholearm.planning.time_domain import explain as timeexplain
+from wholearm.planning.time_domain import explain as time_explain
 from wholearm.planning.time_domain.collocation import make_scheme
 from wholearm.planning.time_domain.explain import (
     change_limit,
@@ -71,7 +71,7 @@ def outline(problem: Problem, index: int = 0) -> Stage:
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Advice takes the time that it needs, however slow the machine is."""
-    monkeypatch.setattr(timeexplain, "ADVICE", np.inf)
+    monkeypatch.setattr(time_explain, "ADVICE", np.inf)
 
 
 def test_a_force_that_weight_limits_has_its_closed_form() -> None:

@@ -80,7 +80,7 @@ def owners(layouts: Sequence[StageLayout]) -> Array:
 
 @pytest.mark.parametrize("elastic", [False, True])
 @pytest.mark.parametrize("with_margin", [False, True])
-@pytest.mark.parametrize("strikes", [False, True])
+@pytest.mark.parametrize("ends_in_impact", [False, True])
 @pytest.mark.parametrize("name, degree", SCHEMES)
 def test_every_unknown_has_one_place(
     name: str, degree: int, ends_in_impact: bool, with_margin: bool, elastic: bool
@@ -105,7 +105,7 @@ def test_unknowns_are_in_the_order_of_time(name: str, degree: int) -> None:
 
 
 @pytest.mark.parametrize("with_margin", [False, True])
-@pytest.mark.parametrize("strikes", [False, True])
+@pytest.mark.parametrize("ends_in_impact", [False, True])
 @pytest.mark.parametrize("name, degree", SCHEMES)
 def test_points_are_packed_and_unpacked(
     name: str, degree: int, ends_in_impact: bool, with_margin: bool

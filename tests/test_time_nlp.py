@@ -225,7 +225,7 @@ def cut(stage: Stage, count: int) -> list[Stage]:
     return halves
 
 
-@pytest.mark.parametrize("strikes", [False, True])
+@pytest.mark.parametrize("ends_in_impact", [False, True])
 @pytest.mark.parametrize("objective", [Objective.TIME, Objective.MARGIN])
 def test_stages_that_follow_share_their_state(objective: Objective, ends_in_impact: bool) -> None:
     scheme = make_scheme("radau", 3)

@@ -17,7 +17,7 @@ from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve, Segment
 from wholearm.mechanics.dynamics import Directions, PathForces
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain import data as pathdata
+from wholearm.planning.path_domain import data as path_data
 from wholearm.planning.path_domain.motion import PathMotion
 from wholearm.planning.path_domain.plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
@@ -76,8 +76,8 @@ class Toy:
     def in_place(self) -> Iterator[None]:
         """Let the planner see this toy's forces."""
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(pathdata, "inverse", self._inverse)
-            patch.setattr(pathdata, "reduced_inertia", lambda *_: np.ones(1))
+            patch.setattr(path_data, "inverse", self._inverse)
+            patch.setattr(path_data, "reduced_inertia", lambda *_: np.ones(1))
             yield
 
     def _inverse(

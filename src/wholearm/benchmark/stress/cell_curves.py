@@ -2,8 +2,8 @@
 
 A motion with two freedoms from rest to the end of its phase follows some curve x(u), phi(u), and
 whether any motion along a given curve keeps all limits is a linear programme, whatever its speeds
-and forces (`lpmotion.fast_margin`). Cubic curves to many places of the end are drawn at random, and
-those with the largest margins are bent further as long as these grow: a search for a plan that
+and forces (`slow_motion.fast_margin`). Cubic curves to many places of the end are drawn at random,
+and those with the largest margins are bent further as long as these grow: a search for a plan that
 shares neither transcription nor guesses with the planner.
 """
 
