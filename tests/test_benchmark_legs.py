@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from shipped import HEPTAGON
 from wholearm.benchmark.legs import (
@@ -30,16 +29,13 @@ def test_legs_slide_and_pass_through_cells_from_rest_to_rest() -> None:
     assert phi < start[2] and np.isfinite(x)
 
 
-@pytest.mark.parametrize(("limit", "kind"), [(None, "planned"), (0.005, "refused, confirmed")])
-def test_outcomes_of_a_slide(limit: float | None, kind: str) -> None:
+def test_a_slide_is_planned() -> None:
     table = dict(read_problem(str(HEPTAGON)).table)
     contacts = table["phases"][0]["contacts"]
     x = float(build_problem(table).start[0]) - 0.01
     problem = build_problem({**table, "phases": [{"contacts": contacts, "until": {"x": x}}]})
-    if limit is not None:
-        problem = problem.with_({f"fingers.{k}.torque_limit": limit for k in (1, 2)})
     outcome = run_leg(Leg("heptagon", problem, [(x, float(problem.start[2]))]), "time")
-    assert outcome.kind == kind and outcome.kind in KINDS, outcome.text
+    assert outcome.kind == "planned", outcome.text
 
 
 def test_what_kind_of_argument_refuses() -> None:

@@ -124,16 +124,14 @@ def test_a_first_phase_lets_go_what_touches_at_the_start() -> None:
     assert (gap[1:] > 1e-6).all()
 
 
-@pytest.mark.parametrize("rolls_first", [True, False])
-def test_a_contact_rolls_in_one_phase_and_slides_in_the_other(rolls_first: bool) -> None:
+def test_a_contact_slides_in_one_phase_and_rolls_in_the_next() -> None:
     sliding = tilting()
     (phase,) = sliding.phases
     rolling = roll(phase.formation, "v1-palm")
-    formations = (rolling, phase.formation) if rolls_first else (phase.formation, rolling)
-    first = replace(phase, formation=formations[0], until=Until(), end=End.SMOOTH)
-    last = replace(phase, index=1, formation=formations[1])
+    first = replace(phase, until=Until(), end=End.SMOOTH)
+    last = replace(phase, index=1, formation=rolling)
     problem = replace(sliding, phases=(first, last))
-    plan = solve(problem, time_intervals=4)
+    plan = solve(problem, time_intervals=6)
     report = verify(problem, plan)
     assert report.ok, report.to_text()
     assert report.phases[0].until == "change of v1-palm"
@@ -147,7 +145,7 @@ def test_a_contact_rolls_in_one_phase_and_slides_in_the_other(rolls_first: bool)
     assert sum(len(stage.points.fractions) for stage in stages) <= 2 * MOST
     assert min(motion.duration for motion in plan.motions) > 0.1 * plan.duration
     # What rolls does so all along; what slides has friction against its motion.
-    for motion, rolls in zip(motions, (rolls_first, not rolls_first), strict=True):
+    for motion, rolls in zip(motions, (False, True), strict=True):
         for stage in motion.stages:
             samples = stage.evaluate(instants(stage, 12))
             slip = measure_slip(stage.formation, samples.z, samples.z_dot)[:, 0]

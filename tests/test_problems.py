@@ -29,7 +29,8 @@ SLOW = [
     for objective in ("effort", "margin")
     if (name, objective) != ("square", "effort")
 ]
-"""Landings that take long to plan; those of the square for effort are left.
+SLOW += [("heptagon_twice", "time"), ("hexagon", "time"), ("heptagon_impact", "margin")]
+"""Those that take long to plan and to look at; landings of the square for effort are left.
 
 `kernels` plans and verifies every problem and objective.
 """

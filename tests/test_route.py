@@ -11,7 +11,6 @@ import pytest
 
 import wholearm
 from shipped import HEPTAGON
-from wholearm.benchmark.stress.scenes import random_route, random_scene
 from wholearm.common.errors import InputError
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import guess_phase
@@ -250,21 +249,3 @@ def test_list_goes_on_where_loading_ends_a_phase(heptagon: Problem, tmp_path: Pa
         assert np.abs(gaps).max() < 1e-9
         assert phase.formation.evaluate_limits(z[None]).min() > -1e-9
         z = guess_phase(problem, phase, z)[-1].z[-1]
-
-
-def test_lists_of_a_random_scene_load(tmp_path: Path) -> None:
-    rng = np.random.default_rng([11, 0])
-    table = random_scene(rng)
-    problem = build_problem(table)
-    listed = 0
-    for _ in range(6):
-        try:
-            route = list_formations(problem, *random_route(rng, problem))
-        except InputError as error:
-            assert error.key == "route"
-            continue
-        assert len(load_pasted(table, route, tmp_path).phases) == len(route)
-        listed += 1
-        if listed == 2:
-            break
-    assert listed
