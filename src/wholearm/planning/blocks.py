@@ -153,6 +153,16 @@ def plan_blocks(problem: Problem, options: PlanOptions, report: Callable[[str], 
     return _require_margin(_plan_each(planning, [0] * count, report))
 
 
+def plan_alone(planning: Planning, report: Callable[[str], None]) -> Planning | None:
+    """Plan without regard to what follows a block; None if that has made no difference."""
+    problem, options = planning.problem, planning.options
+    blocks = split_blocks(problem)
+    if not planning.ahead or all(_look_ahead(problem, own, options) is None for own in blocks):
+        return None
+    alone = replace(planning, blocks=(), ahead=False)
+    return _require_margin(_plan_each(alone, [0] * len(blocks), report))
+
+
 def refine_block(
     planning: Planning, index: int, report: Callable[[str], None], plain: bool = False
 ) -> Planning:

@@ -22,7 +22,7 @@ from ..scene.model import Scales
 from ..verification.newton_euler import balance
 from ..verification.verdict import Allowance, find_least_force, measure_departure
 from ..verification.verify import choose_times, inspect
-from .blocks import PLAIN, BlockPlan, Planning, refine_block
+from .blocks import PLAIN, BlockPlan, Planning, plan_alone, refine_block
 
 REFINEMENTS = 3
 """How often the intervals of a block may be doubled."""
@@ -148,6 +148,11 @@ def replay_plan(
             for k, block in enumerate(planning.blocks)
             if number in [phase.number for phase in block.phases]
         )
+        alone = plan_alone(planning, report) if accepted.failure is not None else None
+        if alone is not None:
+            # Short phases that a landing leaves magnify what is left of the speed at its stop.
+            planning, trajectory = alone, build(alone)
+            continue
         block = planning.blocks[index]
         most = 1 if accepted.failure is None else REFINEMENTS if block.chain else ROUGH
         refined = None
