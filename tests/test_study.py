@@ -44,9 +44,9 @@ def test_a_worker_that_hangs_or_dies_is_replaced() -> None:
 
 
 def test_a_scene_is_drawn_alike_whichever_others_are() -> None:
-    one, other = draw_case(3, 7), draw_case(3, 7)
+    one, other = draw_case(0, 2), draw_case(0, 2)
     assert one == other
-    assert draw_case(3, 8).table != one.table
+    assert draw_case(0, 3).table != one.table
     assert one.table["phases"]
 
 
