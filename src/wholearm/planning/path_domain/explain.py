@@ -89,12 +89,12 @@ def explain(
     data = join(parts)
     torque = _TORQUE * data.curve.formation.scene.scales.torque
     units = units._replace(torque=np.full(2, torque))
-    eased = _ease(data, profile, units)
-    if eased is None:
+    elastic = _solve_elastic(data, profile, units)
+    if elastic is None:
         return SolverError(stopped)
     shortfalls = [
         short
-        for part, own, phase in zip(parts, cut(parts, eased), phases, strict=True)
+        for part, own, phase in zip(parts, cut(parts, elastic), phases, strict=True)
         for short in _list_shortfalls(part, own, f", phase {phase}" if len(phases) > 1 else "")
     ]
     if not shortfalls:
@@ -108,7 +108,7 @@ def explain(
     def find_least(index: int) -> float | None:
         limit, relaxation = candidates[index].limit, candidates[index].relaxation
         if relaxation is not None:
-            return _relax(data, eased, units, candidates[index], relaxation)
+            return _relax(data, elastic, units, candidates[index], relaxation)
         farthest = 0.0 if limit.sign < 0 else _ROUGH * limit.value
         return bracket(limit, farthest, partial(can_plan, index))
 
@@ -157,7 +157,7 @@ def _quicken(data: PhaseData, units: Units) -> Units:
     return units._replace(time=min(units.time, pace), force=min(units.force, _FORCE * scales.force))
 
 
-def _ease(data: PhaseData, profile: Profile, units: Units) -> Profile | None:
+def _solve_elastic(data: PhaseData, profile: Profile, units: Units) -> Profile | None:
     """The motion with the least shortfalls when every limit is soft."""
     formation = data.curve.formation
     intervals, n_c = len(data.grid.s) - 1, formation.n_contacts

@@ -1,6 +1,6 @@
 """The planning NLP of one-freedom phases in the path domain: building, bounds, packing.
 
-`pathterms` has its expressions. Built once for some contacts, intervals and an objective,
+`terms` has its expressions. Built once for some contacts, intervals and an objective,
 it serves every phase: grid, coefficients and limits are its parameters and bounds. Phases that
 impacts join have an interval of length zero between them (`chain`).
 """
@@ -151,7 +151,7 @@ def build_path_nlp(
 ) -> PathNLP:
     """Build the NLP for every phase of so many contacts, of which so many roll.
 
-    See `pathterms` for its unknowns, parameters and rows.
+    See `terms` for its unknowns, parameters and rows.
     """
     started = time.perf_counter()
     nlp = write_terms(n_contacts, intervals, objective, n_rolling)

@@ -1,7 +1,7 @@
 """Planning one-freedom phases: first guess, NLP, and limits that hold between nodes too.
 
-The NLP of `pathnlp` keeps the limits at its nodes. Once solved, the grid is drawn together
-where they are missed most between nodes (where the plan switches from one limit to another). Then
+The NLP of `nlp` keeps the limits at its nodes. Once it is solved, nodes are redistributed towards
+where limits are missed most between them (where the plan switches from one to another). Then
 limits are tightened by what they miss and the NLP is solved again from where it was, until nothing
 misses more than `MISS`.
 """

@@ -36,7 +36,7 @@ class Limits(NamedTuple):
     ----------
     c_n : ndarray, shape (K, n_c)
     cone : ndarray, shape (K, R)
-    gap : ndarray, shape (K, n_watched)
+    gap : ndarray, shape (K, n_monitored)
     sense : ndarray, shape (K, n_c + 2)
         Of the rates of contacts and joints; nothing of rolling contacts.
     """
@@ -65,7 +65,7 @@ class Limits(NamedTuple):
         return max(float(t.max(initial=0.0)) / a for t, a in zip(self, allowed, strict=True))
 
 
-class Check(NamedTuple):
+class CheckPlaces(NamedTuple):
     """A stage at `LOOKS` places of each of its K intervals, one after the other.
 
     Attributes
@@ -83,14 +83,14 @@ class Check(NamedTuple):
     limits: Array
 
 
-def check_between(stage: Stage, motion: StageMotion) -> Check:
+def check_between(stage: Stage, motion: StageMotion) -> CheckPlaces:
     """Look at a stage between its points."""
     places = stage.guess.places(np.linspace(1e-9, 1 - 1e-9, LOOKS)).ravel()
     samples = motion.evaluate(places * motion.duration)
-    return Check(places, samples, stage.formation.evaluate_limits(samples.z))
+    return CheckPlaces(places, samples, stage.formation.evaluate_limits(samples.z))
 
 
-def find_misses(stage: Stage, look: Check, epsilon: float, margin: float = 0.0) -> Limits:
+def find_misses(stage: Stage, look: CheckPlaces, epsilon: float, margin: float = 0.0) -> Limits:
     """By how much limits are missed in each interval, at worst.
 
     Parameters
@@ -122,7 +122,7 @@ def _measure_senses(stage: Stage, samples: Samples) -> Array:
     return senses
 
 
-def monitor_missed(stages: Sequence[Stage], looks: Sequence[Check]) -> list[Stage] | None:
+def monitor_missed(stages: Sequence[Stage], looks: Sequence[CheckPlaces]) -> list[Stage] | None:
     """Stages that also watch the limits which are broken between points; None if none is."""
     changed = []
     for stage, look in zip(stages, looks, strict=True):

@@ -1,4 +1,4 @@
-"""Stages that a solution asks for: limits watched, intervals halved."""
+"""Stages that a solution asks for: limits monitored, intervals bisected."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ class Solution(NamedTuple):
 
     @property
     def monitored(self) -> list[tuple[int, ...]]:
-        """Limits that each stage watches."""
+        """Limits that each stage monitors."""
         return [stage.monitored for stage in self.stages]
 
 

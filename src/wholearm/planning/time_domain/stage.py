@@ -87,7 +87,7 @@ class Stage:
     clearance : float
         What these gaps are at least after a third of the first stage, over the radius of gyration.
     apart : tuple of int
-        Watched limits that are as clear at the end: what comes next ends by closing them.
+        Monitored limits that are as clear at the end: what comes next ends by closing them.
     adapts : float
         What it costs to change the duration of an interval; nothing if they keep their shares.
     """
@@ -114,7 +114,7 @@ class Stage:
         return len(self.guess.fractions)
 
     def list_clearances(self, places: Array, after: float) -> Array:
-        """Least values of watched limits at `places`, shape (n,), of the stage: (n, n_watched).
+        """Least values of monitored limits at `places`, shape (n,), of the stage: (n, n_monitored).
 
         From the share `after` of the stage on, but for contacts that were let go before it.
         """

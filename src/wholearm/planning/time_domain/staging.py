@@ -22,7 +22,7 @@ from .way_pace import Pace
 PRESS = 0.5
 """Normal forces that a first guess is near, over the weight of the object."""
 _NEAR = 0.02
-"""Distance over the radius of gyration at which a limit is watched from the start."""
+"""Distance over the radius of gyration at which a limit is monitored from the start."""
 _TOUCHES = 1e-5
 """Gap over the radius of gyration below which a contact touches that a phase lets go."""
 
@@ -101,7 +101,7 @@ def guess_stages(
                 guess,
                 until=phase.until if last and not phase.until.is_release else None,
                 ends_in_impact=ends_in_impact,
-                monitored=tuple(sorted({*_choose_watched(phase, outline), *released})),
+                monitored=tuple(sorted({*_choose_monitored(phase, outline), *released})),
                 released=released,
                 opens=opens,
             )
@@ -241,7 +241,7 @@ def _turn_first(outline: PathGuess, before: PathGuess) -> list[PathGuess]:
     return pieces
 
 
-def _choose_watched(phase: Phase, outline: PathGuess) -> tuple[int, ...]:
+def _choose_monitored(phase: Phase, outline: PathGuess) -> tuple[int, ...]:
     """Limits that are near zero along the outline, and the phase's own end."""
     values = outline.formation.evaluate_limits(outline.z)
     near = values.min(axis=0) < _NEAR
