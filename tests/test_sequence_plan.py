@@ -11,11 +11,8 @@ from plane import measure_gaps, measure_slip, unbalance
 from shipped import IMPACTS, plan_of, problem_of
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError
-from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.impact import compute_impact
 from wholearm.mechanics.metric import metric_weights
-from wholearm.planning.path_domain.impact_sequence import make_sequence
-from wholearm.planning.path_domain.sequence_plan import add_up
 from wholearm.planning.plan import solve
 from wholearm.problem.definition import Problem, build_problem
 from wholearm.results.trajectory import Samples, Trajectory, load_trajectory
@@ -188,12 +185,6 @@ def test_progress_tells_what_is_planned(problem: Problem) -> None:
         "phase 1: what its impact saves",
         "phase 2: what its impact saves",
     ]
-
-
-def test_durations_add_up(problem: Problem) -> None:
-    chain = make_sequence(problem.phases, trace_phases(problem)).split()[0]
-    assert add_up(chain.phases, [0.1, 0.2, 0.3, 9.0, 9.0]) == pytest.approx(0.6)
-    assert add_up(chain.phases, [None] * 5) is None
 
 
 def unit(values: Array) -> Array:

@@ -22,8 +22,9 @@ from ..results.trajectory import Motion
 from ..scene.model import Scene
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence
-from .path_domain.sequence_plan import add_up, plan_sequence
-from .phase_plan import PhasePlan
+from .path_domain.sequence_plan import plan_sequence
+from .phase_plan import PhasePlan, add_up
+from .stops import Plans
 
 PLAIN = -1
 """In place of how often intervals are doubled: as many as at first, and no search for modes."""
@@ -33,8 +34,6 @@ MOVED = 1e-9
 """Distance from which on a block starts somewhere else, in radii of gyration or radians."""
 SHORT = 5e-7
 """How far below epsilon a margin may be by rounding, over the scene's force."""
-
-Plans = list[PhasePlan[Motion]]
 
 
 @dataclass(frozen=True, eq=False)

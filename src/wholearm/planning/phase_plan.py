@@ -1,11 +1,14 @@
-"""The plan of one phase, whichever NLP found it."""
+"""The plan of one phase, whichever NLP found it, and figures of several."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Generic, NamedTuple, TypeVar
 
+from ..problem.definition import Phase
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion
+from .options import Objective
 
 M_co = TypeVar("M_co", bound=Motion, covariant=True)
 
@@ -36,3 +39,14 @@ class PhasePlan(NamedTuple, Generic[M_co]):
     build_time: float
     solve_time: float
     sequences: int = 0
+
+
+def add_up(phases: Sequence[Phase], allowed: Sequence[float | None]) -> float | None:
+    """Longest duration of some phases in all [s], given that of each of the problem's phases."""
+    own = [allowed[phase.index] for phase in phases]
+    return sum(time for time in own if time is not None) if None not in own else None
+
+
+def combine(goal: Objective, values: Sequence[float]) -> float:
+    """Objective value of some phases, given that of each."""
+    return min(values) if goal is Objective.MARGIN else sum(values)

@@ -19,9 +19,9 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion, Trajectory, assemble
 from ..results.transition import Transition
 from .blocks import Planning, plan_blocks
+from .impacts import assess_impacts
 from .options import Objective, PlanOptions
-from .path_domain.sequence_plan import assess, combine
-from .phase_plan import PhasePlan
+from .phase_plan import PhasePlan, combine
 
 _SETTINGS = (
     "intervals", "transcription", "time_weight", "duration", "time_intervals", "degree", "scheme",
@@ -88,11 +88,7 @@ def solve_with(
 
         planning, trajectory, figures = replay_plan(planning, trajectory, _assemble, report)
     replayed = time.perf_counter()
-    transitions = assess(
-        planning.sequences, planning.plans, problem.epsilon, options, planning.allowed, report
-    )
-    transitions += _assess_time_impacts(planning, report)
-    transitions.sort(key=lambda transition: transition.phase)
+    transitions = _assess(planning, report)
     every = [*planning.least, *planning.plans]
     meta = _describe(planning) | {
         "transitions": [transition.to_dict() for transition in transitions],
@@ -161,15 +157,22 @@ def _describe(planning: Planning) -> dict[str, Any]:
     }
 
 
-def _assess_time_impacts(planning: Planning, report: Callable[[str], None]) -> list[Transition]:
-    """Assess the impacts of blocks that were planned in the time domain."""
+def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transition]:
+    """Assess the impacts of every block, as its domain knows them."""
     found: list[Transition] = []
     for block in planning.blocks:
-        if len(block.phases) > 1 and block.chain is None:
-            from .time_domain.impacts import assess_time_impacts
+        if len(block.phases) == 1:
+            continue
+        if block.chain is None:
+            from .time_domain.impacts import list_impacts, plan_parts_of
 
-            report(f"phase {block.phases[0].number}: what impacts save")
-            found += assess_time_impacts(
-                planning.problem, block.phases, block.plans, planning.options, block.duration
-            )
+            impacts = list_impacts(block.phases, block.plans)
+            plan_part = plan_parts_of(planning.problem, block.phases)
+        else:
+            from .path_domain import sequence_plan
+
+            impacts = sequence_plan.list_impacts(block.chain, block.plans)
+            plan_part = sequence_plan.plan_parts_of(block.chain, planning.problem.epsilon)
+        given = block.phases, impacts, block.plans, plan_part
+        found += assess_impacts(*given, planning.options, planning.allowed, report)
     return found

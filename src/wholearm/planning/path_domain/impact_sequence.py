@@ -18,9 +18,7 @@ from ...geometry.curve import Curve
 from ...mechanics.impact import Impact, compute_impact
 from ...mechanics.metric import metric_weights
 from ...problem.definition import Phase
-
-PER_SPEED = " per m/s"
-"""What impulses and rates of an impact are for: one unit of speed along the curve that ends."""
+from ..impacts import PER_SPEED
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Impacts among phases that are planned in the time domain, and what they save over stopping.
+"""Impacts among phases that are planned in the time domain.
 
 A plan that stops at each of them shows from where the motion comes; impacts that are not possible
 from there stay stops, and the phases beside the others are planned as one.
@@ -6,9 +6,8 @@ from there stay stops, and the phases beside the others are planned as one.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from itertools import pairwise
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,14 +18,12 @@ from ...mechanics.impact import Impact, compute_impact
 from ...mechanics.metric import measure_speed
 from ...problem.definition import End, Phase, Problem
 from ...results.trajectory import Motion
-from ...results.transition import Transition
+from ..impacts import PER_SPEED, BlockImpact
 from ..options import Objective, PlanOptions
-from ..path_domain.impact_sequence import PER_SPEED
 from ..phase_plan import PhasePlan
-from .motion import TimeMotion
+from ..stops import PlanPart, Plans, end_of, plan_stops
 from .plan import plan_phases
 
-Plans = list[PhasePlan[TimeMotion]]
 AT_REST = 1e-4
 """Speed below which an impact counts as a stop, in the scene's own units."""
 
@@ -57,123 +54,68 @@ def plan_with_impacts(
     InputError, InfeasibleError, SolverError
         As `plan_phases` does.
     """
-    ends = [k + 1 for k, phase in enumerate(block) if phase.end is End.IMPACT]
+    ends = _find_impacts(block)
     if not ends:
-        return plan_phases(problem, block, z, options, duration, to_go=to_go)
-    stopped = _plan_stops(problem, block, z, options, duration, ends)
+        return [*plan_phases(problem, block, z, options, duration, to_go=to_go)]
+    explained = plan_parts_of(problem, block, explained=True)
+    # A duration that is too short for stops need not be so without them.
+    probe = (
+        options if duration is None else replace(options, objective=Objective.TIME, duration=None)
+    )
+    stopped = plan_stops(explained, [0, *ends, len(block)], z, probe)
     blocked = [
-        k for k in ends if _strike_at_stop(block[k - 1], block[k], stopped[k - 1]).violations
+        k for k in ends if _impact_at_stop(block[k - 1], block[k], stopped[k - 1]).violations
     ]
-    if len(blocked) == len(ends):
+    if len(blocked) < len(ends):
+        bounds = [0, *blocked, len(block)]
+        try:
+            return plan_stops(plan_parts_of(problem, block), bounds, z, options, duration)
+        except (InfeasibleError, SolverError):
+            pass
+    if duration is None:
         return stopped
-    try:
-        return _plan_stops(problem, block, z, options, duration, blocked, explained=False)
-    except (InfeasibleError, SolverError):
-        return stopped
+    return plan_stops(explained, [0, *ends, len(block)], z, options, duration)
 
 
-def _plan_stops(
-    problem: Problem,
-    block: Sequence[Phase],
-    z: Array,
-    options: PlanOptions,
-    duration: float | None,
-    ends: Sequence[int],
-    explained: bool = True,
-) -> Plans:
-    """Plan a block that stops before the phases `ends` of it."""
-    plans: Plans = []
-    for start, stop in pairwise([0, *ends, len(block)]):
-        share = None if duration is None else duration * (stop - start) / len(block)
+def plan_parts_of(problem: Problem, block: Sequence[Phase], explained: bool = False) -> PlanPart:
+    """How parts of a block are planned; `explained`: finding out why where there is no plan."""
+
+    def plan_part(
+        start: int, stop: int, z: Array, options: PlanOptions, duration: float | None
+    ) -> Plans:
         part = block[start:stop]
-        plans += plan_phases(problem, part, z, options, share, explained=explained)
-        z = _last_state(plans[-1])[0]
-    return plans
+        return [*plan_phases(problem, part, z, options, duration, explained=explained)]
+
+    return plan_part
 
 
-def _strike_at_stop(phase: Phase, following: Phase, plan: PhasePlan[Motion]) -> Impact:
-    """The impact for unit speed in the direction in which a phase comes to its stop."""
-    duration = plan.motion.duration
-    z = _last_state(plan)[0]
-    v = plan.motion.evaluate(np.array([duration * (1 - 1e-3)])).z_dot[0]
-    v = v / measure_speed(phase.formation.scene, v)
-    return compute_impact(phase.formation, following.formation, z, v)
-
-
-def assess_time_impacts(
-    problem: Problem,
-    block: Sequence[Phase],
-    plans: Sequence[PhasePlan[Motion]],
-    options: PlanOptions,
-    duration: float | None,
-) -> list[Transition]:
-    """Assess every impact of a block: whether it is passed at speed, and what that saves.
-
-    Parameters
-    ----------
-    problem : Problem
-    block : sequence of Phase
-    plans : list of PhasePlan
-        Of the block.
-    options : PlanOptions
-    duration : float or None, [s]
-        Longest duration of the block, for the objective `margin`.
-    """
-    ends = [k + 1 for k, phase in enumerate(block) if phase.end is End.IMPACT]
-    speeds = {k: measure_speed(problem.scene, _last_state(plans[k - 1])[1]) for k in ends}
-    stops = [k for k in ends if speeds[k] < AT_REST * problem.scene.scales.speed]
+def list_impacts(block: Sequence[Phase], plans: Sequence[PhasePlan[Motion]]) -> list[BlockImpact]:
+    """The impacts that a block asks for, passed at speed or not."""
     found = []
-    for k in ends:
-        phase, following = block[k - 1], block[k]
-        if k in stops:
-            found.append(_describe_stop(phase, following, plans[k - 1]))
-            continue
-        z, v = _last_state(plans[k - 1])
-        impact = compute_impact(phase.formation, following.formation, z, v / speeds[k])
-        contact, impulse = impact.least
-        ratio = measure_speed(problem.scene, impact.v)
-        begin = max((stop for stop in stops if stop < k), default=0)
-        end = min((stop for stop in stops if stop > k), default=len(block))
-        share = None if duration is None else duration * (end - begin) / len(block)
-        saves = _find_saving(problem, block[begin:end], k - begin, plans[begin:end], options, share)
-        until = str(phase.until)
-        found.append(
-            Transition(phase.number, until, True, "", ratio, impulse, contact, speeds[k], saves)
-        )
+    for k in _find_impacts(block):
+        (z, v), scene, reason = end_of(plans[k - 1]), block[0].formation.scene, ""
+        speed = measure_speed(scene, v)
+        if speed < AT_REST * scene.scales.speed:
+            speed, impact = 0.0, _impact_at_stop(block[k - 1], block[k], plans[k - 1])
+            reason = "no plan passes it at speed"
+            if impact.violations:
+                reason = impact.violations[0].describe(PER_SPEED)
+        else:
+            impact = compute_impact(block[k - 1].formation, block[k].formation, z, v / speed)
+        ratio = measure_speed(scene, impact.v)
+        found.append(BlockImpact(k - 1, impact, ratio, reason, speed))
     return found
 
 
-def _describe_stop(phase: Phase, following: Phase, plan: PhasePlan[Motion]) -> Transition:
-    impact = _strike_at_stop(phase, following, plan)
-    contact, impulse = impact.least
-    reason = "no plan passes it at speed"
-    if impact.violations:
-        reason = impact.violations[0].describe(PER_SPEED)
-    ratio = measure_speed(phase.formation.scene, impact.v)
-    until = str(phase.until)
-    return Transition(phase.number, until, False, reason, ratio, impulse, contact, 0.0, math.nan)
+def _find_impacts(block: Sequence[Phase]) -> list[int]:
+    """Indices in the block of the phases that an impact leads to."""
+    return [k + 1 for k, phase in enumerate(block) if phase.end is End.IMPACT]
 
 
-def _find_saving(
-    problem: Problem,
-    block: Sequence[Phase],
-    at: int,
-    plans: Sequence[PhasePlan[Motion]],
-    options: PlanOptions,
-    duration: float | None,
-) -> float:
-    """What a stop before phase `at` of phases in motion would cost; NaN if it has no plan."""
-    z = plans[0].motion.evaluate(np.zeros(1)).z[0]
-    try:
-        stopped = _plan_stops(problem, block, z, options, duration, [at], explained=False)
-    except (InfeasibleError, SolverError):
-        return math.nan
-    if options.goal is Objective.MARGIN:
-        return min(plan.value for plan in plans) - min(plan.value for plan in stopped)
-    return sum(plan.value for plan in stopped) - sum(plan.value for plan in plans)
-
-
-def _last_state(plan: PhasePlan[Motion]) -> tuple[Array, Array]:
-    """Configuration and velocity at the end of a phase."""
-    samples = plan.motion.evaluate(np.array([plan.motion.duration]))
-    return samples.z[0], samples.z_dot[0]
+def _impact_at_stop(phase: Phase, following: Phase, plan: PhasePlan[Motion]) -> Impact:
+    """The impact for unit speed in the direction in which a phase comes to its stop."""
+    duration = plan.motion.duration
+    z = end_of(plan)[0]
+    v = plan.motion.evaluate(np.array([duration * (1 - 1e-3)])).z_dot[0]
+    v = v / measure_speed(phase.formation.scene, v)
+    return compute_impact(phase.formation, following.formation, z, v)

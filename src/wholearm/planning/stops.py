@@ -1,0 +1,87 @@
+"""Phases that are planned with stops between some of them, in either domain."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.errors import InfeasibleError
+from ..results.trajectory import Motion
+from .options import Objective, PlanOptions
+from .phase_plan import PhasePlan
+
+Plans = list[PhasePlan[Motion]]
+PlanPart = Callable[[int, int, Array, PlanOptions, float | None], Plans]
+"""Plans phases `start` to `stop` of a block, without the latter, from a configuration and within a
+duration: from rest to rest, with what joins them passed in motion."""
+
+
+def plan_stops(
+    plan_part: PlanPart,
+    bounds: Sequence[int],
+    z: Array,
+    options: PlanOptions,
+    duration: float | None = None,
+) -> Plans:
+    """Plan phases of a block with a stop before some of them.
+
+    Parameters
+    ----------
+    plan_part : callable
+        See `PlanPart`.
+    bounds : sequence of int
+        Indices in the block of the phases that start at rest, and what follows the last one.
+    z : ndarray, shape (5,)
+        Where the first of them starts.
+    options : PlanOptions
+    duration : float, optional, [s]
+        Longest duration in all, for the objective `margin`: parts between stops share it in
+        proportion to their least times.
+
+    Raises
+    ------
+    InfeasibleError
+        If a part has no plan, or the duration is shorter than the least time.
+    SolverError
+        If the solver stops without an answer.
+    """
+    parts = list(pairwise(bounds))
+    allowed = [duration] * len(parts)
+    if duration is not None and len(parts) > 1:
+        fastest = replace(options, objective=Objective.TIME, duration=None)
+        least = _plan_parts(plan_part, parts, z, fastest, [None] * len(parts))
+        times = [
+            sum(plan.motion.duration for plan in least[start - bounds[0] : stop - bounds[0]])
+            for start, stop in parts
+        ]
+        if duration <= sum(times):
+            raise InfeasibleError(
+                f"duration = {duration:g} s is not longer than the least time with "
+                f"{'a stop' if len(parts) == 2 else 'stops'}, {sum(times):.6g} s"
+            )
+        allowed = [duration * time / sum(times) for time in times]
+    return _plan_parts(plan_part, parts, z, options, allowed)
+
+
+def _plan_parts(
+    plan_part: PlanPart,
+    parts: Sequence[tuple[int, int]],
+    z: Array,
+    options: PlanOptions,
+    allowed: Sequence[float | None],
+) -> Plans:
+    plans: Plans = []
+    for (start, stop), duration in zip(parts, allowed, strict=True):
+        plans += plan_part(start, stop, z, options, duration)
+        z = end_of(plans[-1])[0]
+    return plans
+
+
+def end_of(plan: PhasePlan[Motion]) -> tuple[Array, Array]:
+    """Configuration z and velocity z' at the end of a phase, shape (5,) each."""
+    samples = plan.motion.evaluate(np.array([plan.motion.duration]))
+    return samples.z[0], samples.z_dot[0]
