@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import wholearm.planning.time_domain.mode_search as mode_search
 import wholearm.planning.time_domain.plan as time_plan
 from plane import make_formation, measure_gaps, measure_slip
 from thrown import parting, raised
@@ -19,7 +20,7 @@ from wholearm.planning.time_domain.mode_search import WORTH, improve
 from wholearm.planning.time_domain.modes import in_mode, link, mode_of, sign_sequence, split
 from wholearm.planning.time_domain.motion import TimeMotion
 from wholearm.planning.time_domain.plan import plan_phases
-from wholearm.planning.time_domain.search import MOST, Search
+from wholearm.planning.time_domain.search import MOST, Search, Solution
 from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.staging import guess_stages
 from wholearm.problem.definition import End, Problem, Until
@@ -98,6 +99,28 @@ def test_rolling_for_a_while_is_found_where_it_is_the_best_of_all_sequences() ->
     c_n, c_t = rolling.guess.forces[..., 0], rolling.guess.forces[..., -1]
     mu = rolling.formation.friction[0]
     assert (mu * (c_n - search.problem.epsilon) - np.abs(c_t)).min() > -1e-6
+
+
+def test_a_stage_of_no_length_that_gains_by_its_intervals_alone_is_dropped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    search, stages = outlined(raised(), 4)
+    first = search.solve(stages)
+    (stage,) = first.stages
+    pieces = link(split(stage, search.scheme, 0, 1, mode_of(stage).changed((1,), 0.0)))
+    split_up = search.solve(pieces)
+    # Rolling shrinks to the shortest that is allowed, and all that follows is one stage less.
+    assert split_up.stages[0].guess.duration < 1e-4
+    assert split_up.cost < (1 - WORTH) * first.cost
+    list_all = mode_search._list
+
+    def list_pieces(search: Search, solution: Solution, leaning: bool = False) -> list[list[Stage]]:
+        return [pieces] if solution is first else list_all(search, solution, leaning)
+
+    monkeypatch.setattr(mode_search, "_list", list_pieces)
+    found = improve(search, first)
+    assert sign_sequence(found.stages) == sign_sequence(first.stages)
+    assert found.cost == pytest.approx(split_up.cost, rel=WORTH)
 
 
 def test_rounding_of_masses_decides_nothing() -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from wholearm.benchmark.stress.plan_check import check_plan
+from wholearm.benchmark.stress.plan_check import _check_rates, check_plan
 from wholearm.common.arrays import Array
 from wholearm.problem.definition import Problem
 from wholearm.results.torque import TorqueProfile
@@ -81,3 +81,23 @@ def test_an_end_elsewhere_is_named(heptagon: Problem, trajectory: Trajectory) ->
     phases[-1] = replace(phases[-1], until=replace(until, value=until.value + 1e-3))
     found = check_plan(replace(heptagon, phases=tuple(phases)), trajectory)
     assert any("ends 0.001 from phi" in text for text in found)
+
+
+def test_a_kink_that_a_curvature_hides_is_no_difference(heptagon: Problem) -> None:
+    """A rate that is the same at four instants about the kink; its integral is known."""
+    t, step = np.linspace(-0.5, 0.5, 6, retstep=True)
+    bend = 1 / (2 * step)
+
+    def sample(x: Array, wrong: float = 0.0) -> Samples:
+        rate = np.abs(x) - bend * x**2
+        value = x * np.abs(x) / 2 - bend * x**3 / 3 + wrong * (x > 0)
+        none = np.zeros((len(x), 5))
+        tables = (np.repeat(column[:, None], 5, axis=1) for column in (value, rate))
+        return Samples(none, *tables, *3 * [none[:, :2]])
+
+    middles = sample((t[1:] + t[:-1]) / 2)
+    right = _check_rates(heptagon.scene, t, sample(t), middles)
+    assert np.ptp(sample(t).z_ddot[1:5, 0]) < 1e-12
+    assert not any(text.startswith("z' and") for text in right)
+    wrong = _check_rates(heptagon.scene, t, sample(t, step**2 / 2), middles)
+    assert any(text.startswith("z' and its rate differ by") for text in wrong)

@@ -9,7 +9,7 @@ import pytest
 from planned import change, plan, plan_landing
 from shipped import HEPTAGON, problem_of
 from wholearm.common.arrays import Array
-from wholearm.common.errors import InputError, ReplayError, SolverError
+from wholearm.common.errors import InputError, JammingError, ReplayError, SolverError
 from wholearm.planning import self_check
 from wholearm.planning.blocks import Planning, plan_blocks
 from wholearm.planning.options import PlanOptions
@@ -23,10 +23,11 @@ from wholearm.planning.self_check import (
     replay_plan,
 )
 from wholearm.problem.definition import Problem
+from wholearm.results.report import Report
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Trajectory
 from wholearm.verification.verdict import Allowance, find_least_force
-from wholearm.verification.verify import verify
+from wholearm.verification.verify import inspect, verify
 
 
 def brake_less(starts: Array, c: Array) -> Array:
@@ -38,6 +39,7 @@ def test_a_plan_that_holds() -> None:
     problem, trajectory = plan()
     check = check_plan(problem, trajectory, Allowance())
     assert check.failure is None and check.residual.size < 1e-9
+    assert isinstance(check.report, Report)
     # Every piece is a step; only phases with few pieces are looked at in between.
     assert check.report.steps < len(trajectory.torque.coefficients) + 150
 
@@ -57,6 +59,7 @@ def test_a_phase_that_hardly_stops_is_found_by_where_the_next_one_ends() -> None
     check = check_plan(
         problem, replace(trajectory, torque=change(trajectory.torque, brake_less)), Allowance()
     )
+    assert isinstance(check.report, Report)
     first, *others = check.report.phases
     speed, least = 1e-3, Allowance(departure=1.0, rest_speed=1.0)
     report = replace(check.report, phases=(replace(first, end_speed=speed), *others))
@@ -138,6 +141,33 @@ def test_only_what_does_not_hold_is_refined(slide: Problem, cured: int) -> None:
     # Twice the intervals, but for those of no length where a direction reverses.
     pieces = [len(block.plans[0].torque.coefficients) for block in planning.blocks]
     assert pieces[1] >= 2**cured * 20 - 2
+
+
+def jam(phase: int, pieces: int) -> Any:
+    """`inspect`, but for torques of less than so many pieces, which jam in a phase."""
+
+    def replay(problem: Problem, torque: TorqueProfile, *given: Any) -> Report:
+        if len(torque.coefficients) < pieces:
+            error = JammingError(f"v1-palm jams in phase {phase} at t = 0.1 s")
+            error.phase = phase
+            raise error
+        return inspect(problem, torque, *given)
+
+    return replay
+
+
+def test_a_replay_that_jams_refines_the_phase(
+    slide: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spoiled = Spoiled(slide, 1, 0)
+    pieces = len(spoiled.build(spoiled.planning).torque.coefficients)
+    monkeypatch.setattr(self_check, "inspect", jam(2, pieces + 1))
+    planning, trajectory, _ = spoiled.run()
+    assert [block.finer for block in planning.blocks] == [0, 1, 0]
+    assert verify(slide, trajectory).ok
+    monkeypatch.setattr(self_check, "inspect", jam(2, 10**6))
+    with pytest.raises(ReplayError, match=r"8 times the intervals: v1-palm jams in phase 2 at t"):
+        spoiled.run()
 
 
 def test_refining_is_bounded_and_the_error_says_where(slide: Problem) -> None:

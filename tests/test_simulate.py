@@ -409,8 +409,9 @@ def test_jamming_is_an_error_that_names_phase_and_time() -> None:
     curve = dataclasses.replace(motion.curve, formation=rough.phases[0].formation)
     torque = CosineMotion(curve, motion.duration, 0.3).fit(40, 7)
     place = r"v6-finger2 jams in phase 1 at t = 0\.1\d+ s: friction"
-    with pytest.raises(JammingError, match=place):
+    with pytest.raises(JammingError, match=place) as caught:
         simulate(rough, torque)
+    assert caught.value.phase == 1
 
 
 def test_a_jammed_formation_at_rest() -> None:

@@ -76,9 +76,21 @@ class SolverError(WholearmError):
     """The solver stopped without an answer although the problem was not shown infeasible."""
 
 
-class JammingError(WholearmError):
+class _PhaseError(WholearmError):
+    """An error that a simulation may end with.
+
+    Attributes
+    ----------
+    phase : int or None
+        Number of the phase that was simulated.
+    """
+
+    phase: int | None = None
+
+
+class JammingError(_PhaseError):
     """Friction makes the reduced inertia vanish or turn negative: no forward dynamics."""
 
 
-class SimulationError(WholearmError):
+class SimulationError(_PhaseError):
     """The forward simulation cannot go on (step size underflow, inconsistent start)."""

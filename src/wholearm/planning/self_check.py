@@ -13,7 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InfeasibleError, ReplayError, SolverError
+from ..common.errors import (
+    InfeasibleError,
+    JammingError,
+    ReplayError,
+    SimulationError,
+    SolverError,
+)
 from ..problem.definition import Problem
 from ..results.report import Deviation, Report
 from ..results.torque import TorqueProfile
@@ -63,9 +69,16 @@ class Residual(NamedTuple):
 
 
 class Check(NamedTuple):
-    """A plan's own replay and its residual."""
+    """A plan's own replay and its residual.
 
-    report: Report
+    Attributes
+    ----------
+    report : Report, JammingError or SimulationError
+        What the replay has shown, or what it has ended with, since it cannot go on.
+    residual : Residual
+    """
+
+    report: Report | JammingError | SimulationError
     residual: Residual
 
     @property
@@ -73,6 +86,8 @@ class Check(NamedTuple):
         """Number of the phase that fails, and the reason; None if the plan holds."""
         if self.residual.size > RESIDUAL:
             return self.residual.phase, self.residual.text
+        if not isinstance(self.report, Report):
+            return self.report.phase or 1, str(self.report)
         if self.report.ok:
             return None
         assert self.report.failed_phase is not None
@@ -91,7 +106,7 @@ class Check(NamedTuple):
         """
         assert self.failure is not None
         following = dict(enumerate(durations[1:].tolist(), start=1))
-        for phase in self.report.phases:
+        for phase in self.report.phases if isinstance(self.report, Report) else ():
             departs = (
                 phase.deviation is not None
                 and measure_departure(phase.deviation, scales.length) > allowance.departure
@@ -126,8 +141,6 @@ def replay_plan(
     ------
     ReplayError
         If a block does not hold with finer intervals either.
-    JammingError, SimulationError
-        If the simulation cannot go on.
     """
     problem = planning.problem
     usual, strict = Allowance(), Allowance().scale(STRICT)
@@ -177,8 +190,12 @@ def check_plan(
     It is looked at in few instants, or at `times`, shape (n,) [s].
     """
     times = pick_times(trajectory) if times is None else times
-    replayed = inspect(problem, trajectory.torque, trajectory, times, allowance, 1e-9)
-    return Check(replayed, find_residual(problem, trajectory))
+    residual = find_residual(problem, trajectory)
+    try:
+        replayed = inspect(problem, trajectory.torque, trajectory, times, allowance, 1e-9)
+    except (JammingError, SimulationError) as error:
+        return Check(error, residual)
+    return Check(replayed, residual)
 
 
 def pick_times(trajectory: Trajectory, pieces: int = PIECES) -> Array:
@@ -271,6 +288,7 @@ def _describe(block: BlockPlan, number: int, check: Check) -> str:
 
 def _list_figures(planning: Planning, check: Check) -> dict[str, Any]:
     """What `meta` keeps of a replay."""
+    assert isinstance(check.report, Report)
     found = [(find_least_force(phase), phase.number) for phase in check.report.phases]
     known = [(least, number) for least, number in found if least is not None]
     least, number = min(known, key=lambda pair: pair[0].least)

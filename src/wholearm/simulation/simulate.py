@@ -73,7 +73,8 @@ def simulate(
     JammingError
         If friction makes the reduced inertia vanish or turn negative.
     SimulationError
-        If a formation does not close at its start, or the step size underflows.
+        If a formation does not close at its start, or the step size underflows. Both errors say in
+        which phase.
     """
     if not 1e-14 <= tolerance <= 1e-2:
         raise InputError("", "tolerance", f"{tolerance!r} is not between 1e-14 and 1e-2")
@@ -85,7 +86,11 @@ def simulate(
     for phase, following in zip(problem.phases, [*problem.phases[1:], None], strict=True):
         if progress is not None:
             progress(f"simulating phase {phase.number} of {len(problem.phases)}")
-        outcome = _play(run, phase, following)
+        try:
+            outcome = _play(run, phase, following)
+        except (JammingError, SimulationError) as error:
+            error.phase = phase.number
+            raise
         if outcome is not None:
             return _collect(run, outcome)
     goal = problem.phases[-1].until

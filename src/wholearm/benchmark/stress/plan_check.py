@@ -33,7 +33,8 @@ def check_plan(problem: Problem, plan: Trajectory) -> list[str]:
         t = _choose_times(plan, start, motion.duration)
         rows = motion.evaluate(t)
         texts = _check_phase(problem, phase, rows)
-        texts += _check_rates(problem.scene, t, rows)
+        middles = motion.evaluate((t[1:] + t[:-1]) / 2)
+        texts += _check_rates(problem.scene, t, rows, middles)
         texts += _check_profile(problem.scene, plan, start + t, rows)
         if before is not None:
             texts += _check_joint(problem, phase, before, rows)
@@ -133,19 +134,23 @@ def _check_forces(problem: Problem, phase: Phase, rows: Samples, touches: list[T
     return texts
 
 
-def _check_rates(scene: Scene, t: Array, rows: Samples) -> list[str]:
+def _check_rates(scene: Scene, t: Array, rows: Samples, middles: Samples) -> list[str]:
     """Whether z' is the derivative of z, and z'' that of z', as well as samples can tell.
 
-    A step of the acceleration between two instants changes what the trapezium rule gives by no
-    more than what the instants about it show.
+    Simpson's rule takes instants, at `rows`, and those halfway between, at `middles`. A step of the
+    acceleration there, or a kink, changes what it gives by no more than what the instants about it
+    show: with the ends alone, a kink and a curvature could cancel in them.
     """
     texts, h = [], np.diff(t)[:, None]
     if not (h > 0).all():
         return ["instants of a phase without a duration"]
     unit = np.array([1.0, 1.0, *[1.0 / scene.scales.length] * 3])
-    for what, value, rate in (("z", rows.z, rows.z_dot), ("z'", rows.z_dot, rows.z_ddot)):
-        miss = np.abs(np.diff(value, axis=0) - h * (rate[1:] + rate[:-1]) / 2)
-        span = _spread(rate)
+    for what, value, rate, middle in (
+        ("z", rows.z, rows.z_dot, middles.z_dot),
+        ("z'", rows.z_dot, rows.z_ddot, middles.z_ddot),
+    ):
+        miss = np.abs(np.diff(value, axis=0) - h * (rate[1:] + 4 * middle + rate[:-1]) / 6)
+        span = _spread(rate, middle)
         tiny = 1e-7 * unit * float((np.abs(value) / unit).max())
         excess = miss - (h * span + tiny)
         if (excess > 0).any():
@@ -154,10 +159,12 @@ def _check_rates(scene: Scene, t: Array, rows: Samples) -> list[str]:
     return texts
 
 
-def _spread(values: Array) -> Array:
-    """How much values change over the intervals about each interval, shape (n - 1, k)."""
-    padded = np.concatenate([values[:1], values, values[-1:]])
-    windows = np.stack([padded[k : k + len(values) - 1] for k in range(4)])
+def _spread(values: Array, middles: Array) -> Array:
+    """How much values change over each interval and those beside it, shape (n - 1, k)."""
+    every = np.empty((2 * len(values) + 3, values.shape[1]))
+    every[2:-2:2], every[3:-3:2] = values, middles
+    every[:2], every[-2:] = values[0], values[-1]
+    windows = np.stack([every[k : k + 2 * len(middles) : 2] for k in range(7)])
     return np.asarray(windows.max(axis=0) - windows.min(axis=0))
 
 

@@ -23,13 +23,15 @@ WORTH = 1e-4
 def improve(search: Search, solution: Solution) -> Solution:
     """Change the modes of a solution for as long as that makes it better."""
     known = {sign_sequence(solution.stages)}
-    waiting = _list(search, solution)
-    while waiting and len(known) < MOST:
+    waiting, tried = _list(search, solution), 1
+    while waiting and tried < MOST:
         moved = waiting.pop(0)
         signs = sign_sequence(moved)
-        if signs in known:
+        # A stage that has shrunk to nothing may have gained by the intervals beside it alone.
+        if signs in known and len(moved) >= len(solution.stages):
             continue
         known.add(signs)
+        tried += 1
         other = search.solve(moved, most=PATIENCE)
         search.statistics.sequences += 1
         if not other.success:
