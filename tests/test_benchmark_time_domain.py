@@ -37,7 +37,7 @@ def test_replays_that_end_early_have_no_error(monkeypatch: pytest.MonkeyPatch) -
     errors = iter([np.nan, 1e-3, 1e-4])
     monkeypatch.setattr(time_domain, "SCHEMES", (("radau", 2),))
     monkeypatch.setattr(time_domain, "ORDER_INTERVALS", (4, 8, 16))
-    monkeypatch.setattr(time_domain, "_find_end_error", lambda *_: next(errors))
+    monkeypatch.setattr(time_domain, "find_end_error", lambda *_: next(errors))
     rows = measure_order(flip())
     assert [row.error for row in rows] == [None, 1e-3, 1e-4]
     assert [row.note for row in rows] == [

@@ -25,7 +25,7 @@ def test_blocks_are_planned_alone_only_where_that_is_another_plan(
         given.append(planning)
         return planning
 
-    monkeypatch.setattr(blocks, "_plan_each", plan_each)
+    monkeypatch.setattr(blocks, "plan_each", plan_each)
     curves, landing = (planning_of(problem_of(path)) for path in (HEPTAGON, TWICE))
     assert plan_alone(curves, print) is None
     assert plan_alone(replace(landing, ahead=False), print) is None

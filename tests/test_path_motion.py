@@ -16,11 +16,11 @@ from wholearm.planning.path_domain.motion import (
     Grid,
     PathMotion,
     Profile,
-    _arctanh_ratio,
-    _cosh_ratio,
-    _sinh_ratio,
+    arctanh_ratio,
+    cosh_ratio,
     make_grid,
     redistribute_nodes,
+    sinh_ratio,
 )
 
 SEEDS = range(6)
@@ -169,9 +169,9 @@ def test_a_run_out_of_near_rest() -> None:
 
 
 SERIES: dict[Any, Callable[[int], float]] = {
-    _sinh_ratio: lambda n: 1 / math.factorial(2 * n + 1),
-    _cosh_ratio: lambda n: 1 / math.factorial(2 * n + 2),
-    _arctanh_ratio: lambda n: 1 / (2 * n + 1),
+    sinh_ratio: lambda n: 1 / math.factorial(2 * n + 1),
+    cosh_ratio: lambda n: 1 / math.factorial(2 * n + 2),
+    arctanh_ratio: lambda n: 1 / (2 * n + 1),
 }
 
 
@@ -185,13 +185,13 @@ def test_ratios_match_their_series(ratio: Any) -> None:
 
 def test_ratios_away_from_zero() -> None:
     root = np.linspace(0.7, 6.0, 50)
-    np.testing.assert_allclose(_sinh_ratio(root**2), np.sinh(root) / root, rtol=1e-14)
-    np.testing.assert_allclose(_sinh_ratio(-(root**2)), np.sin(root) / root, atol=1e-15)
-    np.testing.assert_allclose(_cosh_ratio(root**2), (np.cosh(root) - 1) / root**2, rtol=1e-14)
-    np.testing.assert_allclose(_cosh_ratio(-(root**2)), (1 - np.cos(root)) / root**2, atol=1e-15)
-    np.testing.assert_allclose(_arctanh_ratio(-(root**2)), np.arctan(root) / root, rtol=1e-14)
+    np.testing.assert_allclose(sinh_ratio(root**2), np.sinh(root) / root, rtol=1e-14)
+    np.testing.assert_allclose(sinh_ratio(-(root**2)), np.sin(root) / root, atol=1e-15)
+    np.testing.assert_allclose(cosh_ratio(root**2), (np.cosh(root) - 1) / root**2, rtol=1e-14)
+    np.testing.assert_allclose(cosh_ratio(-(root**2)), (1 - np.cos(root)) / root**2, atol=1e-15)
+    np.testing.assert_allclose(arctanh_ratio(-(root**2)), np.arctan(root) / root, rtol=1e-14)
     part = np.linspace(0.7, 0.9999, 50)
-    np.testing.assert_allclose(np.tanh(part * _arctanh_ratio(part**2)), part, rtol=1e-13)
+    np.testing.assert_allclose(np.tanh(part * arctanh_ratio(part**2)), part, rtol=1e-13)
 
 
 @pytest.mark.parametrize("intervals", [10, 11, 37, 80, 801])

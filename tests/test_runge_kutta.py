@@ -11,19 +11,19 @@ from wholearm.simulation.stepper import build_stepper
 
 
 def test_rows_sum_to_nodes() -> None:
-    sums = [sum(row.values()) for row in runge_kutta._ROWS]
+    sums = [sum(row.values()) for row in runge_kutta.ROWS]
     # The coefficients are rounded to 16 digits and reach 44.
-    assert np.allclose(sums, runge_kutta._NODES, atol=2e-14, rtol=0)
+    assert np.allclose(sums, runge_kutta.NODES, atol=2e-14, rtol=0)
 
 
 @pytest.mark.parametrize("power", range(8))
 def test_weights_integrate_polynomials(power: int) -> None:
-    nodes = np.array(runge_kutta._NODES)
-    total = sum(w * nodes[j] ** power for j, w in runge_kutta._WEIGHTS.items())
+    nodes = np.array(runge_kutta.NODES)
+    total = sum(w * nodes[j] ** power for j, w in runge_kutta.WEIGHTS.items())
     assert total == pytest.approx(1 / (power + 1), abs=1e-14)
 
 
-@pytest.mark.parametrize("weights", [runge_kutta._ERROR_5, runge_kutta._ERROR_3])
+@pytest.mark.parametrize("weights", [runge_kutta.ERROR_5, runge_kutta.ERROR_3])
 def test_error_weights_cancel(weights: dict[int, float]) -> None:
     assert sum(weights.values()) == pytest.approx(0, abs=1e-14)
 

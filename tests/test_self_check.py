@@ -105,10 +105,10 @@ class Spoiled:
         self.planning = plan_blocks(problem, options, lambda _: None)
 
     def build(self, planning: Planning) -> Trajectory:
-        from wholearm.planning.plan import _assemble
+        from wholearm.planning.plan import assemble_plan
 
         if planning.blocks[self.phase].finer >= self.cured:
-            return _assemble(planning)
+            return assemble_plan(planning)
         block = planning.blocks[self.phase]
         (own,) = block.plans
         coefficients = own.torque.coefficients.copy()
@@ -116,7 +116,7 @@ class Spoiled:
         weak: PhasePlan[Any] = own._replace(torque=TorqueProfile(own.torque.breaks, coefficients))
         blocks = list(planning.blocks)
         blocks[self.phase] = replace(block, plans=[weak])
-        return _assemble(replace(planning, blocks=tuple(blocks)))
+        return assemble_plan(replace(planning, blocks=tuple(blocks)))
 
     def run(self) -> tuple[Planning, Trajectory, dict[str, Any]]:
         first = self.build(self.planning)

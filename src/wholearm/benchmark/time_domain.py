@@ -47,7 +47,7 @@ def measure_order(problem: Problem) -> list[Row]:
         before = math.nan
         for intervals in ORDER_INTERVALS:
             started = time.perf_counter()
-            error = _find_end_error(alone, name, degree, intervals)
+            error = find_end_error(alone, name, degree, intervals)
             seconds = time.perf_counter() - started
             order = make_scheme(name, degree).order
             note = "" if math.isfinite(error) else "the replay ends early"
@@ -69,7 +69,8 @@ def _isolate(problem: Problem, index: int, z: Array) -> Problem:
     return Problem(problem.name, problem.scene, problem.epsilon, z, (alone,), problem.source)
 
 
-def _find_end_error(problem: Problem, name: str, degree: int, intervals: int) -> float:
+def find_end_error(problem: Problem, name: str, degree: int, intervals: int) -> float:
+    """Largest difference of any z between simulation and collocation at the end, or NaN."""
     scheme = make_scheme(name, degree)
     search = Search.of(problem, PlanOptions(Objective.EFFORT, scheme=name, degree=degree))
     stages = guess_stages(problem, problem.phases, problem.start, scheme, intervals, _PACE)

@@ -147,9 +147,9 @@ def plan_blocks(problem: Problem, options: PlanOptions, report: Callable[[str], 
     planning = Planning(problem, options, (), none, none)
     if options.goal is Objective.MARGIN:
         first = replace(planning, options=_for_time(options), ahead=False)
-        least = _plan_each(first, [0] * count, report).plans
+        least = plan_each(first, [0] * count, report).plans
         planning = replace(planning, shares=_share_duration(least, options.duration), least=least)
-    return _require_margin(_plan_each(planning, [0] * count, report))
+    return _require_margin(plan_each(planning, [0] * count, report))
 
 
 def plan_alone(planning: Planning, report: Callable[[str], None]) -> Planning | None:
@@ -159,7 +159,7 @@ def plan_alone(planning: Planning, report: Callable[[str], None]) -> Planning | 
     if not planning.ahead or all(_look_ahead(problem, own, options) is None for own in blocks):
         return None
     alone = replace(planning, blocks=(), ahead=False)
-    return _require_margin(_plan_each(alone, [0] * len(blocks), report))
+    return _require_margin(plan_each(alone, [0] * len(blocks), report))
 
 
 def refine_block(
@@ -171,7 +171,7 @@ def refine_block(
     """
     finer = [block.finer for block in planning.blocks]
     finer[index] = PLAIN if plain else finer[index] + 1
-    return _require_margin(_plan_each(planning, finer, report))
+    return _require_margin(plan_each(planning, finer, report))
 
 
 def runs_along_curves(block: Sequence[Phase], options: PlanOptions) -> bool:
@@ -181,7 +181,7 @@ def runs_along_curves(block: Sequence[Phase], options: PlanOptions) -> bool:
     return len(block) == 1 or not any(phase.formation.rolling for phase in block)
 
 
-def _plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str], None]) -> Planning:
+def plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str], None]) -> Planning:
     """Plan block after block, but for those that are planned as wanted.
 
     Where a block starts from somewhere else than in the plans of least duration, the allowed

@@ -80,13 +80,13 @@ def solve_with(
     trace_phases(problem)
     traced = time.perf_counter()
     planning = plan_blocks(problem, options, report)
-    trajectory = _assemble(planning)
+    trajectory = assemble_plan(planning)
     planned = time.perf_counter()
     figures = None
     if options.replay:
         from .self_check import replay_plan
 
-        planning, trajectory, figures = replay_plan(planning, trajectory, _assemble, report)
+        planning, trajectory, figures = replay_plan(planning, trajectory, assemble_plan, report)
     replayed = time.perf_counter()
     transitions = _assess(planning, report)
     every = [*planning.least, *planning.plans]
@@ -105,7 +105,7 @@ def solve_with(
     return replace(trajectory, meta=meta)
 
 
-def _assemble(planning: Planning) -> Trajectory:
+def assemble_plan(planning: Planning) -> Trajectory:
     """The trajectory of a planning, but for its `meta`."""
     torque = TorqueProfile.chain([plan.torque for plan in planning.plans])
     motions = [plan.motion for plan in planning.plans]

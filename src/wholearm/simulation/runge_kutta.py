@@ -21,7 +21,7 @@ from ..common.arrays import Expression
 ORDER = 8
 
 # fmt: off
-_ROWS: tuple[dict[int, float], ...] = (
+ROWS: tuple[dict[int, float], ...] = (
     {},
     {
         0: 0.05260015195876773,
@@ -65,23 +65,27 @@ _ROWS: tuple[dict[int, float], ...] = (
         10: 0.6433927460157636,
     },
 )
-_NODES = (
+"""Weights of the stages before, for each stage."""
+NODES = (
     0.0, 0.05260015195876773, 0.0789002279381516, 0.1183503419072274, 0.2816496580927726,
     0.3333333333333333, 0.25, 0.3076923076923077, 0.6512820512820513, 0.6, 0.8571428571428571, 1.0,
 )
-_WEIGHTS = {
+"""Times of the stages, as shares of a step."""
+WEIGHTS = {
     0: 0.054293734116568765, 5: 4.450312892752409, 6: 1.8915178993145003, 7: -5.801203960010585,
     8: 0.3111643669578199, 9: -0.1521609496625161, 10: 0.20136540080403034,
     11: 0.04471061572777259,
 }
-_ERROR_5 = {
+"""Weights of order 8 by stage."""
+ERROR_5 = {
     0: 0.01312004499419488, 5: -1.2251564463762044, 6: -0.4957589496572502, 7: 1.6643771824549864,
     8: -0.35032884874997366, 9: 0.3341791187130175, 10: 0.08192320648511571,
     11: -0.022355307863886294,
 }
-# The third-order formula's weights, taken off those of order 8.
+"""What the weights of order 8 differ by from those of order 5."""
 _THIRD = {0: 0.2440944881889764, 8: 0.7338466882816118, 11: 0.022058823529411766}
-_ERROR_3 = {j: w - _THIRD.get(j, 0.0) for j, w in _WEIGHTS.items()}
+ERROR_3 = {j: w - _THIRD.get(j, 0.0) for j, w in WEIGHTS.items()}
+"""What the weights of order 8 differ by from those of order 3."""
 # fmt: on
 
 
@@ -108,7 +112,7 @@ def build_step(
     """
     stages, last = _build_combinations(y.shape[0])
     rates: list[Expression] = []
-    for combine, row in zip(stages, _ROWS, strict=True):
+    for combine, row in zip(stages, ROWS, strict=True):
         place = combine(y, t, h, *(rates[j] for j in row)) if row else (y, t)
         rates.append(rate(*place))
     end, fifth, third = last(y, t, h, *rates)
@@ -124,7 +128,7 @@ def _build_combinations(n: int) -> tuple[list[Expression], Expression]:
     right-hand side, and each step calls them.
     """
     y, t, h = ca.SX.sym("y", n), ca.SX.sym("t"), ca.SX.sym("h")
-    rates = [ca.SX.sym(f"rate_{j}", n) for j in range(len(_ROWS))]
+    rates = [ca.SX.sym(f"rate_{j}", n) for j in range(len(ROWS))]
 
     def combine(weights: dict[int, float]) -> Expression:
         used = ca.horzcat(ca.SX(n, 0), *(rates[stage] for stage in weights))
@@ -132,9 +136,9 @@ def _build_combinations(n: int) -> tuple[list[Expression], Expression]:
 
     stages = [
         ca.Function("stage", [y, t, h, *(rates[j] for j in row)], [y + combine(row), t + node * h])
-        for node, row in zip(_NODES, _ROWS, strict=True)
+        for node, row in zip(NODES, ROWS, strict=True)
     ]
-    ends = [y + combine(_WEIGHTS), combine(_ERROR_5), combine(_ERROR_3)]
+    ends = [y + combine(WEIGHTS), combine(ERROR_5), combine(ERROR_3)]
     return stages, ca.Function("last", [y, t, h, *rates], ends)
 
 

@@ -83,7 +83,7 @@ class PathMotion:
         speeds = np.where(some, speeds, 1.0)
         slope = np.divide(rise, h, out=np.zeros_like(rise), where=h > 0)
         # s'' linear in s makes the mean speed that of the ends times tanh(y) / y.
-        return np.asarray(2 * run / speeds * _arctanh_ratio(slope * (run / speeds) ** 2))
+        return np.asarray(2 * run / speeds * arctanh_ratio(slope * (run / speeds) ** 2))
 
     @property
     def duration(self) -> float:
@@ -104,11 +104,11 @@ class PathMotion:
         slope = (a[k + 1] - a[k]) / h
         speed = np.sqrt(b[k])
         x = slope * local**2
-        run = local * (speed * _sinh_ratio(x) + a[k] * local * _cosh_ratio(x))
+        run = local * (speed * sinh_ratio(x) + a[k] * local * cosh_ratio(x))
         run = np.clip(run, 0.0, h)
         part = run / h
         # The speed as a function of time: that of the place would lose half its digits near rest.
-        speed = speed * (1 + x * _cosh_ratio(x)) + a[k] * local * _sinh_ratio(x)
+        speed = speed * (1 + x * cosh_ratio(x)) + a[k] * local * sinh_ratio(x)
         here = Profile(
             a[k] + slope * run,
             np.maximum(speed, 0.0) ** 2,
@@ -182,7 +182,7 @@ def directions_of(curve: Curve, segment: NDArray[np.int64]) -> Directions:
     return Directions(Xi[segment], sigma[segment])
 
 
-def _arctanh_ratio(x: Array) -> Array:
+def arctanh_ratio(x: Array) -> Array:
     """Return artanh(sqrt(x)) / sqrt(x), which is arctan(sqrt(-x)) / sqrt(-x) for x < 0."""
     root = np.sqrt(np.abs(x))
     small = root < 1e-3
@@ -192,7 +192,7 @@ def _arctanh_ratio(x: Array) -> Array:
     return np.where(small, 1 + x / 3 + x**2 / 5, ratio)
 
 
-def _sinh_ratio(x: Array) -> Array:
+def sinh_ratio(x: Array) -> Array:
     """Return sinh(sqrt(x)) / sqrt(x), which is sin(sqrt(-x)) / sqrt(-x) for x < 0."""
     root = np.sqrt(np.abs(x))
     small = root < 1e-2
@@ -201,6 +201,6 @@ def _sinh_ratio(x: Array) -> Array:
     return np.where(small, 1 + x / 6 * (1 + x / 20 * (1 + x / 42)), ratio)
 
 
-def _cosh_ratio(x: Array) -> Array:
+def cosh_ratio(x: Array) -> Array:
     """Return (cosh(sqrt(x)) - 1) / x, which is 1/2 at zero."""
-    return _sinh_ratio(x / 4) ** 2 / 2
+    return sinh_ratio(x / 4) ** 2 / 2
