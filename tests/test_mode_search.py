@@ -112,12 +112,12 @@ def test_a_stage_of_no_length_that_gains_by_its_intervals_alone_is_dropped(
     # Rolling shrinks to the shortest that is allowed, and all that follows is one stage less.
     assert split_up.stages[0].guess.duration < 1e-4
     assert split_up.cost < (1 - WORTH) * first.cost
-    list_all = mode_search._list
+    list_all = mode_search.list_neighbours
 
     def list_pieces(search: Search, solution: Solution, leaning: bool = False) -> list[list[Stage]]:
         return [pieces] if solution is first else list_all(search, solution, leaning)
 
-    monkeypatch.setattr(mode_search, "_list", list_pieces)
+    monkeypatch.setattr(mode_search, "list_neighbours", list_pieces)
     found = improve(search, first)
     assert sign_sequence(found.stages) == sign_sequence(first.stages)
     assert found.cost == pytest.approx(split_up.cost, rel=WORTH)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from wholearm.benchmark.stress.plan_check import _check_rates, check_plan
+from wholearm.benchmark.stress.plan_check import check_plan, check_rates
 from wholearm.common.arrays import Array
 from wholearm.problem.definition import Problem
 from wholearm.results.torque import TorqueProfile
@@ -96,8 +96,8 @@ def test_a_kink_that_a_curvature_hides_is_no_difference(heptagon: Problem) -> No
         return Samples(none, *tables, *3 * [none[:, :2]])
 
     middles = sample((t[1:] + t[:-1]) / 2)
-    right = _check_rates(heptagon.scene, t, sample(t), middles)
+    right = check_rates(heptagon.scene, t, sample(t), middles)
     assert np.ptp(sample(t).z_ddot[1:5, 0]) < 1e-12
     assert not any(text.startswith("z' and") for text in right)
-    wrong = _check_rates(heptagon.scene, t, sample(t, step**2 / 2), middles)
+    wrong = check_rates(heptagon.scene, t, sample(t, step**2 / 2), middles)
     assert any(text.startswith("z' and its rate differ by") for text in wrong)

@@ -34,7 +34,7 @@ def check_plan(problem: Problem, plan: Trajectory) -> list[str]:
         rows = motion.evaluate(t)
         texts = _check_phase(problem, phase, rows)
         middles = motion.evaluate((t[1:] + t[:-1]) / 2)
-        texts += _check_rates(problem.scene, t, rows, middles)
+        texts += check_rates(problem.scene, t, rows, middles)
         texts += _check_profile(problem.scene, plan, start + t, rows)
         if before is not None:
             texts += _check_joint(problem, phase, before, rows)
@@ -134,7 +134,7 @@ def _check_forces(problem: Problem, phase: Phase, rows: Samples, touches: list[T
     return texts
 
 
-def _check_rates(scene: Scene, t: Array, rows: Samples, middles: Samples) -> list[str]:
+def check_rates(scene: Scene, t: Array, rows: Samples, middles: Samples) -> list[str]:
     """Whether z' is the derivative of z, and z'' that of z', as well as samples can tell.
 
     Simpson's rule takes instants, at `rows`, and those halfway between, at `middles`. A step of the

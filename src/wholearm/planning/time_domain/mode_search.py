@@ -23,7 +23,7 @@ WORTH = 1e-4
 def improve(search: Search, solution: Solution) -> Solution:
     """Change the modes of a solution for as long as that makes it better."""
     known = {sign_sequence(solution.stages)}
-    waiting, tried = _list(search, solution), 1
+    waiting, tried = list_neighbours(search, solution), 1
     while waiting and tried < MOST:
         moved = waiting.pop(0)
         signs = sign_sequence(moved)
@@ -39,10 +39,10 @@ def improve(search: Search, solution: Solution) -> Solution:
         gain = solution.cost - other.cost
         least = WORTH if len(moved) >= len(solution.stages) else -WORTH
         if gain > least * abs(solution.cost):
-            solution, waiting = other, _list(search, other)
+            solution, waiting = other, list_neighbours(search, other)
         elif _rolls(moved) > _rolls(solution.stages):
             # No better by itself, but it tells which way its contacts would slide.
-            waiting = [*_list(search, other, leaning=True), *waiting]
+            waiting = [*list_neighbours(search, other, leaning=True), *waiting]
     return solution
 
 
@@ -58,7 +58,7 @@ def adapt(search: Search, solution: Solution) -> Solution:
     return moved if moved.success and moved.cost < solution.cost else solution
 
 
-def _list(search: Search, solution: Solution, leaning: bool = False) -> list[list[Stage]]:
+def list_neighbours(search: Search, solution: Solution, leaning: bool = False) -> list[list[Stage]]:
     own = [search.problem.phases[stage.phase].formation for stage in solution.stages]
     epsilon = search.problem.epsilon
     return list(list_moves(solution.stages, search.scheme, own, epsilon, leaning))
