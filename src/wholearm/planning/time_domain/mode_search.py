@@ -59,6 +59,7 @@ def adapt(search: Search, solution: Solution) -> Solution:
 
 
 def list_neighbours(search: Search, solution: Solution, leaning: bool = False) -> list[list[Stage]]:
+    """Sequences of stages that one move leads to from those of a solution."""
     own = [search.problem.phases[stage.phase].formation for stage in solution.stages]
     epsilon = search.problem.epsilon
     return list(list_moves(solution.stages, search.scheme, own, epsilon, leaning))
