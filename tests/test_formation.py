@@ -24,7 +24,6 @@ from wholearm.contacts.formation import (
     describe,
     find_touching,
     place_flush,
-    split_by_first_joint,
 )
 from wholearm.problem.definition import Problem
 from wholearm.scene.model import Friction, Scene
@@ -182,18 +181,6 @@ def test_mirrored_scene_closes_mirrored(seed: int) -> None:
         # Equal up to whole turns, in which the two conventions differ.
         assert np.cos(angle) == pytest.approx(-np.cos(other), abs=ROUNDING)
         assert np.sin(angle) == pytest.approx(np.sin(other), abs=ROUNDING)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_split_by_first_joint(heptagon: Problem, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    v = rng.uniform(-1, 1, (4, 5))
-    for phase in heptagon.phases:
-        A = phase.formation.evaluate(heptagon.start + v / 10, v).A
-        P_AI, P_AII = split_by_first_joint(A)
-        assert P_AI.shape == (4, 4, 4) and P_AII.shape == (4, 4)
-        parts = np.einsum("nij,nj->ni", P_AI, v[:, [0, 1, 2, 4]]) + P_AII * v[:, [3]]
-        np.testing.assert_allclose(parts, np.einsum("nij,nj->ni", A, v), atol=1e-15)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from planned import LandingMotion, change, plan_landing
+from pushed import forward
 from stepping import march
 from wholearm.benchmark.baseline_simulation import simulate_with_scipy
 from wholearm.common.arrays import Array
 from wholearm.common.errors import SimulationError
 from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
-from wholearm.mechanics.dynamics import Directions, forward
+from wholearm.mechanics.dynamics import Directions
 from wholearm.problem.definition import End, Phase, Problem, Until
 from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.events import EventKind, OutcomeKind

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 from itertools import pairwise
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -130,7 +131,7 @@ def test_a_replay_far_from_its_plan_fails() -> None:
 def test_tolerances_are_positive(key: str, value: float) -> None:
     problem, trajectory = plan()
     with pytest.raises(InputError) as caught:
-        verify(problem, trajectory, **{key: value})
+        verify(problem, trajectory, **cast(Any, {key: value}))
     assert caught.value.key == key
 
 

@@ -123,6 +123,8 @@ def build_parser() -> argparse.ArgumentParser:
     verify.add_argument("--departure", type=float, help=f"{text} (1e-3)")
     text = "speed that passes for rest, over the root of that radius times gravity"
     verify.add_argument("--rest-speed", type=float, help=f"{text} (2e-2)")
+    text = "also list the paper's scalar equation of motion where a phase has four constraints"
+    verify.add_argument("--reduced", action="store_true", help=text)
     verify.add_argument("--json", action="store_true", help="print the report as JSON")
 
     plot = _command(commands, "plot", _plot, "draw force margins, torques and snapshots")
@@ -240,7 +242,8 @@ def _verify(options: argparse.Namespace) -> int:
         if getattr(options, key) is not None
     }
     problem = load(options.problem)
-    report = verify(problem, _read_torques(options.torques), **given)
+    torques = _read_torques(options.torques)
+    report = verify(problem, torques, reduced=options.reduced, **given)
     _clear_progress()
     print(json.dumps(report.to_dict(), indent=2) if options.json else report.to_text())
     return report.exit_status

@@ -221,11 +221,6 @@ class Formation(Keeper):
         return np.asarray(function(z.T).full()[0])
 
 
-def split_by_first_joint(A: Array) -> tuple[Array, Array]:
-    """Return P_AI, shape (..., 4, 4), and P_AII, shape (..., 4), of Eqs. (6)-(9)."""
-    return A[..., [0, 1, 2, 4]], A[..., 3]
-
-
 def place_flush(scene: Scene, edge: int, x: float) -> Array:
     """Pose q with `edge` on the palm and the centroid at `x`, shape (3,) [m, m, rad]."""
     phi = scene.polygon.flush_angle(edge)

@@ -15,8 +15,7 @@ nothing rolls c is c_n, P is A and G = A - U Xi A_t. Three routes through the eq
 * forward, tau to (z'', c): c from K c = -P' z' - P M5^-1 (g + S tau - b), K = P M5^-1 G^T;
 * inverse, along a curve z(s) with speed s' and acceleration s'': the object's rows leave one free
   number, the squeeze lambda, and the joints' rows then give tau;
-* the paper's, Eqs. (6)-(16): everything but theta_1 eliminated, Phi_1 theta_1'' + Phi_2 theta_1' +
-  Phi_3 = 0.
+* the paper's, Eqs. (6)-(16): everything but theta_1 eliminated (`verification.reduced`).
 
 Friction can make the reduced inertia vanish or turn negative (jamming). Its sign is that of
 det(P M5^-1 G^T) / det(P M5^-1 P^T), which is 1 without friction: `reduced_inertia`.
@@ -24,15 +23,13 @@ det(P M5^-1 G^T) / det(P M5^-1 P^T), which is 1 without friction: `reduced_inert
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..common.errors import JammingError
-from ..contacts.formation import Formation, Kinematics, split_by_first_joint
+from ..contacts.formation import Formation, Kinematics
 
 
 class Directions(NamedTuple):
@@ -130,35 +127,6 @@ def split_forces(formation: Formation, c: Array, Xi: Array) -> tuple[Array, Arra
     return c_n, c_t
 
 
-def forward(
-    formation: Formation, z: Array, v: Array, tau: Array, directions: Directions
-) -> tuple[Array, Array]:
-    """Accelerations z'', shape (5,), and contact forces c, shape (n_c + R,), from joint torques.
-
-    Parameters
-    ----------
-    z, v : ndarray, shape (5,)
-        Configuration and velocity, consistent with the contacts.
-    tau : ndarray, shape (2,), [N m]
-    directions : Directions
-        Signs of friction, those of `v` (or of the impending motion at rest).
-
-    Raises
-    ------
-    JammingError
-        If friction makes the reduced inertia vanish or turn negative.
-    """
-    kinematics = formation.evaluate(z[None], v[None])
-    inertia = reduced_inertia(formation, kinematics, directions)[0]
-    if inertia <= 0:
-        raise JammingError(
-            f"{' '.join(formation.names)} jams: friction makes the reduced inertia "
-            f"{inertia:.3g} of its frictionless value"
-        )
-    acceleration, c, _ = build_forward(formation)(z, v, tau, *directions)
-    return acceleration.full()[:, 0], c.full()[:, 0]
-
-
 def reduced_inertia(formation: Formation, kinematics: Kinematics, directions: Directions) -> Array:
     """Reduced inertia over that without friction, shape (n,): jamming at zero and below."""
     inverse_mass = 1 / formation.scene.mass_diagonal
@@ -224,88 +192,6 @@ def inverse(
     )
 
 
-@dataclass(frozen=True)
-class ReducedMotion:
-    """The paper's scalar equation Phi_1 theta_1'' + Phi_2 theta_1' + Phi_3 = 0 at one state.
-
-    Attributes
-    ----------
-    Phi_1 : float, [kg m^2]
-        Reduced inertia.
-    Phi_2 : float, [N m s]
-        Velocity terms over theta_1'.
-    Phi_3 : float, [N m]
-        Gravity, dry friction and torques.
-    acceleration : float, [rad/s^2]
-        theta_1''.
-    c : ndarray, shape (4,), [N]
-        Contact forces [c_n; c_t(rolling)].
-    """
-
-    Phi_1: float
-    Phi_2: float
-    Phi_3: float
-    acceleration: float
-    c: Array
-
-
-def reduce_to_first_joint(
-    formation: Formation,
-    z: Array,
-    theta_1_dot: float,
-    tau: Array,
-    directions: Directions,
-) -> ReducedMotion:
-    """Eliminate everything but theta_1 as the paper does (Eqs. 6-16), for four constraints.
-
-    Eqs. (6)-(9) give (q', theta_2') = -P_AI^+ P_AII theta_1'. The equations of q and theta_2 then
-    give c, and that of theta_1 becomes the scalar equation. The pseudoinverse keeps the formula
-    defined where P_AI is singular, but where that is because theta_1 is stationary the motion is
-    not a multiple of theta_1' and no such formula describes it; `forward` does.
-
-    Raises
-    ------
-    JammingError
-        If Phi_1 is zero or has the wrong sign.
-    """
-    scene = formation.scene
-    others = [0, 1, 2, 4]
-
-    def extend(P: Array, right: Array, first: float) -> Array:
-        P_AI, P_AII = split_by_first_joint(P)
-        full = np.empty(5)
-        full[others] = np.linalg.pinv(P_AI) @ (right - P_AII * first)
-        full[3] = first
-        return full
-
-    P = formation.evaluate(z[None], np.zeros((1, 5))).P[0]
-    slope = extend(P, np.zeros(4), 1.0)
-    kinematics = formation.evaluate(z[None], slope[None])
-    bend = extend(P, -kinematics.P_dot_v[0], 0.0)
-    G = force_rows(formation, kinematics, directions)[0]
-    mass = scene.mass_diagonal
-    dry = scene.dry * np.array([0.0, 0.0, 0.0, *directions.sigma])
-    resting = dry - scene.applied_force - np.array([0.0, 0.0, 0.0, *tau])
-    # Rows of each term of M5 z'' + b - g - S tau = G^T c; the others' rows solve for c.
-    eliminate = G[:, 3] @ np.linalg.inv(G[:, others].T)
-
-    def scalar(term: Array) -> float:
-        return float(term[3] - eliminate @ term[others])
-
-    moving = mass * bend * theta_1_dot + scene.viscous * slope
-    Phi_1, Phi_2, Phi_3 = scalar(mass * slope), scalar(moving), scalar(resting)
-    ratio = reduced_inertia(formation, kinematics, directions)[0]
-    if ratio <= 0:
-        raise JammingError(
-            f"{' '.join(formation.names)} jams: Phi_1 = {Phi_1:.3g} kg m^2, "
-            f"{ratio:.3g} of its frictionless value"
-        )
-    acceleration = -(Phi_2 * theta_1_dot + Phi_3) / Phi_1
-    total = mass * slope * acceleration + moving * theta_1_dot + resting
-    c = np.linalg.solve(G[:, others].T, total[others])
-    return ReducedMotion(Phi_1, Phi_2, Phi_3, acceleration, c)
-
-
 def energy(formation: Formation, z: Array, v: Array) -> Array:
     """Kinetic and potential energy at n states, shape (n,) [J]."""
     scene = formation.scene
@@ -336,14 +222,11 @@ def force_rows(formation: Formation, kinematics: Kinematics, directions: Directi
 __all__ = [
     "Directions",
     "PathForces",
-    "ReducedMotion",
     "build_force_rows",
     "build_forward",
     "energy",
     "force_rows",
-    "forward",
     "inverse",
-    "reduce_to_first_joint",
     "reduced_inertia",
     "split_forces",
 ]

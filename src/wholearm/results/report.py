@@ -152,6 +152,40 @@ class ModeChange:
     kind: str
 
 
+@dataclass(frozen=True)
+class ReducedState:
+    """Phi_1 theta_1'' + Phi_2 theta_1' + Phi_3 = 0, the paper's Eqs. (10)-(16), at one instant.
+
+    Attributes
+    ----------
+    time : float, [s]
+    phase : int
+        Number of the phase.
+    Phi_1 : float, [kg m^2]
+        Inertia at the first joint; its sign depends on what friction makes of the elimination.
+    Phi_2 : float, [N m s]
+        Velocity terms over theta_1'.
+    Phi_3 : float, [N m]
+        Gravity, dry friction and torques.
+    theta_1_dot : float, [rad/s]
+    theta_1_ddot : float, [rad/s^2]
+        As the replay has it.
+    """
+
+    time: float
+    phase: int
+    Phi_1: float
+    Phi_2: float
+    Phi_3: float
+    theta_1_dot: float
+    theta_1_ddot: float
+
+    @property
+    def residual(self) -> float:
+        """What the equation leaves [N m]."""
+        return self.Phi_1 * self.theta_1_ddot + self.Phi_2 * self.theta_1_dot + self.Phi_3
+
+
 class Failure(NamedTuple):
     """Why torques are not good, and in which phase, by its number."""
 
@@ -219,6 +253,8 @@ class Report:
         Of the simulation.
     changes : tuple of ModeChange
         In the order of time.
+    reduced : tuple of ReducedState
+        The paper's scalar equation along the replay, if that was asked for.
     """
 
     name: str
@@ -235,6 +271,7 @@ class Report:
     tolerance: float
     steps: int
     changes: tuple[ModeChange, ...] = ()
+    reduced: tuple[ReducedState, ...] = ()
 
     @property
     def ok(self) -> bool:

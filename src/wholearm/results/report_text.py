@@ -19,7 +19,8 @@ def write(report: Report) -> str:
     if report.finger_gap is not None:
         gap = report.finger_gap
         parts.append(f"least gap of the fingers: {gap.least:.5g} m at t = {gap.time:.5g} s")
-    tables = [_contact_table, _rolling_table, _phase_table, _change_table, _energy_table]
+    tables = [_contact_table, _rolling_table, _phase_table, _change_table, _reduced_table]
+    tables.append(_energy_table)
     parts += [line for table in tables for line in _after_blank(table(report))]
     return "\n".join(parts)
 
@@ -74,6 +75,18 @@ def _change_table(report: Report) -> list[str]:
     """Changes of mode; nothing if there are none."""
     rows = [[str(c.phase), c.what, c.kind, _show(c.time, ".5f")] for c in report.changes]
     return _table(["phase", "mode of", "", "at t [s]"], rows, {1, 2}) if rows else []
+
+
+def _reduced_table(report: Report) -> list[str]:
+    """The paper's scalar equation; nothing if it was not asked for."""
+    header = ["phase", "at t [s]", "Phi_1 [kg m^2]", "Phi_2 [N m s]", "Phi_3 [N m]"]
+    header += ["theta_1' [rad/s]", "theta_1'' [rad/s^2]", "residual [N m]"]
+    rows = []
+    for r in report.reduced:
+        figures = r.Phi_1, r.Phi_2, r.Phi_3, r.theta_1_dot, r.theta_1_ddot
+        texts = [_show(value, ".6g") for value in figures]
+        rows.append([str(r.phase), _show(r.time, ".5f"), *texts, _show(r.residual, ".1e")])
+    return _table(header, rows, set()) if rows else []
 
 
 def _energy_table(report: Report) -> list[str]:

@@ -24,6 +24,7 @@ from ..results.trajectory import Trajectory
 from ..simulation.events import Event, EventKind, Simulation
 from ..simulation.simulate import simulate
 from .margins import find_finger_gap, list_contact_margins, list_slip_margins
+from .reduced import list_reduced_states
 from .verdict import (
     DEPARTURE,
     REST_SPEED,
@@ -50,6 +51,7 @@ def verify(
     tolerance: float = 1e-9,
     departure: float = DEPARTURE,
     rest_speed: float = REST_SPEED,
+    reduced: bool = False,
 ) -> Report:
     """Replay a trajectory's torques, or given ones, open loop and report what happens.
 
@@ -69,6 +71,8 @@ def verify(
     rest_speed : float
         Speed at the end of a phase that passes for rest, relative to the scene's speed (the root
         of length times gravity); angular speeds count times the scene's length.
+    reduced : bool
+        Whether to list the paper's scalar equation of motion along phases with four constraints.
 
     Raises
     ------
@@ -84,7 +88,8 @@ def verify(
     if plan is not None and set(plan.contacts) != names:
         odd = ", ".join(sorted(set(plan.contacts) ^ names))
         raise InputError("", "contacts", f"trajectory and problem differ in {odd}")
-    return inspect(problem, torque, plan, choose_times(torque, plan), allowance, tolerance)
+    times = choose_times(torque, plan)
+    return inspect(problem, torque, plan, times, allowance, tolerance, reduced)
 
 
 def inspect(
@@ -94,6 +99,7 @@ def inspect(
     times: Array,
     allowance: Allowance,
     tolerance: float,
+    reduced: bool = False,
 ) -> Report:
     """Replay torques, look at what happens at `times` [s] and judge it; see `verify`."""
     simulation = simulate(problem, torque, tolerance=tolerance, times=times)
@@ -131,6 +137,7 @@ def inspect(
             for e in simulation.events
             if e.kind in _CHANGES and e.contact
         ),
+        reduced=list_reduced_states(problem, simulation) if reduced else (),
     )
 
 
