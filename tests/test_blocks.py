@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -8,7 +9,7 @@ import pytest
 from shipped import HEPTAGON, TWICE, problem_of
 from wholearm.planning import blocks
 from wholearm.planning.blocks import Planning, plan_alone
-from wholearm.planning.options import PlanOptions
+from wholearm.planning.options import Objective, PlanOptions
 
 
 def planning_of(problem: Any) -> Planning:
@@ -31,3 +32,23 @@ def test_blocks_are_planned_alone_only_where_that_is_another_plan(
     assert plan_alone(replace(landing, ahead=False), print) is None
     assert plan_alone(landing, print) == given[0]
     assert not given[0].ahead and not given[0].blocks
+
+
+def test_no_phase_has_to_press_much_more_than_those_before_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem, given = problem_of(HEPTAGON), list[tuple[PlanOptions, float]]()
+    plan_block = blocks._plan_block
+
+    def record(*of: Any) -> Any:
+        plans, chain = plan_block(*of)
+        given.append((of[3], min(plan.value for plan in plans)))
+        return plans, chain
+
+    monkeypatch.setattr(blocks, "_plan_block", record)
+    blocks.plan_blocks(problem, PlanOptions("margin", intervals=20), lambda _: None)
+    pressed = [(own.enough, value) for own, value in given if own.goal is Objective.MARGIN]
+    assert len(pressed) == len(problem.phases) and pressed[0][0] == math.inf
+    for index in range(1, len(pressed)):
+        before = min(value for _, value in pressed[:index])
+        assert pressed[index][0] == pytest.approx(blocks.AMPLE * before)

@@ -7,6 +7,7 @@ anything else in the time domain.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -30,6 +31,8 @@ PLAIN = -1
 """In place of how often intervals are doubled: as many as at first, and no search for modes."""
 FINEST = 64
 """Most intervals of a phase in the time domain that refining asks for."""
+AMPLE = 1.1
+"""How many times the least normal force of other phases is more than enough."""
 MOVED = 1e-9
 """Distance from which on a block starts somewhere else, in radii of gyration or radians."""
 SHORT = 5e-7
@@ -205,12 +208,19 @@ def plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str], 
             numbers = "-".join(str(phase.number) for phase in phases)
             report(f"phase {numbers} of {len(problem.phases)}: {options.goal.value}")
             own = _refine(options, known, finer[index])
+            if options.goal is Objective.MARGIN:
+                own = replace(own, enough=_find_enough(blocks))
             to_go = _look_ahead(problem, phases, own) if planning.ahead else None
             made = _plan_block(problem, phases, z, own, allowed, to_go)
             known = BlockPlan(phases, z, *wanted, fastest, *made)
         blocks.append(known)
         z = known.end
     return replace(planning, blocks=tuple(blocks), allowed=allowed)
+
+
+def _find_enough(blocks: Sequence[BlockPlan]) -> float:
+    """Least normal force [N] that decides nothing in a block, as blocks before it keep less."""
+    return AMPLE * min((plan.value for block in blocks for plan in block.plans), default=math.inf)
 
 
 def _refine(options: PlanOptions, known: BlockPlan | None, finer: int) -> PlanOptions:

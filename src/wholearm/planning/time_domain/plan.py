@@ -232,7 +232,8 @@ def _solve(
     solution = search.solve(stages, seconds=seconds)
     if not solution.success:
         return solution
-    better = improve(search, solution) if search.options.mode_search else solution
+    plain = not search.options.mode_search or search.is_enough(solution)
+    better = solution if plain else improve(search, solution)
     search, solution = choose_end(search, adapt(search, better))
     for _ in range(halvings):
         if solution.success:

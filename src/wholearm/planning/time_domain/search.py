@@ -167,6 +167,11 @@ class Search:
         """What it costs to end at `z`, shape (5,)."""
         return float(self.price.gradient @ (z - self.price.origin)) if self.price else 0.0
 
+    def is_enough(self, solution: Solution) -> bool:
+        """Whether c_n is as large as another phase allows anyway, for the objective `margin`."""
+        most = self.options.enough - self.problem.epsilon
+        return self.goal is Objective.MARGIN and solution.margin > most
+
     def solve(
         self,
         stages: list[Stage],
