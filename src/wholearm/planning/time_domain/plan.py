@@ -50,6 +50,9 @@ NEAR = -0.3
 """Margin of a way from which on a motion beside it may keep its limits."""
 WAYS = 3
 """Most ways along which a motion is guessed."""
+_EXACT = 3
+"""Points of an interval beyond which collocation is so exact that intervals would stay as they are,
+too long for torques that are linear in each."""
 _PACES = (2.0, 4.0, 1.0)
 """Guessed durations to try, in units of that of a fall."""
 
@@ -235,7 +238,7 @@ def _solve(
     plain = not search.options.mode_search or search.is_enough(solution)
     better = solution if plain else improve(search, solution)
     search, solution = choose_end(search, adapt(search, better))
-    for _ in range(halvings):
+    for _ in range(max(halvings, search.scheme.degree > _EXACT)):
         if solution.success:
             solution = search.solve(_halve(search, solution.stages), solution)
     return search.hold(solution) if solution.success else solution
