@@ -16,7 +16,7 @@ from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.contacts.formation import Formation, close_finger
-from wholearm.geometry.closing import close, contact_table, first_contact
+from wholearm.geometry.closing import close_fingers, contact_table, first_contact
 from wholearm.geometry.curve import Curve
 from wholearm.mapping.borders import NOWHERE, Window, label_cells
 from wholearm.mapping.formation_map import CROSSED, Border, FormationMap, build_map
@@ -75,7 +75,7 @@ def test_closing_many_agrees_with_closing_one(radius: float) -> None:
     scene = make_scene(points, base=0.06, depth=0.01, length=0.1, radius=radius)
     rng = np.random.default_rng(1)
     x, phi = rng.uniform(-0.2, 0.2, 200), rng.uniform(-4.0, 4.0, 200)
-    closed = close(scene, x, phi)
+    closed = close_fingers(scene, x, phi)
     seen = set()
     for row in range(len(x)):
         for finger in (0, 1):
@@ -103,7 +103,7 @@ def test_configurations_of_cells_touch_without_overlap(every: FormationMap) -> N
     rows, columns = np.nonzero(every.cell >= 0)
     chosen = rng.choice(len(rows), 300, replace=False)
     rows, columns = rows[chosen], columns[chosen]
-    z = close(scene, every.x[columns], every.phi[rows]).z
+    z = close_fingers(scene, every.x[columns], every.phi[rows]).z
     lowest = place_corners(scene, z)[..., 1].min(axis=1)
     np.testing.assert_allclose(lowest, 0.0, rtol=0, atol=1e-15)
     for finger in (0, 1):
@@ -122,7 +122,7 @@ def test_cells_that_cannot_be_reached_say_why(every: FormationMap) -> None:
     assert codes == {-1, -2}
     for code in codes:
         row, column = np.argwhere(every.cell == code)[0]
-        z = close(scene, every.x[[column]], every.phi[[row]]).z[0]
+        z = close_fingers(scene, every.x[[column]], every.phi[[row]]).z[0]
         angles = np.linspace(-np.pi, np.pi, 500)
         # Wherever the finger turns, it stays off the object.
         assert finger_gap(scene, z[:3], -code - 1, angles).min() > 0
@@ -257,13 +257,13 @@ def test_directions_inside_cells_balance(chart: FormationMap) -> None:
     checked = 0
     for k in rng.choice(len(chart.places), 80, replace=False):
         place = chart.places[k]
-        z = close(scene, *place[:, None]).z
+        z = close_fingers(scene, *place[:, None]).z
         label = label_cells(scene, *place[:, None])[0]
         contacts = tuple(contact_table(scene)[i] for i in label if i != NOWHERE)
         formation = Formation(scene, contacts)
         part = formation.evaluate(z, z)
         for way, step in enumerate(steps):
-            v = (close(scene, *(place + step)[:, None]).z - z)[0]
+            v = (close_fingers(scene, *(place + step)[:, None]).z - z)[0]
             slip = part.A_t[0] @ v
             if np.abs(slip).min() < 1e-10 or np.abs(v[3:]).min() < 1e-9:
                 continue
@@ -329,7 +329,9 @@ def crossed() -> FormationMap:
 def test_places_where_the_fingers_overlap_are_marked(crossed: FormationMap) -> None:
     scene = crossed.problem.scene
     x, phi = (part.ravel() for part in np.meshgrid(crossed.x, crossed.phi))
-    overlap = (measure_fingers(scene, close(scene, x, phi).z) < 0).reshape(crossed.cell.shape)
+    overlap = (measure_fingers(scene, close_fingers(scene, x, phi).z) < 0).reshape(
+        crossed.cell.shape
+    )
     np.testing.assert_array_equal(crossed.cell == CROSSED, overlap)
     assert 20 < overlap.sum() < overlap.size / 4
 

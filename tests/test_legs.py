@@ -8,7 +8,7 @@ import pytest
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.contacts.formation import Formation
-from wholearm.geometry.closing import close, contact_table
+from wholearm.geometry.closing import close_fingers, contact_table
 from wholearm.mapping.borders import NOWHERE, flush_track, label_cells
 from wholearm.mapping.legs import split_leg
 from wholearm.mapping.nearby import tolerance
@@ -36,7 +36,7 @@ def test_leg_through_cells_changes_one_contact_at_a_time(heptagon: Problem, back
     for one, two in pairwise(parts):
         np.testing.assert_allclose(one.stop, two.start, atol=1e-12)
         assert set(two.contacts) - set(one.contacts) == set(one.gained)
-        z = close(scene, *one.stop[:, None]).z
+        z = close_fingers(scene, *one.stop[:, None]).z
         both = Formation(scene, tuple({*one.contacts, *two.contacts}))
         assert np.abs(both.evaluate(z, z).C).max() < 1e-9
     for part in parts:

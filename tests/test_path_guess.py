@@ -13,7 +13,7 @@ from wholearm.common.errors import InputError
 from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
-from wholearm.geometry.explore import close
+from wholearm.geometry.explore import close_contacts
 from wholearm.geometry.path_guess import (
     POINTS,
     RELEASE_AT,
@@ -171,7 +171,7 @@ def test_closing_moves_as_little_as_possible(landing: Problem, released: Array) 
     rng = np.random.default_rng(4)
     for _ in range(5):
         away = released + 1e-4 * rng.normal(size=5)
-        z = close(formation, away, np.zeros(0))
+        z = close_contacts(formation, away, np.zeros(0))
         assert z is not None and np.abs(measure_gaps(formation, z)).max() < 1e-12
         kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
         scale = formation.scene.polygon.gyration_radius ** np.array([0, 0, 1, 1, 1])
@@ -190,7 +190,7 @@ def test_closing_keeps_what_has_rolled_by(landing: Problem, released: Array) -> 
 
     slip = formation.evaluate_slip(released[None])[0]
     tipped = released - 0.1 * np.eye(5)[2]
-    z = close(formation, tipped, slip)
+    z = close_contacts(formation, tipped, slip)
     assert z is not None and np.abs(measure_gaps(formation, z)).max() < 1e-12
     # The vertex on the palm stays where it was, and the object turns about it.
     assert place(z) == pytest.approx(place(released), abs=1e-12)
@@ -200,7 +200,7 @@ def test_closing_keeps_what_has_rolled_by(landing: Problem, released: Array) -> 
 
 
 def test_closing_what_cannot_touch_gives_nothing(landing: Problem, released: Array) -> None:
-    assert close(landing.phases[5].formation, released, np.zeros(0), (1, 1.0)) is None
+    assert close_contacts(landing.phases[5].formation, released, np.zeros(0), (1, 1.0)) is None
 
 
 @pytest.mark.parametrize(

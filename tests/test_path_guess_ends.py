@@ -13,7 +13,7 @@ from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
-from wholearm.geometry.explore import close
+from wholearm.geometry.explore import close_contacts
 from wholearm.geometry.path_guess import guess_curve, guess_onwards, guess_phase, load
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
@@ -44,7 +44,7 @@ def test_an_end_is_found_where_the_nearest_one_breaks_a_limit(hexagon: Problem) 
     formation = make_formation(hexagon.scene, "v1-palm v3-finger1 v0-finger2")
     until = parse_contact("v1-finger2", hexagon.scene)
     ending = Formation(hexagon.scene, (*formation.contacts, until))
-    nearest = close(ending, start, np.zeros(0))
+    nearest = close_contacts(ending, start, np.zeros(0))
     assert nearest is not None and ending.evaluate_limits(nearest[None]).min() < -CLOSED
     (part,) = guess_phase(hexagon, Phase(5, formation, Until(until)), start)
     assert np.abs(measure_gaps(ending, part.z[-1])).max() < CLOSED

@@ -147,7 +147,7 @@ class Geometry(NamedTuple):
     A_t: Expression
 
 
-class Limit(NamedTuple):
+class GapLimit(NamedTuple):
     """A quantity that is positive while a contact formation is valid.
 
     Attributes

@@ -31,7 +31,14 @@ from ..common.batch import Batch
 from ..common.errors import InputError
 from ..common.sharing import Keeper, Store, exclusive, kept_property
 from ..scene.model import Finger, Scene
-from .elemental import Contact, Limit, build_features, build_gap, build_geometry, candidate_contacts
+from .elemental import (
+    Contact,
+    GapLimit,
+    build_features,
+    build_gap,
+    build_geometry,
+    candidate_contacts,
+)
 from .limits import build_clearance, list_limits
 from .slip import build_slip
 
@@ -173,7 +180,7 @@ class Formation(Keeper):
         return Batch(self.roll_function)
 
     @kept_property
-    def limits(self) -> tuple[Limit, ...]:
+    def limits(self) -> tuple[GapLimit, ...]:
         """Where this formation stops being valid."""
         return tuple(list_limits(self.scene, self.contacts))
 

@@ -11,12 +11,12 @@ from collections.abc import Sequence
 import casadi as ca
 
 from ..scene.model import Scene
-from .elemental import Contact, Limit, build_features, build_gap, candidate_contacts
+from .elemental import Contact, GapLimit, build_features, build_gap, candidate_contacts
 from .links import build_finger_limit
 from .obstacles import build_obstacles, face
 
 
-def list_limits(scene: Scene, contacts: Sequence[Contact]) -> list[Limit]:
+def list_limits(scene: Scene, contacts: Sequence[Contact]) -> list[GapLimit]:
     """Return every limit of a formation: of its contacts, of other features, and of the links."""
     limits = [limit for contact in contacts for limit in build_limits(contact, scene)]
     for finger in (None, 0, 1):
@@ -29,7 +29,7 @@ def list_limits(scene: Scene, contacts: Sequence[Contact]) -> list[Limit]:
     return limits + build_finger_limit(scene)
 
 
-def _list_clearances(scene: Scene, finger: int | None, held: Sequence[Contact]) -> list[Limit]:
+def _list_clearances(scene: Scene, finger: int | None, held: Sequence[Contact]) -> list[GapLimit]:
     """Limits at which contacts with one part of the hand are gained that it does not have."""
     on_side = {contact.index for contact in held if contact.surface == "finger"}
     count = scene.polygon.n_vertices
@@ -52,7 +52,7 @@ def _list_clearances(scene: Scene, finger: int | None, held: Sequence[Contact]) 
     return limits
 
 
-def build_limits(contact: Contact, scene: Scene) -> list[Limit]:
+def build_limits(contact: Contact, scene: Scene) -> list[GapLimit]:
     """Return the limits of one contact's own range: between base and tip, between two vertices.
 
     Where the range goes over into that of a neighbour, the neighbour is the contact gained.
@@ -82,32 +82,32 @@ def build_limits(contact: Contact, scene: Scene) -> list[Limit]:
         run = link.vertex_run[i]
         off = f"v{i} runs off {part} at its"
         return [
-            Limit(run, f"{off} base"),
-            Limit(scene.fingers[finger].length - run, f"{off} tip", gains("v", i), meeting(i)),
+            GapLimit(run, f"{off} base"),
+            GapLimit(scene.fingers[finger].length - run, f"{off} tip", gains("v", i), meeting(i)),
         ]
     if contact.feature == "e":
         run = link.edge_run[i]
         off = f"{part} runs off edge {i} at v"
         return [
-            Limit(run, f"{off}{i}", gains("v", i), meeting(i)),
-            Limit(lengths[i] - run, f"{off}{after}", gains("v", after), meeting(after)),
+            GapLimit(run, f"{off}{i}", gains("v", i), meeting(i)),
+            GapLimit(lengths[i] - run, f"{off}{after}", gains("v", after), meeting(after)),
         ]
     # Both sides of the link begin where the arc ends.
     beyond, side = link.arc_run[i], link.vertex_gap[i] + scene.fingers[finger].radius
     off = f"v{i} leaves {part} for the"
     return [
-        Limit(ca.fmax(beyond, -side), f"{off} side of the link", gains("v", i, "finger")),
-        Limit(ca.fmax(beyond, side), f"{off} far side of the link"),
-        Limit(
+        GapLimit(ca.fmax(beyond, -side), f"{off} side of the link", gains("v", i, "finger")),
+        GapLimit(ca.fmax(beyond, side), f"{off} far side of the link"),
+        GapLimit(
             link.edge_run[before] - lengths[before],
             f"edge {before} turns onto {part}",
             gains("e", before),
         ),
-        Limit(-link.edge_run[i], f"edge {i} turns onto {part}", gains("e", i)),
+        GapLimit(-link.edge_run[i], f"edge {i} turns onto {part}", gains("e", i)),
     ]
 
 
-def build_clearance(contact: Contact, scene: Scene, touching: bool) -> Limit:
+def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
     """Return the limit at which `contact`, not in the formation, is gained.
 
     A feature beyond the ends of its partner cannot touch it, so its gap does not count there, and
@@ -125,4 +125,4 @@ def build_clearance(contact: Contact, scene: Scene, touching: bool) -> Limit:
     if contact.finger is not None and not (touching and contact.surface == "finger"):
         for limit in build_limits(contact, scene):
             gap = ca.fmax(gap, -limit.value)
-    return Limit(gap, text, contact)
+    return GapLimit(gap, text, contact)

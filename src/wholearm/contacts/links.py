@@ -17,7 +17,7 @@ import numpy as np
 from ..common.arrays import Array, Expression
 from ..common.sharing import Store, exclusive
 from ..scene.model import Scene
-from .elemental import Limit, build_features, rotate_quarter
+from .elemental import GapLimit, build_features, rotate_quarter
 
 FINGERS_TOUCH = "finger 1 touches finger 2"
 """What has happened where the gap of the fingers is zero."""
@@ -47,9 +47,9 @@ def build_finger_gap(scene: Scene) -> Expression:
     return ca.mmax(ca.vertcat(*parts)) - radii
 
 
-def build_finger_limit(scene: Scene) -> list[Limit]:
+def build_finger_limit(scene: Scene) -> list[GapLimit]:
     """Return the limit that the gap between the links is; none where they pass each other."""
-    return [Limit(build_finger_gap(scene), FINGERS_TOUCH)] if scene.fingers_collide else []
+    return [GapLimit(build_finger_gap(scene), FINGERS_TOUCH)] if scene.fingers_collide else []
 
 
 def _build_gap_function(scene: Scene) -> Expression:

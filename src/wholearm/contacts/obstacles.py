@@ -23,13 +23,13 @@ import casadi as ca
 
 from ..common.arrays import Expression
 from ..scene.model import Scene
-from .elemental import Contact, Limit, build_features
+from .elemental import Contact, GapLimit, build_features
 
 _ROUNDING = 1e-30
 """Added to squared distances over squared lengths: points that coincide have a direction."""
 
 
-def build_far_side(scene: Scene, finger: int, vertex: int, apart: Expression | None) -> Limit:
+def build_far_side(scene: Scene, finger: int, vertex: int, apart: Expression | None) -> GapLimit:
     """Return the limit at which a vertex touches the far side of a link.
 
     Parameters
@@ -41,10 +41,10 @@ def build_far_side(scene: Scene, finger: int, vertex: int, apart: Expression | N
     link, part = build_features(scene).links[finger], scene.fingers[finger]
     gap = -link.vertex_gap[vertex] - 2 * part.radius
     text = f"v{vertex} touches the far side of finger {finger + 1}"
-    return Limit(confine(gap, link.vertex_run[vertex], part.length, apart), text)
+    return GapLimit(confine(gap, link.vertex_run[vertex], part.length, apart), text)
 
 
-def build_joint_edge(scene: Scene, finger: int, edge: int, held: bool) -> Limit:
+def build_joint_edge(scene: Scene, finger: int, edge: int, held: bool) -> GapLimit:
     """Return the limit at which an edge touches the circle about a joint.
 
     `held` says that the tip touches the same edge, so that no other edge is nearer.
@@ -55,10 +55,10 @@ def build_joint_edge(scene: Scene, finger: int, edge: int, held: bool) -> Limit:
     for other in range(0 if held else gaps.shape[1]):
         if other != edge:
             gap = ca.fmax(gap, gaps[other] - gaps[edge])
-    return Limit(gap, f"e{edge} touches the joint of finger {finger + 1}")
+    return GapLimit(gap, f"e{edge} touches the joint of finger {finger + 1}")
 
 
-def build_joint_vertex(scene: Scene, finger: int, vertex: int) -> Limit:
+def build_joint_vertex(scene: Scene, finger: int, vertex: int) -> GapLimit:
     """Return the limit at which a vertex touches the circle about a joint."""
     features = build_features(scene)
     link, lengths = features.links[finger], features.edge_lengths
@@ -67,10 +67,10 @@ def build_joint_vertex(scene: Scene, finger: int, vertex: int) -> Limit:
     gap = _distance(features.vertices[:, vertex] - link.base) - scene.fingers[finger].radius
     beyond = ca.fmax(runs[vertex], float(lengths[before]) - runs[before])
     gap = ca.fmax(gap, ca.fmax(link.vertex_run[vertex], beyond))
-    return Limit(gap, f"v{vertex} touches the joint of finger {finger + 1}")
+    return GapLimit(gap, f"v{vertex} touches the joint of finger {finger + 1}")
 
 
-def build_obstacles(scene: Scene, finger: int, held: list[Contact]) -> list[Limit]:
+def build_obstacles(scene: Scene, finger: int, held: list[Contact]) -> list[GapLimit]:
     """Return the limits of a link's far side and joint, given its contacts of a formation."""
     vertices = range(scene.polygon.n_vertices)
     if not held:
@@ -90,7 +90,7 @@ def build_obstacles(scene: Scene, finger: int, held: list[Contact]) -> list[Limi
     return limits
 
 
-def face(scene: Scene, finger: int, limits: list[Limit]) -> list[Limit]:
+def face(scene: Scene, finger: int, limits: list[GapLimit]) -> list[GapLimit]:
     """Return limits of a link without contacts for an object that may be on its far side, too."""
     apart = build_apart(scene, finger)
     gaps = build_features(scene).links[finger].vertex_gap

@@ -88,7 +88,7 @@ def lower(scene: Scene, phi: Array) -> tuple[Array, Numbers]:
     return -heights.min(axis=1), vertex
 
 
-def close(scene: Scene, x: Array, phi: Array) -> Closed:
+def close_fingers(scene: Scene, x: Array, phi: Array) -> Closed:
     """Lower the object and close both fingers at n poses, `x` [m] and `phi` [rad] of shape (n,)."""
     y, _ = lower(scene, phi)
     corners = place_corners(scene, x, y, phi)

@@ -9,8 +9,7 @@ import numpy as np
 from ..common.arrays import Array
 from ..contacts.formation import Formation
 from ..mechanics.metric import metric_weights
-from .closing import close as closed_at
-from .closing import lower
+from .closing import close_fingers, lower
 
 GRID = (120, 60)
 """Places across x and phi at which a formation is looked at."""
@@ -80,7 +79,7 @@ def explore(formation: Formation, z: Array, slip: Array, ends: list[Ending]) -> 
         off = end.measure(places)
         order = np.argsort(off)[:SEEDS]
         for k in order[np.argsort((places[order] - z) ** 2 @ metric)]:
-            goal = close(end.formation, places[k], slip, end.fixed, end.active)
+            goal = close_contacts(end.formation, places[k], slip, end.fixed, end.active)
             if goal is None or not is_inside(end.formation, goal):
                 continue
             distance = float(metric @ (goal - z) ** 2)
@@ -106,14 +105,14 @@ def _list_places(formation: Formation, z: Array) -> Array:
     reach = np.array([size + finger.length + finger.radius for finger in scene.fingers])
     across = np.linspace((bases - reach).max(), (bases + reach).min(), GRID[0])
     x, phi = np.meshgrid(across, np.linspace(turned.min(), turned.max(), GRID[1]))
-    closed = closed_at(scene, x.ravel(), phi.ravel()).z
+    closed = close_fingers(scene, x.ravel(), phi.ravel()).z
     closed = np.vstack([z, closed[np.isfinite(closed).all(axis=1)]])
     gaps = np.abs(formation.evaluate(closed, closed).C).max(axis=1)
     inside = formation.evaluate_limits(closed).min(axis=1) > -scene.touching
     return np.asarray(closed[inside & (gaps < scene.touching)])
 
 
-def close(
+def close_contacts(
     formation: Formation,
     z: Array,
     slip: Array,

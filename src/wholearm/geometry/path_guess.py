@@ -15,7 +15,7 @@ from ..mechanics.dynamics import Directions
 from ..mechanics.metric import metric_weights
 from ..problem.definition import Phase, Problem, read_problem
 from .curve import Curve, tangent_basis
-from .explore import Ending, close, explore, is_inside
+from .explore import Ending, close_contacts, explore, is_inside
 from .tracing import require_touching, runs_on_curve, trace_phase, trace_phases
 
 POINTS = 25
@@ -142,7 +142,8 @@ def _find_goal(problem: Problem, phase: Phase, z: Array) -> Array:
             raise InputError(problem.source, key, "is missing; only one freedom needs none")
         # On the way to where a phase ends next, as far as this one's contacts lead there.
         ahead = _find_goal(problem, replace(phase, until=ends[0]), z)
-        middle = close(phase.formation, (z + ahead) / 2, phase.formation.evaluate_slip(z[None])[0])
+        slip = phase.formation.evaluate_slip(z[None])[0]
+        middle = close_contacts(phase.formation, (z + ahead) / 2, slip)
         return ahead if middle is None else middle
     slip, reasons, goals = phase.formation.evaluate_slip(z[None])[0], [], []
     endings = list_ends(phase)
@@ -180,7 +181,7 @@ def list_ends(phase: Phase) -> list[Ending]:
 def _settle(end: Ending, z: Array, slip: Array) -> tuple[Array | None, str]:
     """The end nearest to `z`, up to `_MOST_ACTIVE` limits met exactly, or what is in the way."""
     formation, active, reason = end.formation, end.active, ""
-    goal = close(formation, z, slip, end.fixed, active)
+    goal = close_contacts(formation, z, slip, end.fixed, active)
     while goal is not None:
         limits = formation.evaluate_limits(goal[None])[0]
         if limits.min() > -formation.scene.touching:
@@ -190,7 +191,7 @@ def _settle(end: Ending, z: Array, slip: Array) -> tuple[Array | None, str]:
         if worst in active or len(active) == _MOST_ACTIVE + len(end.active):
             break
         active = (*active, worst)
-        goal = close(formation, goal, slip, end.fixed, active)
+        goal = close_contacts(formation, goal, slip, end.fixed, active)
     return None, reason
 
 
@@ -206,12 +207,12 @@ def guess_onwards(phase: Phase, before: PathGuess) -> list[PathGuess]:
     ending, slip = _end_formation(phase), formation.evaluate_slip(z[None])[0]
     step = z - before.z[-2]
     metric, outlines = metric_weights(formation.scene), []
-    nearest = close(ending, z, slip)
+    nearest = close_contacts(ending, z, slip)
     if nearest is None:
         return []
     far = np.sqrt((metric @ (nearest - z) ** 2) / (metric @ step**2))
     for share in _AHEAD:
-        goal = close(ending, z + share * far * step, slip)
+        goal = close_contacts(ending, z + share * far * step, slip)
         if goal is not None and is_inside(ending, goal):
             outlines.append(connect(formation, z, goal))
     return outlines
@@ -229,8 +230,8 @@ def _look_around(formation: Formation, ending: Formation, z: Array, slip: Array)
     """Nearest end inside all limits that is found from `z` turned by some angle, if any."""
     metric, best, least = metric_weights(formation.scene), None, np.inf
     for turn in _TURNS:
-        turned = close(formation, z, slip, (2, z[2] + turn))
-        goal = None if turned is None else close(ending, turned, slip)
+        turned = close_contacts(formation, z, slip, (2, z[2] + turn))
+        goal = None if turned is None else close_contacts(ending, turned, slip)
         if goal is None or not is_inside(ending, goal):
             continue
         distance = float(metric @ (goal - z) ** 2)
@@ -255,7 +256,7 @@ def connect(
     aside = _find_side(formation, start, goal) if any(bends) else np.zeros(5)
     for x in np.linspace(0.0, 1.0, POINTS)[1:]:
         off = bends[0] * np.sin(np.pi * x) + bends[1] * np.sin(2 * np.pi * x)
-        point = close(formation, start + x * (goal - start) + off * aside, slip)
+        point = close_contacts(formation, start + x * (goal - start) + off * aside, slip)
         points.append(points[-1] if point is None else point)
     z = np.array(points)
     speed = np.gradient(z, axis=0)

@@ -22,7 +22,15 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..contacts.elemental import Contact
-from ..geometry.closing import Closed, Flags, Numbers, close, first_contact, lower, place_corners
+from ..geometry.closing import (
+    Closed,
+    Flags,
+    Numbers,
+    close_fingers,
+    first_contact,
+    lower,
+    place_corners,
+)
 from ..scene.model import Scene
 
 SAME_ANGLE, ROUNDING = 1e-7, 1e-11
@@ -114,7 +122,7 @@ class Piece:
 
 def label_cells(scene: Scene, x: Array, phi: Array) -> Numbers:
     """Labels of n poses inside cells, shape (n, 6); `NOWHERE` where a finger cannot close."""
-    return label_closed(close(scene, x, phi), lower(scene, phi)[1])
+    return label_closed(close_fingers(scene, x, phi), lower(scene, phi)[1])
 
 
 def label_closed(closed: Closed, vertex: int | Numbers) -> Numbers:
@@ -147,7 +155,7 @@ def palm_track(scene: Scene, edge: int, phi: float, places: Array) -> Track:
         return x, np.full_like(x, phi)
 
     def label(x: Array, phi: Array) -> Numbers:
-        labels = label_closed(close(scene, x, phi), edge)
+        labels = label_closed(close_fingers(scene, x, phi), edge)
         labels[labels[:, 0] != NOWHERE, 1] = after
         return labels
 
@@ -174,7 +182,7 @@ def flush_track(scene: Scene, finger: int, edge: int, vertex: int, places: Array
         sign = 1.0 if finger == 0 else -1.0
         axis = sign * np.column_stack([-m[:, 1], m[:, 0]])
         runs = ((corners - base) * axis[:, None]).sum(axis=2)
-        closed = close(scene, x, phi)
+        closed = close_fingers(scene, x, phi)
         labels = label_closed(closed, vertex)
         within = (runs[:, near] > 0) & (runs[:, near] <= link.length)
         # The edge lies on the link up to its far vertex or up to the tip.
@@ -231,7 +239,7 @@ def _circle_track(
         return base[0] - place[:, 0] + branch * across, phi
 
     def label(x: Array, phi: Array) -> Numbers:
-        closed = close(scene, x, phi)
+        closed = close_fingers(scene, x, phi)
         labels = label_closed(closed, vertex)
         place = centre(phi) + np.column_stack([x, np.zeros_like(x)]) - base
         angle = np.arctan2(place[:, 1], place[:, 0])
@@ -254,7 +262,7 @@ def _circle_track(
             pair = np.broadcast_to([arc, first + count + edge], (len(x), 2))
         if link.radius == 0:
             aside = ASIDE * scene.scales.length
-            beside = [close(scene, x + d, phi).touched[:, finger] for d in (-aside, aside)]
+            beside = [close_fingers(scene, x + d, phi).touched[:, finger] for d in (-aside, aside)]
             pair = np.column_stack(beside)
             pair = np.sort(pair, axis=1)
             about = (pair == side) | (pair == first + count + index)

@@ -15,7 +15,7 @@ from ..common.arrays import Array
 from ..common.errors import InputError
 from ..common.sharing import exclusive
 from ..contacts.elemental import Contact
-from ..geometry.closing import Flags, Numbers, close, contact_table, full_formation, lower
+from ..geometry.closing import Flags, Numbers, close_fingers, contact_table, full_formation, lower
 from ..problem.definition import Problem
 from ..scene.model import Scene
 from .borders import NOWHERE, Piece, Window, label_cells, label_closed, list_tracks, name_contacts
@@ -244,7 +244,7 @@ def _label_grid(scene: Scene, x: Array, phi: Array) -> tuple[Numbers, Numbers]:
     labels, obstacles = [], []
     for start in range(0, len(x), CHUNK):
         part = slice(start, start + CHUNK)
-        closed = close(scene, x[part], phi[part])
+        closed = close_fingers(scene, x[part], phi[part])
         labels.append(label_closed(closed, lower(scene, phi[part])[1]))
         both = closed.obstacle
         codes = np.where(both > 0, 2 * both - 1 + np.array([0, 1]), 0)
@@ -256,7 +256,7 @@ def _label_grid(scene: Scene, x: Array, phi: Array) -> tuple[Numbers, Numbers]:
 def _build_border(problem: Problem, piece: Piece) -> Border:
     scene = problem.scene
     x, phi = piece.track.pose(piece.places)
-    z = close(scene, x, phi).z
+    z = close_fingers(scene, x, phi).z
     flush = piece.track.flush
     along = "x" if flush is not None and flush[0] is None else "phi"
     label = piece.label[piece.label != NOWHERE]
@@ -308,7 +308,7 @@ def _check_cells(problem: Problem, window: Window) -> tuple[Array, Flags]:
     places = np.column_stack([x.ravel(), phi.ravel()])
     labels = label_cells(scene, *places.T)
     places, labels = places[labels[:, 0] != NOWHERE], labels[labels[:, 0] != NOWHERE]
-    z, triples = close(scene, *places.T).z, labels[:, [0, 2, 4]]
+    z, triples = close_fingers(scene, *places.T).z, labels[:, [0, 2, 4]]
     known, owner = np.unique(triples, axis=0, return_inverse=True)
     possible = np.zeros((len(places), len(WAYS)), dtype=bool)
     for index, label in enumerate(known):

@@ -10,7 +10,7 @@ from ..common.arrays import Array
 from ..common.errors import InputError
 from ..contacts.elemental import Contact
 from ..contacts.formation import find_touching
-from ..geometry.closing import Numbers, close, contact_table, describe_obstacle
+from ..geometry.closing import Numbers, close_fingers, contact_table, describe_obstacle
 from ..geometry.curve import describe_pose
 from ..scene.model import Scene
 from .borders import Piece, label_cells, name_contacts
@@ -134,7 +134,7 @@ def _build_parts(scene: Scene, leg: Leg, spans: list[Span], at_change: bool) -> 
 
 
 def _find_touching(scene: Scene, pose: Array) -> tuple[Contact, ...]:
-    z = close(scene, pose[:1], pose[1:]).z[0]
+    z = close_fingers(scene, pose[:1], pose[1:]).z[0]
     return find_touching(scene, z) if np.isfinite(z).all() else ()
 
 
@@ -175,7 +175,7 @@ def _require_reached(scene: Scene, leg: Leg, kept: list[Piece], ends: list[float
     for before, after in zip(ends[::2], ends[1::2], strict=True):
         if after - before > BESIDE * leg.near:
             pose = leg.at((before + after) / 2)
-            text = describe_obstacle(close(scene, pose[:1], pose[1:]))
+            text = describe_obstacle(close_fingers(scene, pose[:1], pose[1:]))
             text = text or "there the border has ended"
             raise InputError("", "route", f"cannot be followed at {describe_place(pose)}: {text}")
 

@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..contacts.elemental import Limit, build_features, build_gap
+from ..contacts.elemental import GapLimit, build_features, build_gap
 from ..contacts.formation import Formation
 from ..problem.definition import Until
 from .layout import STATE, EventRows, Inputs, Outputs, lay_out
@@ -162,7 +162,7 @@ def _build_measure(formation: Formation, until: Until, side: float, short: float
     return ca.Function("measure", [z, v], [ca.densify(part) for part in parts])
 
 
-def open_limits(formation: Formation, until: Until) -> list[Limit]:
+def open_limits(formation: Formation, until: Until) -> list[GapLimit]:
     """Limits that end a phase early: all but that of the contact to be gained."""
     return [limit for limit in formation.limits if not limit.gains(until.contact)]
 

@@ -29,7 +29,9 @@ def list_contact_margins(
     shortest, contacts = SHORTEST * problem.scene.scales.time, []
     for name in phase.formation.names:
         column = simulation.contacts.index(name)
-        least, time = find_least(simulation.t[rows], simulation.c_n[rows, column], breaks, shortest)
+        least, time = find_lowest(
+            simulation.t[rows], simulation.c_n[rows, column], breaks, shortest
+        )
         if name in lost and not least <= lost[name].value:
             least, time = lost[name].value, lost[name].time
         contacts.append(ContactMargin(name, least, time, least - problem.epsilon))
@@ -49,7 +51,7 @@ def list_slip_margins(
         formation.rolling_rows, slip_margins(formation, c_n, c_t).T, strict=True
     ):
         name = formation.names[row]
-        least, time = find_least(simulation.t[rows], values, breaks, shortest)
+        least, time = find_lowest(simulation.t[rows], values, breaks, shortest)
         if name in slipped and not least <= slipped[name].value:
             least, time = slipped[name].value, slipped[name].time
         margins.append(SlipMargin(name, least, time))
@@ -61,10 +63,10 @@ def find_finger_gap(scene: Scene, simulation: Simulation, breaks: Array) -> Fing
     if not scene.fingers_collide:
         return None
     gaps, shortest = evaluate_finger_gap(scene, simulation.z), SHORTEST * scene.scales.time
-    return FingerGap(*find_least(simulation.t, gaps, breaks, shortest))
+    return FingerGap(*find_lowest(simulation.t, gaps, breaks, shortest))
 
 
-def find_least(
+def find_lowest(
     t: Array, values: Array, breaks: Array, shortest: float = 0.0
 ) -> tuple[float, float]:
     """Least value of a sampled function and where, refined by parabolas inside smooth stretches.

@@ -15,7 +15,7 @@ import numpy as np
 from ...common.arrays import Array
 from ...common.errors import InputError
 from ...contacts.formation import Formation
-from ...geometry.closing import close
+from ...geometry.closing import close_fingers
 from ...mapping.route import Stretch, format_route, list_formations
 from ...problem.definition import Phase, Problem, build_problem
 from .newton import locate
@@ -91,7 +91,7 @@ def can_move(problem: Problem, stretches: Sequence[Stretch]) -> bool:
     for stretch in stretches:
         share = np.linspace(0.0, 1.0, LOOKS + 2)[1:-1, None] + np.array([0.0, 1e-4])
         poses = stretch.start + share.ravel()[:, None] * (stretch.stop - stretch.start)
-        z = close(scene, *poses.T).z
+        z = close_fingers(scene, *poses.T).z
         if np.isnan(z).any():
             return False
         formation = Formation(scene, stretch.contacts)

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...geometry.curve import tangent_basis
-from ...geometry.explore import close, is_inside
+from ...geometry.explore import close_contacts, is_inside
 from ...geometry.path_guess import PathGuess, connect, guess_phase, list_ends
 from ...mechanics.dynamics import Directions
 from ...mechanics.metric import metric_weights
@@ -136,7 +136,7 @@ def list_goals(phase: Phase, z: Array, nearest: Array) -> list[Array]:
 
     def settle(guess: Array, last: Array, step: float) -> Array | None:
         for end in ends:
-            goal = close(end.formation, guess, slip, end.fixed, end.active)
+            goal = close_contacts(end.formation, guess, slip, end.fixed, end.active)
             if goal is None or not is_inside(end.formation, goal):
                 continue
             if 0.2 * step < np.linalg.norm((goal - last) * metric) < 5 * step:
