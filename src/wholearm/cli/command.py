@@ -179,7 +179,7 @@ def _solve(options: argparse.Namespace) -> int:
     given = {
         key: getattr(options, key)
         for key in (field.name for field in fields(PlanOptions))
-        if getattr(options, key) is not None
+        if getattr(options, key, None) is not None
     }
     plan_options = PlanOptions(**given)
     for path, ending in ((output, ".npz"), (options.torques, ".csv")):
