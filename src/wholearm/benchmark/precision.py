@@ -22,9 +22,10 @@ from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phases
 from ..planning.options import Objective, PlanOptions
 from ..planning.path_domain.data import prepare
+from ..planning.path_domain.first_guess import guess
 from ..planning.path_domain.motion import PathMotion, make_grid
 from ..planning.path_domain.nlp import build_path_nlp
-from ..planning.path_domain.plan import guess, plan_path
+from ..planning.path_domain.plan import plan_path
 from ..planning.plan import solve
 from ..problem.definition import End, Problem, read_problem
 from ..results.torque import TorqueProfile

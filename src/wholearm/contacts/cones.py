@@ -1,13 +1,4 @@
-"""What contact forces have to exceed for a formation to hold, friction cones included.
-
-A sliding contact has to press with c_n >= epsilon. A rolling one must not slip either, |c_t| <= mu
-c_n, which is kept as if the contact pressed with epsilon less: what c_n may lose before the contact
-is lost it may lose before the contact slips.
-
-    c_n >= epsilon,    mu c_n - c_t >= mu epsilon,    mu c_n + c_t >= mu epsilon.
-
-On the contact forces c = [c_n; c_t(rolling)] these are the rows of H c >= least.
-"""
+"""Friction cones: what contact forces have to exceed for a formation to hold, and by how much."""
 
 from __future__ import annotations
 
@@ -24,22 +15,6 @@ def hold_rows(formation: Formation) -> Array:
     rolling = list(formation.rolling_rows)
     edge = formation.friction[rolling, None] * normal[rolling]
     return np.vstack([normal, edge - tangential, edge + tangential])
-
-
-def hold_least(formation: Formation, epsilon: float) -> Array:
-    """The least that each row of H c may be, shape (n_c + 2 R,) [N]."""
-    mu = formation.friction[list(formation.rolling_rows)]
-    return epsilon * np.concatenate([np.ones(formation.n_contacts), mu, mu])
-
-
-def name_holds(formation: Formation, epsilon: float) -> list[str]:
-    """What each row of H c >= least asks for, in words."""
-    names = [f"c_n of {name} >= epsilon = {epsilon:g} N" for name in formation.names]
-    for side in ("c_t <= ", "-c_t <= "):
-        for row in formation.rolling_rows:
-            bound = f"{formation.friction[row]:g} (c_n - {epsilon:g} N)"
-            names.append(f"friction cone of {formation.names[row]}, {side}{bound},")
-    return names
 
 
 def find_weakest(formation: Formation, held: Array) -> tuple[int, float, float | None]:

@@ -75,11 +75,6 @@ class PathForces(NamedTuple):
         affine = self.T0 + self.Ta * a + self.Tb * b + self.Tl * squeeze
         return affine + self.Tv * np.sqrt(np.maximum(b, 0.0))
 
-    def apply_rows(self, H: Array) -> PathForces:
-        """With H c in place of c, for H of shape (m, n_c + R)."""
-        C0, Ca, Cb, Cl = (part @ H.T for part in self[:4])
-        return self._replace(C0=C0, Ca=Ca, Cb=Cb, Cl=Cl)
-
 
 def build_forward(formation: Formation) -> Expression:
     """CasADi function (z, z', tau, Xi, sigma) -> (z'', c, K) of a formation.

@@ -1,16 +1,25 @@
-"""Why there is no plan, and which single change would make one possible: ranking and wording.
+"""Why there is no plan, and which single change would make one possible.
 
-Nothing here depends on how plans are made. A planner says what its limits miss, which limits could
-give way, how far each would have to, and whether it can plan with that.
+Nothing here depends on how plans are made. A planner shows the motion that misses limits least, and
+says how far a parameter of the limits would have to move, and whether it can plan with that.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from ..common.arrays import Array
+from ..common.errors import InfeasibleError, InputError, JammingError, SolverError
+from ..mechanics.limits import LimitSet, Parameter
+from ..scene.model import Scene
+
+SHORT = 1e-4
+"""Least shortfall that counts, over what is much for a limit."""
 DIGITS = 3
 """Significant digits of what is advised."""
 _BEYOND = (0.0, 0.005, 0.015, 0.05, 0.15, 0.5)
@@ -45,35 +54,126 @@ class Shortfall(NamedTuple):
         return f"{self.limit} is {self.amount:.3g} {self.unit} short at {self.where}"
 
 
-class Limit(NamedTuple):
-    """A limit that could give way.
-
-    Attributes
-    ----------
-    name : str
-    value : float
-        As it is.
-    unit : str
-    sign : int
-        1 if it gives way by growing, -1 if by falling (not below zero).
-    """
-
-    name: str
-    value: float
-    unit: str
-    sign: int
-
-
 class Change(NamedTuple):
-    """A limit and a value of it that a plan was found with."""
+    """A parameter and a value of it that a plan was found with."""
 
-    limit: Limit
+    parameter: Parameter
     value: float
 
     def __str__(self) -> str:
-        limit = self.limit
-        value = f"{self.value:g} {limit.unit}".rstrip()
-        return f"{limit.name} = {value} instead of {limit.value:g}"
+        own = self.parameter
+        value = f"{self.value:g} {own.unit}".rstrip()
+        return f"{own.name} = {value} instead of {own.value:g}"
+
+
+def list_shortfalls(
+    limits: LimitSet, values: Array, describe: Callable[[int], str]
+) -> list[Shortfall]:
+    """What a motion is short of, each limit where it is worst.
+
+    Parameters
+    ----------
+    limits : LimitSet
+    values : ndarray, shape (n, m)
+        What the limits are of at n places of the motion.
+    describe : callable
+        Says in words where the k-th place is.
+    """
+    short = limits.fold(-limits.find_slack(values))
+    found = []
+    for k, limit in enumerate(limits.limits):
+        of_limit = short[:, limits.owners == k].max(axis=1)
+        worst = int(of_limit.argmax())
+        amount = float(of_limit[worst])
+        if amount > SHORT * limit.scale:
+            share = amount / limit.scale
+            found.append(Shortfall(limit.text, amount, limit.unit, describe(worst), share))
+    return found
+
+
+def keep_worst(shortfalls: Iterable[Shortfall]) -> list[Shortfall]:
+    """Of several shortfalls of one limit, the largest."""
+    worst: dict[str, Shortfall] = {}
+    for short in shortfalls:
+        if short.limit not in worst or short.amount > worst[short.limit].amount:
+            worst[short.limit] = short
+    return list(worst.values())
+
+
+def name_phases(phases: Sequence[int], what: str = "") -> str:
+    """One phase or several, for messages, and that they are `what`."""
+    first, *others = phases
+    if not others:
+        return f"phase {first} is {what}" if what else f"phase {first}"
+    several = f"phases {first} {'and' if len(others) == 1 else 'to'} {others[-1]}"
+    return f"{several} are {what}" if what else several
+
+
+def advise(
+    text: str,
+    parameters: Iterable[Parameter],
+    find_least: Callable[[Parameter], float | None],
+    replan: Callable[[Parameter, float], object] | None,
+    seconds: float = math.inf,
+) -> str:
+    """Why there is no plan, with the changes of a single parameter that make one possible.
+
+    Parameters
+    ----------
+    text : str
+        What cannot be kept.
+    parameters : iterable of Parameter
+        What may be changed.
+    find_least : callable
+        As of `find_changes`; NaN where it cannot tell.
+    replan : callable or None
+        Plans with another value of a parameter, or raises; without it no change is looked for.
+    seconds : float, [s]
+        Processor time after which no further change is tried.
+    """
+    if replan is None:
+        return text
+    stop, undecided = time.thread_time() + seconds, list[Parameter]()
+
+    def look(parameter: Parameter) -> float | None:
+        least = math.nan if time.thread_time() > stop else find_least(parameter)
+        if least is not None and math.isnan(least):
+            undecided.append(parameter)
+            return None
+        return least
+
+    def can_plan(parameter: Parameter, value: float) -> bool:
+        if time.thread_time() > stop:
+            undecided.append(parameter)
+            return False
+        return succeeds(partial(replan, parameter, value))
+
+    changes = find_changes(parameters, look, can_plan)
+    if undecided and not changes:
+        return f"{text}; no single limit was found that makes it feasible"
+    return f"{text}; {describe_changes(changes)}"
+
+
+def succeeds(plan: Callable[[], object]) -> bool:
+    """Whether there is a plan."""
+    try:
+        plan()
+    except (InfeasibleError, SolverError, JammingError, InputError):
+        return False
+    return True
+
+
+def change_scene(scene: Scene, key: str, value: float) -> Scene:
+    """The scene with another value of a parameter of its hand, such as `fingers.1.torque_limit`."""
+    where, *names = key.split(".")
+    if where == "friction":
+        return replace(scene, friction=replace(scene.friction, **{names[0]: value}))
+    change: Any = {names[1]: value}
+    right, left = (
+        replace(link, **change) if f"{k + 1}" == names[0] else link
+        for k, link in enumerate(scene.fingers)
+    )
+    return replace(scene, fingers=(right, left))
 
 
 def rank_shortfalls(shortfalls: Iterable[Shortfall]) -> str:
@@ -82,19 +182,20 @@ def rank_shortfalls(shortfalls: Iterable[Shortfall]) -> str:
 
 
 def find_changes(
-    limits: Sequence[Limit],
-    find_least: Callable[[int], float | None],
-    can_plan: Callable[[int, float], bool],
+    parameters: Iterable[Parameter],
+    find_least: Callable[[Parameter], float | None],
+    can_plan: Callable[[Parameter, float], bool],
 ) -> list[Change]:
-    """Find the changes of a single limit with which there is a plan.
+    """Find the changes of a single parameter with which there is a plan.
 
     Parameters
     ----------
-    limits : sequence of Limit
+    parameters : iterable of Parameter
     find_least : callable
-        The value at which the i-th limit just lets the others be kept, or None if none does.
+        The value of a parameter at which its limits just let the others be kept, or None if none
+        does.
     can_plan : callable
-        Whether there is a plan with this value of the i-th limit.
+        Whether there is a plan with this value of a parameter.
 
     Returns
     -------
@@ -102,28 +203,28 @@ def find_changes(
         Each with a value, rounded outwards, that `can_plan` has confirmed.
     """
     changes = []
-    for index, limit in enumerate(limits):
-        least = find_least(index)
+    for parameter in parameters:
+        least = find_least(parameter)
         if least is None:
             continue
-        value = _find_enough(least, limit.sign, partial(can_plan, index))
+        value = _find_enough(least, parameter.sign, partial(can_plan, parameter))
         if value is not None:
-            changes.append(Change(limit, value))
+            changes.append(Change(parameter, value))
     return changes
 
 
 def bracket(
-    limit: Limit, farthest: float, can_plan: Callable[[float], bool], halvings: int = 5
+    own: Parameter, farthest: float, can_plan: Callable[[float], bool], halvings: int = 5
 ) -> float | None:
-    """A value that can be planned with, between a limit and `farthest`, as near to it as found.
+    """A value that can be planned with, between a parameter's and `farthest`, as near as found.
 
-    For limits that a planner cannot relax within one solve; None if `farthest` does not do.
+    For parameters that a planner cannot relax within one solve; None if `farthest` does not do.
     """
-    if farthest == limit.value or not can_plan(farthest):
+    if farthest == own.value or not can_plan(farthest):
         return None
-    enough, short = farthest, limit.value
+    enough, short = farthest, own.value
     for _ in range(halvings):
-        middle = round_outwards((enough + short) / 2, limit.sign)
+        middle = round_outwards((enough + short) / 2, own.sign)
         if middle in (enough, short):
             break
         if can_plan(middle):

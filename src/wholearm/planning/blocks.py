@@ -344,10 +344,11 @@ def _share_duration(
     times = [plan.motion.duration for plan in least]
     total = 2 * sum(times) if duration is None else duration
     if total <= sum(times):
-        from .advice import Change, Limit, describe_changes, round_outwards
+        from ..mechanics.limits import Parameter
+        from .advice import Change, describe_changes, round_outwards
 
         # The least-time plan shows it; a little more leaves something to choose.
-        enough = Change(Limit("duration", total, "s", 1), round_outwards(1.005 * sum(times), 1))
+        enough = Change(Parameter("duration", total, "s", 1), round_outwards(1.005 * sum(times), 1))
         raise InfeasibleError(
             f"duration = {total:g} s is not longer than the least time, {sum(times):.6g} s; "
             f"{describe_changes([enough])}"

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from ...common.arrays import Array
 from ...common.errors import JammingError, SolverError
 from ...common.minima import find_least
-from ...contacts.cones import hold_least, hold_rows
 from ...geometry.curve import Curve, describe_pose
 from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
+from ...mechanics.limits import PRESS, SPEED, TORQUE, LimitSet, Parameter, make_limits
 from ...results.torque import TorqueProfile
 from .motion import Grid, PathMotion, Profile, directions_of
 
@@ -35,10 +35,7 @@ class Sampling(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Forces and rates of the joints, d theta / ds with shape (n, 2), at n places of a curve.
-
-    In `forces`, H c (`contacts.cones`) stands for the contact forces c: c itself if nothing rolls.
-    """
+    """Forces and rates of the joints, d theta / ds with shape (n, 2), at n places of a curve."""
 
     forces: PathForces
     rates: Array
@@ -48,20 +45,14 @@ class Places(NamedTuple):
         return Places(PathForces(*(part[rows] for part in self.forces)), self.rates[rows])
 
 
-class Relaxation(NamedTuple):
-    """Which limit gives way when the relaxation grows, and how fast.
+class LimitTerms(NamedTuple):
+    """What limits are of, constant + a s'' + b s'^2 + squeeze lambda + speed s', (n, m) each."""
 
-    Attributes
-    ----------
-    weights : ndarray, shape (n_h + 3,), [N, N m, 1]
-        By how much H c >= least and |tau| <= limit give way per unit of it, and the square of a
-        speed limit, relative to that square.
-    finger : int or None
-        Whose speed limit that is.
-    """
-
-    weights: Array
-    finger: int | None = None
+    constant: Array
+    a: Array
+    b: Array
+    squeeze: Array
+    speed: Array
 
 
 class PhaseData(NamedTuple):
@@ -72,6 +63,10 @@ class PhaseData(NamedTuple):
     curve : Curve
         The first one's where phases are joined.
     epsilon : float, [N]
+    limits : LimitSet
+        Those that are rows of the NLP: of forces and torques.
+    speeds : LimitSet
+        Those of joint speeds alone, which bound b.
     grid : Grid
     nodes : Places
         At the nodes.
@@ -86,6 +81,8 @@ class PhaseData(NamedTuple):
 
     curve: Curve
     epsilon: float
+    limits: LimitSet
+    speeds: LimitSet
     grid: Grid
     nodes: Places
     sampling: Sampling
@@ -94,51 +91,65 @@ class PhaseData(NamedTuple):
     nonempty: NDArray[np.int64]
 
     @property
-    def least(self) -> Array:
-        """The least that each row of H c may be, shape (n_h,) [N]."""
-        return hold_least(self.curve.formation, self.epsilon)
-
-    @property
     def torque_limit(self) -> Array:
         """Torque limits, shape (2,) [N m]."""
-        return self.curve.formation.scene.torque_limit
+        return self.limits.high[self.limits.of(TORQUE)]
 
     @property
     def spans(self) -> Array:
-        """What is much for each limit, shape (n_h + 4,): the scene's force, the torque limits."""
-        force = self.curve.formation.scene.scales.force
-        return np.append(np.full(len(self.least), force), np.tile(self.torque_limit, 2))
+        """What is much for each side of the limits, shape (n_sides,)."""
+        return self.limits.scales[self.limits.sides[0]]
+
+    def find_terms(self) -> LimitTerms:
+        """What limits are of at the nodes."""
+        of_c, of_tau, of_rates = (part.T for part in self.limits.columns)
+        forces = self.nodes.forces
+        return LimitTerms(
+            forces.C0 @ of_c + forces.T0 @ of_tau,
+            forces.Ca @ of_c + forces.Ta @ of_tau,
+            forces.Cb @ of_c + forces.Tb @ of_tau,
+            forces.Cl @ of_c + forces.Tl @ of_tau,
+            forces.Tv @ of_tau + self.nodes.rates @ of_rates,
+        )
+
+    def evaluate(self, places: Places, profile: Profile) -> Array:
+        """What the limits are of, shape (n, m) [N, N m]."""
+        of_c, of_tau, of_rates = (part.T for part in self.limits.columns)
+        values = places.forces.c(*profile) @ of_c + places.forces.tau(*profile) @ of_tau
+        if of_rates.any():
+            values += places.rates * np.sqrt(profile.b)[:, None] @ of_rates
+        return np.asarray(values)
 
     def slack(self, places: Places, profile: Profile, margin: float = 0.0) -> Array:
-        """How far each limit is from being missed, shape (n, n_h + 4) [N, N m].
+        """How far each side of the limits is from being missed, shape (n, n_sides) [N, N m].
 
-        In the order H c - least (less `margin` for normal forces), tau + limit, limit - tau.
+        Less `margin` for normal forces.
         """
-        held, tau = places.forces.c(*profile), places.forces.tau(*profile)
-        limit, spare = self.torque_limit, self.least.copy()
-        spare[: self.curve.formation.n_contacts] += margin
-        return np.hstack([held - spare, tau + limit, limit - tau])
+        values = self.evaluate(places, profile)
+        values[:, self.limits.of(PRESS)] -= margin
+        return self.limits.find_slack(values)
 
-    def largest_b(self, places: Places, spared: int | None = None) -> Array:
+    def largest_b(self, places: Places, spared: Parameter | None = None) -> Array:
         """Largest b that the joints' speed limits allow, shape (n,) [m^2/s^2].
 
-        Without that of the joint `spared`, if one is given.
+        Without the one that the parameter `spared` sets, if one is given.
         """
-        limit = self.curve.formation.scene.speed_limit
-        if spared is not None:
-            limit[spared] = np.inf
-        if np.isinf(limit).all():
-            return np.full(len(places.rates), np.inf)
-        # A joint that stands still has no limit, but dividing by zero would warn.
-        rates = np.maximum(np.abs(places.rates), np.finfo(float).tiny ** 0.25)
-        return np.asarray(((limit / rates) ** 2).min(axis=1))
+        largest = np.full(len(places.rates), np.inf)
+        for limit in self.speeds.limits:
+            if spared is None or limit.parameter.key != spared.key:
+                rates = np.abs(places.rates @ limit.rows[0, -2:])
+                # A joint that stands still has no limit, but dividing by zero would warn.
+                rates = np.maximum(rates, np.finfo(float).tiny ** 0.25)
+                largest = np.minimum(largest, (limit.high[0] / rates) ** 2)
+        return largest
 
-    def relative_rates(self, places: Places, finger: int | None) -> Array:
-        """Rate of a joint over its speed limit, shape (n,) [s/m]; zero without a joint."""
-        if finger is None:
-            return np.zeros(len(places.rates))
-        limit = self.curve.formation.scene.speed_limit[finger]
-        return np.asarray(places.rates[:, finger] / limit)
+    def relative_rates(self, places: Places, parameter: Parameter) -> Array:
+        """Rate of a joint over its speed limit, shape (n,) [s/m]; zero for another parameter."""
+        rates = np.zeros(len(places.rates))
+        for limit in self.speeds.limits:
+            if limit.parameter.key == parameter.key:
+                rates = places.rates @ limit.rows[0, -2:] / limit.high[0]
+        return rates
 
     def spread(self, profile: Profile, fractions: Array) -> Profile:
         """The profile at `fractions` of every solid interval, interval by interval."""
@@ -149,7 +160,7 @@ class PhaseData(NamedTuple):
         return Profile((a + x * rise).ravel(), np.maximum(b, 0.0).ravel(), squeeze.ravel())
 
     def misses(self, profile: Profile, margin: float) -> tuple[Array, Array]:
-        """What limits miss inside each solid interval, shape (n_solid, n_h + 4) [N, N m].
+        """What limits miss inside each solid interval, shape (n_solid, n_sides) [N, N m].
 
         And how far b is beyond what the speed limits allow, shape (n_solid,), relative.
         """
@@ -161,7 +172,7 @@ class PhaseData(NamedTuple):
         return short[:, :-1], short[:, -1]
 
     def slack_at_neighbours(self, profile: Profile, margin: float, short: Array) -> Array:
-        """The lesser slack of the two nodes of each solid interval, shape (n_solid, n_h + 4).
+        """The lesser slack of the two nodes of each solid interval, shape (n_solid, n_sides).
 
         Zero where nothing is `short` in the interval.
         """
@@ -201,8 +212,6 @@ def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
             f"friction makes the reduced inertia {inertia[worst]:.3g} of its frictionless value"
         )
     forces = inverse(formation, *point[:3], directions, point.kinematics)
-    if formation.rolling:
-        forces = forces.apply_rows(hold_rows(formation))
     every = Places(forces, point.z_s[:, 3:])
     own = len(grid.s) + np.arange(len(between)).reshape(len(nonempty), -1)
     order = np.hstack([nonempty[:, None], own, nonempty[:, None] + 1])
@@ -219,14 +228,18 @@ def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
 
     checks = Places(PathForces(*(carry(part) for part in knots.forces)), carry(knots.rates))
     nodes = every.pick(slice(None, len(grid.s)))
-    return PhaseData(curve, epsilon, grid, nodes, sampling, knots, checks, nonempty)
+    limits = make_limits(formation, epsilon)
+    kept = limits.without(SPEED), limits.only(SPEED)
+    return PhaseData(curve, epsilon, *kept, grid, nodes, sampling, knots, checks, nonempty)
 
 
 def join(parts: Sequence[PhaseData]) -> PhaseData:
-    """Put phases one after the other, each with as many nodes and as many sliding contacts.
+    """Put phases one after the other, each with as many nodes and the same rows of limits.
 
     Where two meet, the grid has an interval of length zero, as where a direction reverses.
     """
+    if any(not np.array_equal(part.limits.rows, parts[0].limits.rows) for part in parts):
+        raise ValueError("phases with different rows of limits cannot be joined")
     starts = np.cumsum([0.0, *(part.grid.s[-1] for part in parts)])
     segments = np.cumsum([0, *(part.grid.segment[-1] + 1 for part in parts)])
     nodes = np.cumsum([0, *(len(part.grid.s) for part in parts)])
@@ -250,14 +263,6 @@ def join(parts: Sequence[PhaseData]) -> PhaseData:
         checks=stack([part.checks for part in parts]),
         nonempty=chain((part.nonempty for part in parts), nodes),
     )
-
-
-def name_phases(phases: Sequence[int], what: str = "") -> str:
-    """One phase or several, for messages, and that they are `what`."""
-    if len(phases) == 1:
-        return f"phase {phases[0]} is {what}" if what else f"phase {phases[0]}"
-    several = f"phases {phases[0]} to {phases[-1]}"
-    return f"{several} are {what}" if what else several
 
 
 def cut(parts: Sequence[PhaseData], profile: Profile) -> list[Profile]:

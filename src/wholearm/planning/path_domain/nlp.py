@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array, Expression
+from ...mechanics.limits import LimitSet, Parameter
 from ...solvers.ipopt import build_solver
 from ..options import Objective
-from .data import PhaseData, Relaxation
+from .data import PhaseData
 from .motion import Grid, Profile
-from .terms import CHAINED, LEAST_B, count_extras, write_terms
+from .terms import CHAINED, LEAST_B, SOFT, LimitShape, NLPColumns, list_columns, write_terms
 
 _MU = 1e-2
 """Complementarity of the first guess's multipliers: the barrier parameter to start from."""
@@ -55,9 +56,31 @@ class Units(NamedTuple):
         speed = self.length / self.time
         return np.array([speed**2, speed / self.time, self.force])
 
-    def limits(self, n_held: int) -> Array:
-        """Units of H c, tau + limit and limit - tau, shape (n_held + 4,)."""
-        return np.append(np.full(n_held, self.force), np.tile(self.torque, 2))
+    def of(self, limits: LimitSet) -> Array:
+        """Units of each row of limits, shape (m,)."""
+        of_torque = np.abs(limits.columns[1])
+        return np.where(of_torque.any(axis=1), of_torque @ self.torque, self.force)
+
+
+class Relaxation(NamedTuple):
+    """Which number gives way, and by how much when the relaxation of the NLP grows by 1.
+
+    Attributes
+    ----------
+    parameter : Parameter
+    step : float
+        In its unit; that of a speed is of its square, relatively.
+    """
+
+    parameter: Parameter
+    step: float
+
+    def move(self, relaxed: float) -> float:
+        """The parameter when relaxed so far."""
+        value, sign = self.parameter.value, self.parameter.sign
+        if self.parameter.is_speed:
+            return float(value * (1 + relaxed) ** 0.5)
+        return float(value + sign * self.step * relaxed)
 
 
 class Tightening(NamedTuple):
@@ -65,8 +88,8 @@ class Tightening(NamedTuple):
 
     Attributes
     ----------
-    limits : ndarray, shape (N + 1, n_h + 4), [N, N m]
-        In the order of `PhaseData.slack`.
+    limits : ndarray, shape (N + 1, n_sides), [N, N m]
+        Of each side of the limits.
     speed_share : ndarray, shape (N + 1,)
         Factor on the largest b.
     duration : float or None, [s]
@@ -81,7 +104,7 @@ class Tightening(NamedTuple):
     def none(data: PhaseData, duration: float | None) -> Tightening:
         """Limits as they are."""
         count = len(data.grid.s)
-        limits = np.zeros((count, len(data.least) + 4))
+        limits = np.zeros((count, len(data.spans)))
         return Tightening(limits, np.ones(count), duration)
 
     def by(self, reach: Array, limits: Array, speed_share: Array, late: float) -> Tightening:
@@ -102,65 +125,40 @@ class PathNLP:
     ----------
     solver : casadi.Function
         Takes x0, p, bounds and multipliers; see `build_path_nlp` for their order.
-    n_contacts, n_rolling, intervals : int
+    shape : LimitShape
+    intervals : int
+    columns : NLPColumns
     objective : Objective
     build_time : float, [s]
     """
 
     solver: Expression
-    n_contacts: int
-    n_rolling: int
+    shape: LimitShape
     intervals: int
+    columns: NLPColumns
     objective: Objective
     build_time: float
-
-    @property
-    def n_held(self) -> int:
-        """Number n_h of rows of H c."""
-        return self.n_contacts + 2 * self.n_rolling
-
-    @property
-    def columns(self) -> int:
-        """Unknowns per node: b, a, squeeze, and what the objective adds."""
-        return 3 + count_extras(self.objective, self.n_held)
-
-    @property
-    def links(self) -> int:
-        """Equations per interval."""
-        return 2 if self.objective in CHAINED else 1
-
-    @property
-    def first(self) -> int:
-        """The first of the rows that belong to nodes."""
-        return self.links * self.intervals + 2
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
         """Which entries of the (N + 1, columns) array of unknowns are not b at an end."""
-        mask = np.ones((self.intervals + 1, self.columns), dtype=bool)
-        mask[[0, -1], 0] = False
+        mask = np.ones((self.intervals + 1, self.columns.node.count), dtype=bool)
+        mask[[0, -1], self.columns.node["b"]] = False
         return mask
 
 
 @lru_cache(maxsize=16)
-def build_path_nlp(
-    n_contacts: int,
-    intervals: int,
-    objective: Objective,
-    n_rolling: int = 0,
-) -> PathNLP:
-    """Build the NLP for every phase of so many contacts, of which so many roll.
-
-    See `terms` for its unknowns, parameters and rows.
-    """
+def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> PathNLP:
+    """Build the NLP for every phase with limits of a shape; see `terms`."""
     started = time.perf_counter()
-    nlp = write_terms(n_contacts, intervals, objective, n_rolling)
+    nlp = write_terms(shape, intervals, objective)
     # Started from nowhere near their optimum, these need the more robust strategy.
-    robust = objective in (Objective.ELASTIC, Objective.RELAX)
-    strategy: dict[str, Any] = {"mu_strategy": "monotone"} if robust else {"mu_oracle": "probing"}
+    strategy: dict[str, Any]
+    strategy = {"mu_strategy": "monotone"} if objective in SOFT else {"mu_oracle": "probing"}
     solver = build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
     seconds = time.perf_counter() - started
-    return PathNLP(solver, n_contacts, n_rolling, intervals, objective, seconds)
+    columns = list_columns(shape, intervals, objective)
+    return PathNLP(solver, shape, intervals, columns, objective, seconds)
 
 
 def parameters(
@@ -170,24 +168,32 @@ def parameters(
     time_weight: float,
     relaxation: Relaxation | None = None,
 ) -> Array:
-    """Parameters of the NLP, in its units; see `build_path_nlp` for their order."""
-    forces, (b_unit, a_unit, force) = data.nodes.forces, units.profile
-    torque = units.torque
-    blocks = [
-        np.hstack([forces.Ca * a_unit / force, forces.Ta * a_unit / torque]),
-        np.hstack([forces.Cb * b_unit / force, forces.Tb * b_unit / torque]),
-        np.hstack([forces.Cl, forces.Tl * force / torque]),
-        forces.Tv * np.sqrt(b_unit) / torque,
-    ]
+    """Parameters of the NLP, in its units."""
+    terms, unit, (b_unit, a_unit, force) = data.find_terms(), units.of(data.limits), units.profile
+    blocks = {
+        "a": terms.a * a_unit / unit,
+        "b": terms.b * b_unit / unit,
+        "squeeze": terms.squeeze * force / unit,
+        "speed": (terms.speed * np.sqrt(b_unit) / unit)[:, nlp.shape.fast],
+    }
     if nlp.objective is Objective.EFFORT:
-        blocks += [forces.T0 / torque, torque**2 / units.power]
+        torque = unit[list(nlp.shape.torques)]
+        blocks["torque"] = data.nodes.forces.T0 / torque
+        blocks["joints"] = torque**2 / units.power
     if relaxation is not None:
-        rows = np.concatenate([np.full(nlp.n_held, force), torque, [1.0]])
-        rates = data.relative_rates(data.nodes, relaxation.finger)
-        blocks += [relaxation.weights / rows, rates**2 * b_unit]
-    steps, weight = data.grid.steps / units.length, time_weight / units.power
-    scalars = [weight, force / units.press]
-    return np.concatenate([[0.0, 0.0], steps, scalars, *(b.ravel("F") for b in blocks)])
+        parameter, step = relaxation
+        gives = data.limits.weigh(parameter) * step / unit
+        blocks["gives"] = np.append(gives, parameter.is_speed)
+        blocks["rates"] = data.relative_rates(data.nodes, parameter) ** 2 * b_unit
+    return np.asarray(
+        nlp.columns.p.join(
+            ends=np.zeros(2),
+            steps=data.grid.steps / units.length,
+            weight=[time_weight / units.power],
+            calm=[force / units.press],
+            **{name: block.ravel("F") for name, block in blocks.items()},
+        )
+    )
 
 
 def make_bounds(
@@ -199,33 +205,33 @@ def make_bounds(
 ) -> dict[str, Array]:
     """Bounds of the NLP, with every limit tightened."""
     tight, speed_share, duration = tightening
-    n, n_h = len(data.grid.s), nlp.n_held
-    b_unit = units.profile[0]
-    low, high = np.full((n, nlp.columns), -np.inf), np.full((n, nlp.columns), np.inf)
-    low[:, 0] = LEAST_B
-    relaxed = None if relaxation is None else relaxation.finger
-    b_max = data.largest_b(data.nodes, relaxed)
-    high[:, 0] = np.maximum(b_max * speed_share / b_unit, 2 * LEAST_B)
-    low[:, 3:] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
-    forces, limit = data.nodes.forces, data.torque_limit
-    c_low = (data.least + tight[:, :n_h] - forces.C0) / units.force
-    t_low = (tight[:, n_h : n_h + 2] - limit - forces.T0) / units.torque
-    t_high = (limit - tight[:, n_h + 2 :] - forces.T0) / units.torque
-    free = np.full_like(t_low, np.inf)
-    if nlp.objective in (Objective.ELASTIC, Objective.RELAX):
-        t_low, t_high = np.hstack([t_low, -free]), np.hstack([free, t_high])
+    n, node = len(data.grid.s), nlp.columns.node
+    low, high = np.full((n, node.count), -np.inf), np.full((n, node.count), np.inf)
+    b_max = data.largest_b(data.nodes, relaxation.parameter if relaxation else None)
+    low[:, node["b"]] = LEAST_B
+    high[:, 0] = np.maximum(b_max * speed_share / units.profile[0], 2 * LEAST_B)
+    low[:, node["extra"]] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
+    rows, signs, bounds = data.limits.sides
+    # The constant part of what limits are of is on this side.
+    sides = (bounds + signs * tight - data.find_terms().constant[:, rows]) / units.of(data.limits)[
+        rows
+    ]
+    side = np.arange(len(rows)) if nlp.objective in SOFT else rows
+    width = nlp.columns.g.sizes["limits"] // n
+    rows_low, rows_high = np.full((n, width), -np.inf), np.full((n, width), np.inf)
+    rows_low[:, side[signs > 0]] = sides[:, signs > 0]
+    rows_high[:, side[signs < 0]] = sides[:, signs < 0]
     if nlp.objective is Objective.RELAX:
-        t_low, t_high = np.hstack([t_low, -free[:, :1]]), np.hstack([t_high, np.ones((n, 1))])
-    equal = np.zeros(nlp.first)
-    rows_low, rows_high = np.hstack([c_low, t_low]), np.hstack([c_low * 0 + np.inf, t_high])
-    last_low, last_high = [], []
-    if nlp.objective is Objective.MARGIN:
-        last_low, last_high = [-np.inf], [(duration or np.inf) / units.time]
+        rows_high[:, -1] = 1.0
+    late = nlp.columns.g.sizes["duration"]
+    equal = np.zeros(nlp.columns.g["limits"].start)
     return {
         "lbx": low[nlp.free],
         "ubx": high[nlp.free],
-        "lbg": np.concatenate([equal, rows_low.ravel(), last_low]),
-        "ubg": np.concatenate([equal, rows_high.ravel(), last_high]),
+        "lbg": np.concatenate([equal, rows_low.ravel(), np.full(late, -np.inf)]),
+        "ubg": np.concatenate(
+            [equal, rows_high.ravel(), np.full(late, (duration or np.inf) / units.time)]
+        ),
     }
 
 
@@ -235,31 +241,30 @@ def first_multipliers(
     """Multipliers that put the first guess near the central path of the barrier problem."""
     if nlp.objective is not Objective.TIME:
         return {}
-    n_h = nlp.n_held
-    slack = data.slack(data.nodes, profile)
-    slack /= units.limits(n_h)
-    pull = _MU / np.maximum(slack, 1e-3)
-    rows = np.hstack([-pull[:, :n_h], pull[:, n_h + 2 :] - pull[:, n_h : n_h + 2]])
-    on_b = np.zeros((len(data.grid.s), nlp.columns))
+    rows, signs, _ = data.limits.sides
+    pull = (
+        -_MU
+        * signs
+        / np.maximum(data.slack(data.nodes, profile) / units.of(data.limits)[rows], 1e-3)
+    )
+    on_rows = np.zeros((len(data.grid.s), nlp.shape.rows))
+    for k, row in enumerate(rows):
+        on_rows[:, row] += pull[:, k]
+    on_b = np.zeros(nlp.free.shape)
     on_b[:, 0] = -_MU / np.maximum(profile.b / units.profile[0], 1e-3)
     return {
         "lam_x0": on_b[nlp.free],
-        "lam_g0": np.concatenate([np.zeros(nlp.first), rows.ravel()]),
+        "lam_g0": np.append(np.zeros(nlp.columns.g["limits"].start), on_rows),
     }
 
 
-def pack(
-    nlp: PathNLP, profile: Profile, units: Units, margin: float, short: Array | None = None
-) -> Array:
+def pack(nlp: PathNLP, profile: Profile, units: Units, extra: float | Array) -> Array:
     """Unknowns of the NLP, in its units, from a profile and what its objective adds.
 
-    That is the least margin [N], (elastic) shortfalls [N, N m], or the relaxation, given as margin.
+    That is the least margin [N], the relaxation, or shortfalls in the units of the limits.
     """
-    table = np.zeros((len(profile.a), nlp.columns))
-    if short is not None:
-        table[:, 3:] = short / units.limits(nlp.n_held)[:-2]
-    elif nlp.objective in CHAINED:
-        table[:, 3] = margin / _margin_unit(nlp, units)
+    table = np.empty(nlp.free.shape)
+    table[:, nlp.columns.node["extra"]] = extra / _margin_unit(nlp, units)
     table[:, :3] = np.column_stack([profile.b, profile.a, profile.squeeze]) / units.profile
     return np.asarray(table[nlp.free])
 
@@ -273,7 +278,7 @@ def unpack(nlp: PathNLP, grid: Grid, x: Array, units: Units) -> tuple[Profile, f
 
     b is integrated again from a, so that b' = 2 a holds to rounding and not to Ipopt's tolerance.
     """
-    table = np.zeros((len(grid.s), nlp.columns))
+    table = np.zeros(nlp.free.shape)
     table[nlp.free] = x
     a, squeeze = table[:, 1] * units.profile[1], table[:, 2] * units.profile[2]
     steps = grid.steps
@@ -290,7 +295,7 @@ def move_multipliers(
     nlp: PathNLP, multipliers: dict[str, Array], old: Grid, new: Grid
 ) -> dict[str, Array]:
     """Carry multipliers from one grid to another with the same segments."""
-    nodes, intervals = np.arange(len(old.s)), nlp.intervals
+    nodes = np.arange(len(old.s))
     place = np.empty(len(nodes))
     for segment in range(int(old.segment[-1]) + 1):
         mine = old.segment == segment
@@ -300,17 +305,13 @@ def move_multipliers(
         columns = [np.interp(place, nodes, column) for column in table.T]
         return np.column_stack(columns)
 
-    on_x, on_g = multipliers["lam_x0"], multipliers["lam_g0"]
+    on_x, on_g, rows = multipliers["lam_x0"], multipliers["lam_g0"], nlp.columns.g
     table = np.zeros(nlp.free.shape)
     table[nlp.free] = on_x
-    middles, ends = (place[1:] + place[:-1]) / 2, nlp.links * intervals
-    links = [
-        np.interp(middles, nodes[:-1] + 0.5, column)
-        for column in on_g[:ends].reshape(nlp.links, intervals)
-    ]
-    stop = nlp.first + len(nodes) * (nlp.n_held + 2)
-    rows = carry(on_g[nlp.first : stop].reshape(len(nodes), -1)).ravel()
-    return {
-        "lam_x0": carry(table)[nlp.free],
-        "lam_g0": np.concatenate([*links, on_g[ends : nlp.first], rows, on_g[stop:]]),
-    }
+    middles = (place[1:] + place[:-1]) / 2
+    blocks = {name: on_g[rows[name]] for name in rows}
+    for name in ("links", "chain"):
+        if rows.sizes[name]:
+            blocks[name] = np.interp(middles, nodes[:-1] + 0.5, blocks[name])
+    blocks["limits"] = carry(blocks["limits"].reshape(len(nodes), -1)).ravel()
+    return {"lam_x0": carry(table)[nlp.free], "lam_g0": rows.join(**blocks)}

@@ -9,7 +9,7 @@ misses more than `MISS`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,9 +17,12 @@ import numpy as np
 from ...common.arrays import Array
 from ...common.errors import InfeasibleError, JammingError, SolverError, WholearmError
 from ...geometry.curve import Curve
+from ...mechanics.limits import Parameter
+from ..advice import describe_changes, find_changes, name_phases
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
-from .data import PhaseData, cut, fit_torque, join, name_phases, prepare
+from .data import PhaseData, cut, fit_torque, join, prepare
+from .first_guess import guess, guess_slowly
 from .motion import Grid, PathMotion, Profile, make_grid, redistribute_nodes
 from .nlp import (
     PathNLP,
@@ -33,6 +36,7 @@ from .nlp import (
     parameters,
     unpack,
 )
+from .terms import LimitShape
 
 MISS = 2.5e-7
 """Largest miss of a limit between nodes.
@@ -49,16 +53,34 @@ _LEVER = 30.0
 """Lever at which the typical force makes the typical torque, in radii of gyration."""
 _FINER = (1, 2, 4)
 """Intervals to try, over those that are asked for."""
-_SLOW = -12
-"""Height of the slowest guess, as a power of two times that of a fall."""
-_QUICK = 30.0
-"""How much faster, squared, than the torque limits alone allow a guess may be."""
-_FIRM = 40.0
-"""Largest range of the squeeze that a guess is amid, over the scene's force or the least of it."""
-_LIGHT = 0.5
-"""Least unit of force, over the scene's: where forces are next to nothing they do not count."""
 _OVER = 1.05
 """How much more than the miss a limit is tightened."""
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What is planned: see `plan_curves`."""
+
+    curves: Sequence[Curve]
+    epsilon: float
+    options: PlanOptions
+    phases: Sequence[int]
+    duration: float | None
+
+    @property
+    def name(self) -> str:
+        """The phases, for messages."""
+        return name_phases(self.phases)
+
+    @property
+    def lost(self) -> float:
+        """Least normal force below which a margin is none [N]."""
+        return self.epsilon - MISS * self.curves[0].formation.scene.scales.force
+
+    def prepare(self, grids: Iterable[Grid]) -> list[PhaseData]:
+        """What each phase gives the NLP on its grid."""
+        given = zip(self.curves, grids, self.phases, strict=True)
+        return [prepare(curve, self.epsilon, grid, phase) for curve, grid, phase in given]
 
 
 class _Solution(NamedTuple):
@@ -130,13 +152,13 @@ def plan_curves(
     SolverError
         If the solver stops without an answer.
     """
-    where = name_phases(phases)
+    task = _Task(curves, epsilon, options, phases, duration)
 
     def replan(changed: Sequence[Curve], least: float) -> object:
-        return _plan(changed, least, options, phases, duration)
+        return _plan(replace(task, curves=changed, epsilon=least))
 
     try:
-        plans = _plan_finer(curves, epsilon, options, phases, duration)
+        plans = _plan_finer(task)
     except JammingError as jam:
         if not explained or len(curves) > 1:
             raise
@@ -148,67 +170,50 @@ def plan_curves(
             raise
         from .explain import explain
 
-        late = _explain_duration(curves, epsilon, options, phases, duration)
-        raise late or explain(
-            stuck.parts,
-            *guess_slowly(join(stuck.parts)),
-            phases,
-            str(stuck),
-            replan,
+        guessed = guess_slowly(join(stuck.parts))
+        raise _explain_duration(task) or explain(
+            stuck.parts, *guessed, phases, str(stuck), replan
         ) from None
-    if options.goal is Objective.MARGIN and plans[0].value < epsilon - MISS * _force_of(curves[0]):
-        late = _explain_duration(curves, epsilon, options, phases, duration)
-        raise late or SolverError(f"{where}: the margin found is below epsilon")
+    if options.goal is Objective.MARGIN and plans[0].value < task.lost:
+        late = _explain_duration(task)
+        raise late or SolverError(f"{task.name}: the margin found is below epsilon")
     return plans
 
 
-def _explain_duration(
-    curves: Sequence[Curve],
-    epsilon: float,
-    options: PlanOptions,
-    phases: Sequence[int],
-    duration: float | None,
-) -> InfeasibleError | None:
+def _explain_duration(task: _Task) -> InfeasibleError | None:
     """Say so if the duration is shorter than the least time, and which one would do."""
-    from ..advice import Limit, describe_changes, find_changes
-
+    duration = task.duration
     if duration is None:
         return None
-    fastest = replace(options, objective=Objective.TIME, duration=None)
+    fastest = replace(task.options, objective=Objective.TIME, duration=None)
     try:
-        least = sum(plan.value for plan in _plan(curves, epsilon, fastest, phases, None))
+        plans = _plan(replace(task, options=fastest, duration=None))
     except WholearmError:
         return None
+    least = sum(plan.value for plan in plans)
     if least <= duration:
         return None
 
-    def can_plan(_: int, value: float) -> bool:
+    def can_plan(_: Parameter, value: float) -> bool:
         try:
-            return _plan(curves, epsilon, options, phases, value)[0].value >= epsilon
+            return _plan(replace(task, duration=value))[0].value >= task.epsilon
         except SolverError:
             return False
 
-    changes = find_changes([Limit("duration", duration, "s", 1)], lambda _: least, can_plan)
+    changes = find_changes([Parameter("duration", duration, "s", 1)], lambda _: least, can_plan)
     return InfeasibleError(
-        f"{name_phases(phases, 'infeasible')}: duration = {duration:g} s is "
+        f"{name_phases(task.phases, 'infeasible')}: duration = {duration:g} s is "
         f"{least - duration:.3g} s shorter than the least time; {describe_changes(changes)}"
     )
 
 
-def _plan_finer(
-    curves: Sequence[Curve],
-    epsilon: float,
-    options: PlanOptions,
-    phases: Sequence[int],
-    duration: float | None,
-) -> list[PhasePlan[PathMotion]]:
+def _plan_finer(task: _Task) -> list[PhasePlan[PathMotion]]:
     """Plan, on a finer grid where limits that hold between the nodes leave nothing."""
-    least = epsilon - MISS * _force_of(curves[0])
     for finer in _FINER:
         try:
-            own = replace(options, intervals=finer * options.intervals)
-            plans = _plan(curves, epsilon, own, phases, duration)
-            below = options.goal is Objective.MARGIN and plans[0].value < least
+            own = replace(task.options, intervals=finer * task.options.intervals)
+            plans = _plan(replace(task, options=own))
+            below = own.goal is Objective.MARGIN and plans[0].value < task.lost
             if not below or finer == _FINER[-1]:
                 return plans
         except _TightError as error:
@@ -216,74 +221,102 @@ def _plan_finer(
     raise tight
 
 
-def _plan(
-    curves: Sequence[Curve],
-    epsilon: float,
-    options: PlanOptions,
-    phases: Sequence[int],
-    duration: float | None,
-) -> list[PhasePlan[PathMotion]]:
-    def prepare_all(grids: Iterable[Grid]) -> list[PhaseData]:
-        given = zip(curves, grids, phases, strict=True)
-        return [prepare(curve, epsilon, grid, phase) for curve, grid, phase in given]
-
-    parts = prepare_all(make_grid(curve, options.intervals) for curve in curves)
+def _plan(task: _Task) -> list[PhasePlan[PathMotion]]:
+    """Solve, redistribute nodes once and tighten limits until they hold between nodes too."""
+    options = task.options
+    parts = task.prepare(make_grid(curve, options.intervals) for curve in task.curves)
     data = join(parts)
-    first, intervals = curves[0].formation, len(data.grid.steps)
-    nlp = build_path_nlp(first.n_contacts, intervals, options.goal, first.n_rolling)
+    nlp = build_path_nlp(LimitShape.of(data.limits), len(data.grid.steps), options.goal)
     profile, units = guess(data, options.time_weight)
-    tightening = Tightening.none(data, duration)
+    tightening = Tightening.none(data, task.duration)
     solution = _Solution(profile, 0.0, first_multipliers(nlp, data, profile, units), 0, 0.0)
     for solves in range(1, ROUNDS + 1):
         try:
             solution = _solve(nlp, data, units, tightening, solution, options.time_weight)
         except _StoppedError as stop:
             kind = _StuckError if solves == 1 else _TightError
-            raise kind(parts, f"{name_phases(phases)}: {stop}") from None
-        profile, margin = solution.profile, solution.margin
-        motions = [
-            PathMotion(part.curve, part.grid, own)
-            for part, own in zip(parts, cut(parts, profile), strict=True)
-        ]
-        short, speeding = data.misses(profile, margin)
-        total = sum(motion.duration for motion in motions)
-        late = max(0.0, total / duration - 1) if duration else 0.0
-        if max((short / data.spans).max(), speeding.max(), late) <= MISS:
-            break
-        coarse = _weigh(data, short, speeding, units)
+            raise kind(parts, f"{task.name}: {stop}") from None
+        pairs = zip(parts, cut(parts, solution.profile), strict=True)
+        motions = [PathMotion(part.curve, part.grid, own) for part, own in pairs]
+        misses = _Misses.of(data, solution, motions, task.duration)
+        if misses.find_worst(data) <= MISS:
+            return _summarise(task, parts, motions, solution, solves, nlp)
+        coarse = _weigh(data, misses, units)
         if solves == 1 and coarse.max() > 1:
             old = data.grid
             shares = np.split(coarse, np.cumsum([len(part.nonempty) for part in parts])[:-1])
-            parts = prepare_all(
+            parts = task.prepare(
                 redistribute_nodes(part.grid, part.nonempty, share)
                 for part, share in zip(parts, shares, strict=True)
             )
             data = join(parts)
-            solution = solution._replace(
-                profile=Profile(*(np.interp(data.grid.s, old.s, part) for part in profile)),
-                multipliers=move_multipliers(nlp, solution.multipliers, old, data.grid),
-            )
+            moved = Profile(*(np.interp(data.grid.s, old.s, part) for part in solution.profile))
+            multipliers = move_multipliers(nlp, solution.multipliers, old, data.grid)
+            solution = solution._replace(profile=moved, multipliers=multipliers)
         else:
-            reach = data.spread_to_nodes(data.slack_at_neighbours(profile, margin, short))
-            short, speeding = data.spread_to_nodes(short), data.spread_to_nodes(speeding)
-            tightening = tightening.by(reach, _OVER * short, _OVER * speeding, _OVER * late)
-    else:
-        worst = int((short / data.spans).max(axis=0).argmax())
-        unit = "N" if worst < len(data.least) else "N m"
-        missed = f"limits are still missed by {short[:, worst].max():.2g} {unit} between nodes"
-        if (short / data.spans).max() <= MISS:
-            over = max(speeding.max(), late)
+            tightening = misses.tighten(data, tightening, solution)
+    raise _TightError(parts, f"{task.name}: {misses.describe(data)}")
+
+
+class _Misses(NamedTuple):
+    """What limits miss between nodes: see `PhaseData.misses`; and the duration, relatively."""
+
+    short: Array
+    speeding: Array
+    late: float
+
+    @staticmethod
+    def of(
+        data: PhaseData,
+        solution: _Solution,
+        motions: Sequence[PathMotion],
+        duration: float | None,
+    ) -> _Misses:
+        total = sum(motion.duration for motion in motions)
+        late = max(0.0, total / duration - 1) if duration else 0.0
+        return _Misses(*data.misses(solution.profile, solution.margin), late)
+
+    def find_worst(self, data: PhaseData) -> float:
+        """The largest, over what is much."""
+        return float(max((self.short / data.spans).max(), self.speeding.max(), self.late))
+
+    def tighten(self, data: PhaseData, tightening: Tightening, solution: _Solution) -> Tightening:
+        """Limits that are tightened by somewhat more than they miss."""
+        reach = data.slack_at_neighbours(solution.profile, solution.margin, self.short)
+        short, speeding = data.spread_to_nodes(self.short), data.spread_to_nodes(self.speeding)
+        return tightening.by(
+            data.spread_to_nodes(reach), _OVER * short, _OVER * speeding, _OVER * self.late
+        )
+
+    def describe(self, data: PhaseData) -> str:
+        """What is still missed after all solves."""
+        worst = int((self.short / data.spans).max(axis=0).argmax())
+        limits = data.limits
+        unit = limits.limits[limits.owners[limits.sides[0][worst]]].unit
+        missed = f"limits are still missed by {self.short[:, worst].max():.2g} {unit} between nodes"
+        if (self.short / data.spans).max() <= MISS:
+            over = max(self.speeding.max(), self.late)
             missed = f"the speed limit or the duration is still exceeded by {over:.2g} of it"
-        missed = f"after {ROUNDS} solves {missed}; plan with more intervals"
-        raise _TightError(parts, f"{name_phases(phases)}: {missed}")
+        return f"after {ROUNDS} solves {missed}; plan with more intervals"
+
+
+def _summarise(
+    task: _Task,
+    parts: Sequence[PhaseData],
+    motions: Sequence[PathMotion],
+    solution: _Solution,
+    solves: int,
+    nlp: PathNLP,
+) -> list[PhasePlan[PathMotion]]:
+    """The plan of each phase; what solving has cost counts for the first."""
     plans: list[PhasePlan[PathMotion]] = []
     for part, motion in zip(parts, motions, strict=True):
         torque, squares = fit_torque(part, motion)
         value = {
             Objective.TIME: motion.duration,
-            Objective.EFFORT: squares + options.time_weight * motion.duration,
-            Objective.MARGIN: epsilon + margin,
-        }[options.goal]
+            Objective.EFFORT: squares + task.options.time_weight * motion.duration,
+            Objective.MARGIN: task.epsilon + solution.margin,
+        }[task.options.goal]
         costs = (0, 0, 0.0, 0.0)
         if not plans:
             costs = (solution.iterations, solves, nlp.build_time, solution.seconds)
@@ -291,12 +324,12 @@ def _plan(
     return plans
 
 
-def _weigh(data: PhaseData, short: Array, speeding: Array, units: Units) -> Array:
+def _weigh(data: PhaseData, misses: _Misses, units: Units) -> Array:
     """How much each solid interval misses of what draws the grid together, shape (n_solid,)."""
-    count, lever = len(data.least), _LEVER * data.curve.formation.scene.scales.length
-    held, torque = short[:, :count].max(axis=1), short[:, count:].max(axis=1)
-    forces = np.maximum(held, torque / lever) / (_COARSE * units.force)
-    return np.asarray(np.maximum(forces, speeding / _FAST))
+    lever = _LEVER * data.curve.formation.scene.scales.length
+    of_torque = np.isin(data.limits.sides[0], np.flatnonzero(data.limits.columns[1].any(axis=1)))
+    forces = (misses.short / np.where(of_torque, lever, 1.0)).max(axis=1)
+    return np.asarray(np.maximum(forces / (_COARSE * units.force), misses.speeding / _FAST))
 
 
 def _solve(
@@ -324,96 +357,3 @@ def _solve(
     iterations = start.iterations + stats["iter_count"]
     seconds = start.seconds + stats["t_wall_total"]
     return _Solution(profile, margin, multipliers, iterations, seconds)
-
-
-def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
-    """Guess a motion: b a parabola in s as high as limits allow, the squeeze amid its range.
-
-    Where limits forbid even a slow one, it is as quick as a fall: a plan, if there is one, is not
-    slow, and in units of a slow one the costs that choose among equals would weigh too much.
-    """
-    b_max = data.largest_b(data.nodes)
-    fall = _fall(data)
-
-    def possible(height: float) -> bool:
-        low, high = _squeeze_range(data, height)
-        b = _parabola(data, height)[1]
-        return bool((low <= high).all() and (b <= b_max).all())
-
-    # Bisection over heights from 2^-12 to 2^8 times that of a fall over this length.
-    low_power, high_power = float(_SLOW), 8.0
-    for _ in range(7):
-        power = (low_power + high_power) / 2
-        if possible(fall * 2**power):
-            low_power = power
-        else:
-            high_power = power
-    none = low_power == _SLOW
-    return _guess_at(data, 0.7 * fall * (1.0 if none else 2**low_power), time_weight)
-
-
-def guess_slowly(data: PhaseData) -> tuple[Profile, Units]:
-    """Guess a slow motion, whatever limits say."""
-    return _guess_at(data, 0.7 * _fall(data) * 2.0**_SLOW)
-
-
-def _force_of(curve: Curve) -> float:
-    return curve.formation.scene.scales.force
-
-
-def _fall(data: PhaseData) -> float:
-    """The b of a fall over the length of the curve, or of what joints may do [m^2/s^2]."""
-    length, forces = float(data.grid.s[-1]), data.nodes.forces
-    fall = 2 * data.curve.formation.scene.scales.acceleration * length
-
-    def usual(coefficients: Array) -> float:
-        """Where this coefficient alone would take a joint to its torque limit."""
-        return 1 / max(float((np.abs(coefficients) / data.torque_limit).max(axis=1).mean()), 1e-100)
-
-    b_max = data.largest_b(data.nodes)
-    inertia, drag = 2 * length * usual(forces.Ta), usual(forces.Tv) ** 2
-    return min(fall, _QUICK * min(inertia, drag, _find_median(b_max)))
-
-
-def _find_median(values: Array) -> float:
-    """Median, the upper one of two; that of numpy takes 10 ms to import what it needs."""
-    middle = values.size // 2
-    return float(np.partition(values.ravel(), middle)[middle])
-
-
-def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
-    """The a and b of a parabola in s of this height."""
-    length = data.grid.s[-1]
-    x = data.grid.s / length
-    return height * 2 * (1 - 2 * x) / length, height * 4 * x * (1 - x)
-
-
-def _squeeze_range(data: PhaseData, height: float) -> tuple[Array, Array]:
-    """Least and largest squeeze that limits allow at each node."""
-    a, b = _parabola(data, height)
-    slack = data.slack(data.nodes, Profile(a, b, np.zeros_like(a)))
-    forces = data.nodes.forces
-    rate = np.hstack([forces.Cl, forces.Tl, -forces.Tl])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        bound = -slack / rate
-    low = np.where(rate > 0, bound, -np.inf).max(axis=1)
-    high = np.where(rate < 0, bound, np.inf).min(axis=1)
-    return low, high
-
-
-def _guess_at(data: PhaseData, height: float, time_weight: float = 0.0) -> tuple[Profile, Units]:
-    low, high = _squeeze_range(data, height)
-    weight = data.curve.formation.scene.scales.force
-    open_ = np.isfinite(low + high) & (low <= high)
-    press = float(np.abs(np.where(open_, (low + high) / 2, 0.0)).mean())
-    # A strong hand could press far harder than any motion needs.
-    high = np.minimum(high, low + _FIRM * np.maximum(weight, np.abs(low)))
-    middle = np.where(open_, (low + high) / 2, 0.0)
-    length = float(data.grid.s[-1])
-    duration = np.pi / 2 * length / np.sqrt(height)
-    force = max(_LIGHT * weight, data.epsilon, float(np.abs(middle).mean()))
-    profile = Profile(*_parabola(data, height), middle)
-    torque = data.torque_limit
-    squares = np.minimum(np.abs(data.nodes.forces.tau(*profile)), torque) ** 2
-    power = time_weight + float(squares.sum(axis=1).mean())
-    return profile, Units(length, 0.6 * duration, force, torque, power, max(force, press))

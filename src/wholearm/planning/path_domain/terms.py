@@ -5,10 +5,8 @@ friction (`mechanics.dynamics.PathForces`). At the nodes s_k of a grid the unkno
 lambda_k; between two nodes a and lambda are linear in s, and b' = 2 a (dash: d/ds) is then exact:
 
     b_k+1 = b_k + (s_k+1 - s_k) (a_k + a_k+1),
-    H c >= least,  |tau| <= limit at every node,
+    low <= rows (c, tau, theta') <= high at every node (`mechanics.limits`),
     T = sum of 2 (s_k+1 - s_k) / (sqrt(b_k) + sqrt(b_k+1)).
-
-H c are the normal forces, and the friction cones of contacts that roll (`contacts.cones`).
 
 Where a direction reverses, the grid has an interval of length zero: b is the same on its two sides,
 a and lambda may jump.
@@ -19,13 +17,21 @@ column through all rows would make building the Jacobian quadratic in the number
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
 import casadi as ca
+import numpy as np
 
 from ...common.arrays import Expression
+from ...mechanics.limits import PRESS, TORQUE, LimitSet
+from ..columns import Columns
 from ..options import Objective
 
 CHAINED = (Objective.MARGIN, Objective.RELAX)
 """Objectives with one more unknown, which every node has a copy of."""
+SOFT = (Objective.ELASTIC, Objective.RELAX)
+"""Objectives for which limits give way, so that each side of a limit has a row of its own."""
 LEAST_B = 1e-8
 """Least b away from rest, in units of the typical one; keeps the square root differentiable."""
 _CALM = 1e-4
@@ -34,100 +40,176 @@ _SMOOTH = 1e-5
 """Weight of changes of a and lambda: rules out ripple that the objective does not see."""
 
 
-def count_extras(objective: Objective, n_held: int) -> int:
-    """Unknowns per node besides b, a and squeeze: shortfalls, or the margin or relaxation."""
-    return n_held + 2 if objective is Objective.ELASTIC else int(objective in CHAINED)
+class LimitShape(NamedTuple):
+    """What an NLP has to know of limits, whatever they are of.
 
-
-def write_terms(
-    n_contacts: int, intervals: int, objective: Objective, n_rolling: int
-) -> dict[str, Expression]:
-    """Write the NLP for every phase of so many contacts, of which so many roll.
-
-    The unknowns are (b, a, squeeze, extras) node by node, without b at the two ends. The extras
-    are shortfalls for `elastic`, the least margin for `margin` and the relaxation for `relax`. The
-    parameters are the speeds at the ends, the steps, the weight of time, what the unit of squeeze
-    counts for where it is kept calm, and the coefficients of `PathForces` but for C0 and T0, which
-    are part of the bounds; for `effort` also T0 and the weight of each joint's torque, for `relax`
-    what the relaxation is worth for each limit, and b's coefficients in the speed limit. The rows
-    are the N of b' = 2 a, those that chain the margin or the relaxation, and the changes of a over
-    the first and the last interval; then node by node H c and tau, and the speed for `relax`; last
-    T for `margin`.
-
-    Parameters
+    Attributes
     ----------
-    n_contacts, intervals : int
-    objective : Objective
-    n_rolling : int
+    rows : int
+        Number m of rows.
+    sides : tuple of (int, float)
+        Row and sign of each side, in the order of `LimitSet.sides`.
+    presses, torques, fast : tuple of int
+        Rows of the least normal forces and of the torques, and those that know of the speed.
+    """
+
+    rows: int
+    sides: tuple[tuple[int, float], ...]
+    presses: tuple[int, ...]
+    torques: tuple[int, ...]
+    fast: tuple[int, ...]
+
+    @staticmethod
+    def of(limits: LimitSet) -> LimitShape:
+        """The shape of a set of limits."""
+        rows, signs, _ = limits.sides
+        known = [part.any(axis=1) for part in limits.columns[1:]]
+        return LimitShape(
+            len(limits.low),
+            tuple(zip(rows.tolist(), signs.tolist(), strict=True)),
+            tuple(limits.of(PRESS).tolist()),
+            tuple(limits.of(TORQUE).tolist()),
+            tuple(np.flatnonzero(known[0] | known[1]).tolist()),
+        )
+
+
+class NLPColumns(NamedTuple):
+    """What the vectors of an NLP consist of.
+
+    Attributes
+    ----------
+    node : Columns
+        Unknowns of each node: b (none at the two ends), a, squeeze, and what the objective adds:
+        shortfalls of the limits for `elastic`, the least margin, or the relaxation for `relax`.
+    p : Columns
+        The speeds at the `ends`; the `steps`; the `weight` of time; what the unit of squeeze counts
+        for where it is kept `calm`; column by column, coefficients of the limits at the nodes but
+        for the constant ones, which are part of the bounds; for `effort` the constant torques and
+        the weight of each joint, for `relax` by how much each limit gives way with the relaxation,
+        and b's coefficients in the speed limit.
+    g : Columns
+        The N of b' = 2 a; those that `chain` the margin or the relaxation; the changes of a over
+        the first and the last interval (`ends`); node by node the `limits`, side by side where they
+        are soft, and the speed for `relax`; the `duration` for `margin`.
+    """
+
+    node: Columns
+    p: Columns
+    g: Columns
+
+
+def list_columns(shape: LimitShape, intervals: int, objective: Objective) -> NLPColumns:
+    """List what the vectors of an NLP consist of."""
+    n, m, relax = intervals + 1, shape.rows, objective is Objective.RELAX
+    chained, fast = objective in CHAINED, len(shape.fast)
+    extra = m if objective is Objective.ELASTIC else int(chained)
+    p = {"ends": 2, "steps": intervals, "weight": 1, "calm": 1, "a": n * m, "b": n * m}
+    p |= {"squeeze": n * m, "speed": n * fast}
+    if objective is Objective.EFFORT:
+        p |= {"torque": n * 2, "joints": 2}
+    elif relax:
+        p |= {"gives": m + 1, "rates": n}
+    rows = (len(shape.sides) if objective in SOFT else m) + relax
+    g = {"links": intervals, "chain": intervals * chained, "ends": 2, "limits": n * rows}
+    g |= {"duration": int(objective is Objective.MARGIN)}
+    return NLPColumns(Columns(b=1, a=1, squeeze=1, extra=extra), Columns(**p), Columns(**g))
+
+
+def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict[str, Expression]:
+    """Write the NLP for every phase with limits of a shape; see `NLPColumns` for its vectors.
 
     Returns
     -------
     dict
         Expressions of x, p, f and g.
     """
-    n, n_held = intervals + 1, n_contacts + 2 * n_rolling
-    m = n_held + 2
-    b_inner, ends = ca.SX.sym("b", n - 2), ca.SX.sym("ends", 2)
-    a, squeeze = ca.SX.sym("a", n), ca.SX.sym("squeeze", n)
-    extra = ca.SX.sym("extra", n, count_extras(objective, n_held))
-    h = ca.SX.sym("h", intervals)
-    weight, calm = ca.SX.sym("weight"), ca.SX.sym("calm")
-    coefficients = [ca.SX.sym(name, n, m) for name in ("Pa", "Pb", "Pl")] + [ca.SX.sym("Tv", n, 2)]
+    n, columns = intervals + 1, list_columns(shape, intervals, objective)
+    given, p = columns.p.make_symbols()
+    b_inner, a, squeeze = ca.SX.sym("b", n - 2), ca.SX.sym("a", n), ca.SX.sym("squeeze", n)
+    extra, h, ends = (
+        ca.SX.sym("extra", n, columns.node.sizes["extra"]),
+        given.steps,
+        given.ends,
+    )
     b = ca.vertcat(ends[0] ** 2, b_inner, ends[1] ** 2)
     speed = ca.vertcat(ends[0], ca.sqrt(b_inner), ends[1])
-
-    def spread(column: Expression) -> Expression:
-        return ca.repmat(column, 1, m)
-
-    Pa, Pb, Pl, Tv = coefficients
-    forces = Pa * spread(a) + Pb * spread(b) + Pl * spread(squeeze)
-    held, tau = forces[:, :n_held], forces[:, n_held:] + Tv * ca.repmat(speed, 1, 2)
     interval_times = 2 * h / (speed[:-1] + speed[1:])
-    node_weights = ca.vertcat(0, h) + ca.vertcat(h, 0)
+    values = _write_values(shape, given, (a, b, squeeze, speed))
     # What is relaxed has to be as little as possible, whatever the motion is like.
     share = 1e-3 if objective is Objective.RELAX else 1.0
-    squeezed = calm * squeeze
+    squeezed, node_weights = given.calm * squeeze, ca.vertcat(0, h) + ca.vertcat(h, 0)
     node_costs = share * _CALM * node_weights * squeezed**2
     link_costs = share * _SMOOTH * h * ((a[1:] - a[:-1]) ** 2 + (squeezed[1:] - squeezed[:-1]) ** 2)
-    links = [b[1:] - b[:-1] - h * (a[1:] + a[:-1])]
-    c_rows, tau_rows = held, tau
-    last: tuple[Expression, ...] = ()
-    if objective in CHAINED:
-        links.append(extra[1:] - extra[:-1])
     if objective is Objective.TIME:
         link_costs += interval_times
     elif objective is Objective.EFFORT:
-        # The bounds hold T0, so the full torque is passed as a parameter for the integrand only.
-        T0, joints = ca.SX.sym("T0", n, 2), ca.SX.sym("joints", 2)
-        coefficients += [T0, joints]
-        full = tau + T0
-        squares = full[:-1, :] ** 2 + full[:-1, :] * full[1:, :] + full[1:, :] ** 2
-        link_costs += interval_times * (squares @ joints / 3 + weight)
+        squares = _square_torques(shape, given, values) @ given.joints / 3
+        link_costs += interval_times * (squares + given.weight)
     elif objective is Objective.MARGIN:
-        c_rows = held - extra @ ca.horzcat(ca.DM.ones(1, n_contacts), ca.DM(1, 2 * n_rolling))
         node_costs[0] -= extra[0]
-        last = (ca.sum1(interval_times),)
     elif objective is Objective.ELASTIC:
         # Every node counts alike: where intervals are short, being short must not be cheap.
         node_costs += ca.sum2(extra) / n
         link_costs += 1e-4 * interval_times
-        short = extra
     else:
-        weights, Rb = ca.SX.sym("worth", 1, m + 1), ca.SX.sym("Rb", n)
-        coefficients += [weights, Rb]
-        short = extra @ weights
         node_costs[0] += extra[0]
         link_costs += 1e-5 * interval_times
-    if objective in (Objective.ELASTIC, Objective.RELAX):
-        c_rows, easing = held + short[:, :n_held], short[:, n_held:m]
-        tau_rows = ca.horzcat(tau + easing, tau - easing)
-    if objective is Objective.RELAX:
-        tau_rows = ca.horzcat(tau_rows, Rb * b - short[:, m])
     nodes = ca.horzcat(b, a, squeeze, extra).T
-    rows = ca.horzcat(c_rows, tau_rows)
+    chained, late = objective in CHAINED, objective is Objective.MARGIN
+    rows = _write_limits(shape, objective, given, values, extra, b)
     return {
         "x": ca.vertcat(nodes[1:, 0], ca.vec(nodes[:, 1:-1]), nodes[1:, -1]),
-        "p": ca.vertcat(ends, h, weight, calm, *(ca.vec(block) for block in coefficients)),
+        "p": p,
         "f": ca.sum1(link_costs) + ca.sum1(node_costs),
-        "g": ca.vertcat(*links, a[1] - a[0], a[-1] - a[-2], ca.vec(rows.T), *last),
+        "g": columns.g.write(
+            links=b[1:] - b[:-1] - h * (a[1:] + a[:-1]),
+            chain=extra[1:] - extra[:-1] if chained else ca.SX(0, 1),
+            ends=ca.vertcat(a[1] - a[0], a[-1] - a[-2]),
+            limits=rows.T,
+            duration=ca.sum1(interval_times) if late else ca.SX(0, 1),
+        ),
     }
+
+
+def _write_values(
+    shape: LimitShape, given: SimpleNamespace, motion: tuple[Expression, ...]
+) -> Expression:
+    """What limits are of, but for the constant part, shape (n, m)."""
+    a, b, squeeze, speed = motion
+    n, m, fast = a.numel(), shape.rows, list(shape.fast)
+
+    def spread(name: str, column: Expression, count: int) -> Expression:
+        return ca.reshape(getattr(given, name), n, count) * ca.repmat(column, 1, count)
+
+    values = spread("a", a, m) + spread("b", b, m) + spread("squeeze", squeeze, m)
+    values[:, fast] += spread("speed", speed, len(fast))
+    return values
+
+
+def _square_torques(shape: LimitShape, given: SimpleNamespace, values: Any) -> Expression:
+    """Three times the mean square of each torque over each interval, shape (N, 2)."""
+    # The bounds hold the constant part, so it is passed as a parameter for this only.
+    full = values[:, list(shape.torques)] + ca.reshape(given.torque, values.size1(), 2)
+    return full[:-1, :] ** 2 + full[:-1, :] * full[1:, :] + full[1:, :] ** 2
+
+
+def _write_limits(
+    shape: LimitShape,
+    objective: Objective,
+    given: SimpleNamespace,
+    values: Expression,
+    extra: Expression,
+    b: Expression,
+) -> Expression:
+    """The rows of the limits at the nodes, shape (n, m) or (n, n_sides), and one for the speed."""
+    if objective is Objective.MARGIN:
+        raised = np.isin(np.arange(shape.rows), shape.presses).astype(float)
+        return values - extra @ ca.DM(raised).T
+    if objective not in SOFT:
+        return values
+    relax = objective is Objective.RELAX
+    short = extra @ given.gives.T if relax else extra
+    rows = [values[:, row] + sign * short[:, row] for row, sign in shape.sides]
+    if relax:
+        rows.append(given.rates * b - short[:, shape.rows])
+    return ca.horzcat(*rows)

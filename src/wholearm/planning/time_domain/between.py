@@ -10,8 +10,9 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...common.minima import find_least
-from ...contacts.cones import hold_least, slip_margins
+from ...mechanics.limits import PRESS, LimitSet, make_limits
 from ...results.trajectory import Samples
+from .limits import bound_by_limits
 from .motion import StageMotion
 from .nlp import SLIDING, TimeNLP, least_rates
 from .stage import Stage
@@ -34,15 +35,14 @@ class Limits(NamedTuple):
 
     Attributes
     ----------
-    c_n : ndarray, shape (K, n_c)
-    cone : ndarray, shape (K, R)
+    held : ndarray, shape (K, n_sides)
+        Of each side of the limits of forces, torques and speeds, over what is much for it.
     gap : ndarray, shape (K, n_monitored)
     sense : ndarray, shape (K, n_c + 2)
         Of the rates of contacts and joints; nothing of rolling contacts.
     """
 
-    c_n: Array
-    cone: Array
+    held: Array
     gap: Array
     sense: Array
 
@@ -50,8 +50,8 @@ class Limits(NamedTuple):
     def none(stage: Stage) -> Limits:
         """Nothing is raised."""
         formation = stage.formation
-        n_c = formation.n_contacts
-        widths = (n_c, formation.n_rolling, len(stage.monitored), n_c + 2)
+        sides = len(make_limits(formation, 0.0).sides[0])
+        widths = (sides, len(stage.monitored), formation.n_contacts + 2)
         return Limits(*(np.zeros((stage.intervals, width)) for width in widths))
 
     def raised(self, misses: Limits) -> Limits:
@@ -61,7 +61,7 @@ class Limits(NamedTuple):
     @property
     def worst(self) -> float:
         """The largest, over what is allowed."""
-        allowed = (MISS, MISS, GRAZE, FALTER * SLIDING)
+        allowed = (MISS, GRAZE, FALTER * SLIDING)
         return max(float(t.max(initial=0.0)) / a for t, a in zip(self, allowed, strict=True))
 
 
@@ -98,21 +98,34 @@ def find_misses(stage: Stage, look: CheckPlaces, epsilon: float, margin: float =
     epsilon, margin : float
         Least c_n, and what c_n but no friction cone has to exceed it by.
     """
-    samples = look.samples
-    grip = slip_margins(stage.formation, samples.c_n - epsilon, samples.c_t)
+    samples, limits = look.samples, make_limits(stage.formation, epsilon)
     clear = stage.list_clearances(look.places, after=1 / 2) / 2
     # What a stage is short of where it starts, no bound within it can mend.
     values = look.limits[:, list(stage.monitored)]
     values = values - np.minimum(values[:1], 0.0)
     tables = (
-        samples.c_n - (epsilon + margin),
-        grip,
+        _find_slack(stage, limits, samples, margin),
         values - clear,
         _measure_senses(stage, samples) - 0.5 * least_rates(stage, look.places)[:, None],
     )
     shape = (stage.intervals, LOOKS)
     slack = (find_least(table.reshape(*shape, table.shape[1])) for table in tables)
     return Limits(*(np.maximum(-part, 0.0) for part in slack))
+
+
+def _find_slack(stage: Stage, limits: LimitSet, samples: Samples, margin: float) -> Array:
+    """How far each side of the limits is from being missed, over what is much, shape (n, n_sides).
+
+    Torques alone are linear between places where they are bounded, and miss nothing.
+    """
+    c = [samples.c_n, samples.c_t[:, list(stage.formation.rolling_rows)]]
+    values = np.hstack([*c, samples.tau, samples.z_dot[:, 3:]]) @ limits.rows.T
+    values[:, limits.of(PRESS)] -= margin
+    slack = limits.find_slack(values) / limits.scales[limits.sides[0]]
+    of_c, _, of_rates = limits.columns
+    bent = np.flatnonzero(of_c.any(axis=1) | of_rates.any(axis=1))
+    slack[:, ~np.isin(limits.sides[0], bent)] = 0.0
+    return slack
 
 
 def _measure_senses(stage: Stage, samples: Samples) -> Array:
@@ -138,34 +151,32 @@ def raise_bounds(
     nlp: TimeNLP,
     stages: Sequence[Stage],
     limits: Sequence[Limits],
-    epsilon: float,
     bounds: tuple[Array, Array],
 ) -> tuple[Array, Array]:
-    """Bounds of the NLP's rows; raises `bounds`, those of its unknowns, in place.
-
-    Parameters
-    ----------
-    epsilon : float
-        Least c_n.
-    """
+    """Bounds of the NLP's rows; raises `bounds`, those of its unknowns, in place."""
     low, high = nlp.rows.bounds
     low_x, high_x = bounds
     for k, (stage, raised) in enumerate(zip(stages, limits, strict=True)):
-        formation, own = stage.formation, nlp.rows_of[k]
-        floor = epsilon + raised.c_n
-        c_n = nlp.layouts[k].forces[:, :, : formation.n_contacts]
+        own, layout = nlp.rows_of[k], nlp.layouts[k]
+        kept = own.limits.limits
+        rows, signs, values = kept.sides
+        more = raised.held * kept.scales[rows]
+        pressed = own.limits.pressed
+        floor = values[pressed] + more[:, pressed]
         # Where rows hold c_n at the points too, its own bounds must not.
         if own.limits.presses.shape[1] <= 2:
-            low_x[c_n] = floor[:, None]
+            low_x[layout.forces[..., : stage.formation.n_contacts]] = floor[:, None]
         low[own.limits.presses] = floor[:, None]
-        cushion = hold_least(formation, epsilon)[formation.n_contacts :]
-        low[own.limits.cones] = cushion + np.tile(raised.cone, 2)[:, None]
+        others = own.limits.sides
+        low[own.limits.others] = ((signs * values)[others] + more[:, others])[:, None]
+        bound_by_limits(own.limits, layout, bounds, more)
         low[own.monitor_rows] += raised.gap[:, None]
+        formation = stage.formation
         sliding = [i for i in range(formation.n_contacts) if i not in formation.rolling_rows]
         senses = own.points[:, :, own.points.shape[2] - len(sliding) :]
         low[senses] += raised.sense[:, None, sliding]
         for joint, sigma in enumerate(stage.directions.sigma):
-            rates, more = nlp.layouts[k].v[..., 3 + joint], raised.sense[:, -2 + joint, None]
-            low_x[rates] += more * (sigma > 0)
-            high_x[rates] -= more * (sigma < 0)
+            rates, faster = layout.v[..., 3 + joint], raised.sense[:, -2 + joint, None]
+            low_x[rates] += faster * (sigma > 0)
+            high_x[rates] -= faster * (sigma < 0)
     return low, high

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from ...common.arrays import Array
-from ...common.errors import InfeasibleError, InputError, SolverError
+from ...common.errors import InfeasibleError, SolverError
 from ...geometry.curve import describe_pose
 from ...geometry.path_guess import count_freedoms
+from ...mechanics.limits import EPSILON, Parameter, make_limits
 from ...problem.definition import Phase, Problem
-from ..advice import Limit, Shortfall, describe_changes, find_changes, rank_shortfalls
+from ...scene.model import Scales
+from .. import advice
+from ..advice import Shortfall, advise, change_scene, keep_worst, name_phases, rank_shortfalls
 from ..options import Objective
-from .limits import LimitRelaxation
+from .collocation import Scheme
 from .own_units import to_si
 from .search import Search
 from .stage import Stage
@@ -24,10 +25,6 @@ LONGEST = 1.0
 """Most processor time [s] of one run of the solver that looks for the least shortfalls."""
 ADVICE = 1.0
 """Processor time [s] after which no further change of a limit is tried."""
-SHORT = 1e-4
-"""Least shortfall that counts, of forces over the weight, of torques over that times the radius
-of gyration of the object."""
-
 Replan = Callable[[Problem], object]
 """Plans the same phases of another problem; raises if there is no plan."""
 
@@ -55,7 +52,7 @@ def refuse(
     InfeasibleError
         With the contact that would have to pull, and what single change would do.
     """
-    from .resting import EPSILON, find_block, find_change
+    from .resting import find_block, find_change
 
     epsilon, last = search.problem.epsilon, stages[-1]
     stage, node, phase = stages[0], 0, phases[0]
@@ -78,13 +75,14 @@ def refuse(
         text += " within the torque limits"
     ends, z = node == -1, stage.guess.nodes[node, 0]
 
-    def find_least(index: int) -> float | None:
-        value = find_change(stage.formation, z, epsilon, index, ends)
-        unit = scales.force if index == EPSILON else scales.torque
-        return unit * value if value else None
+    def find_least(parameter: Parameter) -> float | None:
+        if parameter.is_speed:
+            return None
+        finger = None if parameter.key == EPSILON else int(parameter.key.split(".")[1]) - 1
+        value = find_change(stage.formation, z, epsilon, finger, ends)
+        return _unit_of(parameter, problem.scene.scales) * value if value else None
 
-    scales = problem.scene.scales
-    raise _advise(problem, text, find_least, replan)
+    raise _advise(problem, phase, text, find_least, replan)
 
 
 def explain(
@@ -110,98 +108,69 @@ def explain(
     replan : callable, optional
         When left out, no change is looked for.
     """
-    numbers = " and ".join(str(phase.number) for phase in phases)
-    what = f"phase{'s' if len(phases) > 1 else ''} {numbers}"
+    numbers = [phase.number for phase in phases]
     if not short:
         names = " and ".join(" ".join(phase.formation.names) for phase in phases)
-        text = f"no plan for {what} ({names}, until {phases[-1].until}): {status}"
+        text = f"no plan for {name_phases(numbers)} ({names}, until {phases[-1].until}): {status}"
         return SolverError(f"{text}; try other time_intervals")
-    scales = problem.scene.scales
 
     def sum_up(stages: list[Stage]) -> float:
-        return sum(shortfall.amount for shortfall in list_shortfalls(problem, stages))
+        return sum(
+            shortfall.amount for shortfall in list_shortfalls(problem, stages, search.scheme)
+        )
 
     elastic = min(short, key=sum_up)
-    shortfalls = list_shortfalls(problem, elastic)
-    are = "are" if len(phases) > 1 else "is"
-    text = f"{what} {are} infeasible: {rank_shortfalls(shortfalls)}"
-    relaxations = [
-        LimitRelaxation(0.0, (1.0, 0.0)),
-        LimitRelaxation(0.0, (0.0, 1.0)),
-        LimitRelaxation(1.0),
-    ]
-    units = [scales.torque, scales.torque, scales.force]
-    limits, undecided = _list_limits(problem), list[int]()
 
-    def find_least(index: int) -> float | None:
-        solution = search.aiming(Objective.RELAX, relaxations[index]).solve(
-            elastic, seconds=LONGEST
-        )
+    def find_least(parameter: Parameter) -> float | None:
+        aim = search.aiming(Objective.RELAX, parameter)
+        solution = aim.solve(elastic, seconds=LONGEST)
         # A limit that may be tighter is not what keeps the others from being kept.
         if not solution.success or solution.cost < 0.0:
-            undecided.append(index)
-            return None
-        return limits[index].value + limits[index].sign * units[index] * solution.cost
+            return np.nan
+        unit = _unit_of(parameter, problem.scene.scales)
+        return parameter.value + parameter.sign * unit * solution.cost
 
-    return _advise(problem, text, find_least, replan, undecided)
+    ranked = rank_shortfalls(list_shortfalls(problem, elastic, search.scheme))
+    text = f"{name_phases(numbers, 'infeasible')}: {ranked}"
+    return _advise(problem, phases[0], text, find_least, replan)
 
 
-def _list_limits(problem: Problem) -> list[Limit]:
-    """The limits that may give way: both torque limits, and epsilon."""
-    torque = problem.scene.torque_limit
-    limits = [
-        Limit(f"torque limit of finger {k + 1}", float(torque[k]), "N m", 1) for k in range(2)
-    ]
-    return [*limits, Limit("epsilon", problem.epsilon, "N", -1)]
+def _unit_of(parameter: Parameter, scales: Scales) -> float:
+    """What one of a parameter is in SI units, of one in the scene's own."""
+    units = {"N": scales.force, "N m": scales.torque, "rad/s": 1 / scales.time}
+    return units[parameter.unit]
 
 
 def _advise(
     problem: Problem,
+    phase: Phase,
     text: str,
-    find_least: Callable[[int], float | None],
+    find_least: Callable[[Parameter], float | None],
     replan: Replan | None,
-    undecided: list[int] | None = None,
 ) -> InfeasibleError:
     """The error with `text` and what single change of a limit would make a plan possible.
 
     Parameters
     ----------
     problem : Problem
+    phase : Phase
+        One of those that have no plan.
     text : str
     find_least : callable
-        As for `planning.advice.find_changes`.
+        As for `planning.advice.advise`.
     replan : callable or None
         Without it no change is looked for.
-    undecided : list of int, optional
-        Limits of which `find_least` could not tell.
     """
-    if replan is None:
-        return InfeasibleError(text)
-    stop, open_ones = time.thread_time() + ADVICE, [] if undecided is None else undecided
 
-    def look(index: int) -> float | None:
-        if time.thread_time() > stop:
-            open_ones.append(index)
-            return None
-        return find_least(index)
+    def change(parameter: Parameter, value: float) -> object:
+        assert replan is not None
+        return replan(change_limit(problem, parameter.key, value))
 
-    def can_plan(index: int, value: float) -> bool:
-        if time.thread_time() > stop:
-            open_ones.append(index)
-            return False
-        try:
-            replan(change_limit(problem, index, value))
-        except (InfeasibleError, SolverError, InputError):
-            return False
-        return True
-
-    changes = find_changes(_list_limits(problem), look, can_plan)
-    if open_ones and not changes:
-        return InfeasibleError(f"{text}; no single limit was found that makes it feasible")
-    return InfeasibleError(f"{text}; {describe_changes(changes)}")
+    parameters = make_limits(phase.formation, problem.epsilon).parameters
+    return InfeasibleError(advise(text, parameters, find_least, change if replan else None, ADVICE))
 
 
-def list_shortfalls(problem: Problem, stages: Sequence[Stage]) -> list[Shortfall]:
+def list_shortfalls(problem: Problem, stages: Sequence[Stage], scheme: Scheme) -> list[Shortfall]:
     """What the motion of stages is short of, each limit where it is worst.
 
     Parameters
@@ -209,61 +178,37 @@ def list_shortfalls(problem: Problem, stages: Sequence[Stage]) -> list[Shortfall
     problem : Problem
         In SI units, as the answers are; the stages are in the scene's own.
     stages : sequence of Stage
+    scheme : Scheme
     """
-    stages = [to_si(stage, problem) for stage in stages]
-    worst: dict[str, Shortfall] = {}
-    passed = 0.0
-    for stage in stages:
-        for found in _list_of_stage(problem, stage, passed):
-            if found.limit not in worst or found.amount > worst[found.limit].amount:
-                worst[found.limit] = found
+    found, passed = list[Shortfall](), 0.0
+    for own in stages:
+        stage = to_si(own, problem)
+        found += _list_of_stage(problem, stage, scheme, passed)
         passed += stage.guess.duration
-    return list(worst.values())
+    return keep_worst(found)
 
 
-def _list_of_stage(problem: Problem, stage: Stage, passed: float) -> list[Shortfall]:
-    formation, part = stage.formation, stage.guess
-    n_c, count = formation.n_contacts, len(part.fractions)
-    c_n, c_t = part.forces[..., :n_c], part.forces[..., n_c:]
-    rolling = list(formation.rolling_rows)
-    grip = formation.friction[rolling] * (c_n[..., rolling] - problem.epsilon)
-    over = np.abs(part.tau) - problem.scene.torque_limit
-    names = [f"c_n of {name} >= epsilon = {problem.epsilon:g} N" for name in formation.names]
-    names += [
-        f"friction cone of {formation.names[k]}, "
-        f"|c_t| <= {formation.friction[k]:g} (c_n - {problem.epsilon:g} N),"
-        for k in rolling
-    ]
-    names += [
-        f"torque limit of finger {k + 1} = {problem.scene.torque_limit[k]:g} N m" for k in range(2)
-    ]
-
-    def flat(table: Array) -> Array:
-        return np.asarray(table.max(axis=1))
-
-    short = np.hstack([flat(problem.epsilon - c_n), flat(np.abs(c_t) - grip), flat(over)])
+def _list_of_stage(
+    problem: Problem, stage: Stage, scheme: Scheme, passed: float
+) -> list[Shortfall]:
+    """Shortfalls at the points, and of torques at both ends of intervals."""
+    limits, part = make_limits(stage.formation, problem.epsilon), stage.guess
+    pick = np.array([0, *range(scheme.degree), scheme.degree - 1])
+    at = np.concatenate([[0.0], scheme.points, [1.0]])[:, None]
+    tau = part.tau[:, :1] * (1 - at) + part.tau[:, 1:] * at
+    y = np.concatenate([part.forces[:, pick], tau, part.v[:, pick, 3:]], axis=2)
     middles = passed + part.duration * (part.breaks[:-1] + part.fractions / 2)
-    spans = np.full(len(names), problem.scene.scales.force)
-    spans[-2:] = problem.scene.torque_limit
-    found = []
-    for column, name in enumerate(names):
-        row = int(short[:count, column].argmax())
-        joint = column >= len(names) - 2
-        scales = problem.scene.scales
-        if short[row, column] > SHORT * (scales.torque if joint else scales.force):
-            unit = "N m" if joint else "N"
-            where = f"t = {middles[row]:.4f} s, phase {stage.phase + 1}"
-            amount = float(short[row, column])
-            found.append(Shortfall(name, amount, unit, where, amount / spans[column]))
-    return found
 
+    def describe(row: int) -> str:
+        return f"t = {middles[row // len(pick)]:.4f} s, phase {stage.phase + 1}"
 
-def change_limit(problem: Problem, index: int, value: float) -> Problem:
-    """The problem with another torque limit of finger 1 or 2 (index 0 or 1), or epsilon (2)."""
-    if index == 2:
-        return replace(problem, epsilon=value)
-    right, left = (
-        replace(link, torque_limit=value) if k == index else link
-        for k, link in enumerate(problem.scene.fingers)
+    return advice.list_shortfalls(
+        limits, (y @ limits.rows.T).reshape(-1, len(limits.low)), describe
     )
-    return replace(problem, scene=replace(problem.scene, fingers=(right, left)))
+
+
+def change_limit(problem: Problem, key: str, value: float) -> Problem:
+    """The problem with another value of a parameter of its limits."""
+    if key == EPSILON:
+        return replace(problem, epsilon=value)
+    return replace(problem, scene=change_scene(problem.scene, key, value))

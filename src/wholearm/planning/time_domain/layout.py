@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...common.arrays import Array
+from ..columns import Columns
 from .assembly import Indices
 from .collocation import Scheme
 from .stage import Stage, StagePoints
@@ -33,8 +34,8 @@ class StageLayout:
     forces : ndarray of int, shape (K, d, n_f)
     ends : ndarray of int, shape (K, 10)
         z and z' at the end of each interval: those of its last point, if that is there.
-    short : ndarray of int, shape (K, n_c + 2 + R) or (K, 0)
-        Shortfalls of c_n, of tau and of rolling contacts' cones in each interval.
+    short : ndarray of int, shape (K, n) or (K, 0)
+        Shortfalls of limits in each interval.
     impulses : ndarray of int
         Of the impact that leads to the next stage, if one does.
     """
@@ -57,7 +58,10 @@ class StageLayout:
 
 
 def lay_out(
-    stages: Sequence[Stage], scheme: Scheme, with_margin: bool = False, elastic: bool = False
+    stages: Sequence[Stage],
+    scheme: Scheme,
+    with_margin: bool = False,
+    shortfalls: Sequence[int] | None = None,
 ) -> list[StageLayout]:
     """Lay out the unknowns of stages that follow one another.
 
@@ -67,32 +71,38 @@ def lay_out(
     scheme : Scheme
     with_margin : bool
         Whether nodes have a margin.
-    elastic : bool
-        Whether limits have shortfalls.
+    shortfalls : sequence of int, optional
+        How many shortfalls each interval of a stage has, if any.
     """
     layouts: list[StageLayout] = []
-    first, state = 0, STATE + with_margin
-    for stage, coming in zip(stages, [*stages[1:], None], strict=True):
-        n_f = stage.formation.n_constraints
-        inner = scheme.degree * (15 + n_f)
-        n_short = (stage.formation.n_contacts + 2 + stage.formation.n_rolling) if elastic else 0
-        stride = state + 5 + inner + (0 if scheme.ends else 10) + n_short
-        starts = first + stride * np.arange(stage.intervals + 1)
-        points = (starts[:-1, None] + state + 5 + np.arange(inner)).reshape(
-            stage.intervals, scheme.degree, -1
+    first, d = 0, scheme.degree
+    for k, (stage, coming) in enumerate(zip(stages, [*stages[1:], None], strict=True)):
+        point = Columns(z=5, v=5, a=5, forces=stage.formation.n_constraints)
+        end, short = (0 if scheme.ends else STATE), shortfalls[k] if shortfalls else 0
+        interval = Columns(
+            node=STATE + with_margin, h=1, tau=4, points=d * point.count, end=end, short=short
         )
-        short = starts[1:, None] - n_short + np.arange(n_short)
-        ends = (
-            points[:, -1, :10] if scheme.ends else starts[1:, None] - n_short - 10 + np.arange(10)
-        )
-        nodes = starts[:, None] + np.arange(state)
+        starts = first + interval.count * np.arange(stage.intervals + 1)
+        own = {
+            name: starts[:, None] + np.arange(part.start, part.stop)
+            for name, part in interval.items()
+        }
+        points = own["points"][:-1].reshape(stage.intervals, d, point.count)
+        at = {name: points[..., part] for name, part in point.items()}
+        nodes = own["node"]
         ends_in_impact = coming is not None and stage.ends_in_impact
         extra = coming.formation.n_constraints if coming is not None and ends_in_impact else 0
-        z, v, a, forces = np.split(points, [5, 10, 15], axis=2)
-        h = starts[:-1] + state
-        tau = h[:, None] + 1 + np.arange(4)
-        impulses = nodes[-1, -1] + 1 + np.arange(extra)
-        layouts.append(StageLayout(nodes, h, tau, z, v, a, forces, ends, short, impulses))
+        layouts.append(
+            StageLayout(
+                nodes=nodes,
+                h=own["h"][:-1, 0],
+                tau=own["tau"][:-1],
+                **at,
+                ends=points[:, -1, :STATE] if scheme.ends else own["end"][:-1],
+                short=own["short"][:-1],
+                impulses=nodes[-1, -1] + 1 + np.arange(extra),
+            )
+        )
         first = layouts[-1].stop
     return layouts
 

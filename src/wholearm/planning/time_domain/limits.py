@@ -1,11 +1,16 @@
-"""Rows of the time-domain NLP that limits make: least normal forces, friction cones, torques."""
+"""Rows and bounds of the time-domain NLP that limits of the motion make (`mechanics.limits`)."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ...common.arrays import Array
+from ...mechanics.limits import PRESS, SPEED, LimitSet, Parameter, make_limits
+from ..options import Objective
 from .assembly import Indices
 from .collocation import Scheme
 from .layout import MARGIN, StageLayout
@@ -13,98 +18,192 @@ from .rows import Rows
 from .stage import Stage
 
 
-class LimitRelaxation(NamedTuple):
-    """Which limits give way by a common amount, and how much of it each.
+class Target(NamedTuple):
+    """What an NLP is to find.
 
     Attributes
     ----------
-    c_n : float, [N]
-        Of the least normal force; negative if that is raised.
-    tau : tuple of float, [N m]
-        Of the two torque limits.
+    objective : Objective
+    epsilon : float, [N]
+        Least normal force.
+    time_weight : float, [(N m)^2]
+        For `effort`.
+    relaxation : Parameter or None
+        What gives way, for `relax`.
+    price : ndarray or None, shape (5,)
+        What z at the end costs.
     """
 
-    c_n: float
-    tau: tuple[float, float] = (0.0, 0.0)
+    objective: Objective
+    epsilon: float
+    time_weight: float = 0.0
+    relaxation: Parameter | None = None
+    price: Array | None = None
+
+    @property
+    def chained(self) -> bool:
+        """Whether nodes have one more unknown, all of them copies: a margin or a relaxation."""
+        return self.objective in (Objective.MARGIN, Objective.RELAX)
+
+    def count_shortfalls(self, stage: Stage) -> int:
+        """Number of shortfalls in each interval of a stage: of every limit but those of speeds."""
+        limits = make_limits(stage.formation, self.epsilon).without(SPEED).limits
+        return len(limits) * (self.objective is Objective.ELASTIC)
 
 
-class LimitRows(NamedTuple):
-    """Rows of one stage that must not be less than their bounds.
+@dataclass(frozen=True, eq=False)
+class LimitRows:
+    """Limits of one stage, as rows and as bounds of unknowns.
 
     Attributes
     ----------
+    limits : LimitSet
     presses : ndarray of int, shape (K, m, n_c)
         c_n, at the start of each interval, where torques may step, and wherever a bound of the
         unknown itself does not do.
-    cones : ndarray of int, shape (K, d, 2 R)
-        mu c_n less c_t, then plus c_t, of rolling contacts.
+    others : ndarray of int, shape (K, d, n)
+        At the points, sides of limits that are of more than one unknown: friction cones.
+    sides : ndarray of int, shape (n,)
+        Which sides of the limits these are.
+    bounded : tuple of int
+        Sides that are bounds of an unknown.
     """
 
+    limits: LimitSet
     presses: Indices
-    cones: Indices
+    others: Indices
+    sides: NDArray[np.int64]
+    bounded: tuple[int, ...]
+
+    @property
+    def pressed(self) -> NDArray[np.int64]:
+        """Sides of the limits that `presses` belong to."""
+        return np.flatnonzero(np.isin(self.limits.sides[0], self.limits.of(PRESS)))
+
+    @property
+    def groups(self) -> tuple[Indices, Indices]:
+        """The rows, interval by interval."""
+        return self.presses, self.others
+
+
+class _Gives(NamedTuple):
+    """By which unknown of each interval, shape (K,), a row gives way, and how much of it."""
+
+    unknowns: Indices
+    weight: float
+
+
+def find_single(limits: LimitSet, n_forces: int) -> NDArray[np.int64]:
+    """Column of y for each row that is of one torque or joint speed alone, shape (m,); else -1."""
+    alone = (limits.rows != 0).sum(axis=1) == 1
+    column = np.abs(limits.rows).argmax(axis=1)
+    return np.where(alone & (column >= n_forces), column, -1)
 
 
 def add_limits(
+    rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, target: Target
+) -> LimitRows:
+    """Add rows for the limits of a stage."""
+    limits = make_limits(stage.formation, target.epsilon)
+    gives = _list_gives(limits, layout, target)
+    presses = limits.of(PRESS)
+    own, signs, bounds = limits.sides
+    single = find_single(limits, stage.formation.n_constraints)[own]
+    others = np.flatnonzero(~np.isin(own, presses) & (single < 0))
+    pressed = _add_presses(rows, limits, layout, scheme, [gives[row] for row in presses])
+    added = rows.linear(*layout.z.shape[:2], len(others), high=np.inf)
+    for k, side in enumerate(others):
+        row = own[side]
+        _add_point_row(rows, added[..., k], signs[side] * limits.rows[row], layout, scheme)
+        _add_gives(rows, added[..., k], gives[row])
+    bounded = []
+    for side in np.flatnonzero(single >= 0):
+        if gives[own[side]] is None:
+            bounded.append(int(side))
+            continue
+        unknowns = _find_unknowns(layout, stage.formation.n_constraints, single[side])
+        soft = rows.linear(*unknowns.shape, low=signs[side] * bounds[side], high=np.inf)
+        rows.add_entries(soft, unknowns, signs[side])
+        _add_gives(rows, soft, gives[own[side]])
+    return LimitRows(limits, pressed, added, others, tuple(bounded))
+
+
+def bound_by_limits(
+    rows: LimitRows, layout: StageLayout, bounds: tuple[Array, Array], raised: Array | None = None
+) -> None:
+    """Bound torques and joint speeds, in place, by limits raised by shape (K, n_sides)."""
+    low, high = bounds
+    own, signs, values = rows.limits.sides
+    n_forces = layout.forces.shape[2]
+    single = find_single(rows.limits, n_forces)[own]
+    for side in rows.bounded:
+        unknowns = _find_unknowns(layout, n_forces, single[side])
+        more = 0.0 if raised is None else raised[:, side, None]
+        if signs[side] > 0:
+            low[unknowns] = np.maximum(low[unknowns], values[side] + more)
+        else:
+            high[unknowns] = np.minimum(high[unknowns], values[side] - more)
+
+
+def _list_gives(limits: LimitSet, layout: StageLayout, target: Target) -> list[_Gives | None]:
+    """By what each row gives way, if it does."""
+    gives: list[_Gives | None] = [None] * len(limits.low)
+    chain = layout.nodes[:-1, MARGIN:].ravel()
+    if target.objective is Objective.MARGIN:
+        for row in limits.of(PRESS):
+            gives[row] = _Gives(chain, -1.0)
+    elif target.objective is Objective.ELASTIC:
+        for row in limits.of(*{limit.kind for limit in limits.without(SPEED).limits}):
+            gives[row] = _Gives(layout.short[:, limits.owners[row]], 1.0)
+    elif target.relaxation is not None:
+        weights = limits.weigh(target.relaxation)
+        for row in np.flatnonzero(weights):
+            gives[row] = _Gives(chain, float(weights[row]))
+    return gives
+
+
+def _add_gives(rows: Rows, own: Indices, gives: _Gives | None) -> None:
+    if gives is not None:
+        rows.add_entries(own, gives.unknowns[:, None], gives.weight)
+
+
+def _add_presses(
     rows: Rows,
-    stage: Stage,
+    limits: LimitSet,
     layout: StageLayout,
     scheme: Scheme,
-    relaxation: LimitRelaxation | None,
-) -> LimitRows:
-    """Add rows for the limits of a stage.
-
-    Parameters
-    ----------
-    relaxation : LimitRelaxation, optional
-        What gives way by the unknown that every node has a copy of.
-    """
-    formation = stage.formation
-    c_n = layout.forces[:, :, : formation.n_contacts]
-    K, n_c = len(c_n), formation.n_contacts
-    soft = layout.short.size > 0
+    gives: list[_Gives | None],
+) -> Indices:
+    """Normal forces by the polynomials through the points, shape (K, m, n_c)."""
     places = np.zeros(1) if scheme.ends else np.array([0.0, 1.0])
-    if soft or (relaxation is not None and relaxation.c_n):
+    if any(gives):
         places = np.append(places, scheme.points)
-    presses = rows.linear(K, len(places), n_c, high=np.inf)
+    c_n = layout.forces[:, :, limits.rows[limits.of(PRESS)].argmax(axis=1)]
+    presses = rows.linear(len(c_n), len(places), c_n.shape[2], high=np.inf)
     for i, row in enumerate(scheme.interpolate(places)):
         for j in np.flatnonzero(np.abs(row) > 1e-12):
             rows.add_entries(presses[:, i], c_n[:, j], row[j])
-    cones = _add_cones(rows, stage, layout)
-    if soft:
-        short_c, short_tau, short_cone = np.split(layout.short, [n_c, n_c + 2], axis=1)
-        rows.add_entries(presses, short_c[:, None], 1.0)
-        rows.add_entries(cones, np.tile(short_cone, 2)[:, None], 1.0)
-        _soften_torques(rows, stage, layout, short_tau, (1.0, 1.0))
-    elif relaxation is not None:
-        extra = layout.nodes[:-1, MARGIN]
-        if relaxation.c_n:
-            rows.add_entries(presses, extra[:, None, None], relaxation.c_n)
-        if any(relaxation.tau):
-            _soften_torques(rows, stage, layout, np.column_stack([extra, extra]), relaxation.tau)
-    return LimitRows(presses, cones)
+    for k, own in enumerate(gives):
+        _add_gives(rows, presses[..., k], own)
+    return presses
 
 
-def _add_cones(rows: Rows, stage: Stage, layout: StageLayout) -> Indices:
-    formation, (K, d) = stage.formation, layout.z.shape[:2]
-    rolling, R = list(formation.rolling_rows), formation.n_rolling
-    cones = rows.linear(K, d, 2 * R, high=np.inf)
-    if R:
-        c_n, c_t = layout.forces[..., rolling], layout.forces[..., formation.n_contacts :]
-        rows.add_entries(
-            cones, np.concatenate([c_n, c_n], axis=2), np.tile(formation.friction[rolling], 2)
-        )
-        rows.add_entries(cones, np.concatenate([c_t, c_t], axis=2), np.repeat([-1.0, 1.0], R))
-    return cones
-
-
-def _soften_torques(
-    rows: Rows, stage: Stage, layout: StageLayout, short: Indices, weights: tuple[float, float]
+def _add_point_row(
+    rows: Rows, own: Indices, row: Array, layout: StageLayout, scheme: Scheme
 ) -> None:
-    """Torque limits that `short`, shape (K, 2), is added to; bounds of tau do for the others."""
-    tau = layout.tau.reshape(-1, 2, 2)
-    for joint in np.flatnonzero(weights):
-        limit = stage.formation.scene.torque_limit[joint]
-        for sign in (1.0, -1.0):
-            own = rows.linear(len(tau), 2, low=-limit, high=np.inf)
-            rows.add_entries(own, tau[..., joint], sign)
-            rows.add_entries(own, short[:, joint, None], weights[joint])
+    """A row of y at every point, shape (K, d)."""
+    of_c, of_tau, of_rates = np.split(row, [layout.forces.shape[2], layout.forces.shape[2] + 2])
+    for unknowns, of_them in ((layout.forces, of_c), (layout.v[..., 3:], of_rates)):
+        for k in np.flatnonzero(of_them):
+            rows.add_entries(own, unknowns[..., k], of_them[k])
+    for k in np.flatnonzero(of_tau):
+        first, last = layout.tau[:, None, k], layout.tau[:, None, 2 + k]
+        rows.add_entries(own, first, of_tau[k] * (1 - scheme.points))
+        rows.add_entries(own, last, of_tau[k] * scheme.points)
+
+
+def _find_unknowns(layout: StageLayout, n_forces: int, column: int) -> Indices:
+    """The unknowns of one torque or joint speed: at both ends of intervals, or at the points."""
+    if column < n_forces + 2:
+        return layout.tau.reshape(-1, 2, 2)[..., column - n_forces]
+    return layout.v[..., 3 + column - n_forces - 2]

@@ -30,7 +30,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...common.arrays import Array, Expression
 from ...geometry.curve import tangent_basis
@@ -49,8 +48,8 @@ from .kernels import (
     point_kernel,
     stretch_kernel,
 )
-from .layout import MARGIN, StageLayout, V, Z, lay_out
-from .limits import LimitRelaxation, LimitRows, add_limits
+from .layout import MARGIN, STATE, StageLayout, V, Z, lay_out
+from .limits import LimitRows, Target, add_limits, bound_by_limits
 from .rows import Rows
 from .stage import Stage
 
@@ -92,7 +91,7 @@ class StageRows:
     @property
     def groups(self) -> tuple[Indices, ...]:
         """All of them."""
-        return (self.states, self.points, *self.limits, self.monitor_rows)
+        return (self.states, self.points, *self.limits.groups, self.monitor_rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,8 +110,6 @@ class TimeNLP:
     rows_of : list of StageRows
     duration_row : int
         Row of the whole duration, if something gives way; otherwise -1.
-    soft : ndarray of bool, shape (2,)
-        Which torque limits are rows and not bounds.
     build_time : float, [s]
     """
 
@@ -123,7 +120,6 @@ class TimeNLP:
     rows: Rows
     rows_of: list[StageRows]
     duration_row: int
-    soft: NDArray[np.bool_]
     build_time: float
 
     @cached_property
@@ -151,12 +147,9 @@ class TimeNLP:
 def build_time_nlp(
     stages: Sequence[Stage],
     scheme: Scheme,
-    objective: Objective,
-    time_weight: float,
+    target: Target,
     max_iter: int,
-    relaxation: LimitRelaxation | None = None,
     seconds: float = LONGEST,
-    price: Array | None = None,
 ) -> TimeNLP:
     """Build the NLP of stages that follow one another and end at rest.
 
@@ -164,69 +157,60 @@ def build_time_nlp(
     ----------
     stages : sequence of Stage
     scheme : Scheme
-    objective : Objective
-    time_weight : float, [(N m)^2]
-        For `effort`.
+    target : Target
     max_iter : int
         Most iterations of the solver.
-    relaxation : LimitRelaxation, optional
-        Which limits give way, for `relax`; for `margin` it is every c_n.
     seconds : float, [s]
         Most processor time of the solver.
-    price : ndarray, optional, shape (5,)
-        What z at the end costs.
     """
     started = time.perf_counter()
-    if objective is Objective.MARGIN:
-        relaxation = LimitRelaxation(-1.0)
-    layouts = lay_out(stages, scheme, relaxation is not None, objective is Objective.ELASTIC)
+    shortfalls = [target.count_shortfalls(stage) for stage in stages]
+    layouts = lay_out(stages, scheme, target.chained, shortfalls)
     rows, cost = Rows(), np.zeros(layouts[-1].stop)
-    own = rows.linear(
-        10, low=stages[0].guess.nodes[0].ravel(), high=stages[0].guess.nodes[0].ravel()
-    )
-    rows.add_entries(own, layouts[0].nodes[0, :10], 1.0)
-    weights = {Objective.TIME: 1.0, Objective.EFFORT: time_weight, Objective.ELASTIC: _HURRY}
+    start = stages[0].guess.nodes[0].ravel()
+    rows.add_entries(rows.linear(STATE, low=start, high=start), layouts[0].nodes[0, :STATE], 1.0)
     rows_of = []
     for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True)):
-        rows_of.append(_add_stage(rows, stage, layout, scheme, stage is stages[-1], relaxation))
+        rows_of.append(_add_stage(rows, stage, layout, scheme, stage is stages[-1], target))
         if k + 1 < len(stages):
             _join(rows, stage, stages[k + 1], layout, layouts[k + 1].nodes[0])
-        if objective is Objective.EFFORT:
-            columns = np.hstack([layout.tau, layout.h[:, None]])
-            rows.add_cost(effort_kernel(), columns, np.zeros((len(columns), 0)))
-        if stage.adapts:
-            lengths = stage.guess.duration * stage.guess.fractions
-            parameters = np.column_stack([np.full(len(lengths), stage.adapts), lengths])
-            rows.add_cost(stretch_kernel(), layout.h[:, None], parameters)
-        cost[layout.h] = weights.get(objective, 0.0)
-        cost[layout.short] = 1 / stage.intervals
+        _add_costs(rows, cost, stage, layout, target)
     duration_row, last, end = -1, stages[-1], layouts[-1].nodes[-1]
-    if relaxation is not None:
-        cost[end[MARGIN]] = -1.0 if objective is Objective.MARGIN else 1.0
+    if target.chained:
+        cost[end[MARGIN]] = -1.0 if target.objective is Objective.MARGIN else 1.0
         total = rows.linear(1, high=np.inf)
         rows.add_entries(total, np.concatenate([layout.h for layout in layouts]), 1.0)
         duration_row = int(total[0])
-    if price is not None:
-        cost[end[Z]] = price
+    if target.price is not None:
+        cost[end[Z]] = target.price
     N = tangent_basis(last.formation, last.guess.nodes[-1, 0])
     rest = rows.linear(N.shape[1])
     rows.add_entries(rest[:, None], end[V], N.T)
     built = assemble_nlp(len(cost), rows.triplets, rows.linear_rows, rows.blocks, cost)
-    soft = (
-        np.array(relaxation.tau if relaxation else (0.0, 0.0)) + (objective is Objective.ELASTIC)
-        > 0
-    )
     build_time = time.perf_counter() - started
-    return TimeNLP(built, max_iter, seconds, layouts, rows, rows_of, duration_row, soft, build_time)
+    return TimeNLP(built, max_iter, seconds, layouts, rows, rows_of, duration_row, build_time)
+
+
+def _add_costs(rows: Rows, cost: Array, stage: Stage, layout: StageLayout, target: Target) -> None:
+    """What a stage costs."""
+    if target.objective is Objective.EFFORT:
+        columns = np.hstack([layout.tau, layout.h[:, None]])
+        rows.add_cost(effort_kernel(), columns, np.zeros((len(columns), 0)))
+    if stage.adapts:
+        lengths = stage.guess.duration * stage.guess.fractions
+        parameters = np.column_stack([np.full(len(lengths), stage.adapts), lengths])
+        rows.add_cost(stretch_kernel(), layout.h[:, None], parameters)
+    of_time = {
+        Objective.TIME: 1.0,
+        Objective.EFFORT: target.time_weight,
+        Objective.ELASTIC: _HURRY,
+    }
+    cost[layout.h] = of_time.get(target.objective, 0.0)
+    cost[layout.short] = 1 / stage.intervals
 
 
 def _add_stage(
-    rows: Rows,
-    stage: Stage,
-    layout: StageLayout,
-    scheme: Scheme,
-    last: bool,
-    relaxation: LimitRelaxation | None,
+    rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool, target: Target
 ) -> StageRows:
     """What holds in a stage."""
     formation = stage.formation
@@ -253,7 +237,7 @@ def _add_stage(
     goal = goal_kernel(formation, stage.until, stage.turns, stage.gained)
     if goal is not None:
         rows.add_copies(goal, layout.nodes[-1:, :MARGIN], rows.nonlinear(1, goal.outputs))
-    limits = add_limits(rows, stage, layout, scheme, relaxation)
+    limits = add_limits(rows, stage, layout, scheme, target)
     return StageRows(states, points, limits, monitor_rows)
 
 
@@ -380,23 +364,21 @@ def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tup
     """Bounds of the unknowns but for the least c_n: durations, torques, joint speeds, impulses."""
     size = nlp.layouts[-1].stop
     low, high = np.full(size, -np.inf), np.full(size, np.inf)
-    for stage, coming, layout in zip(stages, [*stages[1:], None], nlp.layouts, strict=True):
-        limit = np.tile(stage.formation.scene.torque_limit, 2)
-        soft = np.tile(nlp.soft, 2)
-        low[layout.tau] = np.where(soft, -np.inf, -limit)
-        high[layout.tau] = np.where(soft, np.inf, limit)
+    for k, (stage, coming) in enumerate(zip(stages, [*stages[1:], None], strict=True)):
+        layout = nlp.layouts[k]
         low[layout.short] = 0.0
         low[layout.h] = SHORTEST
         still = find_still(stage, stage is stages[-1]) if scheme.ends else set()
         rate = least_rates(stage, stage.guess.places(scheme.points))
-        fastest = stage.formation.scene.speed_limit
         for joint, sigma in enumerate(stage.directions.sigma):
-            own = layout.v[..., 3 + joint]
-            ends = np.zeros_like(own, dtype=bool)
-            ends[-1, -1] = stage.formation.n_contacts + joint in still
-            slow = np.where(ends, -fastest[joint], rate)
-            low[own] = np.where(sigma > 0, slow, -fastest[joint])
-            high[own] = np.where(sigma > 0, fastest[joint], -slow)
+            own, one_way = layout.v[..., 3 + joint], rate.copy()
+            if stage.formation.n_contacts + joint in still:
+                one_way[-1, -1] = -np.inf
+            if sigma > 0:
+                low[own] = one_way
+            else:
+                high[own] = -one_way
+        bound_by_limits(nlp.rows_of[k].limits, layout, (low, high))
         if coming is not None and stage.ends_in_impact:
             low[layout.impulses[: coming.formation.n_contacts]] = 0.0
     return low, high

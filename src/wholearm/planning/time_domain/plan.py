@@ -176,16 +176,20 @@ def _try_guesses(
             elastic = solve_elastic(
                 search, _halve(search, solution.stages) if solution.is_lost else guess
             )
-        if not solution.is_lost and elastic is not None and not list_shortfalls(problem, elastic):
+        if (
+            not solution.is_lost
+            and elastic is not None
+            and not list_shortfalls(problem, elastic, search.scheme)
+        ):
             solution = _solve(search, elastic, halvings, attempt)
             elastic = None if solution.success else solve_elastic(search, _halve(search, elastic))
-        if elastic is not None and list_shortfalls(problem, elastic):
+        if elastic is not None and list_shortfalls(problem, elastic, search.scheme):
             short.append(elastic)
         late = time.thread_time() > stop
         if solution.success or late or len(short) == (1 if far else CONVINCING):
             break
     if not solution.success and not short and (elastic := solve_elastic(search, first)) is not None:
-        short = [elastic] if list_shortfalls(problem, elastic) else []
+        short = [elastic] if list_shortfalls(problem, elastic, search.scheme) else []
     return _Found(solution, short, list(tried))
 
 

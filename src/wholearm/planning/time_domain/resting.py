@@ -32,10 +32,6 @@ _LEVEL = 1e-6
 """Slope of a limit, in radii of gyration, below which no motion changes it."""
 
 
-EPSILON = 2
-"""Index of epsilon among the limits that may give way, after both torque limits."""
-
-
 class Blocked(NamedTuple):
     """No motion begins.
 
@@ -75,15 +71,15 @@ def find_block(
 
 
 def find_change(
-    formation: Formation, z: Array, epsilon: float, index: int, ends: bool = False
+    formation: Formation, z: Array, epsilon: float, finger: int | None, ends: bool = False
 ) -> float | None:
     """The value of one limit with which a motion can begin from rest at `z`, or end there.
 
     Parameters
     ----------
-    index : int
-        0 or 1 for the torque limit of that finger, of which the least value is sought; 2 for
-        epsilon, of which the largest is.
+    finger : int or None
+        Whose torque limit, of which the least value is sought; None for epsilon, of which the
+        largest is.
     formation, z, epsilon, ends
         As of `find_block`.
 
@@ -92,11 +88,11 @@ def find_change(
     float or None
         None if no value does.
     """
-    found = [mode.find_limit(index) for mode in _list_modes(formation, z, epsilon, ends)]
+    found = [mode.find_limit(finger) for mode in _list_modes(formation, z, epsilon, ends)]
     values = [value for value in found if value is not None]
     if not values:
         return None
-    return max(values) if index == EPSILON else min(values)
+    return max(values) if finger is None else min(values)
 
 
 def list_ways(rates: Array) -> list[Array]:
@@ -224,15 +220,15 @@ class _Programme:
         worst = int(np.argmin(answer[own]))
         return Blocked(self.names[worst], float(answer[-1]))
 
-    def find_limit(self, index: int) -> float | None:
+    def find_limit(self, finger: int | None) -> float | None:
         """The least torque limit of a finger, or the largest epsilon, with which things move."""
-        if index == EPSILON:
+        if finger is None:
             own = slice(self.f, self.f + self.n_c)
             wide = np.column_stack([self.rows, self.relaxations])
             most = self.most + self.relaxations * self.epsilon
             answer = self._minimise(-1.0, wide, most, self._press(1.0, 0.0), own)
         else:
-            at = self.size - 2 + index
+            at = self.size - 2 + finger
             wide = np.column_stack([self.rows, np.zeros(len(self.rows))])
             torque = np.zeros((2, self.size + 1))
             torque[:, at], torque[:, -1] = [1.0, -1.0], -1.0

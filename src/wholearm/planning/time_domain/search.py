@@ -10,12 +10,13 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...geometry.cost_to_go import CostToGo
+from ...mechanics.limits import Parameter
 from ...problem.definition import Problem
 from ..options import Objective, PlanOptions
 from .between import Limits, check_between, find_misses, monitor_missed, raise_bounds
 from .collocation import Scheme, make_scheme
 from .layout import pack, unpack
-from .limits import LimitRelaxation
+from .limits import Target
 from .motion import make_motions
 from .nlp import LONGEST, TimeNLP, bound_unknowns, build_time_nlp
 from .own_units import in_own_units, scale_options, unit_lengths, unit_of
@@ -114,8 +115,8 @@ class Search:
     duration : float or None
         Longest duration, for the objective `margin`.
     goal : Objective
-    relaxation : LimitRelaxation or None
-        Which limits give way, for the objective `relax`.
+    relaxation : Parameter or None
+        What gives way, for the objective `relax`.
     to_go : callable or None
         What follows costs from where stages end, and its gradient, each by the objective.
     price : Price or None
@@ -127,7 +128,7 @@ class Search:
     scheme: Scheme
     duration: float | None
     goal: Objective
-    relaxation: LimitRelaxation | None = None
+    relaxation: Parameter | None = None
     to_go: Callable[[Array], tuple[float, Array]] | None = None
     price: Price | None = None
     statistics: SolverStatistics = field(default_factory=SolverStatistics)
@@ -157,7 +158,7 @@ class Search:
             to_go=expand if to_go else None,
         )
 
-    def aiming(self, goal: Objective, relaxation: LimitRelaxation | None = None) -> Search:
+    def aiming(self, goal: Objective, relaxation: Parameter | None = None) -> Search:
         """The same search with another objective."""
         return replace(
             self, goal=goal, relaxation=relaxation, duration=None, to_go=None, price=None
@@ -205,11 +206,12 @@ class Search:
 
     def build(self, stages: Sequence[Stage], most: int = 150, seconds: float = LONGEST) -> TimeNLP:
         """Build the NLP."""
-        weight, limit = self.options.time_weight, _ITERATIONS.get(self.goal, most)
         gradient = self.price.gradient if self.price else None
-        nlp = build_time_nlp(
-            stages, self.scheme, self.goal, weight, limit, self.relaxation, seconds, gradient
+        target = Target(
+            self.goal, self.problem.epsilon, self.options.time_weight, self.relaxation, gradient
         )
+        most = _ITERATIONS.get(self.goal, most)
+        nlp = build_time_nlp(stages, self.scheme, target, most, seconds)
         self.statistics.build_time += nlp.build_time
         return nlp
 
@@ -223,7 +225,7 @@ class Search:
     ) -> Solution:
         """Run the solver once."""
         low, high = bound_unknowns(nlp, stages, self.scheme)
-        low_g, high_g = raise_bounds(nlp, stages, limits, self.problem.epsilon, (low, high))
+        low_g, high_g = raise_bounds(nlp, stages, limits, (low, high))
         if self.duration is not None and nlp.duration_row >= 0:
             high_g[nlp.duration_row] = self.duration
         solver = nlp.first_solver if multipliers is None else nlp.solver
@@ -257,11 +259,12 @@ class Search:
         prices = []
         for k, (stage, miss) in enumerate(zip(solution.stages, misses, strict=True)):
             layout, rows = solution.nlp.layouts[k], solution.nlp.rows_of[k].limits
-            n_c, R = stage.formation.n_contacts, stage.formation.n_rolling
-            price = on_x[layout.forces[:, :, :n_c]].sum(axis=1) + on_g[rows.presses].sum(axis=1)
-            both = on_g[rows.cones].sum(axis=1)
-            grip = both[:, :R] + both[:, R:]
-            cost = (price * miss.c_n).sum(axis=1) + (grip * miss.cone).sum(axis=1)
+            c_n = layout.forces[..., : stage.formation.n_contacts]
+            price = np.zeros_like(miss.held)
+            price[:, rows.pressed] = on_x[c_n].sum(axis=1) + on_g[rows.presses].sum(axis=1)
+            price[:, rows.sides] = on_g[rows.others].sum(axis=1)
+            spans = rows.limits.scales[rows.limits.sides[0]]
+            cost = (price * miss.held * spans).sum(axis=1)
             prices.append(np.asarray(cost / max(abs(solution.cost), 1e-300)))
         return prices
 

@@ -1,0 +1,236 @@
+"""Limits of a motion: what contact forces, torques and joint speeds must keep at every instant.
+
+With y = (c, tau, theta'), every limit has the form low <= rows y <= high. A sliding contact has to
+press with c_n >= epsilon. A rolling one must not slip either, |c_t| <= mu c_n, which is kept as if
+the contact pressed with epsilon less: what c_n may lose before the contact is lost it may lose
+before the contact slips.
+
+    c_n >= epsilon,    mu c_n - c_t >= mu epsilon,    mu c_n + c_t >= mu epsilon.
+
+`MAKERS` lists what makes the limits of a formation. Planners, checks between nodes, tightening and
+advice go through a `LimitSet`, so that another maker is all that another limit takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.arrays import Array
+from ..contacts.cones import hold_rows
+from ..contacts.formation import Formation
+
+PRESS, CONE, TORQUE, SPEED = "press", "cone", "torque", "speed"
+"""Kinds of limits: least normal forces, friction cones, torques and speeds of the joints."""
+EPSILON = "epsilon"
+"""Key of the least normal force."""
+
+
+class Parameter(NamedTuple):
+    """A number that sets limits, and may be changed to let a motion be planned.
+
+    Attributes
+    ----------
+    name : str
+    value : float
+        As it is.
+    unit : str
+    sign : int
+        1 if limits give way as it grows, -1 if as it falls (not below zero).
+    key : str
+        Dotted key of it in a problem.
+    """
+
+    name: str
+    value: float
+    unit: str
+    sign: int
+    key: str = ""
+
+    @property
+    def is_speed(self) -> bool:
+        """Whether it is a speed, of which motions know the square."""
+        return self.unit == "rad/s"
+
+
+@dataclass(frozen=True, eq=False)
+class MotionLimit:
+    """One limit, low <= rows y <= high, with y = (c, tau, theta').
+
+    Attributes
+    ----------
+    kind : str
+        What finds it in a `LimitSet`.
+    text : str
+        The limit in words, with its value.
+    unit : str
+        Of its rows.
+    rows : ndarray, shape (r, n_c + R + 4)
+    low, high : ndarray, shape (r,)
+        Infinite where there is none.
+    scale : float
+        What is much for it: shortfalls and misses count in this.
+    parameter : Parameter
+        The single number whose change relaxes it.
+    weight : ndarray, shape (r,)
+        By how much its bounds give way per unit of that.
+    """
+
+    kind: str
+    text: str
+    unit: str
+    rows: Array
+    low: Array
+    high: Array
+    scale: float
+    parameter: Parameter
+    weight: Array
+
+
+@dataclass(frozen=True, eq=False)
+class LimitSet:
+    """Limits with their rows one below the other, which are found by kind and never by position."""
+
+    limits: tuple[MotionLimit, ...]
+
+    @cached_property
+    def rows(self) -> Array:
+        """Rows of all limits, shape (m, n_c + R + 4)."""
+        return np.vstack([limit.rows for limit in self.limits])
+
+    @cached_property
+    def low(self) -> Array:
+        """Lower bounds, shape (m,)."""
+        return np.concatenate([limit.low for limit in self.limits])
+
+    @cached_property
+    def high(self) -> Array:
+        """Upper bounds, shape (m,)."""
+        return np.concatenate([limit.high for limit in self.limits])
+
+    @cached_property
+    def owners(self) -> NDArray[np.int64]:
+        """Which limit each row belongs to, shape (m,)."""
+        return np.repeat(np.arange(len(self.limits)), [len(limit.low) for limit in self.limits])
+
+    @cached_property
+    def scales(self) -> Array:
+        """What is much for each row, shape (m,)."""
+        return np.array([self.limits[k].scale for k in self.owners])
+
+    @cached_property
+    def sides(self) -> tuple[NDArray[np.int64], Array, Array]:
+        """Rows, signs and bounds of one-sided limits, sign (row y - bound) >= 0, shape (n,) each.
+
+        First those of all lower bounds, then those of all upper ones.
+        """
+        lows, highs = (np.flatnonzero(np.isfinite(bound)) for bound in (self.low, self.high))
+        signs = np.repeat([1.0, -1.0], [len(lows), len(highs)])
+        bounds = np.concatenate([self.low[lows], self.high[highs]])
+        return np.concatenate([lows, highs]), signs, bounds
+
+    def of(self, *kinds: str) -> NDArray[np.int64]:
+        """Rows of the limits of some kinds."""
+        return np.flatnonzero([self.limits[k].kind in kinds for k in self.owners])
+
+    def only(self, *kinds: str) -> LimitSet:
+        """The limits of some kinds."""
+        return LimitSet(tuple(limit for limit in self.limits if limit.kind in kinds))
+
+    def without(self, *kinds: str) -> LimitSet:
+        """The limits of other kinds."""
+        return LimitSet(tuple(limit for limit in self.limits if limit.kind not in kinds))
+
+    def weigh(self, parameter: Parameter) -> Array:
+        """By how much the bounds of each row give way per unit of a parameter, shape (m,)."""
+        weights = [(limit.parameter.key == parameter.key) * limit.weight for limit in self.limits]
+        return np.concatenate(weights) if weights else np.zeros(0)
+
+    @cached_property
+    def columns(self) -> tuple[Array, Array, Array]:
+        """The columns of `rows` that belong to c, tau and theta'."""
+        n_forces = self.rows.shape[1] - 4
+        c, tau, rates = np.split(self.rows, [n_forces, n_forces + 2], axis=1)
+        return c, tau, rates
+
+    def find_slack(self, values: Array) -> Array:
+        """How far one-sided limits are from being missed, shape (..., n), from rows y, (..., m)."""
+        rows, signs, bounds = self.sides
+        return np.asarray(signs * (values[..., rows] - bounds))
+
+    def fold(self, of_sides: Array) -> Array:
+        """The larger value of the sides of each row, shape (..., m), from (..., n)."""
+        folded = np.full((*of_sides.shape[:-1], len(self.low)), -np.inf)
+        for k, row in enumerate(self.sides[0]):
+            folded[..., row] = np.maximum(folded[..., row], of_sides[..., k])
+        return folded
+
+    @property
+    def parameters(self) -> list[Parameter]:
+        """What may be changed to let a motion be planned, each once, those of fingers first."""
+        found = {limit.parameter.key: limit.parameter for limit in self.limits}
+        return sorted(found.values(), key=lambda parameter: not parameter.key.startswith("finger"))
+
+
+Maker = Callable[[Formation, float], Sequence[MotionLimit]]
+"""Makes limits of a formation and epsilon [N]."""
+
+
+def make_limits(formation: Formation, epsilon: float) -> LimitSet:
+    """Make the limits of a formation and a least normal force [N]."""
+    made = [limit for maker in MAKERS for limit in maker(formation, epsilon)]
+    return LimitSet(tuple(limit for limit in made if len(limit.low)))
+
+
+def _make_holds(formation: Formation, epsilon: float) -> list[MotionLimit]:
+    """Contacts press, and what rolls does not slip."""
+    parameter = Parameter(EPSILON, epsilon, "N", -1, EPSILON)
+    force, n_c, R = formation.scene.scales.force, formation.n_contacts, formation.n_rolling
+    H = hold_rows(formation)
+    H = np.hstack([H, np.zeros((len(H), 4))])
+
+    def make(kind: str, text: str, rows: Array, weight: Array) -> MotionLimit:
+        high = np.full(len(rows), np.inf)
+        low = epsilon * weight
+        return MotionLimit(kind, text, "N", rows, low, high, force, parameter, weight)
+
+    least = f"epsilon = {epsilon:g} N"
+    found = [
+        make(PRESS, f"c_n of {name} >= {least}", H[k : k + 1], np.ones(1))
+        for k, name in enumerate(formation.names)
+    ]
+    for k, row in enumerate(formation.rolling_rows):
+        mu, name = formation.friction[row], formation.names[row]
+        text = f"friction cone of {name}, |c_t| <= {mu:g} (c_n - {epsilon:g} N),"
+        found.append(make(CONE, text, H[[n_c + k, n_c + R + k]], np.full(2, mu)))
+    return found
+
+
+def _make_joint_limits(formation: Formation, _: float) -> list[MotionLimit]:
+    """Torques and speeds of the joints stay within their limits; infinite ones are none."""
+    scene, width = formation.scene, formation.n_contacts + formation.n_rolling + 4
+    found = []
+    for kind, unit, first, limits in (
+        (TORQUE, "N m", width - 4, scene.torque_limit),
+        (SPEED, "rad/s", width - 2, scene.speed_limit),
+    ):
+        for k, limit in enumerate(limits.tolist()):
+            if not np.isfinite(limit):
+                continue
+            name, key = f"{kind} limit of finger {k + 1}", f"fingers.{k + 1}.{kind}_limit"
+            parameter = Parameter(name, limit, unit, 1, key)
+            rows, most = np.eye(width)[[first + k]], np.array([limit])
+            text = f"{name} = {limit:g} {unit}"
+            found.append(
+                MotionLimit(kind, text, unit, rows, -most, most, limit, parameter, np.ones(1))
+            )
+    return found
+
+
+MAKERS: list[Maker] = [_make_holds, _make_joint_limits]
+"""What makes the limits of a formation."""

@@ -1,0 +1,108 @@
+"""First guesses of motions along curves, and the units that fit them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...common.arrays import Array
+from .data import PhaseData
+from .motion import Profile
+from .nlp import Units
+
+_SLOW = -12
+"""Height of the slowest guess, as a power of two times that of a fall."""
+_QUICK = 30.0
+"""How much faster, squared, than the torque limits alone allow a guess may be."""
+_FIRM = 40.0
+"""Largest range of the squeeze that a guess is amid, over the scene's force or the least of it."""
+_LIGHT = 0.5
+"""Least unit of force, over the scene's: where forces are next to nothing they do not count."""
+
+
+def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
+    """Guess a motion: b a parabola in s as high as limits allow, the squeeze amid its range.
+
+    Where limits forbid even a slow one, it is as quick as a fall: a plan, if there is one, is not
+    slow, and in units of a slow one the costs that choose among equals would weigh too much.
+    """
+    b_max = data.largest_b(data.nodes)
+    fall = _fall(data)
+
+    def possible(height: float) -> bool:
+        low, high = _squeeze_range(data, height)
+        b = _parabola(data, height)[1]
+        return bool((low <= high).all() and (b <= b_max).all())
+
+    # Bisection over heights from 2^-12 to 2^8 times that of a fall over this length.
+    low_power, high_power = float(_SLOW), 8.0
+    for _ in range(7):
+        power = (low_power + high_power) / 2
+        if possible(fall * 2**power):
+            low_power = power
+        else:
+            high_power = power
+    none = low_power == _SLOW
+    return _guess_at(data, 0.7 * fall * (1.0 if none else 2**low_power), time_weight)
+
+
+def guess_slowly(data: PhaseData) -> tuple[Profile, Units]:
+    """Guess a slow motion, whatever limits say."""
+    return _guess_at(data, 0.7 * _fall(data) * 2.0**_SLOW)
+
+
+def _fall(data: PhaseData) -> float:
+    """The b of a fall over the length of the curve, or of what joints may do [m^2/s^2]."""
+    length, forces = float(data.grid.s[-1]), data.nodes.forces
+    fall = 2 * data.curve.formation.scene.scales.acceleration * length
+
+    def usual(coefficients: Array) -> float:
+        """Where this coefficient alone would take a joint to its torque limit."""
+        return 1 / max(float((np.abs(coefficients) / data.torque_limit).max(axis=1).mean()), 1e-100)
+
+    b_max = data.largest_b(data.nodes)
+    inertia, drag = 2 * length * usual(forces.Ta), usual(forces.Tv) ** 2
+    return min(fall, _QUICK * min(inertia, drag, _find_median(b_max)))
+
+
+def _find_median(values: Array) -> float:
+    """Median, the upper one of two; that of numpy takes 10 ms to import what it needs."""
+    middle = values.size // 2
+    return float(np.partition(values.ravel(), middle)[middle])
+
+
+def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
+    """The a and b of a parabola in s of this height."""
+    length = data.grid.s[-1]
+    x = data.grid.s / length
+    return height * 2 * (1 - 2 * x) / length, height * 4 * x * (1 - x)
+
+
+def _squeeze_range(data: PhaseData, height: float) -> tuple[Array, Array]:
+    """Least and largest squeeze that limits allow at each node."""
+    a, b = _parabola(data, height)
+    slack = data.slack(data.nodes, Profile(a, b, np.zeros_like(a)))
+    rows, signs, _ = data.limits.sides
+    rate = signs * data.find_terms().squeeze[:, rows]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        bound = -slack / rate
+    low = np.where(rate > 0, bound, -np.inf).max(axis=1)
+    high = np.where(rate < 0, bound, np.inf).min(axis=1)
+    return low, high
+
+
+def _guess_at(data: PhaseData, height: float, time_weight: float = 0.0) -> tuple[Profile, Units]:
+    low, high = _squeeze_range(data, height)
+    weight = data.curve.formation.scene.scales.force
+    open_ = np.isfinite(low + high) & (low <= high)
+    press = float(np.abs(np.where(open_, (low + high) / 2, 0.0)).mean())
+    # A strong hand could press far harder than any motion needs.
+    high = np.minimum(high, low + _FIRM * np.maximum(weight, np.abs(low)))
+    middle = np.where(open_, (low + high) / 2, 0.0)
+    length = float(data.grid.s[-1])
+    duration = np.pi / 2 * length / np.sqrt(height)
+    force = max(_LIGHT * weight, data.epsilon, float(np.abs(middle).mean()))
+    profile = Profile(*_parabola(data, height), middle)
+    torque = data.torque_limit
+    squares = np.minimum(np.abs(data.nodes.forces.tau(*profile)), torque) ** 2
+    power = time_weight + float(squares.sum(axis=1).mean())
+    return profile, Units(length, 0.6 * duration, force, torque, power, max(force, press))
