@@ -4,9 +4,9 @@ import math
 
 import pytest
 
+from wholearm.mechanics.limits import Parameter
 from wholearm.planning.advice import (
     Change,
-    Limit,
     Shortfall,
     bracket,
     describe_changes,
@@ -15,8 +15,8 @@ from wholearm.planning.advice import (
     round_outwards,
 )
 
-TORQUE = Limit("torque limit of finger 2", 2.0, "N m", 1)
-EPSILON = Limit("epsilon", 0.05, "N", -1)
+TORQUE = Parameter("torque limit of finger 2", 2.0, "N m", 1)
+EPSILON = Parameter("epsilon", 0.05, "N", -1)
 
 
 @pytest.mark.parametrize(
@@ -43,15 +43,16 @@ def test_rounding_goes_outwards(value: float, sign: int, rounded: float) -> None
 
 def test_only_confirmed_changes_are_found() -> None:
     """Limit 0 works at its rounded value, 1 needs some room, 2 cannot, 3 is never enough."""
-    limits = [TORQUE, EPSILON, TORQUE, TORQUE]
-    least = [2.341, 0.012, None, 3.0]
+    parameters = [TORQUE, EPSILON, *(TORQUE._replace(key=key) for key in ("2", "3"))]
+    least = dict(zip(parameters, [2.341, 0.012, None, 3.0], strict=True))
     asked: list[tuple[int, float]] = []
 
-    def can_plan(index: int, value: float) -> bool:
+    def can_plan(parameter: Parameter, value: float) -> bool:
+        index = parameters.index(parameter)
         asked.append((index, value))
         return index == 0 or (index == 1 and value < 0.012)
 
-    found = find_changes(limits, least.__getitem__, can_plan)
+    found = find_changes(parameters, least.__getitem__, can_plan)
     assert found == [Change(TORQUE, 2.35), Change(EPSILON, 0.0119)]
     # The rest of what was asked goes outwards, and not far.
     assert [value for index, value in asked if index == 1] == [0.012, 0.0119]
@@ -62,11 +63,13 @@ def test_only_confirmed_changes_are_found() -> None:
 
 @pytest.mark.parametrize("limit, least", [(TORQUE, 3.0), (EPSILON, 0.04)])
 @pytest.mark.parametrize("needed", [0.0, 0.004, 0.013, 0.06, 0.1, 0.3, 0.49])
-def test_more_than_the_least_is_found_closely(limit: Limit, least: float, needed: float) -> None:
+def test_more_than_the_least_is_found_closely(
+    limit: Parameter, least: float, needed: float
+) -> None:
     """Plans may need more than what limits at the nodes ask for."""
     border = least * (1 + limit.sign * needed)
 
-    def can_plan(_: int, value: float) -> bool:
+    def can_plan(_: Parameter, value: float) -> bool:
         return limit.sign * (value - border) >= 0
 
     (change,) = find_changes([limit], lambda _: least, can_plan)
@@ -98,7 +101,7 @@ def test_shortfalls_are_ranked() -> None:
 
 @pytest.mark.parametrize("sign, farthest, edge", [(-1, 0.0, 0.2), (1, 2.0, 0.7)])
 def test_bracket_comes_near_to_the_edge(sign: int, farthest: float, edge: float) -> None:
-    limit = Limit("friction of palm", 0.5, "", sign)
+    limit = Parameter("friction of palm", 0.5, "", sign)
     value = bracket(limit, farthest, lambda value: sign * (value - edge) >= 0)
     assert value is not None and sign * (value - edge) >= 0
     assert abs(value - edge) <= abs(farthest - 0.5) / 30
@@ -107,5 +110,5 @@ def test_bracket_comes_near_to_the_edge(sign: int, farthest: float, edge: float)
 
 
 def test_a_change_without_a_unit() -> None:
-    change = Change(Limit("friction of palm", 0.5, "", -1), 0.2)
+    change = Change(Parameter("friction of palm", 0.5, "", -1), 0.2)
     assert str(change) == "friction of palm = 0.2 instead of 0.5"

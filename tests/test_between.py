@@ -10,8 +10,10 @@ from crossing import make_way, measure_fingers
 from plane import finger_gap, make_formation, measure_gaps
 from thrown import heave
 from timed import instants, landing, plan_landing, stages_of
+from wholearm.common.arrays import Array
 from wholearm.contacts.links import FINGERS_TOUCH
 from wholearm.mechanics.dynamics import Directions
+from wholearm.mechanics.limits import CONE, PRESS, make_limits
 from wholearm.planning.options import CLEARANCE, PlanOptions
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain.between import (
@@ -42,6 +44,15 @@ def as_stage(motion: StageMotion, **fields: object) -> Stage:
     return replace(stage, **fields)  # type: ignore[arg-type]
 
 
+def in_newtons(stage: Stage, misses: Limits, kind: str) -> Array:
+    """Misses of one kind of limits of forces, shape (K, n)."""
+    limits = make_limits(stage.formation, EPSILON)
+    return (
+        misses.held[:, np.isin(limits.sides[0], limits.of(kind))]
+        * stage.formation.scene.scales.force
+    )
+
+
 def look(stage: Stage, motion: StageMotion, *least: float) -> Limits:
     return find_misses(stage, check_between(stage, motion), *least)
 
@@ -62,7 +73,7 @@ def heaved() -> StageMotion:
 def test_what_a_plan_misses_is_within_what_is_allowed() -> None:
     for motion in landed():
         misses = look(as_stage(motion), motion, EPSILON)
-        assert misses.c_n.shape == (len(motion.points.fractions), motion.formation.n_contacts)
+        assert misses.held.shape == (len(motion.points.fractions), motion.formation.n_contacts + 4)
         assert misses.worst <= 1
 
 
@@ -76,12 +87,13 @@ def test_forces_are_missed_by_what_their_least_value_lacks() -> None:
         misses = look(stage, motion, asked)
         expected = np.maximum(asked - dense.min(axis=1), 0.0)
         # Parabolas through 25 looks, of forces that are smooth inside an interval.
-        np.testing.assert_allclose(misses.c_n, expected, atol=1e-3 * np.ptp(dense))
-        most = max(misses.c_n.max(), misses.cone.max(initial=0.0))
-        assert misses.worst == pytest.approx(most / MISS)
+        pressed = in_newtons(stage, misses, PRESS)
+        np.testing.assert_allclose(pressed, expected, atol=1e-3 * np.ptp(dense))
+        assert misses.worst == pytest.approx(misses.held.max() / MISS)
         # A margin asks for as much as a larger epsilon.
         same = look(stage, motion, EPSILON, asked - EPSILON)
-        np.testing.assert_allclose(same.c_n, misses.c_n, atol=1e-12 * asked)
+        again = in_newtons(stage, same, PRESS)
+        np.testing.assert_allclose(again, pressed, atol=1e-12 * asked)
 
 
 def test_cones_are_missed_by_what_epsilon_takes_from_them_but_the_margin_does_not() -> None:
@@ -92,12 +104,12 @@ def test_cones_are_missed_by_what_epsilon_takes_from_them_but_the_margin_does_no
     dense = motion.evaluate(instants(motion, 200))
     grip = mu * dense.c_n[:, row] - np.abs(dense.c_t[:, row])
     least = grip.reshape(stage.intervals, 200).min(axis=1)
-    assert not look(stage, motion, EPSILON).cone.any()
+    assert not in_newtons(stage, look(stage, motion, EPSILON), CONE).any()
     large = 1.0 + least.min() / mu
-    misses = look(stage, motion, large)
-    np.testing.assert_allclose(misses.cone[:, 0], np.maximum(mu * large - least, 0), atol=0.02)
-    assert misses.cone.max() > 1.0
-    assert not look(stage, motion, EPSILON, large).cone.any()
+    misses = in_newtons(stage, look(stage, motion, large), CONE).max(axis=1)
+    np.testing.assert_allclose(misses, np.maximum(mu * large - least, 0), atol=0.02)
+    assert misses.max() > 1.0
+    assert not in_newtons(stage, look(stage, motion, EPSILON, large), CONE).any()
 
 
 def test_released_contacts_have_to_be_clear_in_the_second_half() -> None:
@@ -131,7 +143,7 @@ def test_limits_rise_by_more_than_they_are_missed() -> None:
     motion = heaved()
     stage = as_stage(motion, monitored=(0, 1))
     plain = Limits.none(stage)
-    assert [table.shape[1] for table in plain] == [2, 1, 2, 4] and plain.worst == 0.0
+    assert [table.shape[1] for table in plain] == [8, 2, 4] and plain.worst == 0.0
     missed = Limits(*(table + k * 1e-3 for k, table in enumerate(plain)))
     raised = missed.raised(missed)
     for before, after in zip(missed, raised, strict=True):
@@ -194,7 +206,7 @@ def test_raised_rates_are_bounds_of_contacts_and_joints() -> None:
         limits = [Limits.none(stage) for stage in stages]
         limits[k].sense[:] = rise
         bounds = bound_unknowns(nlp, stages, SCHEME)
-        tables.append((*bounds, raise_bounds(nlp, stages, limits, EPSILON, bounds)[0]))
+        tables.append((*bounds, raise_bounds(nlp, stages, limits, bounds)[0]))
     (low, high, rows), (low_up, high_up, rows_up) = tables
     own = nlp.rows_of[k].points[:, :, -stages[k].formation.n_contacts :]
     known = np.isfinite(rows[own])

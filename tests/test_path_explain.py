@@ -17,7 +17,7 @@ from wholearm.geometry.path_guess import load
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.data import prepare
-from wholearm.planning.path_domain.explain import with_limit
+from wholearm.planning.path_domain.explain import change_curve
 from wholearm.planning.path_domain.impact_sequence import make_sequence
 from wholearm.planning.path_domain.motion import make_grid
 from wholearm.planning.path_domain.plan import plan_curves, plan_path
@@ -252,12 +252,12 @@ def test_a_duration_for_all_phases_is_advised() -> None:
 
 def test_changing_one_limit_leaves_everything_else(curves: tuple[Curve, ...]) -> None:
     curve = curves[0]
-    other = with_limit(curve, 1, "torque_limit", 3.5)
+    other = change_curve(curve, "fingers.2.torque_limit", 3.5)
     scene, changed = curve.formation.scene, other.formation.scene
     np.testing.assert_array_equal(changed.torque_limit, [2.0, 3.5])
     np.testing.assert_array_equal(scene.torque_limit, [2.0, 2.0])
     np.testing.assert_array_equal(
-        with_limit(curve, 0, "speed_limit", 3.0).formation.scene.speed_limit, [3.0, np.inf]
+        change_curve(curve, "fingers.1.speed_limit", 3.0).formation.scene.speed_limit, [3.0, np.inf]
     )
     assert changed.fingers[0] is scene.fingers[0] and changed.polygon is scene.polygon
     assert other.formation.names == curve.formation.names and other.panels is curve.panels

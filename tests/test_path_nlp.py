@@ -14,6 +14,7 @@ from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve
 from wholearm.planning.options import CHOICES, Objective
 from wholearm.planning.path_domain.data import PhaseData, prepare
+from wholearm.planning.path_domain.first_guess import guess
 from wholearm.planning.path_domain.motion import PathMotion, Profile, make_grid, redistribute_nodes
 from wholearm.planning.path_domain.nlp import (
     PathNLP,
@@ -26,12 +27,15 @@ from wholearm.planning.path_domain.nlp import (
     parameters,
     unpack,
 )
-from wholearm.planning.path_domain.plan import guess
+from wholearm.planning.path_domain.terms import LimitShape
 
 EPSILON = 0.05
 INTERVALS = 24
 UNITS = Units(0.04, 0.03, 7.0, np.array([1.7, 0.6]), 1.3, 9.0)
 LIMIT = 2.0
+SIDES = (*((row, 1.0) for row in range(6)), (4, -1.0), (5, -1.0))
+SHAPE = LimitShape(6, SIDES, (0, 1, 2, 3), (4, 5), (4, 5))
+"""Four sliding contacts and two torques."""
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +68,7 @@ def evaluate(nlp: PathNLP, data: PhaseData, x: Array, time_weight: float = 1.0) 
 
 @pytest.mark.parametrize("objective", Objective)
 def test_pack_and_unpack(data: PhaseData, profile: Profile, objective: Objective) -> None:
-    nlp = build_path_nlp(4, INTERVALS, objective)
+    nlp = build_path_nlp(SHAPE, INTERVALS, objective)
     x = pack(nlp, profile, UNITS, 0.7)
     assert x.shape == (nlp.solver.function.size1_in("x0"),)
     found, margin = unpack(nlp, data.grid, x, UNITS)
@@ -77,7 +81,7 @@ def test_pack_and_unpack(data: PhaseData, profile: Profile, objective: Objective
 
 def test_unpack_restores_the_integral_of_a(data: PhaseData, profile: Profile) -> None:
     """What Ipopt leaves of b' = 2 a is taken out, down to rounding."""
-    nlp = build_path_nlp(4, INTERVALS, Objective.TIME)
+    nlp = build_path_nlp(SHAPE, INTERVALS, Objective.TIME)
     rng = np.random.default_rng(2)
     x = pack(nlp, profile, UNITS, 0.0)
     found, _ = unpack(nlp, data.grid, x + 1e-9 * rng.uniform(-1, 1, len(x)), UNITS)
@@ -91,7 +95,7 @@ def test_constraints_are_the_limits(
     data: PhaseData, profile: Profile, objective: Objective
 ) -> None:
     """Distances of the constraints from their bounds are the slacks of the phase."""
-    nlp = build_path_nlp(4, INTERVALS, objective)
+    nlp = build_path_nlp(SHAPE, INTERVALS, objective)
     margin = 0.3 if objective is Objective.MARGIN else 0.0
     _, g = evaluate(nlp, data, pack(nlp, profile, UNITS, margin))
     rng = np.random.default_rng(3)
@@ -101,7 +105,7 @@ def test_constraints_are_the_limits(
     assert len(bounds["lbx"]) == len(bounds["ubx"]) == nlp.solver.function.size1_in("x0")
     assert len(bounds["lbg"]) == len(bounds["ubg"]) == len(g)
 
-    first = nlp.first
+    first = nlp.columns.g["limits"].start
     np.testing.assert_allclose(g[: first - 2], 0.0, atol=1e-13)
     np.testing.assert_array_equal(bounds["lbg"][:first], bounds["ubg"][:first])
     ends = [profile.a[1] - profile.a[0], profile.a[-1] - profile.a[-2]]
@@ -122,10 +126,10 @@ def test_constraints_are_the_limits(
 
 
 def test_elastic_constraints_give_way(data: PhaseData, profile: Profile) -> None:
-    nlp = build_path_nlp(4, INTERVALS, Objective.ELASTIC)
+    nlp = build_path_nlp(SHAPE, INTERVALS, Objective.ELASTIC)
     short = np.random.default_rng(4).uniform(0, 1, (len(data.grid.s), 6))
     _, hard = evaluate(nlp, data, pack(nlp, profile, UNITS, 0.0))
-    _, soft = evaluate(nlp, data, pack(nlp, profile, UNITS, 0.0, short))
+    _, soft = evaluate(nlp, data, pack(nlp, profile, UNITS, short / UNITS.of(data.limits)))
     change = (soft - hard)[INTERVALS + 2 :].reshape(-1, 8)
     np.testing.assert_allclose(change[:, :4] * UNITS.force, short[:, :4], atol=1e-12)
     np.testing.assert_allclose(change[:, 4:6] * UNITS.torque, short[:, 4:], atol=1e-12)
@@ -135,10 +139,10 @@ def test_elastic_constraints_give_way(data: PhaseData, profile: Profile) -> None
 def test_objectives_measure_the_motion(data: PhaseData, profile: Profile) -> None:
     """Up to the rule of each interval and the small weights that choose among equals."""
     motion = PathMotion(data.curve, data.grid, profile)
-    nlp = build_path_nlp(4, INTERVALS, Objective.TIME)
+    nlp = build_path_nlp(SHAPE, INTERVALS, Objective.TIME)
     time, _ = evaluate(nlp, data, pack(nlp, profile, UNITS, 0.0))
     assert time * UNITS.time == pytest.approx(motion.duration, rel=0.02)
-    nlp = build_path_nlp(4, INTERVALS, Objective.EFFORT)
+    nlp = build_path_nlp(SHAPE, INTERVALS, Objective.EFFORT)
     x = pack(nlp, profile, UNITS, 0.0)
     light, heavy = (evaluate(nlp, data, x, weight)[0] for weight in (1.0, 3.0))
     unit = UNITS.power * UNITS.time
@@ -146,7 +150,7 @@ def test_objectives_measure_the_motion(data: PhaseData, profile: Profile) -> Non
     t = np.linspace(0, motion.duration, 4001)
     squares = trapezoid((motion.evaluate(t).tau ** 2).sum(axis=1), t)
     assert (light - (heavy - light) / 2) * unit == pytest.approx(squares, rel=0.03)
-    nlp = build_path_nlp(4, INTERVALS, Objective.MARGIN)
+    nlp = build_path_nlp(SHAPE, INTERVALS, Objective.MARGIN)
     low, high = (evaluate(nlp, data, pack(nlp, profile, UNITS, m))[0] for m in (0.0, 1.4))
     assert low - high == pytest.approx(1.4 / UNITS.force, rel=1e-12)
 
@@ -167,7 +171,7 @@ def test_tightening_reaches_what_is_slack(data: PhaseData) -> None:
 
 @pytest.mark.parametrize("objective", [Objective(choice) for choice in CHOICES])
 def test_multipliers_move_between_grids(data: PhaseData, objective: Objective) -> None:
-    nlp = build_path_nlp(4, INTERVALS, objective)
+    nlp = build_path_nlp(SHAPE, INTERVALS, objective)
     rng = np.random.default_rng(5)
     sizes = {
         "lam_x0": nlp.solver.function.size1_in("x0"),
@@ -182,7 +186,7 @@ def test_multipliers_move_between_grids(data: PhaseData, objective: Objective) -
     new = redistribute_nodes(data.grid, data.nonempty, misses)
     moved = move_multipliers(nlp, multipliers, data.grid, new)
     # Those of the two sides of a reversal do not mix, and all stay between their neighbours.
-    on_nodes = slice(nlp.first, nlp.first + 6 * (INTERVALS + 1))
+    on_nodes = nlp.columns.g["limits"]
     for segment in (0, 1):
         mine = data.grid.segment == segment
         old = multipliers["lam_g0"][on_nodes].reshape(-1, 6)[mine]
@@ -193,9 +197,9 @@ def test_multipliers_move_between_grids(data: PhaseData, objective: Objective) -
 
 
 def test_one_build_serves_every_phase(curves: tuple[Curve, ...]) -> None:
-    nlp = build_path_nlp(4, INTERVALS, Objective.TIME)
-    assert build_path_nlp(4, INTERVALS, Objective.TIME) is nlp
-    assert build_path_nlp(4, INTERVALS, Objective.EFFORT) is not nlp
+    nlp = build_path_nlp(SHAPE, INTERVALS, Objective.TIME)
+    assert build_path_nlp(SHAPE, INTERVALS, Objective.TIME) is nlp
+    assert build_path_nlp(SHAPE, INTERVALS, Objective.EFFORT) is not nlp
     for curve in curves:
         data = prepare(curve, EPSILON, make_grid(curve, INTERVALS), 1)
         _, units = guess(data)
@@ -208,8 +212,8 @@ def test_building_stays_linear(objective: Objective) -> None:
 
     Otherwise the Jacobian would have to be found one unknown at a time.
     """
-    x, p = build_path_nlp(4, INTERVALS, objective).solver.function.oracle().sx_in()
-    _, g = build_path_nlp(4, INTERVALS, objective).solver.function.oracle()(x, p)
+    x, p = build_path_nlp(SHAPE, INTERVALS, objective).solver.function.oracle().sx_in()
+    _, g = build_path_nlp(SHAPE, INTERVALS, objective).solver.function.oracle()(x, p)
     pattern = ca.jacobian(g, x).sparsity()
     rows, columns = (np.array(part) for part in pattern.get_triplet())
     assert np.bincount(columns).max() <= 14
@@ -218,7 +222,7 @@ def test_building_stays_linear(objective: Objective) -> None:
 
 def test_effort_is_not_symbolic_in_the_data() -> None:
     """The same expression graph for every phase: no number of a scene is built in."""
-    oracle = build_path_nlp(4, INTERVALS, Objective.EFFORT).solver.function.oracle()
+    oracle = build_path_nlp(SHAPE, INTERVALS, Objective.EFFORT).solver.function.oracle()
     x, p = oracle.sx_in()
     free = ca.symvar(ca.vertcat(*oracle(x, p)))
     assert len(free) == x.numel() + p.numel()
@@ -348,7 +352,7 @@ def test_viscous_joints(drag: float) -> None:
 
 def test_no_speed_comes_out_imaginary(data: PhaseData, profile: Profile) -> None:
     """Where a motion all but stops, b integrated again from a may fall below zero by rounding."""
-    nlp = build_path_nlp(4, INTERVALS, Objective.TIME)
+    nlp = build_path_nlp(SHAPE, INTERVALS, Objective.TIME)
     s, steps = data.grid.s, data.grid.steps
     middle = len(s) // 2
 

@@ -29,6 +29,7 @@ from wholearm.planning.path_domain.motion import PathMotion, directions_of
 from wholearm.planning.path_domain.nlp import PathNLP, build_path_nlp
 from wholearm.planning.path_domain.plan import plan_curves, plan_path
 from wholearm.planning.path_domain.sequence_plan import plan_sequence
+from wholearm.planning.path_domain.terms import LimitShape
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.problem.definition import Problem, build_problem
@@ -400,8 +401,8 @@ class Stopped:
 
 
 def test_a_stuck_solver_does_not_blame_the_limits(monkeypatch: pytest.MonkeyPatch) -> None:
-    def build(contacts: int, intervals: int, goal: Objective, rolling: int = 0) -> PathNLP:
-        nlp = build_path_nlp(contacts, intervals, goal, rolling)
+    def build(shape: LimitShape, intervals: int, goal: Objective) -> PathNLP:
+        nlp = build_path_nlp(shape, intervals, goal)
         return replace(nlp, solver=Stopped()) if goal is Objective.TIME else nlp
 
     monkeypatch.setattr(path_plan, "build_path_nlp", build)

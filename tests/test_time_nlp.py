@@ -23,6 +23,7 @@ from wholearm.planning.options import CLEARANCE, OPENING, Objective
 from wholearm.planning.time_domain.between import Limits, raise_bounds
 from wholearm.planning.time_domain.collocation import Scheme, make_scheme
 from wholearm.planning.time_domain.layout import MARGIN, V, pack
+from wholearm.planning.time_domain.limits import Target
 from wholearm.planning.time_domain.nlp import (
     SHORTEST,
     SLIDING,
@@ -62,7 +63,7 @@ def driven(name: str, degree: int, count: int, contacts: int = 4) -> Stage:
 def build(
     stages: list[Stage], scheme: Scheme, objective: Objective = Objective.TIME, weight: float = 3.0
 ) -> TimeNLP:
-    return build_time_nlp(stages, scheme, objective, weight, 1)
+    return build_time_nlp(stages, scheme, Target(objective, 0.05, weight), 1)
 
 
 def call(nlp: TimeNLP, part: str, x: Array) -> Array:
@@ -122,7 +123,7 @@ def test_a_known_motion_keeps_the_limits(name: str, degree: int) -> None:
     nlp = build([stage], scheme)
     x = packed(nlp, [stage])
     low_x, high_x = bound_unknowns(nlp, [stage], scheme)
-    low, _ = raise_bounds(nlp, [stage], [Limits.none(stage)], 0.05, (low_x, high_x))
+    low, _ = raise_bounds(nlp, [stage], [Limits.none(stage)], (low_x, high_x))
     nlp.rows.bounds[0][:] = low
     _, inequalities = misses(nlp, x)
     # Slip and joint speeds start from nothing.
@@ -161,8 +162,8 @@ def test_raised_limits_are_missed_by_as_much(name: str) -> None:
     low_x, high_x = bound_unknowns(nlp, [stage], scheme)
     limits = Limits.none(stage)
     least = stage.guess.forces[3, :, 1].min()
-    limits.c_n[3, 1] = least + 0.25 - 0.05
-    low, _ = raise_bounds(nlp, [stage], [limits], 0.05, (low_x, high_x))
+    limits.held[3, 1] = (least + 0.25 - 0.05) / stage.formation.scene.scales.force
+    low, _ = raise_bounds(nlp, [stage], [limits], (low_x, high_x))
     pressed = nlp.rows_of[0].limits.presses[3, :, 1]
     values = call(nlp, "nlp_g", x)
     assert (low_x - x).max() == pytest.approx(0.25, abs=1e-12)
@@ -194,7 +195,7 @@ def test_the_margin_raises_what_forces_have_to_exceed(name: str) -> None:
     scheme, stage = make_scheme(name, 3), driven(name, 3, 8)
     nlp = build([stage], scheme, Objective.MARGIN)
     low_x, high_x = bound_unknowns(nlp, [stage], scheme)
-    low, _ = raise_bounds(nlp, [stage], [Limits.none(stage)], 0.05, (low_x, high_x))
+    low, _ = raise_bounds(nlp, [stage], [Limits.none(stage)], (low_x, high_x))
     assert not np.isfinite(low_x[nlp.layouts[0].forces]).any()
     # The polynomial through the points may pass a little below them at the ends of an interval.
     room = stage.guess.forces.min() - 0.05

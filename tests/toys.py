@@ -58,6 +58,7 @@ class Toy:
             scene=scene,
             n_contacts=1,
             n_rolling=0,
+            n_constraints=1,
             names=("v0-palm",),
             rolling=(),
             rolling_rows=(),

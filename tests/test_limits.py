@@ -1,0 +1,214 @@
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plane import SQUARE, make_formation, make_scene
+from tipping import roll
+from wholearm.common.arrays import Array
+from wholearm.common.errors import InfeasibleError
+from wholearm.contacts.formation import Formation
+from wholearm.geometry.curve import Curve
+from wholearm.mechanics import limits as limits_module
+from wholearm.mechanics.limits import (
+    CONE,
+    PRESS,
+    SPEED,
+    TORQUE,
+    MotionLimit,
+    Parameter,
+    make_limits,
+)
+from wholearm.planning.options import Objective, PlanOptions
+from wholearm.planning.path_domain.data import prepare
+from wholearm.planning.path_domain.explain import change_curve
+from wholearm.planning.path_domain.motion import PathMotion
+from wholearm.planning.path_domain.plan import plan_path
+from wholearm.planning.time_domain.between import MISS, check_between, find_misses
+from wholearm.planning.time_domain.explain import list_shortfalls, solve_elastic
+from wholearm.planning.time_domain.motion import TimeMotion
+from wholearm.planning.time_domain.plan import plan_phases
+from wholearm.planning.time_domain.search import Search
+from wholearm.planning.time_domain.stage import Stage
+from wholearm.planning.time_domain.staging import guess_stages
+from wholearm.problem.definition import Problem
+from wholearm.scene.model import Friction
+
+EPSILON = 0.05
+DROOP = 4.0
+"""By how much a motor's torque falls with its speed, in the scene's torque times its time."""
+
+
+@pytest.fixture
+def formation() -> Formation:
+    scene = replace(make_scene(SQUARE), friction=Friction(0.5, 0.2, 0.3))
+    right, left = scene.fingers
+    scene = replace(scene, fingers=(replace(right, speed_limit=7.0), left))
+    return roll(make_formation(scene, "v0-finger2 v1-palm v2-finger1"), "v1-palm", "v2-finger1")
+
+
+def test_rows_are_found_by_kind(formation: Formation) -> None:
+    limits = make_limits(formation, 0.1)
+    y = np.array([1.0, 2.0, 3.0, 0.7, -0.4, 5.0, 6.0, 8.0, 9.0])
+    values = limits.rows @ y
+    found = {kind: values[limits.of(kind)] for kind in (PRESS, CONE, TORQUE, SPEED)}
+    np.testing.assert_allclose(found[PRESS], [1.0, 2.0, 3.0])
+    sides = [0.5 * 2 - 0.7, 0.5 * 2 + 0.7, 0.2 * 3 + 0.4, 0.2 * 3 - 0.4]
+    np.testing.assert_allclose(found[CONE], sides)
+    np.testing.assert_allclose(found[TORQUE], [5.0, 6.0])
+    # The left finger has no speed limit, which is no row.
+    np.testing.assert_allclose(found[SPEED], [8.0])
+    np.testing.assert_allclose(limits.low[limits.of(CONE)], 0.1 * np.repeat([0.5, 0.2], 2))
+    texts = [limit.text for limit in limits.limits]
+    assert texts[1] == "c_n of v1-palm >= epsilon = 0.1 N"
+    assert texts[4] == "friction cone of v2-finger1, |c_t| <= 0.2 (c_n - 0.1 N),"
+    assert texts[5] == "torque limit of finger 1 = 2 N m"
+    assert texts[7] == "speed limit of finger 1 = 7 rad/s"
+    keys = [parameter.key for parameter in limits.parameters]
+    assert keys[-1] == "epsilon" and set(keys[:-1]) == {
+        "fingers.1.torque_limit",
+        "fingers.2.torque_limit",
+        "fingers.1.speed_limit",
+    }
+
+
+def test_a_parameter_moves_the_bounds_of_its_limits_by_their_weight(formation: Formation) -> None:
+    """The weight is the derivative of every bound, inwards or outwards, at a changed value."""
+    limits = make_limits(formation, 0.1)
+    rows, signs, bounds = limits.sides
+    for parameter in limits.parameters:
+        if parameter.key == "epsilon":
+            other = make_limits(formation, 0.1 - 1e-3)
+        else:
+            _, finger, key = parameter.key.split(".")
+            links = list(formation.scene.fingers)
+            k = int(finger) - 1
+            links[k] = replace(links[k], **{key: getattr(links[k], key) + 1e-3})
+            scene = replace(formation.scene, fingers=(links[0], links[1]))
+            other = make_limits(replace(formation, scene=scene), 0.1)
+        rise = -signs * (other.sides[2] - bounds)
+        np.testing.assert_allclose(rise, 1e-3 * limits.weigh(parameter)[rows], atol=1e-15)
+        assert rise.max() > 1e-4
+
+
+def test_forces_on_the_edge_of_the_limits_are_inside_the_cones(formation: Formation) -> None:
+    """The limits are c_n >= epsilon and |c_t| <= mu (c_n - epsilon), for random forces."""
+    rng = np.random.default_rng(2)
+    limits = make_limits(formation, 0.1).only(PRESS, CONE)
+    mu = np.array([0.5, 0.2])
+    seen = set()
+    for c in rng.uniform([0, 0, 0, -0.6, -0.3], [0.5, 2, 2, 0.6, 0.3], (300, 5)):
+        inside = bool((c[:3] >= 0.1).all() and (np.abs(c[3:]) <= mu * (c[1:3] - 0.1)).all())
+        values = limits.rows @ np.append(c, np.zeros(4))
+        assert bool((limits.find_slack(values) >= 0).all()) == inside
+        seen.add(inside)
+    assert seen == {True, False}
+
+
+def list_motors(formation: Formation, _: float) -> list[MotionLimit]:
+    """A limit that the package does not have: |tau + k theta'| <= the torque limit."""
+    scene, found = formation.scene, []
+    for k, limit in enumerate(scene.torque_limit.tolist()):
+        rows = np.zeros((1, formation.n_constraints + 4))
+        rows[0, -4 + k], rows[0, -2 + k] = 1.0, DROOP * scene.scales.torque * scene.scales.time
+        key = f"fingers.{k + 1}.torque_limit"
+        parameter = Parameter(f"torque limit of finger {k + 1}", limit, "N m", 1, key)
+        most, text = np.array([limit]), f"motor curve of finger {k + 1}"
+        found.append(
+            MotionLimit("motor", text, "N m", rows, -most, most, limit, parameter, np.ones(1))
+        )
+    return found
+
+
+@pytest.fixture
+def motors(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Another limit, by nothing but another maker."""
+    with monkeypatch.context() as patch:
+        patch.setattr(limits_module, "MAKERS", [*limits_module.MAKERS, list_motors])
+        yield
+
+
+def strain(motion: PathMotion | TimeMotion, formation: Formation) -> Array:
+    """|tau + k theta'| over the torque limits, shape (n, 2)."""
+    samples, scales = (
+        motion.evaluate(np.linspace(0.0, motion.duration, 2001)),
+        formation.scene.scales,
+    )
+    droop = DROOP * scales.torque * scales.time
+    driven = samples.tau + droop * samples.z_dot[:, 3:]
+    return np.asarray(np.abs(driven) / formation.scene.torque_limit)
+
+
+PHASE = 1
+COARSE = PlanOptions(time_intervals=6)
+
+
+def test_another_limit_binds_along_a_curve(
+    curves: tuple[Curve, ...], request: pytest.FixtureRequest
+) -> None:
+    curve, options = curves[PHASE], PlanOptions(intervals=40)
+    plain = plan_path(curve, EPSILON, options, 2)
+    request.getfixturevalue("motors")
+    driven = plan_path(curve, EPSILON, options, 2)
+    before, after = (strain(plan.motion, curve.formation).max() for plan in (plain, driven))
+    assert before > 1.02 and 0.999 < after < 1 + 1e-6
+    assert driven.value > 1.001 * plain.value
+    # The check between nodes sees it where it was not kept.
+    data = prepare(curve, EPSILON, plain.motion.grid, 2)
+    short = data.limits.fold(data.misses(plain.motion.profile, 0.0)[0]).max(axis=0)
+    (missed,) = {data.limits.limits[k].kind for k in data.limits.owners[short > 1e-6]}
+    assert missed == "motor"
+    assert short.max() == pytest.approx(2.0 * (before - 1), rel=1e-2)
+
+
+def test_another_limit_binds_over_time(
+    heptagon: Problem, curves: tuple[Curve, ...], request: pytest.FixtureRequest
+) -> None:
+    phase, start = heptagon.phases[PHASE], curves[PHASE - 1].end
+    (plain,) = plan_phases(heptagon, (phase,), start, COARSE)
+    request.getfixturevalue("motors")
+    (driven,) = plan_phases(heptagon, (phase,), start, COARSE)
+    before, after = (strain(plan.motion, phase.formation).max() for plan in (plain, driven))
+    assert before > 1.02 and 0.99 < after < 1 + 1e-6
+    assert driven.value > 1.001 * plain.value
+    worst = []
+    for part in plain.motion.stages:
+        stage = Stage(PHASE, part.formation, part.directions, part.points)
+        misses = find_misses(stage, check_between(stage, part), EPSILON)
+        limits = make_limits(part.formation, EPSILON)
+        of_motors = np.isin(limits.sides[0], limits.of("motor"))
+        assert misses.held[:, ~of_motors].max() < 2 * MISS
+        worst.append(misses.held[:, of_motors].max())
+    assert max(worst) == pytest.approx(before - 1, rel=1e-2)
+
+
+@pytest.mark.usefixtures("motors")
+def test_another_limit_is_short_and_gives_way(heptagon: Problem, curves: tuple[Curve, ...]) -> None:
+    """In both domains, by the parameter that it says it is set by."""
+    weak = change_curve(curves[3], "fingers.1.torque_limit", 0.2)
+    problem = replace(heptagon, scene=weak.formation.scene)
+    phases, start = problem.phases[3:4], curves[2].end
+    with pytest.raises(InfeasibleError, match="motor curve of finger 1 is ") as caught:
+        plan_path(weak, EPSILON, PlanOptions(intervals=20), 4)
+    advised = re.search("feasible with torque limit of finger 1 = (.*?) N m", str(caught.value))
+    assert advised
+    search = Search.of(problem, COARSE)
+    guess = guess_stages(problem, phases, start, search.scheme, 6, 2.0)
+    elastic = solve_elastic(search, guess)
+    assert elastic is not None
+    limits = make_limits(elastic[0].formation, problem.epsilon)
+    (parameter,) = [own for own in limits.parameters if own.name == "torque limit of finger 1"]
+    relaxed = search.aiming(Objective.RELAX, parameter).solve(elastic)
+    assert relaxed.success
+    least = 0.2 + problem.scene.scales.torque * relaxed.cost
+    assert least == pytest.approx(float(advised[1]), rel=0.03)
+    # What it keeps with the larger torques is short of the limits as they are.
+    short = {
+        one.limit: one.amount for one in list_shortfalls(problem, relaxed.stages, search.scheme)
+    }
+    assert set(short) == {"torque limit of finger 1 = 0.2 N m", "motor curve of finger 1"}
+    assert max(short.values()) == pytest.approx(least - 0.2, rel=1e-3)
