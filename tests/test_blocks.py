@@ -38,14 +38,14 @@ def test_no_phase_has_to_press_much_more_than_those_before_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     problem, given = problem_of(HEPTAGON), list[tuple[PlanOptions, float]]()
-    plan_block = blocks._plan_block
+    plan_sequence = blocks.plan_sequence
 
     def record(*of: Any) -> Any:
-        plans, chain = plan_block(*of)
-        given.append((of[3], min(plan.value for plan in plans)))
-        return plans, chain
+        plans = plan_sequence(*of)
+        given.append((of[2], min(plan.value for plan in plans)))
+        return plans
 
-    monkeypatch.setattr(blocks, "_plan_block", record)
+    monkeypatch.setattr(blocks, "plan_sequence", record)
     blocks.plan_blocks(problem, PlanOptions("margin", intervals=20), lambda _: None)
     pressed = [(own.enough, value) for own, value in given if own.goal is Objective.MARGIN]
     assert len(pressed) == len(problem.phases) and pressed[0][0] == math.inf
