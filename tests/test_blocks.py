@@ -10,6 +10,7 @@ from shipped import HEPTAGON, TWICE, problem_of
 from wholearm.planning import blocks
 from wholearm.planning.blocks import Planning, plan_alone
 from wholearm.planning.options import Objective, PlanOptions
+from wholearm.planning.path_domain.sequence_plan import plan_sequence
 
 
 def planning_of(problem: Any) -> Planning:
@@ -38,8 +39,6 @@ def test_no_phase_has_to_press_much_more_than_those_before_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     problem, given = problem_of(HEPTAGON), list[tuple[PlanOptions, float]]()
-    plan_sequence = blocks.plan_sequence
-
     def record(*of: Any) -> Any:
         plans = plan_sequence(*of)
         given.append((of[2], min(plan.value for plan in plans)))
