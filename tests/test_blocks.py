@@ -39,6 +39,7 @@ def test_no_phase_has_to_press_much_more_than_those_before_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     problem, given = problem_of(HEPTAGON), list[tuple[PlanOptions, float]]()
+
     def record(*of: Any) -> Any:
         plans = plan_sequence(*of)
         given.append((of[2], min(plan.value for plan in plans)))
