@@ -16,7 +16,7 @@ def test_the_gradient_of_a_linear_cost_is_its_part_along_the_curve(heptagon: Pro
     phase = heptagon.phases[1]
     curve = trace_phases(heptagon)[1]
     slope = np.random.default_rng(4).normal(size=5)
-    value, gradient = CostToGo(heptagon, phase, lambda z: float(slope @ z)).expand(curve.start)
+    value, gradient = CostToGo(phase, lambda z: float(slope @ z)).expand(curve.start)
     tangent = curve.evaluate(np.zeros(1)).z_s[0]
     assert value == pytest.approx(slope @ curve.start)
     # A quotient of differences over a hundredth of a curve that bends.
@@ -31,9 +31,9 @@ def test_less_way_costs_less_time(heptagon: Problem) -> None:
     options = PlanOptions(intervals=40)
 
     def least_time(z: Array) -> float:
-        return plan_path(trace_phase(heptagon, phase, z), heptagon.epsilon, options, 1).value
+        return plan_path(trace_phase(phase, z), heptagon.epsilon, options, 1).value
 
-    value, gradient = CostToGo(heptagon, phase, least_time).expand(curve.start)
+    value, gradient = CostToGo(phase, least_time).expand(curve.start)
     tangent = curve.evaluate(np.zeros(1)).z_s[0]
     # Forwards, and with steps of another length: what is left is the bend of the time.
     ahead = 0.02 * curve.length

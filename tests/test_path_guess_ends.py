@@ -46,7 +46,7 @@ def test_an_end_is_found_where_the_nearest_one_breaks_a_limit(hexagon: Problem) 
     ending = Formation(hexagon.scene, (*formation.contacts, until))
     nearest = close_contacts(ending, start, np.zeros(0))
     assert nearest is not None and ending.evaluate_limits(nearest[None]).min() < -CLOSED
-    (part,) = guess_phase(hexagon, Phase(5, formation, Until(until)), start)
+    (part,) = guess_phase(Phase(5, formation, Until(until)), start)
     assert np.abs(measure_gaps(ending, part.z[-1])).max() < CLOSED
     assert formation.evaluate_limits(part.z).min() > -CLOSED
     # Edge 0 leaves the palm by the angle between finger 2 and the left end of the palm.
@@ -58,14 +58,14 @@ def test_an_end_that_is_nowhere_is_named(hexagon: Problem) -> None:
     formation = make_formation(hexagon.scene, "v1-palm v3-finger1 v0-finger2")
     until = Until(parse_contact("v5-finger1", hexagon.scene))
     with pytest.raises(InputError, match="v5-finger1 cannot be reached") as caught:
-        guess_phase(hexagon, Phase(5, formation, until), start)
+        guess_phase(Phase(5, formation, until), start)
     assert caught.value.key == "phases[6].until"
 
 
 def test_ends_ahead_lie_where_the_motion_goes(square: Problem) -> None:
     before = guess_curve(trace_phases(square)[2])[-1]
     landing, start = square.phases[3], before.z[-1]
-    (nearest,) = guess_phase(square, landing, start)
+    (nearest,) = guess_phase(landing, start)
     onwards = guess_onwards(landing, before)
     assert onwards
     heading = (start - before.z[-2])[0]
@@ -121,7 +121,7 @@ def test_phases_without_ends_of_their_own_go_towards_the_next_end() -> None:
         problem = replace(sliding, phases=(*phases, replace(phase, index=len(phases))))
         z = problem.start
         for own in problem.phases:
-            ways.append(guess_phase(problem, own, z)[-1].z)
+            ways.append(guess_phase(own, z, problem.phases[own.index + 1 :])[-1].z)
             z = ways[-1][-1]
     np.testing.assert_allclose(ways[0], ways[3], atol=1e-12)
     gaps = [evaluate_gap(sliding, way[-1]) for way in ways]
@@ -140,10 +140,10 @@ def test_a_phase_that_rolls_between_others_does_not_go_back() -> None:
         for k, one in enumerate((last.formation, rolling))
     ]
     parts = replace(problem, phases=(*before, *opened, replace(last, index=last.index + 2)))
-    z = guess_phase(parts, parts.phases[4], trace_phases(parts)[-1].end)[-1].z[-1]
+    z = guess_phase(parts.phases[4], trace_phases(parts)[-1].end)[-1].z[-1]
     gaps = [evaluate_gap(problem, z)]
     for phase in parts.phases[5:]:
-        z = guess_phase(parts, phase, z)[-1].z[-1]
+        z = guess_phase(phase, z, parts.phases[phase.index + 1 :])[-1].z[-1]
         gaps.append(evaluate_gap(problem, z))
     assert (np.diff(gaps) < 0).all() and gaps[-1] == pytest.approx(0.0, abs=CLOSED)
 

@@ -248,4 +248,4 @@ def test_list_goes_on_where_loading_ends_a_phase(heptagon: Problem, tmp_path: Pa
         gaps = phase.formation.evaluate(z[None], z[None]).C[0]
         assert np.abs(gaps).max() < 1e-9
         assert phase.formation.evaluate_limits(z[None]).min() > -1e-9
-        z = guess_phase(problem, phase, z)[-1].z[-1]
+        z = guess_phase(phase, z)[-1].z[-1]

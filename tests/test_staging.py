@@ -34,7 +34,7 @@ def test_stages_are_those_of_the_outlines(stages: list[Stage]) -> None:
     problem = landing()
     z, phases = trace_phases(problem)[-1].end, []
     for phase in problem.phases[4:]:
-        for outline in guess_phase(problem, phase, z):
+        for outline in guess_phase(phase, z):
             phases.append(phase.index)
             z = outline.z[-1]
     # What slides the other way after the release has to turn on its way, in one stage more.
@@ -86,7 +86,7 @@ def test_the_duration_is_that_of_a_fall_times_the_pace(pace: float) -> None:
     stages = guess_stages(problem, phases, start, SCHEME, 12, pace)
     z, length = start, 0.0
     for phase in phases:
-        for outline in guess_phase(problem, phase, z):
+        for outline in guess_phase(phase, z):
             length += outline.length
             z = outline.z[-1]
     whole = sum(stage.guess.duration for stage in stages) * problem.scene.scales.time

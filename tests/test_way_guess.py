@@ -28,7 +28,7 @@ def tipping() -> Problem:
 def test_ends_beside_the_nearest_are_ends_too() -> None:
     problem = tipping()
     (phase,) = problem.phases
-    (nearest,) = guess_phase(problem, phase, problem.start)
+    (nearest,) = guess_phase(phase, problem.start)
     goals = np.array(list_goals(phase, problem.start, nearest.z[-1]))
     assert len(goals) > 5 and np.ptp(goals[:, 0]) > 0.01
     assert np.abs(np.degrees(goals[:, 2]) - 9.5).max() < 1e-6
@@ -38,7 +38,7 @@ def test_ends_beside_the_nearest_are_ends_too() -> None:
 def test_stretches_of_a_way_keep_their_senses() -> None:
     problem = tipping()
     (phase,) = problem.phases
-    (nearest,) = guess_phase(problem, phase, problem.start)
+    (nearest,) = guess_phase(phase, problem.start)
     for goal in list_goals(phase, problem.start, nearest.z[-1]):
         way = split_way(connect(phase.formation, problem.start, goal))
         assert (way[0].z[0] == problem.start).all()
@@ -87,7 +87,7 @@ def test_ways_bend_to_one_side_and_to_the_other() -> None:
     problem = tipping()
     (phase,) = problem.phases
     start, formation = problem.start, phase.formation
-    (nearest,) = guess_phase(problem, phase, start)
+    (nearest,) = guess_phase(phase, start)
     goal, straight = nearest.z[-1], connect(formation, start, nearest.z[-1]).z
     sides = [connect(formation, start, goal, (bend, 0.0)).z for bend in (0.3, -0.3)]
     for z in sides:

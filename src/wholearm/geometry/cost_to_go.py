@@ -13,7 +13,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..mechanics.metric import metric_weights
-from ..problem.definition import Phase, Problem
+from ..problem.definition import Phase
 from .tracing import trace_phase
 
 _STEP = 1e-2
@@ -26,7 +26,6 @@ class CostToGo:
 
     Attributes
     ----------
-    problem : Problem
     phase : Phase
         The first of them. Its curve is where the motion before it may end.
     value : callable
@@ -34,15 +33,14 @@ class CostToGo:
         plan from there.
     """
 
-    problem: Problem
     phase: Phase
     value: Callable[[Array], float]
 
     def expand(self, z: Array) -> tuple[float, Array]:
         """The cost from `z`, shape (5,), and its gradient along the curve, shape (5,)."""
-        curve = trace_phase(self.problem, self.phase, z)
+        curve = trace_phase(self.phase, z)
         step = _STEP * curve.length
         point = curve.evaluate(np.array([0.0, step]))
         here, ahead = (self.value(place) for place in point.z)
         slope = (ahead - here) / step
-        return here, slope * metric_weights(self.problem.scene) * point.z_s[0]
+        return here, slope * metric_weights(self.phase.formation.scene) * point.z_s[0]

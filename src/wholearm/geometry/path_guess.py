@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InputError
+from ..common.errors import InputError, name_source
 from ..common.sharing import exclusive
 from ..contacts.formation import Formation
 from ..contacts.limits import build_limits
@@ -54,11 +55,16 @@ def require_phases(problem: Problem) -> None:
     """
     curves = trace_phases(problem)
     z = curves[-1].end if curves else problem.start
-    for phase in problem.phases[len(curves) :]:
-        if runs_on_curve(phase):
-            z = trace_phase(problem, phase, z).end
-        else:
-            z = guess_phase(problem, phase, z)[-1].z[-1]
+    with name_source(problem.source):
+        for phase in problem.phases[len(curves) :]:
+            z = find_end(phase, z, problem.phases[phase.index + 1 :])
+
+
+def find_end(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> Array:
+    """Configuration in which a phase from `z` ends, shape (5,); see `guess_phase`."""
+    if runs_on_curve(phase):
+        return trace_phase(phase, z, later).end
+    return np.asarray(guess_phase(phase, z, later)[-1].z[-1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +111,18 @@ def guess_curve(curve: Curve, share: float = 1.0) -> list[PathGuess]:
 
 
 def guess_phase(
-    problem: Problem, phase: Phase, z: Array, release_at: float = RELEASE_AT
+    phase: Phase, z: Array, later: Sequence[Phase] = (), release_at: float = RELEASE_AT
 ) -> list[PathGuess]:
-    """Outline a phase from `z`, shape (5,), to its end; a release is at a share of the curve.
+    """Outline a phase from `z`, shape (5,), to its end.
+
+    Parameters
+    ----------
+    phase : Phase
+    z : ndarray, shape (5,)
+    later : sequence of Phase
+        What follows, which says where a phase that ends by a release is heading.
+    release_at : float
+        The share of the curve at which a release is.
 
     Raises
     ------
@@ -115,15 +130,15 @@ def guess_phase(
         If the contacts do not touch at `z`, leave no freedom, or the end cannot be reached.
     """
     formation = phase.formation
-    require_touching(problem, phase, z)
+    require_touching(phase, z)
     freedoms = count_freedoms(formation, z)
     if freedoms == 0:
         key = f"phases[{phase.number}].contacts"
-        raise InputError(problem.source, key, "the contacts leave no freedom to move")
+        raise InputError("", key, "the contacts leave no freedom to move")
     if freedoms == 1:
-        curve = trace_phase(problem, phase, z)
+        curve = trace_phase(phase, z, later)
         return guess_curve(curve, release_at if phase.until.is_release else 1.0)
-    goal = _find_goal(problem, phase, z)
+    goal = _find_goal(phase, z, later)
     return [connect(formation, z, goal)]
 
 
@@ -132,16 +147,15 @@ def count_freedoms(formation: Formation, z: Array) -> int:
     return int(tangent_basis(formation, z).shape[1])
 
 
-def _find_goal(problem: Problem, phase: Phase, z: Array) -> Array:
+def _find_goal(phase: Phase, z: Array, later: Sequence[Phase]) -> Array:
     """Nearest configuration at which the phase ends."""
     key = f"phases[{phase.number}].until"
     if phase.until.is_release:
-        ends = [later.until for later in problem.phases[phase.index + 1 :]]
-        ends = [until for until in ends if not until.is_release]
+        ends = [own.until for own in later if not own.until.is_release]
         if not ends:
-            raise InputError(problem.source, key, "is missing; only one freedom needs none")
+            raise InputError("", key, "is missing; only one freedom needs none")
         # On the way to where a phase ends next, as far as this one's contacts lead there.
-        ahead = _find_goal(problem, replace(phase, until=ends[0]), z)
+        ahead = _find_goal(replace(phase, until=ends[0]), z, later)
         slip = phase.formation.evaluate_slip(z[None])[0]
         middle = close_contacts(phase.formation, (z + ahead) / 2, slip)
         return ahead if middle is None else middle
@@ -158,10 +172,10 @@ def _find_goal(problem: Problem, phase: Phase, z: Array) -> Array:
         found = explore(phase.formation, z, slip, endings)
         goals = [found] if found is not None else []
     if goals:
-        metric = metric_weights(problem.scene)
+        metric = metric_weights(phase.formation.scene)
         return min(goals, key=lambda goal: float(metric @ (goal - z) ** 2))
     text = f"{phase.until} cannot be reached with these contacts{reasons[0]}"
-    raise InputError(problem.source, key, text)
+    raise InputError("", key, text)
 
 
 def list_ends(phase: Phase) -> list[Ending]:

@@ -9,13 +9,13 @@ where theta_1 (or any other) is stationary are nothing special.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InputError
+from ..common.errors import InputError, name_source
 from ..contacts.formation import Formation, describe, find_touching
 from ..mechanics.metric import metric_weights
 from ..problem.definition import End, Phase, Problem, Until
@@ -50,11 +50,12 @@ def trace_phases(problem: Problem) -> tuple[Curve, ...]:
     """
     curves: list[Curve] = []
     z = problem.start
-    for phase in problem.phases:
-        if not runs_on_curve(phase):
-            break
-        curves.append(trace_phase(problem, phase, z))
-        z = curves[-1].end
+    with name_source(problem.source):
+        for phase in problem.phases:
+            if not runs_on_curve(phase):
+                break
+            curves.append(trace_phase(phase, z, problem.phases[phase.index + 1 :]))
+            z = curves[-1].end
     return tuple(curves)
 
 
@@ -63,33 +64,39 @@ def runs_on_curve(phase: Phase) -> bool:
     return phase.formation.n_constraints == 4 and phase.end is not End.SMOOTH
 
 
-def trace_phase(problem: Problem, phase: Phase, z: Array) -> Curve:
+def trace_phase(phase: Phase, z: Array, later: Sequence[Phase] = ()) -> Curve:
     """Trace a one-freedom phase from `z` to its `until`, or as far as it goes before a release.
+
+    Parameters
+    ----------
+    phase : Phase
+    z : ndarray, shape (5,)
+    later : sequence of Phase
+        What follows, which says where a phase that ends by a release is heading.
 
     Raises
     ------
     InputError
         If the contacts do not touch at `z`, or the `until` is never reached.
     """
-    require_touching(problem, phase, z)
+    require_touching(phase, z)
     if not phase.until.is_release:
-        return _trace_phase(problem, phase, z)
+        return _trace_phase(phase, z)
     formation, until = phase.formation, phase.until
-    later = problem.phases[phase.index + 1 :]
     ends = [*(p.until for p in later if not p.until.is_release), until]
     ways = [trace_curve(formation, z, way, until) for way in _headings(formation, z, ends[0])]
-    curve, least = max(ways, key=lambda curve: curve.length), HELD * problem.scene.scales.length
+    curve, least = max(ways, key=lambda curve: curve.length), HELD * formation.scene.scales.length
     same = later and set(later[0].formation.contacts) == set(formation.contacts)
     if same and ways[0].length >= least:
         # Only modes change, which can be anywhere on the way to where a phase ends next.
         curve = ways[0]
     if curve.length < least:
         key = f"phases[{phase.number}].contacts"
-        raise InputError(problem.source, key, f"cannot move: {curve.ending}")
+        raise InputError("", key, f"cannot move: {curve.ending}")
     return curve
 
 
-def require_touching(problem: Problem, phase: Phase, z: Array) -> None:
+def require_touching(phase: Phase, z: Array) -> None:
     """Check that a phase's contacts touch at `z`, shape (5,), and that nothing is overlapped.
 
     Raises
@@ -100,29 +107,29 @@ def require_touching(problem: Problem, phase: Phase, z: Array) -> None:
     key = f"phases[{phase.number}].contacts"
     formation = phase.formation
     gaps = formation.evaluate(z[None], np.zeros((1, 5))).C[0]
-    touching = problem.scene.touching
+    touching = formation.scene.touching
     if np.abs(gaps).max() > touching:
         missing = [
             c.name for c, gap in zip(formation.contacts, gaps, strict=True) if abs(gap) > touching
         ]
         when = f"at the end of phase {phase.index}" if phase.index else "at the start"
-        found = describe(find_touching(problem.scene, z))
+        found = describe(find_touching(formation.scene, z))
         raise InputError(
-            problem.source,
+            "",
             key,
             f"{', '.join(missing)} does not touch {when}; touching are {found}",
         )
     limits = formation.evaluate_limits(z[None])[0]
     if limits.min() < -touching:
         text = formation.limits[int(limits.argmin())].text
-        raise InputError(problem.source, key, f"cannot hold at {describe_pose(z)}: {text}")
+        raise InputError("", key, f"cannot hold at {describe_pose(z)}: {text}")
 
 
-def _trace_phase(problem: Problem, phase: Phase, z: Array) -> Curve:
+def _trace_phase(phase: Phase, z: Array) -> Curve:
     formation, until = phase.formation, phase.until
     key = f"phases[{phase.number}].until"
     if _holds(formation, until, z):
-        raise InputError(problem.source, key, f"{until} holds already at the start of the phase")
+        raise InputError("", key, f"{until} holds already at the start of the phase")
     reason = []
     for heading in _headings(formation, z, until):
         curve = trace_curve(formation, z, heading, until)
@@ -130,7 +137,7 @@ def _trace_phase(problem: Problem, phase: Phase, z: Array) -> Curve:
             return curve
         reason.append(curve.ending)
     raise InputError(
-        problem.source,
+        "",
         key,
         f"{until} is never reached: going one way {reason[0]}, going the other way {reason[1]}",
     )

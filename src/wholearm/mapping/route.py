@@ -189,7 +189,8 @@ def trace_problem(problem: Problem) -> list[Array]:
             paths.append(curve.evaluate(np.linspace(0.0, curve.length, 60)).z[:, [0, 2]])
             z = curve.end
         for phase in problem.phases[len(paths) :]:
-            parts = [part.z for part in guess_phase(problem, phase, z)]
+            later = problem.phases[phase.index + 1 :]
+            parts = [part.z for part in guess_phase(phase, z, later)]
             paths.append(np.concatenate(parts)[:, [0, 2]])
             z = parts[-1][-1]
     except InputError:

@@ -15,8 +15,7 @@ from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..geometry.curve import describe_pose
 from ..geometry.explore import STILL, is_inside
-from ..geometry.path_guess import guess_phase
-from ..geometry.tracing import runs_on_curve, trace_phase
+from ..geometry.path_guess import find_end
 from ..mechanics.metric import metric_weights
 from ..problem.definition import Phase, Problem, Until
 from ..scene.model import Scene
@@ -45,10 +44,7 @@ def advance(problem: Problem, index: int, z: Array, step: Step) -> Array:
         If the phase cannot be carried out geometrically.
     """
     contacts, until = step
-    phase = Phase(index, _form(problem.scene, contacts), until)
-    if runs_on_curve(phase):
-        return trace_phase(problem, phase, z).end
-    return np.asarray(guess_phase(problem, phase, z)[-1].z[-1])
+    return find_end(Phase(index, _form(problem.scene, contacts), until), z)
 
 
 def walk_leg(problem: Problem, index: int, z: Array, start: Array, stop: Array) -> list[Walked]:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InfeasibleError
+from ..common.errors import InfeasibleError, name_source
 from ..geometry.cost_to_go import CostToGo
 from ..geometry.tracing import runs_on_curve, trace_phase, trace_phases
 from ..mechanics.metric import measure_speed
@@ -211,7 +211,8 @@ def plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str], 
             if options.goal is Objective.MARGIN:
                 own = replace(own, enough=_find_enough(blocks))
             to_go = _look_ahead(problem, phases, own) if planning.ahead else None
-            made = _plan_block(problem, phases, z, own, allowed, to_go)
+            with name_source(problem.source):
+                made = _plan_block(problem, phases, z, own, allowed, to_go)
             known = BlockPlan(phases, z, *wanted, fastest, *made)
         blocks.append(known)
         z = known.end
@@ -253,8 +254,8 @@ def _plan_block(
         return plans, None
     curves, known = [], trace_phases(problem)
     for phase in block:
-        traced = phase.index < len(known)
-        curves.append(known[phase.index] if traced else trace_phase(problem, phase, z))
+        traced, later = phase.index < len(known), problem.phases[phase.index + 1 :]
+        curves.append(known[phase.index] if traced else trace_phase(phase, z, later))
         z = curves[-1].end
     chain = make_sequence(block, curves)
     for part in chain.split():
@@ -282,7 +283,7 @@ def _look_ahead(problem: Problem, block: Sequence[Phase], options: PlanOptions) 
     def value(z: Array) -> float:
         return sum(plan.value for plan in _plan_block(problem, following, z, options, None)[0])
 
-    return CostToGo(problem, phase, value)
+    return CostToGo(phase, value)
 
 
 def _require_margin(planning: Planning) -> Planning:

@@ -46,8 +46,9 @@ def guess_stages(
     A single phase may be guessed to go a way of its own instead, at the pace of that.
     """
     parts: list[tuple[Phase, PathGuess, bool]] = []
-    for phase in phases:
-        outlines = list(way.stretches if way else guess_phase(problem, phase, z, release_at))
+    for k, phase in enumerate(phases):
+        later = phases[k + 1 :]
+        outlines = list(way.stretches if way else guess_phase(phase, z, later, release_at))
         if parts and parts[-1][0].end is End.SMOOTH:
             outlines = [*_turn_first(outlines[0], parts[-1][1]), *outlines[1:]]
             if onwards:

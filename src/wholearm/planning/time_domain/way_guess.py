@@ -87,7 +87,7 @@ def list_ways(problem: Problem, phase: Phase, z: Array, most: int) -> list[Paced
     formation = phase.formation
     if phase.until.is_release or tangent_basis(formation, z).shape[1] != 2:
         return []
-    (nearest,) = guess_phase(problem, phase, z)
+    (nearest,) = guess_phase(phase, z)
     found: list[_Bent] = []
 
     def look(goal: Array, bends: tuple[float, float]) -> None:
