@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from plane import cross, point_to_segment
 from shipped import HEXAGON
 from wholearm.common.arrays import Array
-from wholearm.problem.definition import Problem, build_problem
+from wholearm.problem.definition import Problem
+from wholearm.problem.read import build_problem
 from wholearm.scene.model import Scene
 
 

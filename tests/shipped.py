@@ -8,6 +8,7 @@ from pathlib import Path
 from once import once
 from wholearm.geometry.path_guess import load
 from wholearm.planning.plan import solve
+from wholearm.planning.result import Plan
 from wholearm.problem.definition import Problem
 from wholearm.results.trajectory import Trajectory
 
@@ -31,5 +32,9 @@ def problem_of(path: Path) -> Problem:
 
 
 @once
-def plan_of(path: Path, objective: str = "time") -> Trajectory:
+def solved(path: Path, objective: str = "time") -> Plan:
     return solve(problem_of(path), objective)
+
+
+def plan_of(path: Path, objective: str = "time") -> Trajectory:
+    return solved(path, objective).trajectory

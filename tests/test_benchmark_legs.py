@@ -14,7 +14,7 @@ from wholearm.benchmark.legs import (
     run_legs,
     summarise,
 )
-from wholearm.problem.definition import build_problem, read_problem
+from wholearm.problem.read import build_problem, read_problem
 
 PROBLEMS = HEPTAGON.parent
 

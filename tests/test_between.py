@@ -221,7 +221,7 @@ def test_raised_rates_are_bounds_of_contacts_and_joints() -> None:
 @lru_cache(maxsize=1)
 def make_way_twice() -> tuple[Trajectory, Trajectory]:
     """Plans of least effort with fingers that pass each other, and with solid ones."""
-    passing, solid = (solve(make_way(solid), "effort") for solid in (False, True))
+    passing, solid = (solve(make_way(solid), "effort").trajectory for solid in (False, True))
     return passing, solid
 
 

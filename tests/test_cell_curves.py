@@ -10,7 +10,8 @@ from wholearm.benchmark.stress import cell_curves
 from wholearm.benchmark.stress.cell_curves import best_end, find_best, list_ends
 from wholearm.benchmark.stress.slow_motion import slow_margin
 from wholearm.common.arrays import Array
-from wholearm.problem.definition import Problem, build_problem, read_problem
+from wholearm.problem.definition import Problem
+from wholearm.problem.read import build_problem, read_problem
 
 
 @cache

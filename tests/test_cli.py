@@ -19,7 +19,8 @@ from shipped import BOX, HEPTAGON, IMPACTS, plan_of
 from tipping import scale, tipped
 from wholearm.cli.command import build_parser, main
 from wholearm.results.torque_table import format_rows, place_rows
-from wholearm.results.trajectory import Trajectory, load_trajectory
+from wholearm.results.trajectory import Trajectory
+from wholearm.results.trajectory_file import load_trajectory
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
 Edit = Callable[[dict[str, Any]], object]
@@ -103,7 +104,8 @@ def test_solve_writes_the_plan(folder: Path, capsys: pytest.CaptureFixture[str])
     assert max(float(line.split()[3]) for line in lines[1:6]) <= 2.0
     assert lines[6].startswith("replayed: least c_n 0.0500")
     assert lines[7].startswith("wrote a.csv: ") and " rows; its replay holds: phi = " in lines[7]
-    assert lines[8] == (f"time = {plan.duration:.6f} s, {plan.duration:.6f} s in all; wrote a.npz")
+    took = f"{plan.duration:.6f} s"
+    assert lines[8] == f"solved: time = {took}, {took} in all; wrote a.npz"
     assert main(["verify", str(HEPTAGON), "a.csv"]) == 0
     assert len(plan.t) == 5 * 21
     assert Path("a.csv").read_text().startswith("t,tau1,tau2\n0.0,")

@@ -13,7 +13,8 @@ from plane import finger_gap, place_corners
 from shipped import HEPTAGON
 from wholearm.common.errors import InputError
 from wholearm.geometry.path_guess import load
-from wholearm.problem.definition import End, Problem, build_problem, read_problem
+from wholearm.problem.definition import End, Problem
+from wholearm.problem.read import build_problem, read_problem
 
 TEXT = HEPTAGON.read_text(encoding="utf-8")
 Edit = Callable[[dict[str, Any]], object]

@@ -22,7 +22,7 @@ from wholearm.mechanics.dynamics import (
     reduced_inertia,
     split_forces,
 )
-from wholearm.problem.definition import build_problem
+from wholearm.problem.read import build_problem
 from wholearm.scene.model import Friction, Scene
 from wholearm.verification.reduced import reduce_to_first_joint
 

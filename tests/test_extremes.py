@@ -12,7 +12,8 @@ from shipped import HEPTAGON
 from wholearm.common.errors import InfeasibleError, JammingError
 from wholearm.geometry.path_guess import load
 from wholearm.planning.plan import solve
-from wholearm.problem.definition import Problem, build_problem
+from wholearm.problem.definition import Problem
+from wholearm.problem.read import build_problem
 from wholearm.verification.verify import verify
 
 TABLE = dict(load(str(HEPTAGON)).table)

@@ -21,7 +21,8 @@ from wholearm.geometry.curve import Curve
 from wholearm.mapping.borders import NOWHERE, Window, label_cells
 from wholearm.mapping.formation_map import CROSSED, Border, FormationMap, build_map
 from wholearm.mapping.route import list_formations
-from wholearm.problem.definition import Problem, build_problem
+from wholearm.problem.definition import Problem
+from wholearm.problem.read import build_problem
 from wholearm.scene.model import Scene
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))

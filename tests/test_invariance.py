@@ -19,7 +19,8 @@ from wholearm.benchmark.invariance import (
 )
 from wholearm.geometry.path_guess import load
 from wholearm.geometry.tracing import trace_phases
-from wholearm.problem.definition import Problem, build_problem
+from wholearm.problem.definition import Problem
+from wholearm.problem.read import build_problem
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
 CASES = [("heptagon_impact", 2, 20), ("box_rolling", 1, 80)]

@@ -136,7 +136,7 @@ def test_a_first_phase_lets_go_what_touches_at_the_start() -> None:
     (phase,) = problem.phases
     touching = find_touching(problem.scene, problem.start)
     (left,) = {c.name for c in touching} - set(phase.formation.names)
-    plan = solve(problem, transcription="time", time_intervals=8)
+    plan = solve(problem, transcription="time", time_intervals=8).trajectory
     report = verify(problem, plan)
     assert report.ok, report.to_text()
     motion = plan.motions[0]
@@ -154,7 +154,7 @@ def test_a_contact_slides_in_one_phase_and_rolls_in_the_next() -> None:
     first = replace(phase, until=Until(), end=End.SMOOTH)
     last = replace(phase, index=1, formation=rolling)
     problem = replace(sliding, phases=(first, last))
-    plan = solve(problem, time_intervals=6)
+    plan = solve(problem, time_intervals=6).trajectory
     report = verify(problem, plan)
     assert report.ok, report.to_text()
     assert report.phases[0].until == "change of v1-palm"

@@ -23,7 +23,8 @@ from wholearm.planning.path_domain.motion import make_grid
 from wholearm.planning.path_domain.plan import plan_curves, plan_path
 from wholearm.planning.path_domain.sequence_plan import plan_sequence
 from wholearm.planning.plan import solve
-from wholearm.problem.definition import Problem, build_problem
+from wholearm.problem.definition import Problem
+from wholearm.problem.read import build_problem
 
 INTERVALS = 30
 OPTIONS = PlanOptions(intervals=INTERVALS)

@@ -23,7 +23,8 @@ from wholearm.planning.time_domain import impacts as time_impacts
 from wholearm.planning.time_domain import plan as time_plan
 from wholearm.planning.time_domain.motion import TimeMotion
 from wholearm.problem.definition import Problem
-from wholearm.results.trajectory import Samples, Trajectory, load_trajectory
+from wholearm.results.trajectory import Samples, Trajectory
+from wholearm.results.trajectory_file import load_trajectory
 
 OBJECTIVES = ["time", "effort", "margin"]
 LIMIT = 2.0
@@ -233,7 +234,7 @@ def test_meta_says_how_it_was_made(
 
 def test_samples_and_progress(heptagon: Problem) -> None:
     told: list[str] = []
-    trajectory = solve(heptagon, intervals=20, samples=7, progress=told.append)
+    trajectory = solve(heptagon, intervals=20, samples=7, progress=told.append).trajectory
     assert trajectory.phase.tolist() == [k for k in range(5) for _ in range(7)]
     assert trajectory.meta["intervals"] == 20
     for phase in range(5):

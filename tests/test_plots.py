@@ -24,6 +24,7 @@ from wholearm import plots
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.figures.data import choose_snapshots, find_steps
+from wholearm.figures.style import SIZE
 from wholearm.problem.definition import Problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Trajectory, assemble
@@ -363,7 +364,7 @@ def test_save_writes_the_format_of_the_ending_and_the_same_bytes(
 def test_png_has_at_least_150_dots_per_inch(figure: Figure, tmp_path: Path) -> None:
     plots.save(figure, tmp_path / "a.png")
     width = int.from_bytes((tmp_path / "a.png").read_bytes()[16:20], "big")
-    assert width >= 150 * plots.SIZE[0]
+    assert width >= 150 * SIZE[0]
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a", "png", "a.png.txt"])

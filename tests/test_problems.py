@@ -58,7 +58,7 @@ def measure(path: Path) -> dict[str, Any]:
     """
     plan = plan_of(path)
     return {
-        "status": plan.meta["status"],
+        "status": plan.meta["status"].partition(",")[0],
         "objective": plan.meta["objective"],
         "phase_durations": [round(duration, 6) for duration in plan.meta["phase_durations"]],
         "least_margin": round(float(np.nanmin(plan.c_n)) - plan.meta["epsilon"], 6),

@@ -11,7 +11,7 @@ from wholearm.benchmark.invariance import Units, in_units
 from wholearm.benchmark.stress.scenes import random_scene
 from wholearm.common.errors import InputError
 from wholearm.geometry.path_guess import load
-from wholearm.problem.definition import build_problem
+from wholearm.problem.read import build_problem
 
 PROBLEMS = sorted((Path(__file__).parents[1] / "problems").glob("*.toml"))
 HEPTAGON = dict(load(str(PROBLEMS[0].with_name("heptagon_four_contacts.toml"))).table)

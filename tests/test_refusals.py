@@ -5,7 +5,8 @@ import pytest
 from shipped import HEPTAGON
 from wholearm.benchmark.stress.refusals import judge
 from wholearm.common.errors import InfeasibleError, InputError, JammingError
-from wholearm.problem.definition import Problem, build_problem, read_problem
+from wholearm.problem.definition import Problem
+from wholearm.problem.read import build_problem, read_problem
 
 WEAK = {f"fingers.{k}.torque_limit": 0.05 for k in (1, 2)}
 

@@ -15,7 +15,8 @@ from wholearm.common.errors import InputError
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import guess_phase
 from wholearm.mapping.route import Route, format_route, list_formations
-from wholearm.problem.definition import Problem, build_problem
+from wholearm.problem.definition import Problem
+from wholearm.problem.read import build_problem
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
 FLAT = -1.984

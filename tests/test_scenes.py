@@ -5,7 +5,7 @@ import pytest
 
 from wholearm.benchmark.stress.scenes import random_route, random_scene
 from wholearm.contacts.formation import find_touching
-from wholearm.problem.definition import build_problem
+from wholearm.problem.read import build_problem
 
 
 @pytest.mark.parametrize("seed", range(4))

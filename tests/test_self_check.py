@@ -23,6 +23,7 @@ from wholearm.planning.self_check import (
     replay_plan,
 )
 from wholearm.problem.definition import Problem
+from wholearm.results.replay_figures import ReplayFigures
 from wholearm.results.report import Report
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Trajectory
@@ -118,7 +119,7 @@ class Spoiled:
         blocks[self.phase] = replace(block, plans=[weak])
         return assemble_plan(replace(planning, blocks=tuple(blocks)))
 
-    def run(self) -> tuple[Planning, Trajectory, dict[str, Any]]:
+    def run(self) -> tuple[Planning, Trajectory, ReplayFigures]:
         first = self.build(self.planning)
         return replay_plan(self.planning, first, self.build, lambda _: None)
 
@@ -134,7 +135,7 @@ def test_only_what_does_not_hold_is_refined(slide: Problem, cured: int) -> None:
     spoiled = Spoiled(slide, 1, cured)
     planning, trajectory, figures = spoiled.run()
     assert [block.finer for block in planning.blocks] == [0, cured, 0]
-    assert figures["refinements"] == [0, cured, 0]
+    assert figures.refinements == (0, cured, 0)
     for k in 0, 2:
         assert planning.blocks[k] is spoiled.planning.blocks[k]
     assert verify(slide, trajectory).ok
@@ -202,7 +203,7 @@ def test_meta_keeps_the_figures(heptagon: Problem, trajectory: Trajectory) -> No
     ]
     for own, phase in zip(figures["phases"], report.phases, strict=True):
         assert own["arrival"] == pytest.approx(phase.arrival, abs=1e-9)
-        assert max(own["end_deviation"].values()) < 1e-9
+        assert max(own["end_deviation"][unit] for unit in ("m", "rad")) < 1e-9
         assert max(own["deviation"].values()) < 1e-9 and own["end_speed"] < 1e-6
     assert figures["residual"] < 1e-11 and figures["refinements"] == [0] * 5
 

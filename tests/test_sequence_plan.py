@@ -14,8 +14,10 @@ from wholearm.common.errors import InfeasibleError
 from wholearm.mechanics.impact import compute_impact
 from wholearm.mechanics.metric import metric_weights
 from wholearm.planning.plan import solve
-from wholearm.problem.definition import Problem, build_problem
-from wholearm.results.trajectory import Samples, Trajectory, load_trajectory
+from wholearm.problem.definition import Problem
+from wholearm.problem.read import build_problem
+from wholearm.results.trajectory import Samples, Trajectory
+from wholearm.results.trajectory_file import load_trajectory
 from wholearm.verification.verify import verify
 
 OBJECTIVES = ["time", "effort", "margin"]
@@ -161,12 +163,12 @@ def test_without_an_impact_the_plan_is_that_of_stops(heptagon: Problem) -> None:
     table: dict[str, Any] = copy.deepcopy(dict(heptagon.table))
     for phase in table["phases"][:-1]:
         phase["end"] = "impact"
-    trajectory = solve(build_problem(table), intervals=40)
+    struck = solve(build_problem(table), intervals=40)
     plain = solve(heptagon, intervals=40)
-    assert not any(row["possible"] for row in trajectory.meta["transitions"])
-    assert trajectory.meta["phase_durations"] == plain.meta["phase_durations"]
-    assert plain.meta["transitions"] == []
-    np.testing.assert_array_equal(trajectory.tau, plain.tau)
+    assert not any(row.possible for row in struck.transitions)
+    assert [p.duration for p in struck.phases] == [p.duration for p in plain.phases]
+    assert plain.transitions == ()
+    np.testing.assert_array_equal(struck.trajectory.tau, plain.trajectory.tau)
 
 
 def test_transitions_survive_their_file(plans: dict[str, Trajectory], tmp_path: Any) -> None:

@@ -31,7 +31,7 @@ IN_THREADS = """
 import gc, sys, threading, time
 import tomllib
 import wholearm
-from wholearm.problem.definition import build_problem
+from wholearm.problem.read import build_problem
 
 path, shared = sys.argv[1], sys.argv[2] == "shared"
 failures, values, running = [], {}, True
@@ -51,7 +51,7 @@ def work(number):
             plan = wholearm.solve(problem, goal, intervals=10)
             values.setdefault(goal, []).append(plan.meta["value"])
             plan.at(0.3 * plan.duration)
-            assert wholearm.simulate(problem, plan.torque).outcome.reached
+            assert wholearm.simulate(problem, plan).outcome.reached
             try:
                 wholearm.solve(problem, goal, intervals=10, degree=99)
             except wholearm.InputError as error:
@@ -269,7 +269,7 @@ def test_copies_leave_kept_values_behind(tracked: type[Tracked]) -> None:
 
 
 def _plan(problem: wholearm.problem.Problem) -> wholearm.Trajectory:
-    return wholearm.solve(problem, intervals=10)
+    return wholearm.solve(problem, intervals=10).trajectory
 
 
 def _refuse(key: str) -> None:

@@ -20,7 +20,8 @@ from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import energy
 from wholearm.mechanics.impact import compute_impact
-from wholearm.problem.definition import End, Phase, Problem, build_problem
+from wholearm.problem.definition import End, Phase, Problem
+from wholearm.problem.read import build_problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Trajectory
 from wholearm.simulation.events import EventKind, OutcomeKind, Simulation

@@ -12,7 +12,8 @@ from plane import make_formation
 from planned import CosineMotion, choose_squeeze, join
 from shipped import HEXAGON
 from wholearm.geometry.tracing import trace_phases
-from wholearm.problem.definition import Problem, build_problem
+from wholearm.problem.definition import Problem
+from wholearm.problem.read import build_problem
 from wholearm.simulation.simulate import simulate
 from wholearm.simulation.starting import Departure, Touching
 from wholearm.simulation.sticking import find_rest

@@ -38,7 +38,7 @@ def plan_part(
     starts = z[0] + np.cumsum([0.0, *LEAST[start:stop]])
     value = times if options.goal is Objective.TIME else times / least
     return [
-        PhasePlan(Shift(*own), torque, cost, 0, 0, 0.0, 0.0)
+        PhasePlan(Shift(*own), torque, cost)
         for *own, cost in zip(starts, LEAST[start:stop], times, value, strict=False)
     ]
 

@@ -16,7 +16,8 @@ from wholearm.common.errors import InputError
 from wholearm.contacts.elemental import build_features
 from wholearm.geometry.path_guess import load
 from wholearm.planning.plan import solve
-from wholearm.problem.definition import End, Problem, build_problem, read_problem
+from wholearm.problem.definition import End, Problem
+from wholearm.problem.read import build_problem, read_problem
 from wholearm.problem.table import describe_scene
 from wholearm.scene.model import Friction
 from wholearm.simulation.simulate import simulate
@@ -75,8 +76,9 @@ def test_both_ways_to_another_friction_plan_the_same(heptagon: Problem) -> None:
     assert durations[1] == pytest.approx(durations[2], rel=1e-8)
     assert durations[1] != pytest.approx(durations[0], rel=1e-3)
     plan = solve(rough)
-    assert simulate(by_name, plan.torque).outcome.reached
-    assert not simulate(first, plan.torque).missed_by == pytest.approx(0.0, abs=1e-7)
+    torque = plan.trajectory.torque
+    assert simulate(by_name, torque).outcome.reached
+    assert not simulate(first, torque).missed_by == pytest.approx(0.0, abs=1e-7)
     assert plan.meta["problem"]["friction"]["palm"] == 0.2
 
 

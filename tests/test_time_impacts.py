@@ -17,6 +17,7 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.impact import compute_impact
 from wholearm.mechanics.metric import metric_weights
 from wholearm.planning.plan import solve
+from wholearm.planning.result import Plan
 from wholearm.problem.definition import End, Problem
 from wholearm.results.trajectory import Samples, Trajectory
 from wholearm.verification.verify import verify
@@ -36,15 +37,19 @@ def problem(objective: str) -> Problem:
 
 
 @once
-def planned(objective: str) -> Trajectory:
+def solved(objective: str) -> Plan:
     """Plans on few intervals, whose replay is a test of its own."""
     options: dict[str, Any] = {"time_intervals": 6, "replay": False}
     return solve(problem(objective), objective, transcription="time", **options)
 
 
+def planned(objective: str) -> Trajectory:
+    return solved(objective).trajectory
+
+
 @cache
 def along(objective: str) -> Trajectory:
-    return solve(problem(objective), objective, intervals=40)
+    return solve(problem(objective), objective, intervals=40).trajectory
 
 
 def ends_of(trajectory: Trajectory, phase: int) -> tuple[Samples, Samples]:
@@ -127,7 +132,7 @@ def test_it_stops_where_no_impact_is_possible() -> None:
 
 
 def test_impacts_are_listed() -> None:
-    lines = summarise(planned("time"), "a.npz").splitlines()
+    lines = summarise(solved("time"), "a.npz").splitlines()
     (head,) = (k for k, line in enumerate(lines) if "least impulse [N s per m/s]" in line)
     for line, row in zip(
         lines[head + 1 : head + 3], planned("time").meta["transitions"], strict=True

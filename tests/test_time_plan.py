@@ -66,7 +66,7 @@ def gentle() -> Trajectory:
 @once
 def in_time() -> Trajectory:
     """The heptagon's last slide and its flip, which curves are for, in the time domain."""
-    return solve(turning(), transcription="time", time_intervals=16, replay=False)
+    return solve(turning(), transcription="time", time_intervals=16, replay=False).trajectory
 
 
 @cache
@@ -82,7 +82,7 @@ def thrown(
 ) -> tuple[Problem, Trajectory, float]:
     """A problem of one and two contacts, its plan, and the time that its second phase takes."""
     problem, expected = throw()
-    return problem, solve(problem, objective, time_intervals=8), expected
+    return problem, solve(problem, objective, time_intervals=8).trajectory, expected
 
 
 def statistics(stages: list[StageMotion]) -> float:
@@ -157,7 +157,7 @@ def test_rolling_contacts_are_planned_like_along_the_curve() -> None:
     # Measured 0.77 % on 32 intervals, half of that on 64.
     assert -1e-4 < within.duration / tipped().meta["phase_durations"][1] - 1 < 1e-2
     rolls = phase.formation.rolling
-    (motion,) = within.motions
+    (motion,) = within.trajectory.motions
     assert isinstance(motion, TimeMotion) and len(rolls) == 1
     for stage in motion.stages:
         samples = stage.evaluate(instants(stage, 9))
@@ -175,7 +175,7 @@ def test_margins_with_rolling_contacts_are_those_along_the_curve() -> None:
     along = solve(problem, "margin", duration=1.0, replay=False)
     phase, allowed = problem.phases[1], along.meta["phase_durations"][1]
     assert phase.formation.rolling
-    start = along.motions[1].evaluate(np.zeros(1)).z[0]
+    start = along.trajectory.motions[1].evaluate(np.zeros(1)).z[0]
     options = PlanOptions("margin", time_intervals=8)
     (within,) = plan_phases(problem, (phase,), start, options, allowed)
     # Forces on an eighth of the phase cannot follow as closely.
@@ -192,7 +192,7 @@ def test_what_moves_by_itself_takes_its_time(
 ) -> None:
     problem, plan, expected = thrown(throw)
     if name != "radau":
-        plan = solve(problem, time_intervals=8, scheme=name)
+        plan = solve(problem, time_intervals=8, scheme=name).trajectory
     # One or two contacts are left, and with them four or three freedoms.
     formation = problem.phases[1].formation
     assert formation.n_constraints == 2 - (throw is lift)

@@ -28,7 +28,8 @@ from wholearm.contacts.formation import Formation, close_finger, find_touching, 
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_curve, trace_phases
 from wholearm.mechanics.metric import metric_weights
-from wholearm.problem.definition import Phase, Problem, Until, build_problem
+from wholearm.problem.definition import Phase, Problem, Until
+from wholearm.problem.read import build_problem
 from wholearm.scene.model import Scene
 
 NEVER = Until(coordinate="x", value=9.0)

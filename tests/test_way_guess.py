@@ -14,7 +14,8 @@ from wholearm.planning.options import PlanOptions
 from wholearm.planning.time_domain.plan import plan_phases
 from wholearm.planning.time_domain.way_guess import AMPLE, list_goals, list_ways, split_way
 from wholearm.planning.time_domain.way_pace import WayForces
-from wholearm.problem.definition import Problem, build_problem, read_problem
+from wholearm.problem.definition import Problem
+from wholearm.problem.read import build_problem, read_problem
 
 
 @cache

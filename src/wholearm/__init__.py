@@ -1,9 +1,9 @@
 """Plans joint-torque trajectories for dynamic whole-arm manipulation in the plane.
 
 >>> problem = wholearm.load("problems/heptagon.toml")
->>> trajectory = wholearm.solve(problem, objective="time")
->>> report = wholearm.verify(problem, trajectory)
->>> figure = wholearm.plots.force_margins(trajectory)
+>>> plan = wholearm.solve(problem, objective="time")
+>>> report = wholearm.verify(problem, plan)
+>>> figure = wholearm.plots.force_margins(plan)
 
 Everything is imported when it is first used, so that a program pays only for what it needs.
 """
@@ -18,51 +18,109 @@ if TYPE_CHECKING:
         InfeasibleError,
         InputError,
         JammingError,
+        ReplayError,
         SimulationError,
         SolverError,
         WholearmError,
     )
+    from .contacts.elemental import Contact
+    from .contacts.formation import Formation
     from .figures import plots
     from .geometry.path_guess import load
+    from .planning.options import Objective, PlanOptions
     from .planning.plan import solve
+    from .planning.result import Plan, Status
+    from .planning.saved import load_plan
+    from .problem.definition import End, Phase, Problem, Until
+    from .problem.read import place_start, read_formation, read_until
+    from .results.narrow import save
+    from .results.report import Report
     from .results.torque import TorqueProfile, read_torque_csv
-    from .results.trajectory import Trajectory, load_trajectory
+    from .results.trajectory import Trajectory
+    from .results.trajectory_file import load_trajectory
+    from .scene.model import Finger, Friction, Scene
+    from .scene.polygon import Polygon
+    from .simulation.events import Simulation
     from .simulation.simulate import simulate
     from .verification.verify import verify
 
 __version__ = "0.1.0"
 
 _HOMES = {
+    "Contact": "contacts.elemental",
+    "End": "problem.definition",
+    "Finger": "scene.model",
+    "Formation": "contacts.formation",
+    "Friction": "scene.model",
     "InfeasibleError": "common.errors",
     "InputError": "common.errors",
     "JammingError": "common.errors",
+    "Objective": "planning.options",
+    "Phase": "problem.definition",
+    "Plan": "planning.result",
+    "PlanOptions": "planning.options",
+    "Polygon": "scene.polygon",
+    "Problem": "problem.definition",
+    "ReplayError": "common.errors",
+    "Report": "results.report",
+    "Scene": "scene.model",
+    "Simulation": "simulation.events",
     "SimulationError": "common.errors",
     "SolverError": "common.errors",
+    "Status": "planning.result",
     "TorqueProfile": "results.torque",
     "Trajectory": "results.trajectory",
+    "Until": "problem.definition",
     "WholearmError": "common.errors",
     "load": "geometry.path_guess",
-    "load_trajectory": "results.trajectory",
+    "load_plan": "planning.saved",
+    "load_trajectory": "results.trajectory_file",
+    "place_start": "problem.read",
+    "read_formation": "problem.read",
     "read_torque_csv": "results.torque",
+    "read_until": "problem.read",
+    "save": "results.narrow",
     "simulate": "simulation.simulate",
     "solve": "planning.plan",
     "verify": "verification.verify",
 }
 
 __all__ = [
+    "Contact",
+    "End",
+    "Finger",
+    "Formation",
+    "Friction",
     "InfeasibleError",
     "InputError",
     "JammingError",
+    "Objective",
+    "Phase",
+    "Plan",
+    "PlanOptions",
+    "Polygon",
+    "Problem",
+    "ReplayError",
+    "Report",
+    "Scene",
+    "Simulation",
     "SimulationError",
     "SolverError",
+    "Status",
     "TorqueProfile",
     "Trajectory",
+    "Until",
     "WholearmError",
     "__version__",
     "load",
+    "load_plan",
     "load_trajectory",
+    "place_start",
     "plots",
+    "read_formation",
     "read_torque_csv",
+    "read_until",
+    "save",
     "simulate",
     "solve",
     "verify",

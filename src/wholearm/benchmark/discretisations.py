@@ -18,7 +18,8 @@ from typing import NamedTuple
 from ..common.errors import InfeasibleError, ReplayError, SolverError
 from ..planning.options import CHOICES
 from ..planning.plan import solve
-from ..problem.definition import Problem, read_problem
+from ..problem.definition import Problem
+from ..problem.read import read_problem
 
 INTERVALS = (8, 10, 12, 16, 20, 30, 40)
 DEGREES = (3, 4)
@@ -60,7 +61,7 @@ def plan_each(
             plan = solve(
                 problem, objective, time_intervals=count, degree=degree, scheme=scheme, samples=2
             )
-            values.append(float(plan.meta["value"]))
+            values.append(plan.value)
             text = f"{values[-1]:.8g}"
         except (InfeasibleError, SolverError, ReplayError) as error:
             values.append(None)

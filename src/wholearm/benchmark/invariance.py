@@ -18,7 +18,8 @@ from ..common.arrays import Array
 from ..contacts.elemental import Contact
 from ..planning.options import Objective
 from ..planning.plan import solve
-from ..problem.definition import ROLLING, Problem, build_problem
+from ..problem.definition import Problem
+from ..problem.read import ROLLING, build_problem
 from ..results.trajectory import Trajectory
 
 Table = Mapping[str, Any]
@@ -219,11 +220,9 @@ def answer(
     units = telling.units if telling else _SAME
     if objective == Objective.EFFORT.value:
         options["time_weight"] = units.torque**2
-    trajectory = solve(problem, objective, **options)
+    plan = solve(problem, objective, **options)
     cost = {"time": units.time, "effort": units.torque**2 * units.time, "margin": units.force}
-    return Answer(
-        float(trajectory.meta["value"]) / cost[objective], *_torques(problem, trajectory, telling)
-    )
+    return Answer(plan.value / cost[objective], *_torques(problem, plan.trajectory, telling))
 
 
 def _torques(

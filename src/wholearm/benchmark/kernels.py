@@ -86,7 +86,7 @@ def plan_and_verify(path: str, objective: str) -> Outcome:
     try:
         problem = load(path)
         plan = solve(problem, objective)
-        value = plan.meta["value"]
+        value = plan.value
         fault = "; ".join(verify(problem, plan).failures)
     except WholearmError as error:
         fault = str(error)

@@ -23,7 +23,8 @@ from ..common.errors import InfeasibleError, InputError, SolverError, WholearmEr
 from ..mapping.route import format_route, list_formations
 from ..planning.options import CHOICES
 from ..planning.plan import solve
-from ..problem.definition import Problem, build_problem, read_problem
+from ..problem.definition import Problem
+from ..problem.read import build_problem, read_problem
 from ..verification.verify import verify
 from .stress.plan_check import check_plan
 from .stress.refusals import judge
@@ -145,10 +146,10 @@ def run_leg(leg: Leg, objective: str) -> Outcome:
     except Exception as error:
         return Outcome("traceback", "", repr(error), spent())
     seconds = spent()
-    failures = [*verify(leg.problem, plan).failures, *check_plan(leg.problem, plan)]
+    failures = [*verify(leg.problem, plan).failures, *check_plan(leg.problem, plan.trajectory)]
     if failures:
         return Outcome("plan that fails", "", failures[0], seconds)
-    return Outcome("planned", "", f"{plan.meta['value']:.6g}", seconds)
+    return Outcome("planned", "", f"{plan.value:.6g}", seconds)
 
 
 def name_argument(text: str) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from ..common.errors import InputError
 from ..geometry.path_guess import load
 from ..mapping.route import Route, format_route, list_formations
-from ..problem.definition import build_problem
+from ..problem.read import build_problem
 from .stress.scenes import Table, random_route, random_scene
 from .stress.toml import to_toml
 

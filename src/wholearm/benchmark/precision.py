@@ -27,10 +27,12 @@ from ..planning.path_domain.motion import PathMotion, make_grid
 from ..planning.path_domain.nlp import build_path_nlp
 from ..planning.path_domain.plan import plan_path
 from ..planning.plan import solve
-from ..problem.definition import End, Problem, read_problem
+from ..problem.definition import End, Problem
+from ..problem.read import read_problem
 from ..results.torque import TorqueProfile
 from ..simulation.events import Simulation
 from ..simulation.simulate import simulate
+from ..solvers.statistics import open_ledger
 from ..verification.verify import verify
 from .baseline_opti import plan_with_opti
 from .baseline_simulation import simulate_with_scipy
@@ -123,7 +125,7 @@ def measure_planner(problem: Problem) -> list[Row]:
             started = time.perf_counter()
             times = _plan_times(problem, curves, intervals)
             seconds.append(time.perf_counter() - started)
-        trajectory = solve(problem, intervals=intervals)
+        trajectory = solve(problem, intervals=intervals).trajectory
         ends = trajectory.phase_starts[1:]
         simulation = simulate(problem, trajectory.torque, tolerance=1e-11, times=ends)
         missed = 0.0
@@ -271,7 +273,8 @@ def measure_baseline(problem: Problem) -> list[Row]:
     build_path_nlp.cache_clear()
     for phase, curve in zip(problem.phases, trace_phases(problem), strict=True):
         started = time.perf_counter()
-        plan = plan_path(curve, problem.epsilon, options, phase.number)
+        with open_ledger() as ledger:
+            plan = plan_path(curve, problem.epsilon, options, phase.number)
         elapsed = time.perf_counter() - started
         plain = plan_with_opti(curve, problem.epsilon, BASELINE_INTERVALS)
         took = plain.build_time + plain.solve_time
@@ -279,7 +282,7 @@ def measure_baseline(problem: Problem) -> list[Row]:
         number = f"phase {phase.number}"
         alone = replace(problem, start=curve.start, phases=(replace(phase, index=0),))
         for method, seconds, duration, torque, iterations in (
-            ("path NLP", elapsed, plan.motion.duration, plan.torque, plan.iterations),
+            ("path NLP", elapsed, plan.motion.duration, plan.torque, ledger.of(0).iterations),
             ("plain Opti", took, plain.duration, plain.torque, plain.iterations),
         ):
             margins = verify(alone, torque).phases[0].contacts
@@ -319,12 +322,12 @@ def measure_parts(problem: Problem) -> list[Row]:
     timed(
         "build the NLP", lambda: build_path_nlp(4, PlanOptions().intervals, Objective.TIME), forget
     )
-    trajectory = timed("plan and sample (NLP built)", lambda: solve(problem))
-    rows.append(Row("parts", "Ipopt alone", "", trajectory.meta["timings"]["solve"], None))
+    plan = timed("plan and sample (NLP built)", lambda: solve(problem))
+    rows.append(Row("parts", "Ipopt alone", "", plan.timings.solve, None))
     with tempfile.TemporaryDirectory() as folder:
         path = os.path.join(folder, "plan.npz")
-        timed("write", lambda: trajectory.save(path))
-        timed("simulate", lambda: simulate(problem, trajectory.torque))
+        timed("write", lambda: plan.save(path))
+        timed("simulate", lambda: simulate(problem, plan.trajectory.torque))
         imports = [sys.executable, "-c", "import casadi, numpy"]
         timed("process: import casadi, numpy", lambda: _run(imports))
         if problem.source:

@@ -20,6 +20,7 @@ from ..planning.time_domain.search import Search
 from ..planning.time_domain.staging import guess_stages
 from ..problem.definition import Phase, Problem
 from ..simulation.simulate import simulate
+from ..solvers.statistics import open_ledger
 from .report import Row
 
 SCHEMES = (("radau", 2), ("radau", 3), ("radau", 4), ("legendre", 2), ("legendre", 3))
@@ -91,7 +92,9 @@ def measure_transcriptions(problem: Problem) -> list[Row]:
         for intervals in TIME_INTERVALS:
             options = PlanOptions(time_intervals=intervals, transcription="time")
             started = time.perf_counter()
-            plan = plan_phases(problem, (phase,), z, options)[0]
+            with open_ledger() as ledger:
+                plan = plan_phases(problem, (phase,), z, options)[0]
+            cost = ledger.of(0)
             seconds = time.perf_counter() - started
             rows.append(
                 Row(
@@ -100,7 +103,7 @@ def measure_transcriptions(problem: Problem) -> list[Row]:
                     f"{intervals} intervals",
                     seconds,
                     plan.value / least.value - 1,
-                    f"{plan.iterations} iterations in {plan.solves} solves",
+                    f"{cost.iterations} iterations in {cost.solves} solves",
                 )
             )
         z = curve.end
@@ -116,19 +119,20 @@ def measure_blocks(problem: Problem) -> list[Row]:
     if all(runs_on_curve(phase) for phase in problem.phases):
         return rows
     for goal in ("time", "effort", "margin"):
-        trajectory = solve(problem, goal)
-        timings = trajectory.meta["timings"]
+        plan = solve(problem, goal)
+        trajectory, timings = plan.trajectory, plan.timings
         ends = trajectory.phase_starts[1:]
         simulation = simulate(problem, trajectory.torque, tolerance=1e-11, times=ends)
         missed = 0.0
         for motion, end in zip(trajectory.motions, ends, strict=True):
             planned = motion.evaluate(np.array([motion.duration])).z[0]
             missed = max(missed, float(np.abs(planned - simulation.at(end)[:5]).max()))
-        for phase, count in enumerate(trajectory.meta["iterations"]):
-            solves = trajectory.meta["solves"][phase]
-            if isinstance(trajectory.motions[phase], TimeMotion) and solves:
-                note = f"{count} iterations in {solves} solves from phase {phase + 1}"
-        share = timings["build"] / timings["plan"]
+        for phase, motion in zip(plan.phases, trajectory.motions, strict=True):
+            cost = phase.statistics
+            if isinstance(motion, TimeMotion) and cost.solves:
+                note = f"{cost.iterations} iterations in {cost.solves} solves"
+                note += f" from phase {phase.number}"
+        share = timings.build / timings.plan
         note += f"; building is {share:.0%} of planning"
-        rows.append(Row("time domain: whole plans", goal, "default", timings["plan"], missed, note))
+        rows.append(Row("time domain: whole plans", goal, "default", timings.plan, missed, note))
     return rows

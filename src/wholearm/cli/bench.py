@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+
+from .progress import clear_progress, show_progress
 
 STUDIES = ("problem", "stress")
 """What can follow ``bench``; the word ``problem`` may be left out."""
@@ -21,14 +23,14 @@ def name_study(arguments: Sequence[str]) -> list[str]:
     return ["bench", "problem", *given[1:]]
 
 
-def add_bench(bench: argparse.ArgumentParser, progress: Callable[[], object]) -> None:
+def add_bench(bench: argparse.ArgumentParser) -> None:
     """Give the parser of ``bench`` its studies."""
     studies = bench.add_subparsers(metavar="STUDY", required=True)
     text = "measure run time against error (the word problem may be left out)"
     problem = studies.add_parser("problem", help=text, description=text)
     problem.add_argument("problem", help="problem file (TOML)")
     problem.add_argument("-o", "--output", default="results", help="folder for tables and figures")
-    problem.set_defaults(run=lambda options: _measure(options, progress))
+    problem.set_defaults(run=_measure)
 
     text = "plan generated scenes and read damaged files, and count what must not happen"
     stress = studies.add_parser("stress", help=text, description=text)
@@ -43,22 +45,21 @@ def add_bench(bench: argparse.ArgumentParser, progress: Callable[[], object]) ->
     stress.add_argument("--fresh", action="store_true", help=words)
     stress.add_argument("--again", action="store_true", help="run again what had findings")
     stress.add_argument("-o", "--output", default="results", help="folder for records and table")
-    stress.set_defaults(run=lambda options: _stress(options, progress))
+    stress.set_defaults(run=_stress)
 
 
-def _measure(options: argparse.Namespace, progress: Callable[[], object]) -> int:
+def _measure(options: argparse.Namespace) -> int:
     from ..benchmark.precision import run_bench
     from ..geometry.path_guess import load
 
-    show = progress()
-    written = run_bench(load(options.problem), options.output, progress=show)  # type: ignore[arg-type]
-    _clear(show)
+    written = run_bench(load(options.problem), options.output, progress=show_progress())
+    clear_progress()
     for path in written:
         print(f"wrote {path}")
     return 0
 
 
-def _stress(options: argparse.Namespace, progress: Callable[[], object]) -> int:
+def _stress(options: argparse.Namespace) -> int:
     from ..benchmark.stress.study import StressOptions, run_only, run_stress
     from ..geometry.path_guess import load
 
@@ -80,9 +81,8 @@ def _stress(options: argparse.Namespace, progress: Callable[[], object]) -> int:
         print(json.dumps(records, indent=2))
         print(f"wrote {path}")
         return 1 if any(record["findings"] for record in records) else 0
-    show = progress()
-    text, path, count = run_stress(chosen, options.output, show)  # type: ignore[arg-type]
-    _clear(show)
+    text, path, count = run_stress(chosen, options.output, show_progress())
+    clear_progress()
     print(text)
     print(f"wrote {path}")
     return 1 if count else 0
@@ -103,8 +103,3 @@ def _write_scene(seed: int, number: int, folder: str) -> str:
     text = to_toml(draw_case(seed, number).table)
     write_whole(path, lambda stream: stream.write(text.encode()))
     return path
-
-
-def _clear(show: object) -> None:
-    if callable(show):
-        show("")

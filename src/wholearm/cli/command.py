@@ -11,16 +11,18 @@ import errno
 import json
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
 from ..common.errors import InputError, WholearmError, name_source
 from ..common.interrupts import guard
+from .arguments import add_map, add_plot, add_solve, add_verify
 from .bench import add_bench, name_study
+from .progress import clear_progress, show_progress
 
 if TYPE_CHECKING:
+    from ..planning.result import Plan
     from ..planning.table_check import Table
-    from ..problem.definition import Problem
     from ..results.torque import TorqueProfile
     from ..results.trajectory import Trajectory
 
@@ -33,7 +35,7 @@ class _Parser(argparse.ArgumentParser):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status."""
     given = sys.argv[1:] if arguments is None else arguments
-    return guard(lambda: _run(given), _clear_progress)
+    return guard(lambda: _run(given), clear_progress)
 
 
 def _run(given: Sequence[str]) -> int:
@@ -44,7 +46,7 @@ def _run(given: Sequence[str]) -> int:
         sys.stdout.flush()
         return status
     except WholearmError as error:
-        _clear_progress()
+        clear_progress()
         _complain(str(error))
         return error.exit_status
     except BrokenPipeError:
@@ -76,84 +78,17 @@ def build_parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="wholearm", description="Plan and verify whole-arm manipulation.")
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-
-    solve = _command(commands, "solve", _solve, "plan joint torques for a problem file")
-    solve.add_argument("problem", help="problem file (TOML)")
-    solve.add_argument("-o", "--output", help="trajectory file to write (default: NAME.npz)")
-    solve.add_argument("--torques", metavar="FILE", help="also write the torques as CSV")
-    text = "write samples of the torques at this rate [Hz] instead, and what becomes of the motion"
-    solve.add_argument("--sample-rate", metavar="HZ", type=float, help=text)
-    text = "of samples: linear (the default), or hold for sample-and-hold"
-    solve.add_argument("--interpolation", help=text)
-    solve.add_argument("--objective", default="time", help="time, effort or margin (default: time)")
-    solve.add_argument("--intervals", type=int, help="intervals of each phase's grid")
-    solve.add_argument("--duration", type=float, help="longest duration [s], for margin")
-    solve.add_argument("--time-weight", type=float, help="weight of time [(N m)^2], for effort")
-    solve.add_argument("--samples", type=int, help="rows per phase of the trajectory file")
-    solve.add_argument("--transcription", help="auto, or time for the time domain throughout")
-    solve.add_argument(
-        "--opening", type=float, help="least acceleration of contacts that are let go, over gravity"
-    )
-    solve.add_argument(
-        "--clearance",
-        type=float,
-        help="least gap of contacts that were let go, over the radius of gyration",
-    )
-    solve.add_argument("--time-intervals", type=int, help="intervals of a phase in the time domain")
-    solve.add_argument("--degree", type=int, help="collocation points of an interval there")
-    solve.add_argument("--scheme", help="radau (the default) or legendre points")
-    text = "keep the contact modes of the first plan that is found"
-    solve.add_argument("--no-mode-search", dest="mode_search", action="store_false", help=text)
-    text = "return the plan without replaying it"
-    solve.add_argument("--no-replay", dest="replay", action="store_false", help=text)
-    solve.add_argument("--json", action="store_true", help="print the summary as JSON")
-
-    verify = _command(commands, "verify", _verify, "replay torques open loop and check the motion")
-    verify.add_argument("problem", help="problem file (TOML)")
-    verify.add_argument("torques", help="trajectory file (.npz) or torques (.csv: t,tau1,tau2)")
-    verify.add_argument(
-        "--tolerance",
-        type=float,
-        default=1e-9,
-        help="of the simulator's steps, relative to the scene's scales (1e-9)",
-    )
-    text = (
-        "how far the replay may be from the plan, over the object's radius of gyration, and in rad"
-    )
-    verify.add_argument("--departure", type=float, help=f"{text} (1e-3)")
-    text = "speed that passes for rest, over the root of that radius times gravity"
-    verify.add_argument("--rest-speed", type=float, help=f"{text} (2e-2)")
-    text = "also list the paper's scalar equation of motion where a phase has four constraints"
-    verify.add_argument("--reduced", action="store_true", help=text)
-    verify.add_argument("--json", action="store_true", help="print the report as JSON")
-
-    plot = _command(commands, "plot", _plot, "draw force margins, torques and snapshots")
-    plot.add_argument("trajectory", help="trajectory file (.npz)")
-    plot.add_argument("-o", "--output", required=True, help="figure to write (.png, .pdf, .svg)")
-    plot.add_argument("--simulate", action="store_true", help="overlay the simulated forces")
-
-    chart = _command(commands, "map", _map, "draw the contact formations over (x, phi)")
-    chart.add_argument("problem", help="problem file (TOML)")
-    chart.add_argument("-o", "--output", help="figure to write (default: map_NAME.png)")
-    chart.add_argument("--plan", metavar="FILE", help="trajectory file (.npz) to draw over it")
-    chart.add_argument("--phi", metavar="LOW,HIGH", help="range of phi [deg] (default: the plan's)")
-    text = "print the formations along a route of two or more poses [m, deg] as [[phases]]"
-    chart.add_argument("--list", metavar="X,PHI", nargs="+", help=text)
-
-    text = "measure run time against error, or run the stress study"
-    bench = commands.add_parser("bench", help=text, description=f"{text[0].upper()}{text[1:]}.")
-    add_bench(bench, _progress)
-    return parser
-
-
-def _command(
-    commands: argparse._SubParsersAction[_Parser],
-    name: str,
-    run: Callable[[argparse.Namespace], int],
-    text: str,
-) -> argparse.ArgumentParser:
-    parser = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
-    parser.set_defaults(run=run)
+    for name, add, run, text in (
+        ("solve", add_solve, _solve, "plan joint torques for a problem file"),
+        ("verify", add_verify, _verify, "replay torques open loop and check the motion"),
+        ("plot", add_plot, _plot, "draw force margins, torques and snapshots"),
+        ("map", add_map, _map, "draw the contact formations over (x, phi)"),
+        ("bench", add_bench, None, "measure run time against error, or run the stress study"),
+    ):
+        own = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
+        if run is not None:
+            own.set_defaults(run=run)
+        add(own)
     return parser
 
 
@@ -188,19 +123,19 @@ def _solve(options: argparse.Namespace) -> int:
             require_ending(path, ending)
     _check_sampling(options)
     problem = load(options.problem)
-    trajectory = solve_with(problem, plan_options, _progress())
-    table = None if options.torques is None else _make_table(options, problem, trajectory)
+    plan = solve_with(problem, plan_options, show_progress())
+    table = None if options.torques is None else _make_table(options, plan)
     with together():
-        trajectory.save(output)
+        plan.save(output)
         if table is not None:
             write_text(options.torques, format_rows(table.rows))
-    _clear_progress()
+    clear_progress()
     figures = None if table is None else {"file": options.torques, **table.figures}
     if options.json:
         extra = {} if figures is None else {"torques": figures}
-        print(json.dumps({**trajectory.meta, **extra}, indent=2))
+        print(json.dumps({**plan.meta, **extra}, indent=2))
     else:
-        print(summarise(trajectory, output, figures))
+        print(summarise(plan, output, figures))
     return 0
 
 
@@ -217,14 +152,16 @@ def _check_sampling(options: argparse.Namespace) -> None:
     require_sampling(options.sample_rate, options.interpolation or "linear")
 
 
-def _make_table(options: argparse.Namespace, problem: Problem, trajectory: Trajectory) -> Table:
+def _make_table(options: argparse.Namespace, plan: Plan) -> Table:
     """The torque table that is asked for, replayed."""
     from ..planning.table_check import make_table, sample_table
 
     if options.sample_rate is None:
-        return make_table(problem, trajectory, options.replay)
+        return make_table(plan.problem, plan.trajectory, options.replay)
     interpolation = options.interpolation or "linear"
-    return sample_table(problem, trajectory, options.sample_rate, interpolation, options.replay)
+    return sample_table(
+        plan.problem, plan.trajectory, options.sample_rate, interpolation, options.replay
+    )
 
 
 def _stem(path: str) -> str:
@@ -232,10 +169,14 @@ def _stem(path: str) -> str:
 
 
 def _verify(options: argparse.Namespace) -> int:
+    from ..common.files import require_ending, require_writable
     from ..common.require import require_number
     from ..geometry.path_guess import load
     from ..verification.verify import verify
 
+    if options.output is not None:
+        require_writable(options.output)
+        require_ending(options.output, ".npz")
     given = {
         key: require_number(getattr(options, key), f"--{key.replace('_', '-')}", positive=True)
         for key in ("tolerance", "departure", "rest_speed")
@@ -244,15 +185,19 @@ def _verify(options: argparse.Namespace) -> int:
     problem = load(options.problem)
     torques = _read_torques(options.torques)
     report = verify(problem, torques, reduced=options.reduced, **given)
-    _clear_progress()
+    clear_progress()
     print(json.dumps(report.to_dict(), indent=2) if options.json else report.to_text())
+    if options.output is not None:
+        report.trajectory.save(options.output)
+        if not options.json:
+            print(f"wrote {options.output}")
     return report.exit_status
 
 
 def _read_torques(path: str) -> Trajectory | TorqueProfile:
     from ..common.files import require_ending
     from ..results.torque import read_torque_csv
-    from ..results.trajectory import load_trajectory
+    from ..results.trajectory_file import load_trajectory
 
     csv = require_ending(path, ".npz", ".csv") == ".csv"
     return read_torque_csv(path) if csv else load_trajectory(path)
@@ -261,7 +206,7 @@ def _read_torques(path: str) -> Trajectory | TorqueProfile:
 def _plot(options: argparse.Namespace) -> int:
     from ..common.files import require_writable
     from ..figures import plots
-    from ..results.trajectory import load_trajectory
+    from ..results.trajectory_file import load_trajectory
 
     plots.require_format(options.output)
     require_writable(options.output)
@@ -269,19 +214,20 @@ def _plot(options: argparse.Namespace) -> int:
     with name_source(options.trajectory):
         simulation = None
         if options.simulate:
+            from ..problem.read import read_own_problem
             from ..simulation.simulate import simulate
 
-            problem = plots.read_own_problem(trajectory)
-            simulation = simulate(problem, trajectory.torque, progress=_progress())
+            problem = read_own_problem(trajectory.meta)
+            simulation = simulate(problem, trajectory.torque, progress=show_progress())
         figure = plots.force_margins(trajectory, simulation=simulation)
     plots.save(figure, options.output)
-    _clear_progress()
+    clear_progress()
     print(f"wrote {options.output}")
     return 0
 
 
 def _map(options: argparse.Namespace) -> int:
-    from ..problem.definition import read_problem
+    from ..problem.read import read_problem
 
     route = [_read_pair(text, "--list", "X,PHI in m and degrees") for text in options.list or ()]
     phi = options.phi and _read_pair(options.phi, "--phi", "LOW,HIGH in degrees")
@@ -304,8 +250,8 @@ def _draw_map(options: argparse.Namespace, phi: tuple[float, float] | None) -> i
     from ..figures import plots
     from ..figures.formation_map import draw_map
     from ..mapping.formation_map import build_map, choose_window
-    from ..problem.definition import read_problem
-    from ..results.trajectory import load_trajectory
+    from ..problem.read import read_problem
+    from ..results.trajectory_file import load_trajectory
 
     output = options.output or f"map_{_stem(options.problem)}.png"
     plots.require_format(output)
@@ -313,8 +259,8 @@ def _draw_map(options: argparse.Namespace, phi: tuple[float, float] | None) -> i
     problem = read_problem(options.problem)
     plan = None if options.plan is None else load_trajectory(options.plan)
     window = choose_window(problem, phi)
-    plots.save(draw_map(build_map(problem, window=window, progress=_progress()), plan), output)
-    _clear_progress()
+    plots.save(draw_map(build_map(problem, window=window, progress=show_progress()), plan), output)
+    clear_progress()
     print(f"wrote {output}", file=sys.stderr if options.list else sys.stdout)
     return 0
 
@@ -334,19 +280,3 @@ def _protect(text: str) -> str:
     """Keep argparse from taking a pair of numbers that starts with a minus for an option."""
     pair = text[:1] == "-" and text[1:2] in tuple(".0123456789") and "," in text
     return f" {text}" if pair else text
-
-
-def _progress() -> Callable[[str], None] | None:
-    """A progress line on stderr when that is a terminal."""
-    if not sys.stderr.isatty():
-        return None
-
-    def show(text: str) -> None:
-        print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
-
-    return show
-
-
-def _clear_progress() -> None:
-    if sys.stderr.isatty():
-        print("\r\033[K", end="", file=sys.stderr, flush=True)

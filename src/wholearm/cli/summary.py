@@ -2,54 +2,56 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ..results.trajectory import Trajectory
+    from ..planning.result import Plan
+    from ..results.replay_figures import ReplayFigures
 
 
-def summarise(trajectory: Trajectory, output: str, table: Mapping[str, Any] | None = None) -> str:
+def summarise(plan: Plan, output: str, table: Mapping[str, Any] | None = None) -> str:
     """What has been planned, as text.
 
     Parameters
     ----------
-    trajectory : Trajectory
+    plan : Plan
     output : str
         The trajectory file.
     table : mapping, optional
         Name and figures of the torque table, if one is written; see `planning.table_check`.
     """
-    meta = trajectory.meta
+    trajectory = plan.trajectory
     lines = [
         f"{'phase':>5}  {'duration [s]':>12}  {'least c_n [N]':>13}  {'largest |tau| [N m]':>19}"
     ]
-    for index, duration in enumerate(meta["phase_durations"]):
+    for index, phase in enumerate(plan.phases):
         rows = trajectory.phase == index
         c_n = trajectory.c_n[rows]
         least = c_n[c_n == c_n].min()
         torque = abs(trajectory.tau[rows]).max()
-        lines.append(f"{index + 1:>5}  {duration:>12.6f}  {least:>13.6f}  {torque:>19.6f}")
-    lines += _list_modes(meta)
-    lines += _list_transitions(meta)
-    value = f"{meta['objective']} = {meta['value']:.6f} {meta['value_unit']}"
-    lines += _list_replay(meta.get("replay"))
+        lines.append(f"{phase.number:>5}  {phase.duration:>12.6f}  {least:>13.6f}  {torque:>19.6f}")
+    lines += _list_modes(plan)
+    lines += _list_transitions(plan)
+    lines += [_describe_replay(plan.replay)]
     lines += _list_table(table) if table is not None else []
-    return "\n".join([*lines, f"{value}, {trajectory.duration:.6f} s in all; wrote {output}"])
+    value = f"{plan.status.value}: {plan.options.goal.value} = {plan.value:.6f} {plan.unit}"
+    return "\n".join([*lines, f"{value}, {plan.duration:.6f} s in all; wrote {output}"])
 
 
-def _list_replay(replay: Mapping[str, Any] | None) -> list[str]:
+def _describe_replay(replay: ReplayFigures | None) -> str:
     """What the replay of the plan has shown, in a line."""
     if replay is None:
-        return ["the plan was not replayed"]
-    ends = [phase["end_deviation"] for phase in replay["phases"] if phase["end_deviation"]]
-    far = [max((end[unit] for end in ends), default=0.0) for unit in ("m", "rad")]
-    least, finer = replay["least_c_n"], max(replay["refinements"])
+        return "the plan was not replayed"
+    ends = [phase.end_deviation for phase in replay.phases if phase.end_deviation]
+    least, finer = replay.least_c_n, max(replay.refinements)
     text = (
-        f"replayed: least c_n {least['value']:.6f} N on {least['contact']}, off by at most "
-        f"{far[0]:.1e} m and {far[1]:.1e} rad at the ends of phases"
+        f"replayed: least c_n {least.value:.6f} N on {least.contact}, off by at most "
+        f"{max((end.position for end in ends), default=0.0):.1e} m and "
+        f"{max((end.angle for end in ends), default=0.0):.1e} rad at the ends of phases"
     )
-    return [text + (f", with up to {2**finer} times the intervals" if finer > 0 else "")]
+    return text + (f", with up to {2**finer} times the intervals" if finer > 0 else "")
 
 
 def _list_table(table: Mapping[str, Any]) -> list[str]:
@@ -74,42 +76,41 @@ def _list_table(table: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _list_modes(meta: Mapping[str, Any]) -> list[str]:
+def _list_modes(plan: Plan) -> list[str]:
     """Contact modes of the phases that were planned in the time domain; empty if none was."""
     lines: list[str] = []
     words = {"+": " slides +", "-": " slides -", "rolls": " rolls"}
-    for index, (modes, tried) in enumerate(zip(meta["modes"], meta["sequences"], strict=True)):
-        for mode in modes:
-            contacts = ", ".join(name + words[how] for name, how in mode["contacts"].items())
-            span = f"{mode['start']:.4f} to {mode['stop']:.4f} s"
-            joints = " ".join(mode["joints"])
-            lines.append(f"{index + 1:>5}  {span}: {contacts}; joints turn {joints}")
-        if tried:
-            lines[-1] += f"; best of {tried} sequences of modes"
+    for phase in plan.phases:
+        for mode in phase.modes:
+            contacts = ", ".join(name + words[how] for name, how in mode.contacts.items())
+            span = f"{mode.start:.4f} to {mode.stop:.4f} s"
+            joints = " ".join(mode.joints)
+            lines.append(f"{phase.number:>5}  {span}: {contacts}; joints turn {joints}")
+        if phase.sequences:
+            lines[-1] += f"; best of {phase.sequences} sequences of modes"
     return ["", "modes, from the start of each phase", *lines, ""] if lines else []
 
 
-def _list_transitions(meta: Mapping[str, Any]) -> list[str]:
+def _list_transitions(plan: Plan) -> list[str]:
     """Table of the impacts that a problem asks for; empty if it has none."""
-    transitions = meta["transitions"]
-    if not transitions:
+    if not plan.transitions:
         return []
-    saves = f"saves [{meta['value_unit']}]"
+    saves = f"saves [{plan.unit}]"
     width = len(saves)
     lines = [
         "",
         f"{'after phase':>11}  {'velocity ratio':>14}  {'least impulse [N s per m/s]':>27}  "
         f"{'speed [m/s]':>11}  {saves}",
     ]
-    for row in transitions:
-        impulse = f"{_show(row['least_impulse'])} {row['least_impulse_contact']}"
+    for row in plan.transitions:
+        impulse = f"{_show(row.least_impulse)} {row.least_impulse_contact}"
         lines.append(
-            f"{row['phase']:>11}  {_show(row['velocity_ratio']):>14}  {impulse:>27}  "
-            f"{_show(row['speed']):>11}  {_show(row['saves']):>{width}}"
-            + ("" if row["possible"] else f"  stops: {row['reason']}")
+            f"{row.phase:>11}  {_show(row.velocity_ratio):>14}  {impulse:>27}  "
+            f"{_show(row.speed):>11}  {_show(row.saves):>{width}}"
+            + ("" if row.possible else f"  stops: {row.reason}")
         )
     return [*lines, ""]
 
 
 def _show(value: float | None) -> str:
-    return "-" if value is None else f"{value:.6f}"
+    return "-" if value is None or math.isnan(value) else f"{value:.6f}"

@@ -42,8 +42,11 @@ def find_steps(trajectory: Trajectory) -> NDArray[np.int64]:
     stepping = np.abs(after - before).max(axis=1) > STEP * np.abs(profile.coefficients).max()
     breaks, starts = profile.breaks[1:-1], trajectory.phase_starts
     inner = np.abs(breaks[:, None] - starts).min(axis=1) > 1e-9 * trajectory.duration
-    steps = np.searchsorted(trajectory.t, breaks[stepping & inner], side="right")
-    phases = np.flatnonzero(np.diff(trajectory.phase)) + 1
+    t = trajectory.t
+    # Where a time is there twice, in a replay, the step is between the two rows.
+    repeated = np.flatnonzero(np.diff(t) == 0) + 1
+    steps = np.searchsorted(t, np.setdiff1d(breaks[stepping & inner], t[repeated]), side="right")
+    phases = np.append(np.flatnonzero(np.diff(trajectory.phase)) + 1, repeated)
     # The friction of a contact that rolls passes zero without a step.
     slid = np.where(trajectory.rolling, 0.0, trajectory.c_t)
     turns = np.flatnonzero((slid[1:] * slid[:-1] < 0).any(axis=1)) + 1

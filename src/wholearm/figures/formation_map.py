@@ -24,7 +24,7 @@ from ..geometry.closing import Flags, Numbers
 from ..mapping.formation_map import CROSSED, Border, FormationMap
 from ..mapping.route import trace_problem
 from ..results.trajectory import Trajectory
-from .plots import _STYLE
+from .style import STYLE
 
 SIZE = (11.0, 7.9)  # in
 _BOX = (0.75, 1.0, 9.4, 6.2)  # axes: left, bottom, width, height [in]
@@ -66,7 +66,7 @@ def draw_map(chart: FormationMap, plan: Trajectory | None = None) -> Figure:
     Figure
         With one axes: x [mm] and phi [deg].
     """
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=SIZE)
         FigureCanvasAgg(figure)
         left, bottom, width, height = _BOX

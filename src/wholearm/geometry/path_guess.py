@@ -14,7 +14,8 @@ from ..contacts.formation import Formation
 from ..contacts.limits import build_limits
 from ..mechanics.dynamics import Directions
 from ..mechanics.metric import metric_weights
-from ..problem.definition import Phase, Problem, read_problem
+from ..problem.definition import Phase, Problem
+from ..problem.read import read_problem
 from .curve import Curve, tangent_basis
 from .explore import Ending, close_contacts, explore, is_inside
 from .tracing import require_touching, runs_on_curve, trace_phase, trace_phases

@@ -21,6 +21,7 @@ from ..mechanics.metric import measure_speed
 from ..problem.definition import End, Phase, Problem
 from ..results.trajectory import Motion
 from ..scene.model import Scene
+from ..solvers.statistics import charge
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence
 from .path_domain.sequence_plan import plan_sequence
@@ -118,11 +119,6 @@ class Planning:
     def plans(self) -> Plans:
         """One for each phase."""
         return [plan for block in self.blocks for plan in block.plans]
-
-    @property
-    def sequences(self) -> list[ImpactSequence]:
-        """The curves of the blocks that are planned along them."""
-        return [block.chain for block in self.blocks if block.chain is not None]
 
 
 def split_blocks(problem: Problem) -> list[tuple[Phase, ...]]:
@@ -250,7 +246,8 @@ def _plan_block(
     if not runs_along_curves(block, options):
         from .time_domain.impacts import plan_with_impacts
 
-        plans += plan_with_impacts(problem, block, z, options, add_up(block, allowed), to_go)
+        with charge(block[0].number):
+            plans += plan_with_impacts(problem, block, z, options, add_up(block, allowed), to_go)
         return plans, None
     curves, known = [], trace_phases(problem)
     for phase in block:
@@ -259,7 +256,8 @@ def _plan_block(
         z = curves[-1].end
     chain = make_sequence(block, curves)
     for part in chain.split():
-        plans += plan_sequence(part, problem.epsilon, options, add_up(part.phases, allowed))
+        with charge(part.phases[0].number):
+            plans += plan_sequence(part, problem.epsilon, options, add_up(part.phases, allowed))
     return plans, chain
 
 

@@ -17,6 +17,7 @@ from ..mechanics.impact import Impact
 from ..problem.definition import Phase
 from ..results.trajectory import Motion
 from ..results.transition import Transition
+from ..solvers.statistics import charge
 from .options import Objective, PlanOptions
 from .phase_plan import PhasePlan, add_up, combine
 from .stops import PlanPart, plan_stops
@@ -89,7 +90,8 @@ def assess_impacts(
             report(f"phase {phase.number}: what its impact saves")
             start, stop = max(k for k in stops if k < at), min(k for k in stops if k > at)
             duration = add_up(block[start:stop], allowed)
-            saves = _find_saving(plans, (start, at, stop), plan_part, options, duration)
+            with charge(phase.number):
+                saves = _find_saving(plans, (start, at, stop), plan_part, options, duration)
         contact, impulse = own.impact.least
         until = str(phase.until)
         found.append(

@@ -23,22 +23,18 @@ class PhasePlan(NamedTuple, Generic[M_co]):
         From the start of the phase.
     value : float
         The phase's share of the objective: s, (N m)^2 s or N.
-    iterations, solves : int
-        Of the solver in all, and how often it ran. Of phases in one NLP only the first one counts.
-    build_time, solve_time : float, [s]
-        The same for them.
     sequences : int
-        Sequences of contact modes that were tried; none along curves.
+        Sequences of contact modes that were tried, of phases in one NLP booked to the first; none
+        along curves.
+    complete : bool
+        Whether the search for contact modes has tried all that promised to be better.
     """
 
     motion: M_co
     torque: TorqueProfile
     value: float
-    iterations: int
-    solves: int
-    build_time: float
-    solve_time: float
     sequences: int = 0
+    complete: bool = True
 
 
 def add_up(phases: Sequence[Phase], allowed: Sequence[float | None]) -> float | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -16,19 +16,15 @@ from ..common.sharing import exclusive
 from ..geometry.tracing import trace_phases
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
-from ..results.trajectory import Motion, Trajectory, assemble
+from ..results.trajectory import Trajectory, assemble
 from ..results.transition import Transition
+from ..solvers.statistics import Ledger, open_ledger
 from .blocks import Planning, plan_blocks
 from .impacts import assess_impacts
-from .options import Objective, PlanOptions
-from .phase_plan import PhasePlan, combine
-
-_SETTINGS = (
-    "intervals", "transcription", "time_weight", "duration", "time_intervals", "degree", "scheme",
-    "opening", "clearance",
-)  # fmt: skip
-"""Options that `meta` says what a plan was made with."""
-UNITS = {Objective.TIME: "s", Objective.EFFORT: "(N m)^2 s", Objective.MARGIN: "N"}
+from .options import PlanOptions
+from .phase_plan import combine
+from .result import Plan, PlannedPhase, Status, Timings
+from .saved import write_meta
 
 
 def solve(
@@ -37,7 +33,7 @@ def solve(
     *,
     progress: Callable[[str], None] | None = None,
     **options: Any,
-) -> Trajectory:
+) -> Plan:
     """Plan joint torques that carry the object through every phase of a problem.
 
     Parameters
@@ -48,13 +44,40 @@ def solve(
         largest least normal force within `duration`.
     progress : callable, optional
         Told in a few words what is being done.
-    **options
-        Other fields of `PlanOptions`, such as `intervals`, `time_weight`, `duration`, `samples` and
-        `replay`.
+    intervals : int
+        Intervals of the grid of each phase along a curve, at least 10; 80 by default.
+    time_weight : float, [(N m)^2]
+        Weight of the duration against the effort, for `effort`; 1 by default.
+    duration : float, optional, [s]
+        What `margin` may take for all phases together; twice the least time by default.
+    samples : int
+        Rows per phase of the trajectory, at least 2; 201 by default.
+    transcription : {"auto", "time"}
+        Phases with one freedom along their curves where that is possible, or all in the time
+        domain.
+    time_intervals : int, optional
+        Intervals of each phase in the time domain, at least 4; by default 32 for a phase with one
+        freedom that is planned alone and 10 for others.
+    degree : int
+        Collocation points per interval in the time domain, from 2 to 6; 3 by default.
+    scheme : {"radau", "legendre"}
+        Which points.
+    opening : float
+        Least acceleration, over gravity, with which the gap of a contact that is let go opens in
+        the time domain; 0.01 by default.
+    clearance : float
+        What that gap is at least, over the object's radius of gyration, from a third of the first
+        stage on; 5e-4 by default.
+    mode_search : bool
+        Whether contact modes are changed, in the time domain, for as long as that makes the plan
+        better; True by default.
+    replay : bool
+        Whether to replay the plan, to refine what does not hold and to return only what does; True
+        by default.
 
     Returns
     -------
-    Trajectory
+    Plan
         Its motions satisfy the equations of motion at any instant.
 
     Raises
@@ -72,89 +95,78 @@ def solve(
 @exclusive
 def solve_with(
     problem: Problem, options: PlanOptions, progress: Callable[[str], None] | None = None
-) -> Trajectory:
+) -> Plan:
     """Plan with `options` given as one object; see `solve`."""
-    started = time.perf_counter()
     report = progress or (lambda _: None)
-    report("tracing the phases")
-    trace_phases(problem)
-    traced = time.perf_counter()
-    planning = plan_blocks(problem, options, report)
-    trajectory = assemble_plan(planning)
-    planned = time.perf_counter()
-    figures = None
-    if options.replay:
-        from .self_check import replay_plan
+    with open_ledger() as ledger:
+        started = time.perf_counter()
+        report("tracing the phases")
+        trace_phases(problem)
+        traced = time.perf_counter()
+        planning = plan_blocks(problem, options, report)
+        trajectory, figures = assemble_plan(planning), None
+        planned = time.perf_counter()
+        if options.replay:
+            from .self_check import replay_plan
 
-        planning, trajectory, figures = replay_plan(planning, trajectory, assemble_plan, report)
-    replayed = time.perf_counter()
-    transitions = _assess(planning, report)
-    every = [*planning.least, *planning.plans]
-    meta = _describe(planning) | {
-        "transitions": [transition.to_dict() for transition in transitions],
-        "replay": figures,
-        "timings": {
-            "trace": traced - started,
-            "build": sum({plan.build_time for plan in every}),
-            "solve": sum(plan.solve_time for plan in every),
-            "plan": planned - started,
-            "replay": replayed - planned,
-            "assess": time.perf_counter() - replayed,
-        },
-    }
-    return replace(trajectory, meta=meta)
-
-
-def assemble_plan(planning: Planning) -> Trajectory:
-    """The trajectory of a planning, but for its `meta`."""
-    torque = TorqueProfile.chain([plan.torque for plan in planning.plans])
-    motions = [plan.motion for plan in planning.plans]
-    # What rolls is a part of the trajectory that is kept in `meta`.
-    meta = {
-        "rolling": _list_rolling(planning.problem),
-        "modes": _list_modes(planning.plans),
-        "phase_durations": [motion.duration for motion in motions],
-    }
-    return assemble(motions, torque, meta, planning.options.samples)
-
-
-def _list_rolling(problem: Problem) -> list[list[str]]:
-    """Names of the rolling contacts of each phase."""
-    return [[c.name for c in phase.formation.rolling] for phase in problem.phases]
-
-
-def _list_modes(plans: Sequence[PhasePlan[Motion]]) -> list[list[dict[str, Any]]]:
-    """Contact modes of each phase, with times from its start; none where it runs on a curve."""
-    return [getattr(plan.motion, "modes", []) for plan in plans]
-
-
-def _describe(planning: Planning) -> dict[str, Any]:
-    """What `meta` says of the problem, the options and the plans."""
-    problem, options, plans = planning.problem, planning.options, planning.plans
-    values = [plan.value for plan in plans]
-    return {
-        "status": "solved",
-        "name": problem.name,
-        "objective": options.goal.value,
-        "value": combine(options.goal, values),
-        "value_unit": UNITS[options.goal],
-        "epsilon": problem.epsilon,
-        "phase_values": values,
-        "rolling": _list_rolling(problem),
-        "modes": _list_modes(plans),
-        "sequences": [plan.sequences for plan in plans],
-        "phase_durations": [plan.motion.duration for plan in plans],
-        **{name: getattr(options, name) for name in _SETTINGS},
-        "iterations": [plan.iterations for plan in plans],
-        "solves": [plan.solves for plan in plans],
-        "versions": {
+            planning, trajectory, figures = replay_plan(planning, trajectory, assemble_plan, report)
+        replayed = time.perf_counter()
+        transitions = _assess(planning, report)
+        assessed = time.perf_counter()
+    phases = _list_phases(planning, ledger)
+    plan = Plan(
+        problem,
+        options,
+        Status.of(phases),
+        combine(options.goal, [phase.value for phase in phases]),
+        trajectory,
+        phases,
+        tuple(transitions),
+        figures,
+        Timings(
+            traced - started,
+            sum(phase.statistics.build_time for phase in phases),
+            sum(phase.statistics.solve_time for phase in phases),
+            planned - started,
+            replayed - planned,
+            assessed - replayed,
+        ),
+        {
             "wholearm": __version__,
             "casadi": ca.__version__,
             "numpy": np.__version__,
             "python": ".".join(map(str, sys.version_info[:3])),
         },
-        "problem": problem.table,
+    )
+    return replace(plan, trajectory=replace(trajectory, meta=write_meta(plan)))
+
+
+def assemble_plan(planning: Planning) -> Trajectory:
+    """The trajectory of a planning; of its `meta` only what the motion itself depends on."""
+    torque = TorqueProfile.chain([plan.torque for plan in planning.plans])
+    phases = _list_phases(planning, Ledger(None))
+    meta = {
+        "rolling": [list(phase.rolling) for phase in phases],
+        "modes": [[mode.to_dict() for mode in phase.modes] for phase in phases],
     }
+    motions = [plan.motion for plan in planning.plans]
+    return assemble(motions, torque, meta, planning.options.samples)
+
+
+def _list_phases(planning: Planning, ledger: Ledger) -> tuple[PlannedPhase, ...]:
+    return tuple(
+        PlannedPhase(
+            phase.number,
+            plan.value,
+            plan.motion.duration,
+            tuple(contact.name for contact in phase.formation.rolling),
+            getattr(plan.motion, "modes", ()),
+            plan.sequences,
+            plan.complete,
+            ledger.of(phase.number),
+        )
+        for phase, plan in zip(planning.problem.phases, planning.plans, strict=True)
+    )
 
 
 def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transition]:

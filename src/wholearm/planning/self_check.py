@@ -8,7 +8,7 @@ at in few instants, since those are what it costs: the plan keeps its limits in 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +21,8 @@ from ..common.errors import (
     SolverError,
 )
 from ..problem.definition import Problem
-from ..results.report import Deviation, Report
+from ..results.replay_figures import LeastForce, ReplayedPhase, ReplayFigures
+from ..results.report import Report
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Samples, Trajectory, assemble
 from ..scene.model import Scales
@@ -124,7 +125,7 @@ def replay_plan(
     trajectory: Trajectory,
     build: Callable[[Planning], Trajectory],
     report: Callable[[str], None],
-) -> tuple[Planning, Trajectory, dict[str, Any]]:
+) -> tuple[Planning, Trajectory, ReplayFigures]:
     """Replay a plan, refine the blocks that do not hold, and return what does, with its figures.
 
     Parameters
@@ -179,7 +180,7 @@ def replay_plan(
         if refined is None:
             raise ReplayError(_describe(planning.blocks[index], number, accepted))
         planning, trajectory = refined, build(refined)
-    return planning, trajectory, _list_figures(planning, check)
+    return planning, trajectory, _collect_figures(planning, check)
 
 
 def check_plan(
@@ -286,33 +287,19 @@ def _describe(block: BlockPlan, number: int, check: Check) -> str:
     )
 
 
-def _list_figures(planning: Planning, check: Check) -> dict[str, Any]:
-    """What `meta` keeps of a replay."""
+def _collect_figures(planning: Planning, check: Check) -> ReplayFigures:
+    """What a plan keeps of its replay."""
     assert isinstance(check.report, Report)
     found = [(find_least_force(phase), phase.number) for phase in check.report.phases]
     known = [(least, number) for least, number in found if least is not None]
     least, number = min(known, key=lambda pair: pair[0].least)
-    return {
-        "least_c_n": {
-            "value": least.least,
-            "contact": least.contact,
-            "phase": number,
-            "time": least.time,
-        },
-        "phases": [
-            {
-                "arrival": own.arrival,
-                "end_speed": own.end_speed,
-                "end_deviation": _list_deviation(own.end_deviation),
-                "deviation": _list_deviation(own.deviation),
-            }
+    return ReplayFigures(
+        LeastForce(least.least, least.contact, number, least.time),
+        tuple(
+            ReplayedPhase(own.arrival, own.end_speed, own.end_deviation, own.deviation)
             for own in check.report.phases
-        ],
-        "residual": check.residual.size,
-        "refinements": [block.finer for block in planning.blocks for _ in block.phases],
-        "steps": check.report.steps,
-    }
-
-
-def _list_deviation(deviation: Deviation | None) -> dict[str, float] | None:
-    return None if deviation is None else {"m": deviation.position, "rad": deviation.angle}
+        ),
+        check.residual.size,
+        tuple(block.finer for block in planning.blocks for _ in block.phases),
+        check.report.steps,
+    )

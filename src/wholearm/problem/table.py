@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..common.errors import InputError
-from ..contacts.formation import place_flush
+from ..contacts.formation import close_finger, place_flush
 from ..scene.model import Scene
 from ..scene.polygon import Polygon
 
@@ -130,8 +130,8 @@ def _to_plain(value: Any) -> Any:
 def match_table(problem: Problem) -> Mapping[str, Any]:
     """Return the problem's table with everything that differs from the problem written into it.
 
-    Empty where there is none, or where the start is no edge flush on the palm, which no file can
-    say.
+    Empty where there is none, or where the start is no edge flush on the palm with both fingers
+    closed, which is all that a file can say.
     """
     table = problem.table
     if not table:
@@ -148,6 +148,25 @@ def match_table(problem: Problem) -> Mapping[str, Any]:
     for key, value in differing.items():
         _set(changed, key, value)
     return changed
+
+
+def write_table(problem: Problem) -> Mapping[str, Any]:
+    """The table of a problem that has none; empty where no file can say its start."""
+    start = _match_start({"flush": 0, "x": None}, problem)
+    if start is None:
+        return {}
+    table: dict[str, Any] = {
+        "name": problem.name,
+        "epsilon": problem.epsilon,
+        "object": {},
+        "fingers": {"1": {}, "2": {}},
+        "friction": {},
+        "start": start,
+        "phases": [_match_phase([], phase) for phase in problem.phases],
+    }
+    for key, value in describe_scene(problem.scene).items():
+        _set(table, key, value)
+    return table
 
 
 def describe_scene(scene: Scene) -> dict[str, Any]:
@@ -192,8 +211,14 @@ def _agrees(table: Mapping[str, Any], key: str, value: object) -> bool:
 
 
 def _match_start(start: Mapping[str, Any], problem: Problem) -> Mapping[str, Any] | None:
-    """The table of the start, or None if no edge is flush there."""
+    """The table of the start, or None if no edge is flush there or a finger is not closed."""
     q, scene = problem.start[:3], problem.scene
+    try:
+        closed = [close_finger(scene, q, finger) for finger in (0, 1)]
+    except InputError:
+        return None
+    if np.abs(problem.start[3:] - closed).max() > 1e-9:
+        return None
     edges = [start["flush"], *range(scene.polygon.n_vertices)]
     for edge in edges:
         flush = edge < scene.polygon.n_vertices and place_flush(scene, edge, float(q[0]))

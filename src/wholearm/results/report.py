@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
+
+from .narrow import Moved
+from .trajectory import Trajectory
 
 
 @dataclass(frozen=True)
@@ -255,6 +258,8 @@ class Report:
         In the order of time.
     reduced : tuple of ReducedState
         The paper's scalar equation along the replay, if that was asked for.
+    replay : Simulation or None
+        What is reported on.
     """
 
     name: str
@@ -272,6 +277,13 @@ class Report:
     steps: int
     changes: tuple[ModeChange, ...] = ()
     reduced: tuple[ReducedState, ...] = ()
+    replay: Moved | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The replayed motion, to be saved and drawn like a plan."""
+        assert self.replay is not None
+        return self.replay.trajectory
 
     @property
     def ok(self) -> bool:
@@ -290,7 +302,8 @@ class Report:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain values for JSON, with None where there is no number."""
-        plain = _plain(asdict(self))
+        plain = _plain(asdict(replace(self, replay=None)))
+        del plain["replay"]
         verdict = {"ok": self.ok, "exit_status": self.exit_status, "reason": self.reason}
         return {**verdict, **plain}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 
@@ -48,3 +49,9 @@ class Transition(NamedTuple):
             key: None if isinstance(value, float) and not math.isfinite(value) else value
             for key, value in self._asdict().items()
         }
+
+    @staticmethod
+    def of(given: Mapping[str, Any]) -> Transition:
+        """The transition that `to_dict` has written."""
+        values: dict[str, Any] = {k: math.nan if v is None else v for k, v in given.items()}
+        return Transition(**values)

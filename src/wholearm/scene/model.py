@@ -32,7 +32,7 @@ S. L. Yeap and J. C. Trinkle, "Dynamic Whole-Arm Dexterous Manipulation in the P
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -186,6 +186,10 @@ class Scene:
         if not isinstance(self.fingers_collide, bool):
             given = f"{self.fingers_collide!r} given; allowed are true and false"
             raise InputError("", "fingers_collide", given)
+        # Messages name a finger by its place here, whatever it was made as.
+        named = zip(self.fingers, ("fingers.1", "fingers.2"), strict=True)
+        fingers = tuple(f if f.name == name else replace(f, name=name) for f, name in named)
+        object.__setattr__(self, "fingers", fingers)
         right, left = (np.asarray(finger.base) for finger in self.fingers)
         if right[0] <= left[0]:
             raise InputError(

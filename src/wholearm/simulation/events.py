@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..mechanics.dynamics import energy
 from ..problem.definition import Phase, Problem
+from ..results.torque import TorqueProfile
+from ..results.trajectory import Trajectory
 from .layout import Outputs
 
 
@@ -146,6 +148,9 @@ class Simulation:
         Every contact of the problem.
     c_n, c_t : ndarray, shape (n, m), [N]
         NaN where a contact is not in the formation, and at rest, where forces are indeterminate.
+    problem : Problem
+    torque : TorqueProfile
+        What was simulated.
     events : tuple of Event
     energies : Energies
     outcome : Outcome
@@ -165,12 +170,21 @@ class Simulation:
     contacts: tuple[str, ...]
     c_n: Array
     c_t: Array
+    problem: Problem = field(repr=False)
+    torque: TorqueProfile = field(repr=False)
     events: tuple[Event, ...]
     energies: Energies
     outcome: Outcome
     missed_by: float
     steps: int
     rejected: int
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The simulated motion as a trajectory, to be saved and drawn like a plan."""
+        from .recording import make_trajectory
+
+        return make_trajectory(self)
 
     def find(self, kind: EventKind) -> tuple[Event, ...]:
         """Events of one kind, in the order of time."""
@@ -214,6 +228,7 @@ def collect(
     problem: Problem,
     sections: Sequence[Section],
     events: Sequence[Event],
+    torque: TorqueProfile,
     outcome: Outcome,
     missed_by: float,
     counts: tuple[int, int],
@@ -245,6 +260,8 @@ def collect(
         contacts=tuple(contact.name for contact in contacts),
         c_n=c_n,
         c_t=c_t,
+        problem=problem,
+        torque=torque,
         events=tuple(sorted(events, key=lambda event: event.time)),
         energies=Energies(stored, y[:, 10], y[:, 11], y[:, 12], y[:, 13], impact),
         outcome=outcome,

@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike
 from ..common.errors import InputError, JammingError, SimulationError
 from ..common.sharing import exclusive
 from ..problem.definition import End, Phase, Problem
+from ..results.narrow import Torques, narrow
 from ..results.torque import TorqueProfile
 from .events import EventKind, Outcome, OutcomeKind, Simulation, collect
 from .jumps import Arrival, Ending, Released, Rested, Switched, is_there
@@ -40,7 +41,7 @@ from .transitions import collide, enter, go_on, set_off
 @exclusive
 def simulate(
     problem: Problem,
-    torque: TorqueProfile,
+    torque: Torques,
     *,
     tolerance: float = 1e-9,
     times: ArrayLike | None = None,
@@ -76,13 +77,14 @@ def simulate(
         If a formation does not close at its start, or the step size underflows. Both errors say in
         which phase.
     """
+    profile, _ = narrow(torque)
     if not 1e-14 <= tolerance <= 1e-2:
         raise InputError("", "tolerance", f"{tolerance!r} is not between 1e-14 and 1e-2")
     wanted = np.sort(np.asarray([] if times is None else times, dtype=float).ravel())
     if not np.isfinite(wanted).all():
         raise InputError("", "times", "holds numbers that are not finite")
     wanted = wanted[np.diff(wanted, prepend=-np.inf) > 0]
-    run = Replay(problem, torque, tolerance, wanted)
+    run = Replay(problem, profile, tolerance, wanted)
     for phase, following in zip(problem.phases, [*problem.phases[1:], None], strict=True):
         if progress is not None:
             progress(f"simulating phase {phase.number} of {len(problem.phases)}")
@@ -92,10 +94,10 @@ def simulate(
             error.phase = phase.number
             raise
         if outcome is not None:
-            return _collect(run, outcome)
+            return _collect(run, profile, outcome)
     goal = problem.phases[-1].until
     text = f"{goal} is reached at t = {run.t:.5g} s, the end of phase {len(problem.phases)}"
-    return _collect(run, Outcome(OutcomeKind.GOAL_REACHED, text))
+    return _collect(run, profile, Outcome(OutcomeKind.GOAL_REACHED, text))
 
 
 def _play(run: Replay, phase: Phase, following: Phase | None) -> Outcome | None:
@@ -227,13 +229,13 @@ def _collapse(run: Replay, rest: Rest, change: Collapse) -> Released | Switched 
     return run.lose(change.contact, change.c_n)
 
 
-def _collect(run: Replay, outcome: Outcome) -> Simulation:
+def _collect(run: Replay, torque: TorqueProfile, outcome: Outcome) -> Simulation:
     """Put everything recorded together."""
     missed = 0.0 if outcome.reached else run.value(run.stepper.rows.until)
     if run.phase.until.is_release:
         missed = math.nan
     counts = (run.steps, run.rejected)
-    return collect(run.problem, run.sections, run.events, outcome, missed, counts)
+    return collect(run.problem, run.sections, run.events, torque, outcome, missed, counts)
 
 
 __all__ = ["simulate"]

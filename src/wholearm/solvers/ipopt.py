@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import casadi as ca
 
 from ..common.arrays import Expression
 from ..common.interrupts import check
+from .statistics import SolverStatistics, book
 
 STOPPED = "User_Requested_Stop"
 """Status of a solver that an interrupt stopped: nothing else asks it to."""
@@ -61,7 +63,10 @@ def build_solver(
         "error_on_fail": False,
         **(derivatives or {}),
     }
-    return Solver(ca.nlpsol(name, "ipopt", nlp, casadi_options))
+    started = time.perf_counter()
+    solver = Solver(ca.nlpsol(name, "ipopt", nlp, casadi_options))
+    book(SolverStatistics(build_time=time.perf_counter() - started))
+    return solver
 
 
 class Solver:
@@ -79,8 +84,11 @@ class Solver:
             If a signal stopped the solver.
         """
         result: dict[str, Expression] = self.function(**arguments)
+        stats = self.function.stats()
+        cost = {"iterations": stats["iter_count"], "solve_time": stats["t_wall_total"]}
+        book(SolverStatistics(solves=1, **cost))
         check()
-        if self.function.stats()["return_status"] == STOPPED:
+        if stats["return_status"] == STOPPED:
             raise KeyboardInterrupt
         return result
 

@@ -10,6 +10,7 @@ from ..common.arrays import Array
 from ..common.errors import InputError
 from ..common.sharing import exclusive
 from ..problem.definition import End, Phase, Problem
+from ..results.narrow import Torques, narrow
 from ..results.report import (
     Deviation,
     EnergyBalance,
@@ -46,23 +47,23 @@ SAMPLES = 2000
 @exclusive
 def verify(
     problem: Problem,
-    what: Trajectory | TorqueProfile,
+    what: Torques,
     *,
     tolerance: float = 1e-9,
     departure: float = DEPARTURE,
     rest_speed: float = REST_SPEED,
     reduced: bool = False,
 ) -> Report:
-    """Replay a trajectory's torques, or given ones, open loop and report what happens.
+    """Replay the torques of a plan, or given ones, open loop and report what happens.
 
     Every contact has to hold, every phase with an end at rest has to be at rest there, and the goal
-    has to be reached. A trajectory has to keep every normal force above epsilon, too, and its
+    has to be reached. A plan has to keep every normal force above epsilon, too, and its
     replay has to stay near it; of torques alone a force below epsilon is a warning.
 
     Parameters
     ----------
     problem : Problem
-    what : Trajectory or TorqueProfile
+    what : Plan, Trajectory or TorqueProfile
     tolerance : float
         Of the simulation.
     departure : float
@@ -81,8 +82,7 @@ def verify(
     JammingError, SimulationError
         If the simulation cannot go on.
     """
-    plan = what if isinstance(what, Trajectory) else None
-    torque = what.torque if isinstance(what, Trajectory) else what
+    torque, plan = narrow(what)
     allowance = Allowance(departure, rest_speed)
     names = {contact.name for contact in problem.contacts}
     if plan is not None and set(plan.contacts) != names:
@@ -138,6 +138,7 @@ def inspect(
             if e.kind in _CHANGES and e.contact
         ),
         reduced=list_reduced_states(problem, simulation) if reduced else (),
+        replay=simulation,
     )
 
 

@@ -17,7 +17,8 @@ from ...common.errors import InputError
 from ...contacts.formation import Formation
 from ...geometry.closing import close_fingers
 from ...mapping.route import Stretch, format_route, list_formations
-from ...problem.definition import Phase, Problem, build_problem
+from ...problem.definition import Phase, Problem
+from ...problem.read import build_problem
 from .newton import locate
 from .scenes import Table, random_route, random_scene
 from .slow_motion import slow_margin

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...planning.plan import solve
-from ...problem.definition import Problem, build_problem
+from ...problem.definition import Problem
+from ...problem.read import build_problem
 from .toml import to_toml
 
 BASE: dict[str, Any] = {
@@ -123,7 +124,9 @@ def base_files() -> tuple[bytes, bytes, bytes]:
             torques = stream.read()
     # Timings and dates would make every run's files different.
     meta = json.loads(str(arrays["meta"]))
-    arrays["meta"] = np.array(json.dumps({**meta, "timings": {}}))
+    none = [0.0] * len(meta["solves"])
+    told = {"timings": {}, "build_times": none, "solve_times": none}
+    arrays["meta"] = np.array(json.dumps(meta | told))
     return to_toml(BASE).encode(), torques, _pack(arrays)
 
 

@@ -12,7 +12,8 @@ import numpy as np
 from ...common.errors import InputError, SolverError, WholearmError
 from ...geometry.path_guess import require_phases
 from ...planning.plan import solve
-from ...problem.definition import Problem, build_problem
+from ...problem.definition import Problem
+from ...problem.read import build_problem
 from ...results.trajectory import Trajectory
 from ...verification.verify import verify
 from .cases import Case, draw_case
@@ -148,7 +149,7 @@ def _plan(problem: Problem, objective: str, case: Case) -> Answer:
         return Answer("refused", None, str(error), found, verdict)
     except Exception as error:
         return _fail(error)
-    return Answer("planned", float(plan.meta["value"]), "", _check(problem, plan))
+    return Answer("planned", plan.value, "", _check(problem, plan.trajectory))
 
 
 def _fail(error: Exception | None) -> Answer:
@@ -205,7 +206,7 @@ def _plan_again(problem: Problem | None, objective: str) -> Answer:
     if problem is None:
         return Answer("failed", None, "does not load", [])
     try:
-        return Answer("planned", float(solve(problem, objective).meta["value"]), "", [])
+        return Answer("planned", solve(problem, objective).value, "", [])
     except SolverError as error:
         return Answer("failed", None, str(error), [])
     except WholearmError as error:

@@ -10,7 +10,7 @@ import numpy as np
 from ...common.errors import WholearmError
 from ...geometry.path_guess import require_phases
 from ...planning.plan import solve
-from ...problem.definition import build_problem, read_problem
+from ...problem.read import build_problem, read_problem
 from ...verification.verify import verify
 from ..changes import change_numbers
 from .plan_check import check_plan
@@ -52,10 +52,10 @@ def run_trial(task: tuple[str, str, str, int]) -> dict[str, Any]:
             problem = given.with_(change_numbers(given.table, SPREAD, rng))
         require_phases(problem)
         plan = solve(problem, objective)
-        value = float(plan.meta["value"])
+        value = plan.value
         report = verify(problem, plan)
         findings += [Finding("plan refuted by replay", text) for text in report.failures[:1]]
-        wrong = check_plan(problem, plan)
+        wrong = check_plan(problem, plan.trajectory)
         findings += [Finding("plan refuted by residual", "; ".join(wrong[:3]))] if wrong else []
     except WholearmError as error:
         findings.append(Finding("no plan for a shipped problem", str(error)))

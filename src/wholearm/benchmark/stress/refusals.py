@@ -103,7 +103,7 @@ def _find_start(problem: Problem, number: int, objective: str) -> Array | None:
         plan = solve(replace(problem, phases=before), objective, replay=False)
     except WholearmError:
         return None
-    motion = plan.motions[-1]
+    motion = plan.trajectory.motions[-1]
     return np.asarray(motion.evaluate(np.array([motion.duration])).z[0])
 
 

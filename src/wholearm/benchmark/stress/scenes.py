@@ -17,7 +17,8 @@ from ...contacts.formation import close_finger, find_touching, place_flush
 from ...mapping.borders import NOWHERE, Piece, Window, flush_track, label_cells, palm_track
 from ...mapping.nearby import tolerance
 from ...mapping.pieces import cut
-from ...problem.definition import Problem, build_problem
+from ...problem.definition import Problem
+from ...problem.read import build_problem
 from ...scene.model import Finger, Friction, Scene
 from ...scene.polygon import Polygon
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ...common.arrays import Array, Expression
 from ...mechanics.limits import LimitSet, Parameter
 from ...solvers.ipopt import build_solver
+from ...solvers.statistics import SolverStatistics, book
 from ..options import Objective
 from .data import PhaseData
 from .motion import Grid, Profile
@@ -129,7 +130,6 @@ class PathNLP:
     intervals : int
     columns : NLPColumns
     objective : Objective
-    build_time : float, [s]
     """
 
     solver: Expression
@@ -137,7 +137,6 @@ class PathNLP:
     intervals: int
     columns: NLPColumns
     objective: Objective
-    build_time: float
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
@@ -152,13 +151,13 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     """Build the NLP for every phase with limits of a shape; see `terms`."""
     started = time.perf_counter()
     nlp = write_terms(shape, intervals, objective)
+    book(SolverStatistics(build_time=time.perf_counter() - started))
     # Started from nowhere near their optimum, these need the more robust strategy.
     strategy: dict[str, Any]
     strategy = {"mu_strategy": "monotone"} if objective in SOFT else {"mu_oracle": "probing"}
     solver = build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
-    seconds = time.perf_counter() - started
     columns = list_columns(shape, intervals, objective)
-    return PathNLP(solver, shape, intervals, columns, objective, seconds)
+    return PathNLP(solver, shape, intervals, columns, objective)
 
 
 def parameters(

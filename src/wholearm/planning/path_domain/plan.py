@@ -87,8 +87,6 @@ class _Solution(NamedTuple):
     profile: Profile
     margin: float
     multipliers: dict[str, Array]
-    iterations: int
-    seconds: float
 
 
 class _StoppedError(Exception):
@@ -229,7 +227,7 @@ def _plan(task: _Task) -> list[PhasePlan[PathMotion]]:
     nlp = build_path_nlp(LimitShape.of(data.limits), len(data.grid.steps), options.goal)
     profile, units = guess(data, options.time_weight)
     tightening = Tightening.none(data, task.duration)
-    solution = _Solution(profile, 0.0, first_multipliers(nlp, data, profile, units), 0, 0.0)
+    solution = _Solution(profile, 0.0, first_multipliers(nlp, data, profile, units))
     for solves in range(1, ROUNDS + 1):
         try:
             solution = _solve(nlp, data, units, tightening, solution, options.time_weight)
@@ -240,7 +238,7 @@ def _plan(task: _Task) -> list[PhasePlan[PathMotion]]:
         motions = [PathMotion(part.curve, part.grid, own) for part, own in pairs]
         misses = _Misses.of(data, solution, motions, task.duration)
         if misses.find_worst(data) <= MISS:
-            return _summarise(task, parts, motions, solution, solves, nlp)
+            return _summarise(task, parts, motions, solution)
         coarse = _weigh(data, misses, units)
         if solves == 1 and coarse.max() > 1:
             old = data.grid
@@ -305,10 +303,8 @@ def _summarise(
     parts: Sequence[PhaseData],
     motions: Sequence[PathMotion],
     solution: _Solution,
-    solves: int,
-    nlp: PathNLP,
 ) -> list[PhasePlan[PathMotion]]:
-    """The plan of each phase; what solving has cost counts for the first."""
+    """The plan of each phase."""
     plans: list[PhasePlan[PathMotion]] = []
     for part, motion in zip(parts, motions, strict=True):
         torque, squares = fit_torque(part, motion)
@@ -317,10 +313,7 @@ def _summarise(
             Objective.EFFORT: squares + task.options.time_weight * motion.duration,
             Objective.MARGIN: task.epsilon + solution.margin,
         }[task.options.goal]
-        costs = (0, 0, 0.0, 0.0)
-        if not plans:
-            costs = (solution.iterations, solves, nlp.build_time, solution.seconds)
-        plans.append(PhasePlan(motion, torque, value, *costs))
+        plans.append(PhasePlan(motion, torque, value))
     return plans
 
 
@@ -354,6 +347,4 @@ def _solve(
         raise _StoppedError(f"Ipopt stopped with {stats['return_status']}")
     profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], units)
     multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
-    iterations = start.iterations + stats["iter_count"]
-    seconds = start.seconds + stats["t_wall_total"]
-    return _Solution(profile, margin, multipliers, iterations, seconds)
+    return _Solution(profile, margin, multipliers)

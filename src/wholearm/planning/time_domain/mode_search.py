@@ -33,7 +33,7 @@ def improve(search: Search, solution: Solution) -> Solution:
         known.add(signs)
         tried += 1
         other = search.solve(moved, most=PATIENCE)
-        search.statistics.sequences += 1
+        search.tried.sequences += 1
         if not other.success:
             continue
         gain = solution.cost - other.cost
@@ -43,6 +43,7 @@ def improve(search: Search, solution: Solution) -> Solution:
         elif _rolls(moved) > _rolls(solution.stages):
             # No better by itself, but it tells which way its contacts would slide.
             waiting = [*list_neighbours(search, other, leaning=True), *waiting]
+    search.tried.complete = all(sign_sequence(moved) in known for moved in waiting)
     return solution
 
 

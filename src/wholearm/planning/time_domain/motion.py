@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from ...contacts.elemental import Contact
 from ...contacts.formation import Formation
 from ...mechanics.dynamics import Directions, build_forward, split_forces
 from ...mechanics.metric import metric_weights
+from ...results.modes import ROLLS, ModeSpan
 from ...results.torque import TorqueProfile
 from ...results.trajectory import Samples
 from .collocation import Scheme
@@ -190,20 +190,19 @@ class TimeMotion:
         return TorqueProfile.chain([stage.torque for stage in self.stages])
 
     @property
-    def modes(self) -> list[dict[str, Any]]:
+    def modes(self) -> tuple[ModeSpan, ...]:
         """What slides and turns which way and what rolls in each stage, from when to when."""
         found = []
         for stage, start in zip(self.stages, self.starts[:-1].tolist(), strict=True):
             formation, (Xi, sigma) = stage.formation, stage.directions
             rolls = formation.rolling_rows
             contacts = {
-                name: "rolls" if k in rolls else "+" if Xi[k] > 0 else "-"
+                name: ROLLS if k in rolls else "+" if Xi[k] > 0 else "-"
                 for k, name in enumerate(formation.names)
             }
-            joints = ["+" if sign > 0 else "-" for sign in sigma]
-            stop = start + stage.duration
-            found.append({"start": start, "stop": stop, "contacts": contacts, "joints": joints})
-        return found
+            joints = tuple("+" if sign > 0 else "-" for sign in sigma)
+            found.append(ModeSpan(start, start + stage.duration, contacts, joints))
+        return tuple(found)
 
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""

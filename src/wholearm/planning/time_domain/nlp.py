@@ -34,6 +34,7 @@ import numpy as np
 from ...common.arrays import Array, Expression
 from ...geometry.curve import tangent_basis
 from ...solvers.ipopt import build_solver
+from ...solvers.statistics import SolverStatistics, book
 from ..options import Objective
 from .assembly import Assembled, Indices, assemble_nlp
 from .collocation import Scheme
@@ -110,7 +111,6 @@ class TimeNLP:
     rows_of : list of StageRows
     duration_row : int
         Row of the whole duration, if something gives way; otherwise -1.
-    build_time : float, [s]
     """
 
     assembled: Assembled
@@ -120,7 +120,6 @@ class TimeNLP:
     rows: Rows
     rows_of: list[StageRows]
     duration_row: int
-    build_time: float
 
     @cached_property
     def solver(self) -> Expression:
@@ -187,8 +186,8 @@ def build_time_nlp(
     rest = rows.linear(N.shape[1])
     rows.add_entries(rest[:, None], end[V], N.T)
     built = assemble_nlp(len(cost), rows.triplets, rows.linear_rows, rows.blocks, cost)
-    build_time = time.perf_counter() - started
-    return TimeNLP(built, max_iter, seconds, layouts, rows, rows_of, duration_row, build_time)
+    book(SolverStatistics(build_time=time.perf_counter() - started))
+    return TimeNLP(built, max_iter, seconds, layouts, rows, rows_of, duration_row)
 
 
 def _add_costs(rows: Rows, cost: Array, stage: Stage, layout: StageLayout, target: Target) -> None:

@@ -257,8 +257,8 @@ def _halve(search: Search, stages: list[Stage]) -> list[Stage]:
 def _summarise(
     problem: Problem, search: Search, phases: Sequence[Phase], solution: Solution
 ) -> list[PhasePlan[TimeMotion]]:
-    """The plan of each phase; what solving has cost counts for the first."""
-    plans, statistics = [], search.statistics
+    """The plan of each phase; the sequences of modes that were tried count for the first."""
+    plans, tried = [], search.tried
     unit, margin = unit_of(search.goal, problem.scene.scales), solution.margin
     weight = search.options.time_weight * problem.scene.scales.torque**2
     solved = [to_si(stage, problem) for stage in solution.stages]
@@ -272,12 +272,6 @@ def _summarise(
             Objective.EFFORT: weight * motion.duration + torque.integrate_squares(),
             Objective.MARGIN: problem.epsilon + unit * margin,
         }[search.goal]
-        plans.append(PhasePlan(motion, torque, value, 0, 0, 0.0, 0.0))
-    plans[0] = plans[0]._replace(
-        iterations=statistics.iterations,
-        solves=statistics.solves,
-        build_time=statistics.build_time,
-        solve_time=statistics.solve_time,
-        sequences=statistics.sequences,
-    )
+        plans.append(PhasePlan(motion, torque, value))
+    plans[0] = plans[0]._replace(sequences=tried.sequences, complete=tried.complete)
     return plans

@@ -41,14 +41,11 @@ _COARSE = 0.1
 
 
 @dataclass
-class SolverStatistics:
-    """What solving has cost so far; `sequences` counts the sequences of modes that were tried."""
+class Tried:
+    """How many sequences of modes were tried, and whether the search for them was complete."""
 
-    iterations: int = 0
-    solves: int = 0
-    build_time: float = 0.0
-    solve_time: float = 0.0
     sequences: int = 1
+    complete: bool = True
 
 
 class Price(NamedTuple):
@@ -120,7 +117,8 @@ class Search:
     to_go : callable or None
         What follows costs from where stages end, and its gradient, each by the objective.
     price : Price or None
-    statistics : SolverStatistics
+    tried : Tried
+        Shared by all searches for one plan.
     """
 
     problem: Problem
@@ -131,7 +129,7 @@ class Search:
     relaxation: Parameter | None = None
     to_go: Callable[[Array], tuple[float, Array]] | None = None
     price: Price | None = None
-    statistics: SolverStatistics = field(default_factory=SolverStatistics)
+    tried: Tried = field(default_factory=Tried)
 
     @staticmethod
     def of(
@@ -211,9 +209,7 @@ class Search:
             self.goal, self.problem.epsilon, self.options.time_weight, self.relaxation, gradient
         )
         most = _ITERATIONS.get(self.goal, most)
-        nlp = build_time_nlp(stages, self.scheme, target, most, seconds)
-        self.statistics.build_time += nlp.build_time
-        return nlp
+        return build_time_nlp(stages, self.scheme, target, most, seconds)
 
     def run(
         self,
@@ -238,9 +234,6 @@ class Search:
             **(multipliers or first_multipliers((low, high), (low_g, high_g), FIRST_SIZE)),
         )
         stats = solver.stats()
-        self.statistics.iterations += stats["iter_count"]
-        self.statistics.solves += 1
-        self.statistics.solve_time += stats["t_wall_total"]
         x, cost = result["x"].full()[:, 0], float(result["f"])
         cost -= float(self.price.gradient @ self.price.origin) if self.price else 0.0
         return Solution(

@@ -1,0 +1,84 @@
+"""What each command takes."""
+
+from __future__ import annotations
+
+import argparse
+
+
+def add_solve(parser: argparse.ArgumentParser) -> None:
+    """Add what `solve` takes."""
+    parser.add_argument("problem", help="problem file (TOML)")
+    parser.add_argument("-o", "--output", help="trajectory file to write (default: NAME.npz)")
+    parser.add_argument("--torques", metavar="FILE", help="also write the torques as CSV")
+    text = "write samples of the torques at this rate [Hz] instead, and what becomes of the motion"
+    parser.add_argument("--sample-rate", metavar="HZ", type=float, help=text)
+    text = "of samples: linear (the default), or hold for sample-and-hold"
+    parser.add_argument("--interpolation", help=text)
+    parser.add_argument(
+        "--objective", default="time", help="time, effort or margin (default: time)"
+    )
+    parser.add_argument("--intervals", type=int, help="intervals of each phase's grid")
+    parser.add_argument("--duration", type=float, help="longest duration [s], for margin")
+    parser.add_argument("--time-weight", type=float, help="weight of time [(N m)^2], for effort")
+    parser.add_argument("--samples", type=int, help="rows per phase of the trajectory file")
+    parser.add_argument("--transcription", help="auto, or time for the time domain throughout")
+    parser.add_argument(
+        "--opening", type=float, help="least acceleration of contacts that are let go, over gravity"
+    )
+    parser.add_argument(
+        "--clearance",
+        type=float,
+        help="least gap of contacts that were let go, over the radius of gyration",
+    )
+    parser.add_argument(
+        "--time-intervals", type=int, help="intervals of a phase in the time domain"
+    )
+    parser.add_argument("--degree", type=int, help="collocation points of an interval there")
+    parser.add_argument("--scheme", help="radau (the default) or legendre points")
+    text = "keep the contact modes of the first plan that is found"
+    parser.add_argument("--no-mode-search", dest="mode_search", action="store_false", help=text)
+    text = "return the plan without replaying it"
+    parser.add_argument("--no-replay", dest="replay", action="store_false", help=text)
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+
+
+def add_verify(parser: argparse.ArgumentParser) -> None:
+    """Add what `verify` takes."""
+    parser.add_argument("problem", help="problem file (TOML)")
+    parser.add_argument("torques", help="trajectory file (.npz) or torques (.csv: t,tau1,tau2)")
+    parser.add_argument(
+        "--tolerance",
+        type=float,
+        default=1e-9,
+        help="of the simulator's steps, relative to the scene's scales (1e-9)",
+    )
+    text = (
+        "how far the replay may be from the plan, over the object's radius of gyration, and in rad"
+    )
+    parser.add_argument("--departure", type=float, help=f"{text} (1e-3)")
+    text = "speed that passes for rest, over the root of that radius times gravity"
+    parser.add_argument("--rest-speed", type=float, help=f"{text} (2e-2)")
+    text = "also list the paper's scalar equation of motion where a phase has four constraints"
+    parser.add_argument("--reduced", action="store_true", help=text)
+    text = "trajectory file to write (.npz) of the replayed motion, for plot"
+    parser.add_argument("-o", "--output", metavar="FILE", help=text)
+    parser.add_argument("--json", action="store_true", help="print the report as JSON")
+
+
+def add_plot(parser: argparse.ArgumentParser) -> None:
+    """Add what `plot` takes."""
+    parser.add_argument("trajectory", help="trajectory file (.npz)")
+    parser.add_argument("-o", "--output", required=True, help="figure to write (.png, .pdf, .svg)")
+    parser.add_argument("--simulate", action="store_true", help="overlay the simulated forces")
+
+
+def add_map(parser: argparse.ArgumentParser) -> None:
+    """Add what `map` takes."""
+    parser.add_argument("problem", help="problem file (TOML)")
+    parser.add_argument("-o", "--output", help="figure to write (default: map_NAME.png)")
+    parser.add_argument("--plan", metavar="FILE", help="trajectory file (.npz) to draw over it")
+    parser.add_argument(
+        "--phi", metavar="LOW,HIGH", help="range of phi [deg] (default: the plan's)"
+    )
+    text = "print the formations along a route of two or more poses [m, deg] as [[phases]]"
+    parser.add_argument("--list", metavar="X,PHI", nargs="+", help=text)

@@ -1,0 +1,163 @@
+"""Forces and torques over time."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.scale import SymmetricalLogTransform
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+from ..common.arrays import Array
+from ..contacts.elemental import parse_contact
+from ..results.torque import TorqueProfile
+from ..results.trajectory import Trajectory
+from ..scene.model import Scene
+from .data import cone_shares, find_steps, sample_torques
+from .style import BAND, FINGERS, GRID, LOST, LOW, SIMULATED, Styles, write
+
+if TYPE_CHECKING:
+    from ..simulation.events import Simulation
+
+
+def draw_margins(
+    axes: Axes, trajectory: Trajectory, epsilon: float, styles: Styles, covered: Array | None = None
+) -> list[Line2D]:
+    """Draw c_n - epsilon [N] of every contact over time, on a scale that is linear near zero.
+
+    Returns one line per contact, labelled with its name and broken where forces step. The scale
+    covers further margins `covered`, shape (n, m) [N], too.
+    """
+    steps, margins = find_steps(trajectory), trajectory.c_n - epsilon
+    t = np.insert(trajectory.t, steps, np.nan)
+    lines = []
+    for index, name in enumerate(trajectory.contacts):
+        # Where margins coincide the earlier, wider line stays visible beside the later one.
+        rank = index / max(1, len(trajectory.contacts) - 1)
+        colour, line, _ = styles[name]
+        look: Any = {"color": colour, "linestyle": line, "linewidth": 3.4 - 2.0 * rank}
+        values = np.insert(margins[:, index], steps, np.nan)
+        lines += axes.plot(t, values, zorder=3 + rank, label=name, **look)
+    axes.axhline(0.0, color="black", linewidth=1.3, zorder=2.5)
+    _scale_margins(axes, np.vstack([margins, *([] if covered is None else [covered])]), epsilon)
+    return lines
+
+
+def _scale_margins(axes: Axes, margins: Array, epsilon: float) -> None:
+    """Set a scale that is linear within a hundredth of the largest margin, ticks and limits."""
+    # Where everything is at rest no force is known.
+    largest, smallest = (float(f.reduce(margins, None, initial=0.0)) for f in (np.fmax, np.fmin))
+    reach = max(largest, -smallest, 2 * epsilon) or 1.0
+    linear = 10.0 ** (round(math.log10(reach)) - 2)
+    transform = SymmetricalLogTransform(10, linear, 1.0)
+    ends = transform.transform(np.array([min(smallest, -epsilon), max(largest, 2 * linear)]))
+    pad = np.ptp(ends) * np.array([-0.1, 0.05])
+    low, high = (float(end) for end in transform.inverted().transform(ends + pad))
+    axes.set_yscale("symlog", linthresh=linear, linscale=1.0)
+    axes.set_ylim(low, high)
+    axes.set_ylabel(f"force margin $c_n - \\varepsilon$ [N], linear to {linear:g}")
+    axes.axhspan(-epsilon, 0.0, color=LOW, linewidth=0, zorder=1.5)
+    axes.axhspan(low, -epsilon, color=LOST, linewidth=0, zorder=1.5)
+    look: Any = {"xycoords": "axes fraction", "ha": "left", "fontsize": 8, "color": "#7a2a12"}
+    write(axes, "contact lost, $c_n < 0$", (0, 0), (4, 3), **look)
+    decades = linear * 10.0 ** np.arange(math.ceil(math.log10(reach / linear)) + 1)
+    positive = np.outer([1, 2, 5] if len(decades) < 5 else [1], decades)
+    every = np.unique([0.0, linear / 2, *positive.flat])
+    every = np.concatenate([-every[:0:-1], every])
+    axes.yaxis.set_major_locator(FixedLocator(every[(every >= low) & (every <= high)].tolist()))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.grid(axis="y", color=GRID, linewidth=0.4)
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:.6g}".replace("-", "\u2212")))
+
+
+def draw_cones(
+    axes: Axes,
+    trajectory: Trajectory,
+    scene: Scene,
+    styles: Styles,
+    simulation: Simulation | None = None,
+) -> list[Line2D]:
+    """Draw c_t / (mu c_n) of every contact while it rolls; at +1 and -1 it would slip.
+
+    Returns one line per contact that rolls, labelled with its name.
+    """
+    fingers = [parse_contact(name, scene).finger for name in trajectory.contacts]
+    mu = np.array([scene.friction.of(finger) for finger in fingers])
+    shares = cone_shares(trajectory.rolling, mu, trajectory.c_n, trajectory.c_t)
+    steps = find_steps(trajectory)
+    t, lines = np.insert(trajectory.t, steps, np.nan), []
+    for index in np.flatnonzero(trajectory.rolling.any(axis=0)):
+        name = trajectory.contacts[index]
+        look: Any = {"color": styles[name].colour, "linestyle": styles[name].line, "zorder": 3}
+        values = np.insert(shares[:, index], steps, np.nan)
+        lines += axes.plot(t, values, linewidth=1.8, label=name, **look)
+    for edge in (-1.0, 1.0):
+        axes.axhline(edge, color="black", linewidth=1.0, zorder=2)
+        axes.axhspan(edge, 1.25 * edge, color=LOST, linewidth=0, zorder=1.5)
+    axes.axhline(0.0, color=GRID, linewidth=0.5, zorder=1.6)
+    axes.set(ylim=(-1.25, 1.25), yticks=[-1, 0, 1], ylabel="rolling\n$c_t / (\\mu c_n)$")
+    if simulation is not None:
+        first = np.flatnonzero(np.diff(trajectory.phase, prepend=-1))
+        rolls = trajectory.rolling[first][simulation.phase]
+        values = cone_shares(rolls, mu, simulation.c_n, simulation.c_t)
+        axes.plot(simulation.t, values, **SIMULATED)
+    return lines
+
+
+def draw_torques(axes: Axes, torque: TorqueProfile, limits: Array) -> list[Line2D]:
+    """Draw the torques of both joints, with every step upright, and `limits`, shape (2,) [N m].
+
+    Returns the lines of finger 1 and finger 2.
+    """
+    t, tau = sample_torques(torque)
+    lines = []
+    for index, (colour, _) in enumerate(FINGERS):
+        look: Any = {"color": colour, "linewidth": 2.2 - 0.8 * index, "zorder": 3 + index}
+        lines += axes.plot(t, tau[:, index], label=f"finger {index + 1}", **look)
+    for index, (colour, _) in enumerate(FINGERS):
+        # Dashes that alternate keep both limits visible where they are equal.
+        look = {"color": colour, "linewidth": 1.0, "linestyle": (6 * index, (5, 7)), "zorder": 2}
+        axes.axhline(limits[index], label=None if index else "limits", **look)
+        axes.axhline(-limits[index], **look)
+    axes.axhline(0.0, color=GRID, linewidth=0.5, zorder=1.6)
+    reach = 1.12 * max(float(limits.max()), float(np.abs(tau).max()))
+    axes.set(ylim=(-reach, reach), ylabel="joint torque $\\tau$ [N m]")
+    return lines
+
+
+def draw_simulation(
+    margins: Axes, torques: Axes, simulation: Simulation, epsilon: float
+) -> list[Line2D]:
+    """Draw simulated margins and torques over the planned ones; returns the lines."""
+    t = simulation.t
+    gaps = np.flatnonzero((np.diff(t) <= 0) | (np.diff(simulation.phase) != 0)) + 1
+    c_n = np.insert(simulation.c_n, gaps, np.nan, axis=0)
+    lines = margins.plot(np.insert(t, gaps, np.nan), c_n - epsilon, **SIMULATED)
+    lines += torques.plot(t, simulation.tau, **SIMULATED)
+    for line in (lines[0], lines[-1]):
+        line.set_label("simulated")
+    return lines
+
+
+def draw_phases(axes: Axes, starts: Array, *, labels: bool = True) -> list[Artist]:
+    """Shade every other phase and write each one's number above it, where there is room.
+
+    `starts` holds when each phase starts and the last one ends, shape (n_phases + 1,) [s]. The axes
+    must be at their final place, which decides what there is room for.
+    """
+    artists: list[Artist] = []
+    points = axes.bbox.width / axes.figure.dpi * 72 / (starts[-1] - starts[0])
+    for index, (start, end) in enumerate(pairwise(starts)):
+        colour = "white" if index % 2 else BAND
+        artists.append(axes.axvspan(start, end, facecolor=colour, linewidth=0, zorder=0.5))
+        for text in (f"phase {index + 1}", str(index + 1)) if labels else ():
+            if 6.5 * len(text) < points * (end - start):
+                place, units = ((start + end) / 2, 1.0), ("data", "axes fraction")
+                artists.append(write(axes, text, place, (0, 4), xycoords=units))
+                break
+    return artists

@@ -1,0 +1,60 @@
+"""How figures look: sizes, colours, lines and text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+
+SIZE = (10.0, 8.2)
+"""Of a figure [in]."""
+# Okabe and Ito's colours without yellow and black, which here are Tol's wine and a grey.
+PALETTE = (
+    "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#882255", "#56B4E9", "#D55E00", "#777777",
+)  # fmt: skip
+LINES: Any = (("-", "o"), ((0, (5, 1.5)), "s"), ((0, (1.5, 1)), "D"))  # and markers
+FINGERS = (("#444444", "#c4c4c4"), ("#999999", "#ececec"))  # line and face
+BAND, LOW, LOST, INK, GRID = "#eef1f5", "#fff4d9", "#f6d5cc", "#222222", "#c4c9d0"
+STYLE: Any = {
+    "font.family": "sans-serif", "font.sans-serif": ["DejaVu Sans"], "font.size": 9.0,
+    "axes.linewidth": 0.8, "axes.spines.top": False, "axes.spines.right": False,
+    "lines.solid_capstyle": "butt", "lines.dash_capstyle": "butt", "path.simplify": False,
+    "legend.frameon": False, "legend.fontsize": 9.0, "xtick.labelsize": 9.0,
+    "ytick.labelsize": 9.0, "legend.handlelength": 1.6, "legend.borderpad": 0.0,
+    "pdf.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "wholearm",
+}  # fmt: skip
+SIMULATED: Any = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 1.0, "zorder": 5}
+
+
+class ContactStyle(NamedTuple):
+    """How one contact is drawn: alike in the snapshots and over time."""
+
+    colour: str
+    line: Any
+    marker: str
+
+
+Styles = Mapping[str, ContactStyle]
+TOP, STRIP = 0.40, 1.75
+"""Upper margin of the figure, and greatest height of the snapshots [in]."""
+
+
+def choose_styles(contacts: Sequence[str]) -> dict[str, ContactStyle]:
+    """Give every contact its own combination of colour, line and marker."""
+    looks = [ContactStyle(colour, *rest) for rest in LINES for colour in PALETTE]
+    return dict(zip(contacts, cycle(looks), strict=False))
+
+
+def write(axes: Axes, text: str, place: Any, shift: Any, **look: Any) -> Artist:
+    """Write `text` at a place, shifted by points."""
+    options: Any = {"ha": "center", "fontsize": 9, "zorder": 5, "textcoords": "offset points"}
+    return axes.annotate(text, tuple(place), tuple(shift), **(options | look))
+
+
+def inset(*inches: float) -> Any:
+    """Left, bottom, width and height as fractions of the figure."""
+    return tuple(np.array(inches) / (SIZE + SIZE))

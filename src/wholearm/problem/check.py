@@ -1,0 +1,155 @@
+"""What a problem has to be, whether it comes from a file or was made of objects.
+
+Every message names the key that the value has in a file, says what was given and what is allowed.
+"""
+
+from __future__ import annotations
+
+import math
+
+from ..common.errors import InputError
+from ..common.require import require_number, require_vector
+from ..common.sharing import exclusive
+from ..contacts.formation import Formation, describe, find_touching
+from ..contacts.links import evaluate_finger_gap
+from ..scene.model import Scene
+from ..scene.ranges import TURN, check_epsilon, check_place, check_ranges
+from .definition import End, Phase, Problem, Until
+
+
+@exclusive
+def check_problem(problem: Problem) -> None:
+    """Check a problem; whether each phase can be reached is not checked here.
+
+    Raises
+    ------
+    InputError
+        For the first thing that is wrong.
+    """
+    if not isinstance(problem.name, str):
+        raise InputError("", "name", f"{problem.name!r} is not a string")
+    epsilon = require_number(problem.epsilon, "epsilon", nonnegative=True)
+    check_ranges(problem.scene)
+    check_epsilon(problem.scene, epsilon)
+    check_place(problem.scene, "start.x", float(require_vector(problem.start, "start", 5)[0]))
+    if not problem.phases:
+        raise InputError("", "phases", "() is not a list of one or more [[phases]]")
+    for index, phase in enumerate(problem.phases):
+        if phase.index != index:
+            text = f"has the index {phase.index}; phases count up from 0, which makes it {index}"
+            raise InputError("", f"phases[{index + 1}]", text)
+        _check_formation(phase.formation, f"phases[{index + 1}].contacts")
+        _check_until(problem.scene, phase, f"phases[{index + 1}].until")
+    for phase, following in zip(problem.phases, [*problem.phases[1:], None], strict=True):
+        _check_end(phase, following)
+    _check_fingers(problem)
+    _check_first_formation(problem)
+
+
+def _check_formation(formation: Formation, key: str) -> None:
+    """Check that contacts are there once, and that those that roll can."""
+    contacts = formation.contacts
+    if not contacts:
+        raise InputError("", key, "[] is not a list of contact names")
+    twice = {contact.name for contact in contacts if contacts.count(contact) > 1}
+    if twice:
+        raise InputError("", key, f"{', '.join(sorted(twice))} is given twice")
+    for row in formation.rolling_rows:
+        if formation.friction[row] == 0:
+            finger = contacts[row].finger
+            part = "palm" if finger is None else f"finger{finger + 1}"
+            text = f"{contacts[row]} cannot roll without friction, and friction.{part} is 0"
+            raise InputError("", key, text)
+    if formation.rolling and formation.n_constraints > 4:
+        raise InputError(
+            "",
+            key,
+            f"{len(contacts)} contacts of which {formation.n_rolling} roll leave no freedom to "
+            f"move: a rolling one counts twice, which makes {formation.n_constraints}; allowed are "
+            "up to 4",
+        )
+
+
+def _check_until(scene: Scene, phase: Phase, key: str) -> None:
+    until = phase.until
+    if until.is_release and phase.end is not End.SMOOTH:
+        raise InputError("", key, "is missing; only a phase with end = 'smooth' has none")
+    if until.contact is not None and until.contact in phase.formation.contacts:
+        raise InputError("", key, f"{until} is already in the phase's contacts")
+    if until.value is not None:
+        check_coordinate(scene, until, key)
+
+
+def check_coordinate(scene: Scene, until: Until, key: str) -> None:
+    """Check the coordinate of the pose that ends a phase, and its value.
+
+    Raises
+    ------
+    InputError
+        If there is no such coordinate, or its value is out of its range.
+    """
+    if until.coordinate not in ("x", "phi"):
+        raise InputError("", key, f"{until.coordinate!r} given; allowed are 'x' and 'phi'")
+    value = require_number(until.value, key)
+    if until.coordinate == "x":
+        check_place(scene, key, value)
+    else:
+        # Rounding in radians is no matter at the end of the range.
+        TURN.check(key, round(math.degrees(value), 9), "degrees")
+
+
+def _check_end(phase: Phase, following: Phase | None) -> None:
+    """Check that a phase passes into the next one as its `end` says."""
+    if phase.end is End.REST:
+        return
+    key, until = f"phases[{phase.number}].end", phase.until
+    given = f"{phase.end.value!r} given"
+    if following is None:
+        raise InputError("", key, f"{given}, but the last phase ends at rest")
+    contacts = following.formation.contacts
+    if phase.end is End.IMPACT and until.contact is None:
+        raise InputError("", key, f"{given}, but until is {until}, not a contact that is gained")
+    if phase.end is End.IMPACT and until.contact not in contacts:
+        raise InputError("", key, f"{given}, but phase {following.number} does not have {until}")
+    before = {*phase.formation.contacts, until.contact}
+    extra = [c.name for c in contacts if c not in before]
+    if extra:
+        raise InputError(
+            "", key, f"{given}, but phase {following.number} has {', '.join(extra)} too"
+        )
+    same = set(contacts) == set(phase.formation.contacts)
+    if (
+        until.is_release
+        and same
+        and set(following.formation.rolling) == set(phase.formation.rolling)
+    ):
+        raise InputError(
+            "", key, f"phase {following.number} releases no contact, and none rolls or slides anew"
+        )
+
+
+def _check_fingers(problem: Problem) -> None:
+    """Check that the fingers do not overlap at the start."""
+    scene = problem.scene
+    if not scene.fingers_collide:
+        return
+    gap = float(evaluate_finger_gap(scene, problem.start[None])[0])
+    if gap < -scene.touching:
+        raise InputError(
+            "",
+            "start.x",
+            f"{problem.start[0]:g} closes the fingers into each other: their gap is {gap:.4g} m; "
+            "allowed is 0 or more, unless fingers_collide = false",
+        )
+
+
+def _check_first_formation(problem: Problem) -> None:
+    """Check that what the first phase names touches; it may let go what else does."""
+    touching = find_touching(problem.scene, problem.start)
+    first = problem.phases[0].formation.contacts
+    if not set(first) <= set(touching):
+        raise InputError(
+            "",
+            "phases[1].contacts",
+            f"{describe(first)} given, but the closed fingers touch {describe(touching)}",
+        )

@@ -1,0 +1,268 @@
+"""Reading problems: files in TOML, their nested tables, and the names of contacts.
+
+Every message names the file and the key, says what was given and what is allowed.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.errors import InputError, name_source
+from ..common.require import require_number
+from ..common.sharing import exclusive
+from ..contacts.elemental import Contact, parse_contact
+from ..contacts.formation import Formation, close_finger, place_flush
+from ..scene.model import Finger, Friction, Scene
+from ..scene.polygon import Polygon
+from ..scene.ranges import TURN, check_place, check_ranges
+from .definition import End, Phase, Problem, Until
+from .table import name_keys
+
+_T = TypeVar("_T")
+
+ROLLING = " rolling"
+"""Follows the name of a contact that rolls in a phase's `contacts`."""
+
+_OPTIONAL = {"name", "gravity", "fingers_collide"}
+_TOP = _OPTIONAL | {"epsilon", "object", "fingers", "friction", "start", "phases"}
+_OBJECT = {"vertices", "mass", "inertia"}
+_FINGER = {
+    "base": True,
+    "length": True,
+    "radius": False,
+    "inertia": True,
+    "viscous": False,
+    "dry": False,
+    "torque_limit": True,
+    "speed_limit": False,
+}
+NAMES = name_keys(_TOP, _FINGER)
+"""Short names for `Problem.with_` and the keys that each stands for."""
+_ENDS = ", ".join(repr(end.value) for end in End)
+
+
+def read_problem(path: str) -> Problem:
+    """Read and validate a problem file; whether each phase can be reached is not checked here.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or anything in it is malformed.
+    """
+    try:
+        with open(path, "rb") as stream:
+            table = tomllib.load(stream)
+    except OSError as error:
+        raise InputError(str(path), "", f"cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise InputError(str(path), "", f"is not TOML: {error}") from None
+    except RecursionError:
+        raise InputError(str(path), "", "is nested too deeply") from None
+    return build_problem(table, str(path))
+
+
+@exclusive
+def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
+    """Validate a problem given as the nested tables of a problem file.
+
+    Raises
+    ------
+    InputError
+        If anything in it is malformed; names `source`.
+    """
+    with name_source(source):
+        return _build_problem(table, source)
+
+
+def _build_problem(table: Mapping[str, Any], source: str) -> Problem:
+    _check_keys(table, "", _TOP, required=_TOP - _OPTIONAL)
+    scene = _read_scene(table)
+    check_ranges(scene)
+    start = _read_start(scene, _table(table, "start"))
+    given = table["phases"]
+    if not isinstance(given, list) or not given:
+        raise InputError("", "phases", f"{given!r} is not a list of one or more [[phases]]")
+    phases = tuple(_read_phase(scene, i, entry) for i, entry in enumerate(given))
+    return Problem(
+        table.get("name", "unnamed"), scene, table["epsilon"], start, phases, source, table
+    )
+
+
+def read_own_problem(meta: Mapping[str, Any], source: str = "") -> Problem:
+    """The problem whose tables the `meta` of a trajectory carries along.
+
+    Raises
+    ------
+    InputError
+        If there is none, or it is malformed; names `source`, the file of the trajectory.
+    """
+    table = meta.get("problem")
+    if not isinstance(table, Mapping) or not table:
+        raise InputError(
+            source, "meta.problem", "the trajectory does not hold its problem's tables"
+        )
+    try:
+        return build_problem(table)
+    except InputError as error:
+        raise InputError(source, f"meta.problem.{error.key}", error.problem) from None
+
+
+def _read_scene(table: Mapping[str, Any]) -> Scene:
+    body = _table(table, "object")
+    _check_keys(body, "object", _OBJECT, required=_OBJECT - {"inertia"})
+    polygon = Polygon(body["vertices"], body["mass"], body.get("inertia"))
+    fingers = _table(table, "fingers")
+    _check_keys(fingers, "fingers", {"1", "2"}, required={"1", "2"})
+    friction = _table(table, "friction")
+    parts = {"palm", "finger1", "finger2"}
+    _check_keys(friction, "friction", parts, required=parts)
+    return Scene(
+        polygon,
+        (_read_finger(fingers, "1"), _read_finger(fingers, "2")),
+        Friction(friction["palm"], friction["finger1"], friction["finger2"]),
+        table.get("gravity", 9.81),
+        table.get("fingers_collide", True),
+    )
+
+
+def _read_finger(fingers: Mapping[str, Any], key: str) -> Finger:
+    name = f"fingers.{key}"
+    entry = _table(fingers, key, name)
+    _check_keys(entry, name, set(_FINGER), required={k for k, needed in _FINGER.items() if needed})
+    defaults = {"radius": 0.0, "viscous": 0.0, "dry": 0.0}
+    return Finger(**(defaults | dict(entry)), name=name)
+
+
+def _read_start(scene: Scene, start: Mapping[str, Any]) -> Array:
+    _check_keys(start, "start", {"flush", "x"}, required={"flush", "x"})
+    edge, count = start["flush"], scene.polygon.n_vertices
+    if not isinstance(edge, int) or isinstance(edge, bool) or not 0 <= edge < count:
+        raise InputError(
+            "", "start.flush", f"{edge!r} is not an edge; allowed are 0 to {count - 1}"
+        )
+    return place_start(scene, edge, require_number(start["x"], "start.x"))
+
+
+@exclusive
+def place_start(scene: Scene, flush: int, x: float) -> Array:
+    """The configuration with an edge flush on the palm and both fingers closed, shape (5,).
+
+    Parameters
+    ----------
+    scene : Scene
+    flush : int
+        The edge.
+    x : float, [m]
+        Of the object's centroid.
+
+    Raises
+    ------
+    InputError
+        If `x` is out of its range, or a finger does not reach the object.
+    """
+    check_place(scene, "start.x", x)
+    q = place_flush(scene, flush, x)
+    z = np.array([*q, close_finger(scene, q, 0), close_finger(scene, q, 1)])
+    z.setflags(write=False)
+    return z
+
+
+def _read_phase(scene: Scene, index: int, entry: object) -> Phase:
+    key = f"phases[{index + 1}]"
+    if not isinstance(entry, dict):
+        raise InputError("", key, f"{entry!r} is not a table")
+    _check_keys(entry, key, {"contacts", "until", "end"}, required={"contacts"})
+    names = entry["contacts"]
+    if not isinstance(names, list) or not names:
+        raise InputError("", f"{key}.contacts", f"{names!r} is not a list of contact names")
+    formation = _at(f"{key}.contacts", lambda: read_formation(scene, names))
+    given = entry.get("end", End.REST.value)
+    if given not in [end.value for end in End]:
+        raise InputError("", f"{key}.end", f"{given!r} given; allowed are {_ENDS}")
+    until, end = Until(), End(given)
+    if "until" in entry:
+        until = _at(f"{key}.until", lambda: read_until(scene, entry["until"]))
+    return Phase(index, formation, until, end)
+
+
+def read_formation(scene: Scene, names: Sequence[object]) -> Formation:
+    """The formation of contacts by name, each sliding unless its name is followed by ``rolling``.
+
+    Raises
+    ------
+    InputError
+        If there is no such contact.
+    """
+    stems = [n.removesuffix(ROLLING) if isinstance(n, str) else n for n in names]
+    contacts = tuple(_parse_name(stem, scene) for stem in stems)
+    rolls = [stem != name for stem, name in zip(stems, names, strict=True)]
+    rolling = tuple(contact for contact, own in zip(contacts, rolls, strict=True) if own)
+    return Formation(scene, contacts, rolling)
+
+
+def _parse_name(name: object, scene: Scene) -> Contact:
+    try:
+        return parse_contact(name, scene)
+    except InputError as error:
+        if isinstance(name, str) and " " in name:
+            raise InputError("", "", f"{error.problem}; {ROLLING!r} may follow") from None
+        raise
+
+
+def read_until(scene: Scene, given: object) -> Until:
+    """What ends a phase: the name of a contact, ``{"phi_deg": ...}`` or ``{"x": ...}``.
+
+    Raises
+    ------
+    InputError
+        If it is none of these.
+    """
+    if isinstance(given, str):
+        return Until(contact=parse_contact(given, scene))
+    allowed = "allowed are a contact name, { phi_deg = ... } or { x = ... }"
+    if not isinstance(given, dict) or len(given) != 1 or not set(given) <= {"phi_deg", "x"}:
+        raise InputError("", "", f"{given!r} does not end a phase; {allowed}")
+    ((key, value),) = given.items()
+    number = require_number(value, "")
+    if key == "x":
+        return Until(coordinate="x", value=number)
+    TURN.check("", number, "degrees")
+    return Until(coordinate="phi", value=math.radians(number))
+
+
+def _at(key: str, read: Callable[[], _T]) -> _T:
+    """Run `read`, giving the key to an error that does not know its own."""
+    try:
+        return read()
+    except InputError as error:
+        raise InputError("", key, error.problem) from None
+
+
+def _table(parent: Mapping[str, Any], key: str, name: str = "") -> Mapping[str, Any]:
+    value = parent[key]
+    if not isinstance(value, dict):
+        raise InputError("", name or key, f"{value!r} is not a table")
+    return value
+
+
+def _check_keys(
+    table: Mapping[str, Any], where: str, allowed: set[str], required: set[str]
+) -> None:
+    prefix = f"{where}." if where else ""
+    for key in table:
+        if key not in allowed:
+            from difflib import get_close_matches
+
+            near = get_close_matches(key, allowed, 1, 0.5)
+            hint = f"did you mean {near[0]!r}? " if near else ""
+            raise InputError(
+                "", f"{prefix}{key}", f"unknown key; {hint}allowed are {', '.join(sorted(allowed))}"
+            )
+    for key in sorted(required - set(table)):
+        raise InputError("", f"{prefix}{key}", "is missing")

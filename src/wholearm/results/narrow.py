@@ -1,0 +1,57 @@
+"""What plans, replays, trajectories and torques have in common."""
+
+from __future__ import annotations
+
+import os
+from typing import Protocol
+
+from ..common.errors import InputError
+from ..common.files import require_ending, write_text
+from .torque import TorqueProfile
+from .trajectory import Trajectory
+
+
+class Moved(Protocol):
+    """What has a trajectory: a plan, a simulation, a report."""
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The motion with its forces and torques."""
+
+
+Torques = TorqueProfile | Trajectory | Moved
+"""What torques can be taken of."""
+
+
+def narrow(what: Torques) -> tuple[TorqueProfile, Trajectory | None]:
+    """The torques of a plan, a replay or a trajectory and its motion; None for torques alone."""
+    if isinstance(what, TorqueProfile):
+        return what, None
+    trajectory = what if isinstance(what, Trajectory) else what.trajectory
+    return trajectory.torque, trajectory
+
+
+def save(what: Torques, path: str | os.PathLike[str]) -> None:
+    """Write a motion to a ``.npz`` file, or torques as CSV, by the ending of `path`.
+
+    Parameters
+    ----------
+    what : Plan, Simulation, Report, Trajectory or TorqueProfile
+    path : path
+        A ``.csv`` file has the columns ``t,tau1,tau2``, a repeated time being a step, and rows as
+        dense as the torques are bent.
+
+    Raises
+    ------
+    InputError
+        If the file has another ending or cannot be written, or torques alone are to be a motion.
+    """
+    torque, trajectory = narrow(what)
+    if require_ending(path, ".npz", ".csv") == ".csv":
+        from .torque_table import format_rows, place_rows
+
+        write_text(path, format_rows(place_rows(torque)))
+    elif trajectory is None:
+        raise InputError(str(path), "", "torques alone have no motion; simulate them, or give .csv")
+    else:
+        trajectory.save(path)

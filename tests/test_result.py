@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from shipped import HEPTAGON, IMPACTS, problem_of
+from wholearm.common.errors import InputError
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.plan import solve
+from wholearm.planning.result import Plan, Status
+from wholearm.planning.saved import load_plan, write_meta
+from wholearm.problem.definition import Problem
+from wholearm.solvers.ipopt import Solver
+from wholearm.solvers.statistics import SolverStatistics, book, charge, open_ledger
+from wholearm.verification.verify import verify
+
+NOT_IN_0_1_0 = (
+    "rolling", "modes", "sequences", "complete", "transcription", "duration", "time_intervals",
+    "degree", "scheme", "opening", "clearance", "samples", "mode_search", "build_times",
+    "solve_times", "transitions", "replay",
+)  # fmt: skip
+
+
+def two_phases(path: Path = HEPTAGON) -> Problem:
+    """The first two phases of a problem, the last one ending at rest."""
+    whole = problem_of(path)
+    first, second = whole.phases[:2]
+    return replace(whole, phases=(first, replace(second, end=whole.phases[-1].end)))
+
+
+@pytest.fixture(scope="module")
+def made() -> Plan:
+    return solve(two_phases(), "effort", intervals=20, samples=21, time_weight=2.0)
+
+
+@pytest.fixture(scope="module")
+def within() -> Plan:
+    """A plan in the time domain."""
+    whole = two_phases()
+    return solve(replace(whole, phases=whole.phases[:1]), transcription="time", time_intervals=8)
+
+
+def change_meta(plan: Plan, path: Path, changed: dict[str, Any], gone: tuple[str, ...] = ()) -> str:
+    meta = {key: value for key, value in plan.meta.items() if key not in gone} | changed
+    replace(plan.trajectory, meta=meta).save(path)
+    return str(path)
+
+
+@pytest.mark.parametrize("which", ["made", "within"])
+def test_a_plan_comes_back_from_its_file(
+    which: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    plan: Plan = request.getfixturevalue(which)
+    plan.save(tmp_path / "a.npz")
+    loaded = load_plan(tmp_path / "a.npz")
+    for name in ("options", "status", "value", "phases", "transitions", "timings", "versions"):
+        assert getattr(loaded, name) == getattr(plan, name), name
+    assert loaded.replay == plan.replay
+    assert loaded.meta == plan.meta == write_meta(loaded)
+    assert loaded.problem.table == plan.problem.table
+    np.testing.assert_array_equal(loaded.trajectory.tau, plan.trajectory.tau)
+
+
+def test_a_plan_says_what_it_is(made: Plan) -> None:
+    assert repr(made).startswith("Plan('heptagon") and "\n" not in repr(made)
+    assert made.options == PlanOptions("effort", intervals=20, samples=21, time_weight=2.0)
+    assert made.unit == "(N m)^2 s" and made.status is Status.SOLVED
+    assert made.value == pytest.approx(sum(phase.value for phase in made.phases))
+    assert made.duration == pytest.approx(sum(phase.duration for phase in made.phases))
+    assert made.at(0.0).z[0] == pytest.approx(made.problem.start, abs=1e-9)
+    report = verify(made.problem, made)
+    assert report.ok and made.replay is not None
+    arrivals = [phase.arrival for phase in made.replay.phases]
+    assert arrivals == pytest.approx([phase.arrival for phase in report.phases])
+
+
+def test_a_search_for_modes_shows_in_the_status(within: Plan) -> None:
+    tried = [phase.sequences for phase in within.phases]
+    assert within.status is (Status.BEST if max(tried) > 1 else Status.SOLVED)
+    stopped = tuple(phase._replace(complete=False) for phase in within.phases)
+    assert Status.of(stopped) is Status.STOPPED
+
+
+def test_a_file_of_0_1_0_loads(made: Plan, tmp_path: Path) -> None:
+    path = change_meta(made, tmp_path / "a.npz", {}, NOT_IN_0_1_0)
+    loaded = load_plan(path)
+    assert loaded.value == made.value and loaded.phases[0].duration == made.phases[0].duration
+    assert loaded.options == replace(
+        PlanOptions("effort"), intervals=20, time_weight=2.0, replay=False
+    )
+    assert loaded.replay is None and loaded.transitions == ()
+    assert loaded.statistics.solves == made.statistics.solves
+
+
+@pytest.mark.parametrize(
+    ("changed", "gone", "text"),
+    [
+        ({"status": "replayed"}, (), "'replayed' is not a valid Status"),
+        ({"objective": "fast"}, (), "meta.objective: 'fast' given"),
+        ({"phase_values": [1.0]}, (), "meta.phase_values: 1 values given, 2 needed"),
+        ({"iterations": ["a", "b"]}, (), "does not describe a plan"),
+        ({"transitions": [3]}, (), "does not describe a plan"),
+        ({"replay": {}}, (), "does not describe a plan"),
+        ({"timings": {"plan": "long"}}, (), "does not describe a plan"),
+        ({}, ("value",), "does not describe a plan"),
+        ({}, ("problem",), "does not hold its problem's tables"),
+    ],
+)
+def test_what_is_no_plan_is_an_error(
+    made: Plan, tmp_path: Path, changed: dict[str, Any], gone: tuple[str, ...], text: str
+) -> None:
+    path = change_meta(made, tmp_path / "a.npz", changed, gone)
+    with pytest.raises(InputError, match=text) as caught:
+        load_plan(path)
+    assert str(caught.value).startswith(path)
+
+
+@pytest.mark.parametrize(
+    ("case", "options"),
+    [
+        ("slides", {"objective": "time"}),
+        ("slides", {"objective": "margin"}),
+        ("impacts", {"objective": "time"}),
+        ("impacts", {"objective": "time", "transcription": "time", "time_intervals": 4}),
+    ],
+)
+def test_every_solve_is_counted_once(
+    monkeypatch: pytest.MonkeyPatch, case: str, options: dict[str, Any]
+) -> None:
+    """Those of plans with stops, of least time, refined ones and what impacts save as well."""
+    calls = []
+    run = Solver.__call__
+
+    def count(self: Solver, **arguments: Any) -> Any:
+        result = run(self, **arguments)
+        calls.append(self.stats()["iter_count"])
+        return result
+
+    monkeypatch.setattr(Solver, "__call__", count)
+    problem = two_phases(IMPACTS if case == "impacts" else HEPTAGON)
+    plan = solve(problem, intervals=20, samples=5, **options)
+    assert plan.statistics.solves == len(calls) > len(problem.phases)
+    assert plan.statistics.iterations == sum(calls)
+    assert plan.timings.solve == pytest.approx(plan.statistics.solve_time)
+    assert json.loads(json.dumps(plan.meta["solves"])) == [
+        phase.statistics.solves for phase in plan.phases
+    ]
+
+
+def test_an_nlp_at_hand_is_not_built_again() -> None:
+    problem = two_phases()
+    first, second = (solve(problem, intervals=23, samples=5, replay=False) for _ in range(2))
+    assert first.timings.build > 0 and second.timings.build == 0
+    assert first.phases[0].statistics.build_time == first.timings.build
+
+
+def test_costs_are_booked_to_the_innermost_phase_and_every_ledger() -> None:
+    cost = SolverStatistics(3, 1, 0.5, 0.25)
+    book(cost)
+    with open_ledger() as outer:
+        book(cost)
+        with charge(2), open_ledger() as inner:
+            book(cost)
+            with charge(5):
+                book(cost)
+    assert (outer.of(0), outer.of(2), outer.of(5)) == (cost, cost, cost)
+    assert inner.of(0) == SolverStatistics() and inner.of(5) == cost
+    assert cost + cost == SolverStatistics(6, 2, 1.0, 0.5)
