@@ -13,6 +13,8 @@ from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.mechanics.dynamics import split_forces
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.time_domain import kernels
 from wholearm.planning.time_domain.assembly import Kernel
 from wholearm.planning.time_domain.collocation import make_scheme
 from wholearm.planning.time_domain.kernels import (
@@ -28,7 +30,8 @@ from wholearm.planning.time_domain.kernels import (
     point_kernel,
     stretch_kernel,
 )
-from wholearm.problem.definition import Until
+from wholearm.planning.time_domain.plan import plan_phases
+from wholearm.problem.definition import Problem, Until
 from wholearm.results.trajectory import Samples
 from wholearm.scene.model import Scene
 
@@ -278,3 +281,23 @@ def test_kernels_of_a_formation_are_built_once(curves: tuple[Curve, ...]) -> Non
     formation = curves[0].formation
     assert point_kernel(formation) is point_kernel(formation)
     assert monitor_kernel(formation, (0, 1)) is not monitor_kernel(formation, (1, 0))
+
+
+def test_limits_are_no_part_of_kernels(heptagon: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With other torque limits, nothing that has been built is built again."""
+    weaker = heptagon.with_(torque_limit=1.9, speed_limit2=20.0)
+    before, after = (problem.phases[0].formation for problem in (heptagon, weaker))
+    assert before is not after and point_kernel(before) is point_kernel(after)
+    assert before.function is after.function
+    stronger = heptagon.with_(torque_limit=2.1)
+    other = heptagon.with_(friction_palm=0.11).phases[0].formation
+    assert point_kernel(other) is not point_kernel(before)
+    options = PlanOptions(time_intervals=6)
+    plan_phases(weaker, weaker.phases[:1], weaker.start, options)
+
+    def refuse(*_: object) -> Kernel:
+        raise AssertionError("a kernel is built again")
+
+    monkeypatch.setattr(kernels, "build_kernel", refuse)
+    (plan,) = plan_phases(stronger, stronger.phases[:1], stronger.start, options)
+    assert np.abs(plan.motion.evaluate(np.zeros(1)).tau).max() < 2.1 + 1e-6

@@ -26,6 +26,7 @@ from ..planning.path_domain.first_guess import guess
 from ..planning.path_domain.motion import PathMotion, make_grid
 from ..planning.path_domain.nlp import build_path_nlp
 from ..planning.path_domain.plan import plan_path
+from ..planning.path_domain.terms import LimitShape
 from ..planning.plan import solve
 from ..problem.definition import End, Problem
 from ..problem.read import read_problem
@@ -319,9 +320,10 @@ def measure_parts(problem: Problem) -> list[Row]:
     if problem.source:
         timed("read", lambda: read_problem(problem.source))
     timed("trace", lambda: trace_phases(problem), forget)
-    timed(
-        "build the NLP", lambda: build_path_nlp(4, PlanOptions().intervals, Objective.TIME), forget
-    )
+    curve = trace_phases(problem)[0]
+    limits = prepare(curve, problem.epsilon, make_grid(curve, 20), 1).limits
+    shape, intervals = LimitShape.of(limits), PlanOptions().intervals
+    timed("build the NLP", lambda: build_path_nlp(shape, intervals, Objective.TIME), forget)
     plan = timed("plan and sample (NLP built)", lambda: solve(problem))
     rows.append(Row("parts", "Ipopt alone", "", plan.timings.solve, None))
     with tempfile.TemporaryDirectory() as folder:

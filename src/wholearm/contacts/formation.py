@@ -136,27 +136,20 @@ class Formation(Keeper):
         friction[list(self.rolling_rows)] = 0.0
         return friction
 
-    @kept_property
+    @property
+    def equations(self) -> tuple[object, ...]:
+        """Equal for formations with the same equations of motion, whatever limits they have."""
+        return (self.scene.equations, self.contacts, self.rolling)
+
+    @property
     def function(self) -> Expression:
         """CasADi function (z, v) -> (C, A, A_t, A' v), with n_c rows each."""
-        z, v = build_features(self.scene).z, ca.SX.sym("v", 5)
-        parts = [build_geometry(contact, self.scene) for contact in self.contacts]
-        gaps = ca.vertcat(*(part.gap for part in parts))
-        A = ca.vertcat(*(part.A for part in parts))
-        A_t = ca.vertcat(*(part.A_t for part in parts))
-        outputs = [gaps, A, A_t, ca.jtimes(A @ v, z, v)]
-        return ca.Function("formation", [z, v], [ca.densify(part) for part in outputs])
+        return _FUNCTIONS(self)
 
-    @kept_property
+    @property
     def roll_function(self) -> Expression:
         """CasADi function (z, v) -> (slip coordinates [m], A_t' v), one row per rolling contact."""
-        z, v = build_features(self.scene).z, ca.SX.sym("v", 5)
-        rolling = [self.contacts[row] for row in self.rolling_rows]
-        slip = ca.vertcat(ca.SX(0, 1), *(build_slip(c, self.scene) for c in rolling))
-        rows = [build_geometry(c, self.scene).A_t for c in rolling]
-        A_t = ca.vertcat(ca.SX(0, 5), *rows)
-        bend = ca.jtimes(A_t @ v, z, v)
-        return ca.Function("roll", [z, v], [ca.densify(slip), ca.densify(bend)])
+        return _ROLL_FUNCTIONS(self)
 
     def build_constraints(self, z: Expression, v: Expression) -> tuple[Expression, ...]:
         """Expressions of z and v: the gaps and slip coordinates [m], P, P' v and A_t.
@@ -179,16 +172,15 @@ class Formation(Keeper):
     def _roll_batch(self) -> Batch:
         return Batch(self.roll_function)
 
-    @kept_property
+    @property
     def limits(self) -> tuple[GapLimit, ...]:
         """Where this formation stops being valid."""
-        return tuple(list_limits(self.scene, self.contacts))
+        return _LIMITS(self)[0]
 
-    @kept_property
+    @property
     def limit_function(self) -> Expression:
         """CasADi function z -> values of `limits`, shape (n_limits,) [m]."""
-        values = ca.vertcat(*(limit.value for limit in self.limits))
-        return ca.Function("limits", [build_features(self.scene).z], [ca.densify(values)])
+        return _LIMITS(self)[1]
 
     @kept_property
     def _limit_batch(self) -> Batch:
@@ -331,3 +323,39 @@ def _distance_from_origin(corners: Array) -> float:
 def _rotate(angle: float, vector: Array) -> Array:
     c, s = math.cos(angle), math.sin(angle)
     return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
+
+
+def _build_function(formation: Formation) -> Expression:
+    z, v = build_features(formation.scene).z, ca.SX.sym("v", 5)
+    parts = [build_geometry(contact, formation.scene) for contact in formation.contacts]
+    gaps = ca.vertcat(*(part.gap for part in parts))
+    A = ca.vertcat(*(part.A for part in parts))
+    A_t = ca.vertcat(*(part.A_t for part in parts))
+    outputs = [gaps, A, A_t, ca.jtimes(A @ v, z, v)]
+    return ca.Function("formation", [z, v], [ca.densify(part) for part in outputs])
+
+
+def _build_roll_function(formation: Formation) -> Expression:
+    scene = formation.scene
+    z, v = build_features(scene).z, ca.SX.sym("v", 5)
+    rolling = [formation.contacts[row] for row in formation.rolling_rows]
+    slip = ca.vertcat(ca.SX(0, 1), *(build_slip(c, scene) for c in rolling))
+    rows = [build_geometry(c, scene).A_t for c in rolling]
+    A_t = ca.vertcat(ca.SX(0, 5), *rows)
+    bend = ca.jtimes(A_t @ v, z, v)
+    return ca.Function("roll", [z, v], [ca.densify(slip), ca.densify(bend)])
+
+
+def _build_limits(formation: Formation) -> tuple[tuple[GapLimit, ...], Expression]:
+    limits = tuple(list_limits(formation.scene, formation.contacts))
+    values = ca.densify(ca.vertcat(*(limit.value for limit in limits)))
+    return limits, ca.Function("limits", [build_features(formation.scene).z], [values])
+
+
+_FUNCTIONS = Store(_build_function, lambda own: (own.scene.shape, own.contacts))
+_ROLL_FUNCTIONS = Store(
+    _build_roll_function, lambda own: (own.scene.shape, own.contacts, own.rolling)
+)
+_LIMITS = Store(
+    _build_limits, lambda own: (own.scene.shape, own.scene.fingers_collide, own.contacts)
+)

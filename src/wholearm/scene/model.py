@@ -214,6 +214,16 @@ class Scene:
         sizes = [(finger.length, finger.radius) for finger in self.fingers]
         return (self.polygon.vertices.tobytes(), *joints, *sizes)
 
+    @cached_property
+    def equations(self) -> tuple[object, ...]:
+        """Equal for scenes with the same equations of motion and the same features to touch.
+
+        Limits of torques and speeds, and names, are no part of it.
+        """
+        known = (self.mass_diagonal, self.viscous, self.dry, self.applied_force)
+        solid = self.fingers_collide
+        return (self.shape, *(part.tobytes() for part in known), self.friction, solid)
+
     @property
     def touching(self) -> float:
         """Gap below which features count as touching [m]: above rounding, below real clearance."""

@@ -308,7 +308,7 @@ def move_multipliers(
     table = np.zeros(nlp.free.shape)
     table[nlp.free] = on_x
     middles = (place[1:] + place[:-1]) / 2
-    blocks = {name: on_g[rows[name]] for name in rows}
+    blocks = {name: on_g[rows[name]] for name in rows.sizes}
     for name in ("links", "chain"):
         if rows.sizes[name]:
             blocks[name] = np.interp(middles, nodes[:-1] + 0.5, blocks[name])

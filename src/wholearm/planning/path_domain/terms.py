@@ -17,7 +17,6 @@ column through all rows would make building the Jacobian quadratic in the number
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -25,7 +24,7 @@ import numpy as np
 
 from ...common.arrays import Expression
 from ...mechanics.limits import PRESS, TORQUE, LimitSet
-from ..columns import Columns
+from ..columns import Columns, Symbols
 from ..options import Objective
 
 CHAINED = (Objective.MARGIN, Objective.RELAX)
@@ -124,7 +123,7 @@ def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict
         Expressions of x, p, f and g.
     """
     n, columns = intervals + 1, list_columns(shape, intervals, objective)
-    given, p = columns.p.make_symbols()
+    given = columns.p.make_symbols()
     b_inner, a, squeeze = ca.SX.sym("b", n - 2), ca.SX.sym("a", n), ca.SX.sym("squeeze", n)
     extra, h, ends = (
         ca.SX.sym("extra", n, columns.node.sizes["extra"]),
@@ -159,7 +158,7 @@ def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict
     rows = _write_limits(shape, objective, given, values, extra, b)
     return {
         "x": ca.vertcat(nodes[1:, 0], ca.vec(nodes[:, 1:-1]), nodes[1:, -1]),
-        "p": p,
+        "p": given.every,
         "f": ca.sum1(link_costs) + ca.sum1(node_costs),
         "g": columns.g.write(
             links=b[1:] - b[:-1] - h * (a[1:] + a[:-1]),
@@ -171,9 +170,7 @@ def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict
     }
 
 
-def _write_values(
-    shape: LimitShape, given: SimpleNamespace, motion: tuple[Expression, ...]
-) -> Expression:
+def _write_values(shape: LimitShape, given: Symbols, motion: tuple[Expression, ...]) -> Expression:
     """What limits are of, but for the constant part, shape (n, m)."""
     a, b, squeeze, speed = motion
     n, m, fast = a.numel(), shape.rows, list(shape.fast)
@@ -186,7 +183,7 @@ def _write_values(
     return values
 
 
-def _square_torques(shape: LimitShape, given: SimpleNamespace, values: Any) -> Expression:
+def _square_torques(shape: LimitShape, given: Symbols, values: Any) -> Expression:
     """Three times the mean square of each torque over each interval, shape (N, 2)."""
     # The bounds hold the constant part, so it is passed as a parameter for this only.
     full = values[:, list(shape.torques)] + ca.reshape(given.torque, values.size1(), 2)
@@ -196,7 +193,7 @@ def _square_torques(shape: LimitShape, given: SimpleNamespace, values: Any) -> E
 def _write_limits(
     shape: LimitShape,
     objective: Objective,
-    given: SimpleNamespace,
+    given: Symbols,
     values: Expression,
     extra: Expression,
     b: Expression,

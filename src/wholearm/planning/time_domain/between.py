@@ -173,8 +173,7 @@ def raise_bounds(
         low[own.monitor_rows] += raised.gap[:, None]
         formation = stage.formation
         sliding = [i for i in range(formation.n_contacts) if i not in formation.rolling_rows]
-        senses = own.points[:, :, own.points.shape[2] - len(sliding) :]
-        low[senses] += raised.sense[:, None, sliding]
+        low[own.senses] += raised.sense[:, None, sliding]
         for joint, sigma in enumerate(stage.directions.sigma):
             rates, faster = layout.v[..., 3 + joint], raised.sense[:, -2 + joint, None]
             low_x[rates] += faster * (sigma > 0)

@@ -1,8 +1,15 @@
-"""The equations of the time-domain NLP: at a point, over an interval, from stage to stage."""
+"""The equations of the time-domain NLP: at a point, over an interval, from stage to stage.
+
+Every kernel declares the columns that it takes and gives by name. Kernels of a formation serve all
+that have the same equations, whatever their limits are.
+"""
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache, wraps
+from typing import Any, TypeVar
 
 import casadi as ca
 
@@ -11,100 +18,151 @@ from ...contacts.elemental import Contact, build_features, build_gap
 from ...contacts.formation import Formation
 from ...mechanics.dynamics import build_force_rows
 from ...problem.definition import Until
+from ..columns import Columns, Symbols
 from .assembly import Kernel, build_kernel
 from .collocation import Scheme, make_scheme
 
-NOTHING = ca.SX(0, 1)
+_K = TypeVar("_K", bound=Kernel)
+_NOTHING = Columns().make_symbols()
 
 
-@lru_cache(maxsize=32)
-def point_kernel(formation: Formation) -> Kernel:
+@dataclass(frozen=True, eq=False)
+class NamedKernel(Kernel):
+    """A kernel whose x, p and y consist of named blocks."""
+
+    x: Columns
+    p: Columns
+    y: Columns
+
+
+class _Alike:
+    """A formation that equals all with the same equations."""
+
+    def __init__(self, formation: Formation) -> None:
+        self.formation = formation
+        self.key = formation.equations
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Alike) and self.key == other.key
+
+
+def share(size: int) -> Callable[[Callable[..., _K]], Callable[..., _K]]:
+    """Keep the last `size` kernels, each for all formations with the same equations."""
+
+    def decorate(build: Callable[..., _K]) -> Callable[..., _K]:
+        @lru_cache(maxsize=size)
+        def build_once(*args: Any) -> _K:
+            return build(*(arg.formation if isinstance(arg, _Alike) else arg for arg in args))
+
+        @wraps(build)
+        def find(*args: Any) -> _K:
+            return build_once(*(_Alike(a) if isinstance(a, Formation) else a for a in args))
+
+        return find
+
+    return decorate
+
+
+def _name(x: Symbols, p: Symbols, **y: Expression) -> NamedKernel:
+    """Build the kernel of named expressions `y` of symbols."""
+    columns = Columns(**{name: int(block.numel()) for name, block in y.items()})
+    own = build_kernel(x.every, p.every, columns.write(**y))
+    return NamedKernel(**vars(own), x=x.columns, p=p.columns, y=columns)
+
+
+@share(32)
+def point_kernel(formation: Formation) -> NamedKernel:
     """Equations and inequalities at a collocation point.
 
-    x is (z, z', z'', forces, tau at the start and the end of the interval), and z at the start of
-    the interval if a contact rolls. p is (Xi, sigma, the point's place in the interval, the least
-    rate). y is the contacts' constraints, in position, velocity and acceleration, the five
-    equations of motion, and what must not be negative: the senses of friction of the sliding
-    contacts.
+    `tau` is that at the start and the end of the interval, `first` z at its start if a contact
+    rolls, `place` the point's place in it and `least` the least rate. The contacts' constraints, in
+    position, velocity and acceleration, and the five equations of motion are zero; the senses of
+    friction of the sliding contacts must not be negative.
     """
-    scene, n_c, n_p = formation.scene, formation.n_contacts, formation.n_constraints
-    z, v, a = (ca.SX.sym(name, 5) for name in ("z", "v", "a"))
-    forces, tau = ca.SX.sym("forces", n_p), ca.SX.sym("tau", 4)
-    first = ca.SX.sym("first", 5 if formation.rolling else 0)
-    Xi, sigma, place = ca.SX.sym("Xi", n_c), ca.SX.sym("sigma", 2), ca.SX.sym("place")
-    least = ca.SX.sym("least")
-    gaps, P, P_dot_v, A_t = formation.build_constraints(z, v)
-    if formation.rolling:
-        gaps[n_c:] -= formation.roll_function(first, v)[0]
+    scene, n_c, rolls = formation.scene, formation.n_contacts, bool(formation.rolling)
+    x = Columns(z=5, v=5, a=5, forces=formation.n_constraints, tau=4, first=5 * rolls)
+    s = x.make_symbols()
+    p = Columns(Xi=n_c, sigma=2, place=1, least=1).make_symbols()
+    gaps, P, P_dot_v, A_t = formation.build_constraints(s.z, s.v)
+    if rolls:
+        gaps[n_c:] -= formation.roll_function(s.first, s.v)[0]
     applied = (
         ca.DM(scene.applied_force)
-        + ca.vertcat(0, 0, 0, tau[:2] * (1 - place) + tau[2:] * place)
-        - ca.DM(scene.dry) * ca.vertcat(0, 0, 0, sigma)
-        + build_force_rows(formation, P, A_t, Xi).T @ forces
+        + ca.vertcat(0, 0, 0, s.tau[:2] * (1 - p.place) + s.tau[2:] * p.place)
+        - ca.DM(scene.dry) * ca.vertcat(0, 0, 0, p.sigma)
+        + build_force_rows(formation, P, A_t, p.Xi).T @ s.forces
     )
-    balance = ca.DM(scene.mass_diagonal) * a + ca.DM(scene.viscous) * v - applied
     sliding = [k for k in range(n_c) if k not in formation.rolling_rows]
-    # With `:`, no rows of a single one are no rows, and not a row without columns.
-    senses = (Xi * (A_t @ v) - least)[sliding, :]
-    y = ca.vertcat(gaps, P @ v, P @ a + P_dot_v, balance, senses)
-    return build_kernel(
-        ca.vertcat(z, v, a, forces, tau, first), ca.vertcat(Xi, sigma, place, least), y
+    return _name(
+        s,
+        p,
+        gaps=gaps,
+        rates=P @ s.v,
+        bends=P @ s.a + P_dot_v,
+        balance=ca.DM(scene.mass_diagonal) * s.a + ca.DM(scene.viscous) * s.v - applied,
+        # With `:`, no rows of a single one are no rows, and not a row without columns.
+        senses=(p.Xi * (A_t @ s.v) - p.least)[sliding, :],
     )
 
 
-@lru_cache(maxsize=32)
-def end_kernel(formation: Formation) -> Kernel:
-    """Contacts at the end of an interval without a point there, of x = (z, z', z at its start)."""
-    z, v = ca.SX.sym("z", 5), ca.SX.sym("v", 5)
-    first = ca.SX.sym("first", 5 if formation.rolling else 0)
-    gaps, P, _, _ = formation.build_constraints(z, v)
+@share(32)
+def end_kernel(formation: Formation) -> NamedKernel:
+    """Contacts at the end of an interval without a point there; `first` is z at its start."""
+    x = Columns(z=5, v=5, first=5 * bool(formation.rolling)).make_symbols()
+    gaps, P, _, _ = formation.build_constraints(x.z, x.v)
     if formation.rolling:
-        gaps[formation.n_contacts :] -= formation.roll_function(first, v)[0]
-    return build_kernel(ca.vertcat(z, v, first), NOTHING, ca.vertcat(gaps, P @ v))
+        gaps[formation.n_contacts :] -= formation.roll_function(x.first, x.v)[0]
+    return _name(x, _NOTHING, gaps=gaps, rates=P @ x.v)
 
 
 @lru_cache(maxsize=32)
-def collocation_kernel(name: str, degree: int, freedoms: int) -> Kernel:
+def collocation_kernel(name: str, degree: int, freedoms: int) -> NamedKernel:
     """Collocation along the tangent space: N^T (s_j - s_0 - h sum_l a_jl r_l).
 
-    x is (s at the start, at the points and, if no point is there, at the end; the rates r at the
-    points; h), p the columns of N, and y a row for each freedom at each point and end.
+    s is the state at the `start`, at the points and, if no point is there, at the `end`, and r are
+    the `rates` at the points. There is a row for each freedom at each point and end; p is made of
+    the columns of N.
     """
     scheme: Scheme = make_scheme(name, degree)
     rungs = degree + (not scheme.ends)
     table = scheme.integrals.tolist() + ([] if scheme.ends else [scheme.weights.tolist()])
-    start, h = ca.SX.sym("start", 5), ca.SX.sym("h")
-    here, rates = ca.SX.sym("here", 5, rungs), ca.SX.sym("rates", 5, degree)
-    N = ca.SX.sym("N", 5, freedoms)
-    steps = here - ca.repmat(start, 1, rungs) - h * (rates @ ca.DM(table).T)
-    x = ca.vertcat(start, ca.vec(here), ca.vec(rates), h)
-    return build_kernel(x, ca.vec(N), ca.vec(N.T @ steps))
+    x = Columns(start=5, points=5 * degree, end=5 * (rungs - degree), rates=5 * degree, h=1)
+    s, p = x.make_symbols(), Columns(N=5 * freedoms).make_symbols()
+    here = ca.reshape(ca.vertcat(s.points, s.end), 5, rungs)
+    rates, N = ca.reshape(s.rates, 5, degree), ca.reshape(p.N, 5, freedoms)
+    steps = here - ca.repmat(s.start, 1, rungs) - s.h * (rates @ ca.DM(table).T)
+    return _name(s, p, steps=N.T @ steps)
 
 
-@lru_cache(maxsize=64)
-def monitor_kernel(formation: Formation, monitored: tuple[int, ...]) -> Kernel:
-    """Limits of a formation, of x = z."""
+@share(64)
+def monitor_kernel(formation: Formation, monitored: tuple[int, ...]) -> NamedKernel:
+    """Limits of a formation."""
+    x = Columns(z=5).make_symbols(z=build_features(formation.scene).z)
     values = ca.vertcat(*(formation.limits[k].value for k in monitored))
-    return build_kernel(build_features(formation.scene).z, NOTHING, values)
+    return _name(x, _NOTHING, values=values)
 
 
-@lru_cache(maxsize=64)
-def opening_kernel(formation: Formation, contact: Contact) -> Kernel:
-    """Second derivative of a contact's gap, of x = (z, z', z'')."""
-    z, v, a = (ca.SX.sym(name, 5) for name in ("z", "v", "a"))
-    _, A, _, A_dot_v = Formation(formation.scene, (contact,)).function(z, v)
-    return build_kernel(ca.vertcat(z, v, a), NOTHING, A @ a + A_dot_v)
+@share(64)
+def opening_kernel(formation: Formation, contact: Contact) -> NamedKernel:
+    """Second derivative of a contact's gap."""
+    x = Columns(z=5, v=5, a=5).make_symbols()
+    _, A, _, A_dot_v = Formation(formation.scene, (contact,)).function(x.z, x.v)
+    return _name(x, _NOTHING, opening=A @ x.a + A_dot_v)
 
 
 def goal_kernel(
     formation: Formation, until: Until | None, turns: tuple[int, ...], gained: Formation | None
-) -> Kernel | None:
-    """What is zero at the end of a stage, of x = (z, z'); None if nothing is.
+) -> NamedKernel | None:
+    """What is zero at the end of a stage; None if nothing is.
 
     The end of the phase is reached, rates turn, and what is gained is approached without speed.
     """
     scene = formation.scene
-    z, v = build_features(scene).z, ca.SX.sym("v", 5)
+    x = Columns(z=5, v=5).make_symbols(z=build_features(scene).z)
+    z, v = x.z, x.v
     parts: list[Expression] = []
     if until is not None and until.contact is not None:
         parts.append(build_gap(until.contact, scene))
@@ -117,7 +175,7 @@ def goal_kernel(
     if gained is not None:
         P = gained.build_constraints(z, v)[1]
         parts += [P[i, :] @ v for i in new_rows(formation, gained)]
-    return build_kernel(ca.vertcat(z, v), NOTHING, ca.vertcat(*parts)) if parts else None
+    return _name(x, _NOTHING, goals=ca.vertcat(*parts)) if parts else None
 
 
 def new_rows(formation: Formation, following: Formation) -> list[int]:
@@ -129,19 +187,19 @@ def new_rows(formation: Formation, following: Formation) -> list[int]:
 
 
 @lru_cache(maxsize=1)
-def effort_kernel() -> Kernel:
-    """Integral of tau^T tau over an interval, of x = (tau, h)."""
-    tau, h = ca.SX.sym("tau", 4), ca.SX.sym("h")
-    first, last = tau[:2], tau[2:]
+def effort_kernel() -> NamedKernel:
+    """Integral of tau^T tau over an interval."""
+    x = Columns(tau=4, h=1).make_symbols()
+    first, last = x.tau[:2], x.tau[2:]
     squares = ca.sumsqr(first) + ca.dot(first, last) + ca.sumsqr(last)
-    return build_kernel(ca.vertcat(tau, h), NOTHING, h * squares / 3)
+    return _name(x, _NOTHING, effort=x.h * squares / 3)
 
 
 @lru_cache(maxsize=1)
-def stretch_kernel() -> Kernel:
-    """What it costs to change the duration of an interval, of x = h, p = (weight, h before)."""
-    h, p = ca.SX.sym("h"), ca.SX.sym("p", 2)
-    return build_kernel(h, p, p[0] * (h / p[1] - 1) ** 2)
+def stretch_kernel() -> NamedKernel:
+    """What it costs to change the duration of an interval."""
+    x, p = Columns(h=1).make_symbols(), Columns(weight=1, before=1).make_symbols()
+    return _name(x, p, cost=p.weight * (x.h / p.before - 1) ** 2)
 
 
 def find_leaving(formation: Formation, following: Formation) -> list[int]:
@@ -149,29 +207,26 @@ def find_leaving(formation: Formation, following: Formation) -> list[int]:
     return [i for i, c in enumerate(formation.contacts) if c not in following.contacts]
 
 
-@lru_cache(maxsize=32)
-def impact_kernel(formation: Formation, following: Formation) -> Kernel:
+@share(32)
+def impact_kernel(formation: Formation, following: Formation) -> NamedKernel:
     """A plastic impact M5 (v+ - v-) = G+^T p, P+ v+ = 0 onto the next formation.
 
-    x is (z' after, z' before, z, impulses), p the sliding directions after it. y is zero
-    in its first 5 + n_c + R rows; then come what must not be negative: the rates of the gaps that
-    open, and the friction cones of rolling contacts.
+    `Xi` are the sliding directions after it. The rates of the gaps that open, and the friction
+    cones of rolling contacts, must not be negative; the rest is zero.
     """
     scene, n_c = following.scene, following.n_contacts
-    after, before = ca.SX.sym("after", 5), ca.SX.sym("before", 5)
-    z, impulses = ca.SX.sym("z", 5), ca.SX.sym("impulses", following.n_constraints)
-    Xi = ca.SX.sym("Xi", n_c)
-    _, P, _, A_t = following.build_constraints(z, after)
-    push = build_force_rows(following, P, A_t, Xi).T @ impulses
-    jump = ca.DM(scene.mass_diagonal) * (after - before) - push
-    A = formation.function(z, after)[1]
+    x = Columns(after=5, before=5, z=5, impulses=following.n_constraints).make_symbols()
+    p = Columns(Xi=n_c).make_symbols()
+    _, P, _, A_t = following.build_constraints(x.z, x.after)
+    push = build_force_rows(following, P, A_t, p.Xi).T @ x.impulses
+    A = formation.function(x.z, x.after)[1]
     rolling = list(following.rolling_rows)
-    grip = ca.DM(following.friction)[rolling, :] * impulses[rolling, :]
-    y = ca.vertcat(
-        jump,
-        P @ after,
-        A[find_leaving(formation, following), :] @ after,
-        grip - impulses[n_c:, :],
-        grip + impulses[n_c:, :],
+    grip = ca.DM(following.friction)[rolling, :] * x.impulses[rolling, :]
+    return _name(
+        x,
+        p,
+        jump=ca.DM(scene.mass_diagonal) * (x.after - x.before) - push,
+        held=P @ x.after,
+        leaving=A[find_leaving(formation, following), :] @ x.after,
+        cones=ca.vertcat(grip - x.impulses[n_c:, :], grip + x.impulses[n_c:, :]),
     )
-    return build_kernel(ca.vertcat(after, before, z, impulses), Xi, y)

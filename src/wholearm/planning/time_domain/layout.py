@@ -85,10 +85,10 @@ def lay_out(
         starts = first + interval.count * np.arange(stage.intervals + 1)
         own = {
             name: starts[:, None] + np.arange(part.start, part.stop)
-            for name, part in interval.items()
+            for name, part in interval.slices.items()
         }
         points = own["points"][:-1].reshape(stage.intervals, d, point.count)
-        at = {name: points[..., part] for name, part in point.items()}
+        at = {name: points[..., part] for name, part in point.slices.items()}
         nodes = own["node"]
         ends_in_impact = coming is not None and stage.ends_in_impact
         extra = coming.formation.n_constraints if coming is not None and ends_in_impact else 0

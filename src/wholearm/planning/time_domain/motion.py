@@ -10,7 +10,7 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...common.batch import Batch
-from ...common.sharing import Keeper, kept_property
+from ...common.sharing import Store
 from ...contacts.elemental import Contact
 from ...contacts.formation import Formation
 from ...mechanics.dynamics import Directions, build_forward, split_forces
@@ -25,10 +25,14 @@ _NODES = 8
 """Places per interval at which the equations of motion are solved."""
 _SWEEPS = 6
 """Times that accelerations are improved. Each gains one to two digits."""
+_FORWARDS = Store(
+    lambda formation: Batch(build_forward(formation)), lambda formation: formation.equations
+)
+"""Forward dynamics of formations."""
 
 
 @dataclass(frozen=True, eq=False)
-class StageMotion(Keeper):
+class StageMotion:
     """One stage as a function of time.
 
     tau is linear in each interval. z is what it leads to from the interval's start, pulled onto
@@ -68,9 +72,9 @@ class StageMotion(Keeper):
         coefficients = np.stack([(first + last) / 2, (last - first) / 2], axis=2)
         return TorqueProfile(self.breaks, coefficients)
 
-    @kept_property
+    @property
     def _forward(self) -> Batch:
-        return Batch(build_forward(self.formation))
+        return _FORWARDS(self.formation)
 
     @property
     def _pieces(self) -> Array:

@@ -79,6 +79,8 @@ class StageRows:
         How z and z' go on.
     points : ndarray of int, shape (K, d, m)
         What holds at the points.
+    senses : ndarray of int, shape (K, d, n_sliding)
+        Of these, the senses of friction of sliding contacts.
     limits : LimitRows
     monitor_rows : ndarray of int, shape (K, d, m)
         Limits of the formation.
@@ -86,6 +88,7 @@ class StageRows:
 
     states: Indices
     points: Indices
+    senses: Indices
     limits: LimitRows
     monitor_rows: Indices
 
@@ -193,12 +196,13 @@ def build_time_nlp(
 def _add_costs(rows: Rows, cost: Array, stage: Stage, layout: StageLayout, target: Target) -> None:
     """What a stage costs."""
     if target.objective is Objective.EFFORT:
-        columns = np.hstack([layout.tau, layout.h[:, None]])
-        rows.add_cost(effort_kernel(), columns, np.zeros((len(columns), 0)))
+        kernel = effort_kernel()
+        rows.add_cost(kernel, kernel.x.join(tau=layout.tau, h=layout.h[:, None]))
     if stage.adapts:
         lengths = stage.guess.duration * stage.guess.fractions
-        parameters = np.column_stack([np.full(len(lengths), stage.adapts), lengths])
-        rows.add_cost(stretch_kernel(), layout.h[:, None], parameters)
+        stretch = stretch_kernel()
+        given = stretch.p.join(weight=[stage.adapts], before=lengths[:, None])
+        rows.add_cost(stretch, stretch.x.join(h=layout.h[:, None]), given)
     of_time = {
         Objective.TIME: 1.0,
         Objective.EFFORT: target.time_weight,
@@ -220,24 +224,27 @@ def _add_stage(
     rows.add_entries(chain[:, MARGIN:], node[:, MARGIN:], -1.0)
     states = np.hstack([chain, _collocate(rows, stage, layout, scheme)])
     _share(rows, stage, layout)
-    points = _balance(rows, stage, layout, scheme, last)
+    points, senses = _balance(rows, stage, layout, scheme, last)
+    first = node[:, Z] if formation.rolling else node[:, :0]
     if not scheme.ends:
-        first = node[:, Z] if formation.rolling else node[:, :0]
         kernel = end_kernel(formation)
         own = rows.nonlinear(stage.intervals, kernel.outputs)
-        rows.add_copies(kernel, np.hstack([layout.ends, first]), own)
+        z, v = layout.ends[:, Z], layout.ends[:, V]
+        rows.add_copies(kernel, kernel.x.join(z=z, v=v, first=first), own)
         states = np.hstack([states, own])
     monitor_rows = _add_monitor_rows(rows, stage, layout, scheme)
     gained = [formation.limits[k].gained for k in stage.released]
     for contact in [c for c in gained if c is not None and stage.opens]:
-        columns = [layout.z[0], layout.v[0], layout.a[0]]
-        own = rows.nonlinear(scheme.degree, 1, low=stage.opening, high=np.inf)
-        rows.add_copies(opening_kernel(formation, contact), np.hstack(columns), own)
+        kernel = opening_kernel(formation, contact)
+        columns = kernel.x.join(z=layout.z[0], v=layout.v[0], a=layout.a[0])
+        own = rows.nonlinear(scheme.degree, kernel.outputs, low=stage.opening, high=np.inf)
+        rows.add_copies(kernel, columns, own)
     goal = goal_kernel(formation, stage.until, stage.turns, stage.gained)
     if goal is not None:
-        rows.add_copies(goal, layout.nodes[-1:, :MARGIN], rows.nonlinear(1, goal.outputs))
+        end = layout.nodes[-1]
+        rows.add_copies(goal, goal.x.join(z=end[Z], v=end[V]), rows.nonlinear(goal.outputs))
     limits = add_limits(rows, stage, layout, scheme, target)
-    return StageRows(states, points, limits, monitor_rows)
+    return StageRows(states, points, senses, limits, monitor_rows)
 
 
 def _collocate(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
@@ -250,11 +257,15 @@ def _collocate(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) ->
     if not kernel.outputs:
         return np.zeros((K, 0), dtype=np.int64)
     for state, rate, part in ((layout.z, layout.v, Z), (layout.v, layout.a, V)):
-        columns = [layout.nodes[:-1, part], state.reshape(K, -1)]
-        columns += [] if scheme.ends else [layout.ends[:, part]]
-        columns += [rate.reshape(K, -1), layout.h[:, None]]
+        columns = kernel.x.join(
+            start=layout.nodes[:-1, part],
+            points=state.reshape(K, -1),
+            end=layout.ends[:, :0] if scheme.ends else layout.ends[:, part],
+            rates=rate.reshape(K, -1),
+            h=layout.h[:, None],
+        )
         own = rows.nonlinear(K, kernel.outputs)
-        rows.add_copies(kernel, np.hstack(columns), own, parameters)
+        rows.add_copies(kernel, columns, own, kernel.p.join(N=parameters))
         collected.append(own)
     return np.hstack(collected)
 
@@ -275,33 +286,41 @@ def _share(rows: Rows, stage: Stage, layout: StageLayout) -> None:
         rows.add_entries(own, longer, -EVEN)
 
 
-def _balance(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool) -> Indices:
-    """The equations of motion, constraints and senses at every point, shape (K, d, n)."""
+def _balance(
+    rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool
+) -> tuple[Indices, Indices]:
+    """The equations of motion, constraints and senses at every point, shape (K, d, n).
+
+    And the rows of the senses alone, shape (K, d, n_sliding).
+    """
     formation, shape = stage.formation, layout.z.shape[:2]
-    n_c, kernel = formation.n_contacts, point_kernel(formation)
-    node = layout.nodes[:-1]
-
-    def spread(table: Indices) -> Indices:
-        return np.broadcast_to(table[:, None], (*shape, table.shape[1]))
-
-    columns = [layout.z, layout.v, layout.a, layout.forces, spread(layout.tau)]
-    columns += [spread(node[:, Z] if formation.rolling else node[:, :0])]
-    signs = np.concatenate(stage.directions)
-    parameters = np.empty((*shape, n_c + 4))
-    parameters[..., : n_c + 2] = signs
-    parameters[..., n_c + 2] = scheme.points
-    parameters[..., n_c + 3] = least_rates(stage, stage.guess.places(scheme.points))
-    sliding = [k for k in range(n_c) if k not in formation.rolling_rows]
+    kernel, node = point_kernel(formation), layout.nodes[:-1, None]
+    columns = kernel.x.join(
+        z=layout.z,
+        v=layout.v,
+        a=layout.a,
+        forces=layout.forces,
+        tau=layout.tau[:, None],
+        first=node[..., Z] if formation.rolling else node[..., :0],
+    )
+    parameters = kernel.p.join(
+        Xi=stage.directions.Xi,
+        sigma=stage.directions.sigma,
+        place=scheme.points[:, None],
+        least=least_rates(stage, stage.guess.places(scheme.points))[..., None],
+    )
+    sliding = [k for k in range(formation.n_contacts) if k not in formation.rolling_rows]
     still = find_still(stage, last) if scheme.ends else set()
-    senses = kernel.outputs - len(sliding)
-    high = np.where(np.arange(kernel.outputs) < senses, 0.0, np.inf)
-    low = np.zeros((*shape, kernel.outputs))
-    low[-1, -1, [senses + i for i, k in enumerate(sliding) if k in still]] = -np.inf
+    senses, low, high = (
+        kernel.y["senses"],
+        np.zeros((*shape, kernel.outputs)),
+        np.zeros(kernel.outputs),
+    )
+    high[senses] = np.inf
+    low[-1, -1, senses] = np.where([k in still for k in sliding], -np.inf, 0.0)
     own = rows.nonlinear(*shape, kernel.outputs, low=low, high=high)
-    count = shape[0] * shape[1]
-    table = np.concatenate(columns, axis=2).reshape(count, -1)
-    rows.add_copies(kernel, table, own.reshape(count, -1), parameters.reshape(count, -1))
-    return own
+    rows.add_copies(kernel, columns, own, parameters)
+    return own, own[..., senses]
 
 
 def least_rates(stage: Stage, places: Array) -> Array:
@@ -336,7 +355,7 @@ def _add_monitor_rows(rows: Rows, stage: Stage, layout: StageLayout, scheme: Sch
         low[-1, -1, reached] = -np.inf
     own = rows.nonlinear(K, d, len(stage.monitored), low=low, high=np.inf)
     kernel = monitor_kernel(formation, stage.monitored)
-    rows.add_copies(kernel, layout.z.reshape(K * d, 5), own.reshape(K * d, -1))
+    rows.add_copies(kernel, kernel.x.join(z=layout.z), own)
     return own
 
 
@@ -353,10 +372,11 @@ def _join(rows: Rows, stage: Stage, coming: Stage, layout: StageLayout, first: I
     rows.add_entries(own, last[same], -1.0)
     if stage.ends_in_impact:
         kernel = impact_kernel(stage.formation, coming.formation)
-        equal = np.arange(kernel.outputs) < 5 + coming.formation.n_constraints
-        own = rows.nonlinear(1, kernel.outputs, high=np.where(equal, 0.0, np.inf))
-        columns = [first[V], last[V], last[Z], layout.impulses]
-        rows.add_copies(kernel, np.concatenate(columns)[None], own, coming.directions.Xi[None])
+        high = np.zeros(kernel.outputs)
+        high[kernel.y["leaving"]] = high[kernel.y["cones"]] = np.inf
+        columns = kernel.x.join(after=first[V], before=last[V], z=last[Z], impulses=layout.impulses)
+        own = rows.nonlinear(kernel.outputs, high=high)
+        rows.add_copies(kernel, columns, own, kernel.p.join(Xi=coming.directions.Xi))
 
 
 def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tuple[Array, Array]:

@@ -43,14 +43,15 @@ class Rows:
     def add_copies(
         self, kernel: Kernel, columns: Indices, rows: Indices, parameters: Array | None = None
     ) -> None:
-        """Say which rows are copies of a kernel, one per row of `columns`."""
-        given = np.zeros((len(columns), 0)) if parameters is None else parameters
-        self.blocks.append(Block(kernel, columns, rows, given))
+        """Say which rows are copies of a kernel, one for all but the last axis of `columns`."""
+        table = columns.reshape(-1, columns.shape[-1])
+        given = np.zeros((len(table), 0)) if parameters is None else parameters
+        own = rows.reshape(len(table), -1)
+        self.blocks.append(Block(kernel, table, own, given.reshape(len(table), -1)))
 
-    def add_cost(self, kernel: Kernel, columns: Indices, parameters: Array) -> None:
+    def add_cost(self, kernel: Kernel, columns: Indices, parameters: Array | None = None) -> None:
         """Add copies of a kernel to the cost."""
-        nothing = np.zeros((len(columns), 0), dtype=np.int64)
-        self.blocks.append(Block(kernel, columns, nothing, parameters))
+        self.add_copies(kernel, columns, np.zeros((len(columns), 0), dtype=np.int64), parameters)
 
     @property
     def bounds(self) -> tuple[Array, Array]:
