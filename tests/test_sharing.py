@@ -22,7 +22,6 @@ import wholearm
 from shipped import FOLDER, LANDING, plan_of, problem_of
 from wholearm.common import sharing
 from wholearm.common.sharing import Keeper, exclusive, kept_property, retire_with
-from wholearm.contacts.formation import Formation
 from wholearm.simulation.simulate import simulate
 
 SQUARE = str(FOLDER / "square.toml")
@@ -265,7 +264,6 @@ def test_copies_leave_kept_values_behind(tracked: type[Tracked]) -> None:
     owner = Owner(3)
     assert owner.value is not copy.copy(owner).value
     assert copy.deepcopy(owner).number == 3
-    assert isinstance(Formation.function, kept_property)
 
 
 def _plan(problem: wholearm.problem.Problem) -> wholearm.Trajectory:

@@ -22,7 +22,7 @@ from ..columns import Columns, Symbols
 from .assembly import Kernel, build_kernel
 from .collocation import Scheme, make_scheme
 
-_K = TypeVar("_K", bound=Kernel)
+_K = TypeVar("_K")
 _NOTHING = Columns().make_symbols()
 
 
@@ -153,6 +153,7 @@ def opening_kernel(formation: Formation, contact: Contact) -> NamedKernel:
     return _name(x, _NOTHING, opening=A @ x.a + A_dot_v)
 
 
+@share(64)
 def goal_kernel(
     formation: Formation, until: Until | None, turns: tuple[int, ...], gained: Formation | None
 ) -> NamedKernel | None:
