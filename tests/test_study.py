@@ -13,12 +13,13 @@ from misbehaving import misbehave
 from wholearm.benchmark.stress.cases import draw_case
 from wholearm.benchmark.stress.files import look, run_file
 from wholearm.benchmark.stress.journal import Journal
-from wholearm.benchmark.stress.mutation import BASE, change_tree, draw_mutant
+from wholearm.benchmark.stress.mutation import BASE, draw_mutant
 from wholearm.benchmark.stress.plans import Finding
 from wholearm.benchmark.stress.problems import compare_values
 from wholearm.benchmark.stress.report import format_summary
 from wholearm.benchmark.stress.study import StressOptions, run_stress
 from wholearm.benchmark.stress.toml import to_toml
+from wholearm.benchmark.stress.trees import change_tree
 from wholearm.benchmark.stress.workers import run_tasks
 from wholearm.cli.bench import name_study
 from wholearm.cli.command import main

@@ -9,14 +9,25 @@ phase is split where a direction reverses, each stretch with a duration of its o
 from __future__ import annotations
 
 import time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from ..geometry.curve import Curve
+from ..common.arrays import Expression
+from ..contacts.formation import Formation
+from ..geometry.curve import Curve, Segment
 from ..results.torque import TorqueProfile
 from ..solvers.ipopt import STOPPED
+
+IPOPT = {
+    "print_level": 0,
+    "sb": "yes",
+    "tol": 1e-8,
+    "bound_relax_factor": 0.0,
+    "max_iter": 1000,
+}
+"""Options of the solver."""
 
 
 class BaselineResult(NamedTuple):
@@ -46,7 +57,7 @@ def plan_with_opti(curve: Curve, epsilon: float, intervals: int) -> BaselineResu
     started = time.perf_counter()
     opti = ca.Opti()
     scene = curve.formation.scene
-    mass, limit = ca.DM(scene.mass_diagonal), ca.DM(scene.torque_limit)
+    limit = ca.DM(scene.torque_limit)
     ends = curve.evaluate(np.array([0.0, *(part.stop for part in curve.segments)])).z
     turn = abs(ends[-1] - ends[0])
     progress = 2 if turn[2] > 1e-6 else 0
@@ -59,21 +70,7 @@ def plan_with_opti(curve: Curve, epsilon: float, intervals: int) -> BaselineResu
         duration = opti.variable()
         durations.append(duration)
         torques.append(tau)
-        step = duration / count
-        signs = ca.DM(curve.formation.friction * part.Xi)
-        dry = ca.DM(scene.dry) * ca.DM([0, 0, 0, *part.sigma])
-        accelerations = []
-        for k in range(count + 1):
-            _, A, A_t, A_dot_v = curve.formation.function(z[:, k], v[:, k])
-            G = A - ca.diag(signs) @ A_t
-            applied = ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau[:, k])
-            friction = ca.DM(scene.viscous) * v[:, k] + dry
-            accelerations.append((applied - friction + G.T @ c_n[:, k]) / mass)
-            opti.subject_to(A @ accelerations[-1] + A_dot_v == 0)
-        for k in range(count):
-            opti.subject_to(z[:, k + 1] == z[:, k] + step / 2 * (v[:, k] + v[:, k + 1]))
-            mean = (accelerations[k] + accelerations[k + 1]) / 2
-            opti.subject_to(v[:, k + 1] == v[:, k] + step * mean)
+        _collocate(opti, curve.formation, part, duration / count, z, v, c_n, tau)
         opti.subject_to(z[:, 0] == z_before)
         opti.subject_to(v[:, 0] == v_before)
         opti.subject_to(z[progress, -1] == ends[index + 1][progress])
@@ -89,14 +86,7 @@ def plan_with_opti(curve: Curve, epsilon: float, intervals: int) -> BaselineResu
     opti.subject_to(v_before[progress] == 0)
     total = sum(durations)
     opti.minimize(total)
-    ipopt = {
-        "print_level": 0,
-        "sb": "yes",
-        "tol": 1e-8,
-        "bound_relax_factor": 0.0,
-        "max_iter": 1000,
-    }
-    opti.solver("ipopt", {"print_time": False, "record_time": True, "ipopt": ipopt})
+    opti.solver("ipopt", {"print_time": False, "record_time": True, "ipopt": IPOPT})
     built = time.perf_counter()
     try:
         opti.solve()
@@ -120,3 +110,31 @@ def plan_with_opti(curve: Curve, epsilon: float, intervals: int) -> BaselineResu
         solved - built,
         stats["iter_count"],
     )
+
+
+def _collocate(
+    opti: Any,
+    formation: Formation,
+    part: Segment,
+    step: Expression,
+    z: Expression,
+    v: Expression,
+    c_n: Expression,
+    tau: Expression,
+) -> None:
+    """Equations of motion at every node of a stretch, and the trapezoidal rule between them."""
+    scene, count = formation.scene, z.shape[1] - 1
+    signs = ca.DM(formation.friction * part.Xi)
+    dry = ca.DM(scene.dry) * ca.DM([0, 0, 0, *part.sigma])
+    accelerations = []
+    for k in range(count + 1):
+        _, A, A_t, A_dot_v = formation.function(z[:, k], v[:, k])
+        G = A - ca.diag(signs) @ A_t
+        applied = ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau[:, k])
+        friction = ca.DM(scene.viscous) * v[:, k] + dry
+        accelerations.append((applied - friction + G.T @ c_n[:, k]) / ca.DM(scene.mass_diagonal))
+        opti.subject_to(A @ accelerations[-1] + A_dot_v == 0)
+    for k in range(count):
+        opti.subject_to(z[:, k + 1] == z[:, k] + step / 2 * (v[:, k] + v[:, k + 1]))
+        mean = (accelerations[k] + accelerations[k + 1]) / 2
+        opti.subject_to(v[:, k + 1] == v[:, k] + step * mean)

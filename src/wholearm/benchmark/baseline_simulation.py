@@ -10,6 +10,7 @@ no reversals, no change of formation.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -66,70 +67,69 @@ def simulate_with_scipy(
     ----------
     problem : Problem
     phase_index : int
-        From 0.
     torque : TorqueProfile
     z0, z_dot0 : ndarray, shape (5,)
         State at t_span[0].
     Xi, sigma : ndarray, shape (n_c,) and (2,)
         Directions of sliding and of the joints, kept throughout.
     t_span : tuple of float, [s]
-    rtol, atol : float
-        Tolerances of `solve_ivp`.
-    method : str
-        Method of `solve_ivp`.
+    rtol, atol, method
+        Of `solve_ivp`.
     watch_forces : bool
         Stop where a c_n falls to zero.
     """
     from scipy.integrate import solve_ivp
 
-    scene = problem.scene
-    contacts = problem.phases[phase_index].formation.contacts
+    contacts, piece = problem.phases[phase_index].formation.contacts, 0
 
     def forces(t: float, state: Array) -> tuple[Array, Array]:
-        piece = active
-        start, stop = torque.breaks[piece], torque.breaks[piece + 1]
-        x = (2 * t - start - stop) / (stop - start)
-        tau = torque.coefficients[piece] @ x ** np.arange(torque.coefficients.shape[2])
-        return solve_motion(scene, contacts, state[:5], state[5:], tau, Xi, sigma)
+        tau = _evaluate_piece(torque, piece, t)
+        return solve_motion(problem.scene, contacts, state[:5], state[5:], tau, Xi, sigma)
 
     def derivative(t: float, state: Array) -> Array:
-        acceleration, _ = forces(t, state)
-        return np.concatenate([state[5:], acceleration])
+        return np.concatenate([state[5:], forces(t, state)[0]])
 
-    def watch(index: int) -> object:
-        def event(t: float, state: Array) -> float:
-            return float(forces(t, state)[1][index])
-
-        event.terminal = True  # type: ignore[attr-defined]
-        event.direction = -1  # type: ignore[attr-defined]
-        return event
-
-    events = [watch(k) for k in range(len(contacts))] if watch_forces else None
+    events = [_fall(forces, k) for k in range(len(contacts))] if watch_forces else None
     inner = torque.breaks[(torque.breaks > t_span[0]) & (torque.breaks < t_span[1])]
-    ends = [t_span[0], *inner.tolist(), t_span[1]]
+    parts, normal, lost = [], [], None
     state = np.concatenate([z0, z_dot0])
-    times, states, normal, evaluations, lost = [], [], [], 0, None
-    for start, stop in pairwise(ends):
-        middle = (start + stop) / 2
-        active = int(np.searchsorted(torque.breaks, middle, side="right")) - 1
-        active = min(max(active, 0), len(torque.coefficients) - 1)
-        solution = solve_ivp(
-            derivative, (start, stop), state, method=method, rtol=rtol, atol=atol, events=events
-        )
-        state = solution.y[:, -1]
-        times.append(solution.t)
-        states.append(solution.y.T)
+    for start, stop in pairwise([t_span[0], *inner.tolist(), t_span[1]]):
+        piece = _find_piece(torque, (start + stop) / 2)
+        given = {"method": method, "rtol": rtol, "atol": atol, "events": events}
+        parts.append(found := solve_ivp(derivative, (start, stop), state, **given))
+        state = found.y[:, -1]
         if watch_forces:
-            normal += [forces(t, y)[1] for t, y in zip(solution.t, solution.y.T, strict=True)]
-        evaluations += solution.nfev
-        if solution.status == 1:
-            lost = next(k for k, found in enumerate(solution.t_events) if len(found))
+            normal += [forces(t, y)[1] for t, y in zip(found.t, found.y.T, strict=True)]
+        if found.status == 1:
+            lost = next(k for k, times in enumerate(found.t_events) if len(times))
             break
-    history = np.concatenate(states)
-    c_n = np.array(normal).reshape(-1, len(contacts))
-    return BaselineRun(
-        np.concatenate(times), history[:, :5], history[:, 5:], c_n, evaluations, lost
-    )
+    z, z_dot = np.split(np.concatenate([part.y.T for part in parts]), 2, axis=1)
+    c_n, times = np.array(normal).reshape(-1, len(contacts)), np.concatenate([p.t for p in parts])
+    return BaselineRun(times, z, z_dot, c_n, sum(part.nfev for part in parts), lost)
+
+
+def _fall(forces: Callable[[float, Array], tuple[Array, Array]], index: int) -> object:
+    """The event that a c_n falls to zero."""
+
+    def event(t: float, state: Array) -> float:
+        return float(forces(t, state)[1][index])
+
+    event.terminal = True  # type: ignore[attr-defined]
+    event.direction = -1  # type: ignore[attr-defined]
+    return event
+
+
+def _find_piece(torque: TorqueProfile, t: float) -> int:
+    """The piece of the torques that a time is in, or the nearest one."""
+    piece = int(np.searchsorted(torque.breaks, t, side="right")) - 1
+    return min(max(piece, 0), len(torque.coefficients) - 1)
+
+
+def _evaluate_piece(torque: TorqueProfile, piece: int, t: float) -> Array:
+    """Torques of one piece at a time, shape (2,) [N m]."""
+    start, stop = torque.breaks[piece], torque.breaks[piece + 1]
+    x = (2 * t - start - stop) / (stop - start)
+    return np.asarray(torque.coefficients[piece] @ x ** np.arange(torque.coefficients.shape[2]))
 
 
 def solve_motion(

@@ -223,8 +223,7 @@ def _circle_track(
 ) -> Track:
     """Vertex `index` at the end of a link's side, or (with an edge) at an end of that edge."""
     link, base = scene.fingers[finger], np.asarray(scene.fingers[finger].base)
-    count = scene.polygon.n_vertices
-    first = first_contact(scene, finger)
+    count, first = scene.polygon.n_vertices, first_contact(scene, finger)
     side, arc = first + index, first + 2 * count + index
     distance = np.hypot(link.length, link.radius) if edge is None else link.length
 
@@ -263,8 +262,7 @@ def _circle_track(
         if link.radius == 0:
             aside = ASIDE * scene.scales.length
             beside = [close_fingers(scene, x + d, phi).touched[:, finger] for d in (-aside, aside)]
-            pair = np.column_stack(beside)
-            pair = np.sort(pair, axis=1)
+            pair = np.sort(np.column_stack(beside), axis=1)
             about = (pair == side) | (pair == first + count + index)
             about |= pair == first + count + (index - 1) % count
             supported = about.all(axis=1) & (pair[:, 0] != pair[:, 1])

@@ -116,9 +116,8 @@ def balance(
         Speed that counts as none, relative to the scene's speed; angular speeds count times the
         scene's length.
     """
-    z, v, scales = samples.z, samples.z_dot, scene.scales
+    z, v, scales, body = samples.z, samples.z_dot, scene.scales, scene.polygon
     slow = still * scales.speed
-    body = scene.polygon
     assert body.inertia is not None
     inertias = np.array([body.mass, body.mass, body.inertia, *(f.inertia for f in scene.fingers)])
     left = -inertias * samples.z_ddot
@@ -128,12 +127,10 @@ def balance(
     against = np.zeros((len(z), len(contacts) + 2), dtype=bool)
     for k, contact in enumerate(contacts):
         touch = _touch(scene, contact, z)
-        n = touch.normal
-        t = np.stack([n[:, 1], -n[:, 0]], axis=1)
-        arm = touch.point - z[:, :2]
+        n, t = touch.normal, -_quarter(touch.normal)
+        arm, lever = touch.point - z[:, :2], _lever(scene, contact, touch)
         slip = v[:, :2] + v[:, 2:3] * _quarter(arm)
         if contact.finger is not None:
-            lever = touch.point - np.asarray(scene.fingers[contact.finger].base)
             slip = slip - v[:, 3 + contact.finger, None] * _quarter(lever)
         v_n, v_t = (slip * n).sum(axis=1), (slip * t).sum(axis=1)
         c_n, c_t = samples.c_n[:, k], samples.c_t[:, k]
@@ -157,9 +154,15 @@ def balance(
         row -= np.where(turns, link.dry * np.sign(turn), np.clip(row, -link.dry, link.dry))
         other = np.abs(row + 2 * link.dry * np.sign(turn)) < 1e-6 * scales.torque
         against[:, len(contacts) + k] = turns & other & (np.abs(row) > 1e-6 * scales.torque)
-    units = np.array([scales.force] * 2 + [scales.torque] * 3)
+    left /= np.array([scales.force] * 2 + [scales.torque] * 3)
     names = tuple(contact.name for contact in contacts)
-    return Balance(left / units, gaps / scales.length, rates / scales.speed, against, names)
+    return Balance(left, gaps / scales.length, rates / scales.speed, against, names)
+
+
+def _lever(scene: Scene, contact: Contact, touch: _Touch) -> Array:
+    """From the joint of the link that a contact is on to its point, shape (n, 2) [m]."""
+    base = (0.0, 0.0) if contact.finger is None else scene.fingers[contact.finger].base
+    return np.asarray(touch.point - np.asarray(base))
 
 
 def _touch(scene: Scene, contact: Contact, z: Array) -> _Touch:

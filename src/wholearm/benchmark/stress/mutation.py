@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import copy
-import io
 import json
 import os
-import zipfile
-from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -16,7 +13,9 @@ import numpy as np
 from ...planning.plan import solve
 from ...problem.definition import Problem
 from ...problem.read import build_problem
+from .archives import mutate_archive, pack
 from .toml import to_toml
+from .trees import change_tree, pick
 
 BASE: dict[str, Any] = {
     "name": "square",
@@ -55,15 +54,6 @@ BASE: dict[str, Any] = {
 }
 """A problem that is planned quickly: a square that slides to the left in two phases."""
 
-STRANGE: tuple[Any, ...] = (
-    float("nan"), float("inf"), float("-inf"), 0, 0.0, -0.0, -1, 1, 2**63, 10**400, -(10**30),
-    1e308, -1e308, 1e-308, 5e-324, 1e30, 1e-30, True, False, "", "text", "v0-palm", "v99-palm",
-    "e1-tip1", "v0-palm rolling", "rest", "smooth", "impact", "\u00e9\u4e2d\U0001f600", "a\\u0000b",
-    [], [[]], [0], [1, 2, 3], ["v0-palm"], [[0, 0]], [["a", "b"]], [float("nan")], {}, {"x": 1},
-    {"x": "y"}, {"a": {"b": {}}}, {"phi_deg": 1e9}, {"x": 0.0, "phi_deg": 1.0},
-)  # fmt: skip
-"""What takes the place of a value."""
-
 DAMAGE = (
     "truncated", "flipped", "inserted", "cut out", "repeated", "empty", "folder", "noise", "utf-16",
     "latin-1", "bom", "crlf", "zeros", "reversed", "twice",
@@ -74,12 +64,6 @@ ROW_DAMAGE = (
     "column", "semicolon", "quote", "scale", "scale", "few", "blank", "field",
 )  # fmt: skip
 """What is done to rows of torques."""
-METAS = (
-    "{" * 5000, "[" * 100_000, '{"problem": {}}', '{"rolling": [[]]}', "NaN", '{"epsilon": NaN}',
-)  # fmt: skip
-"""What takes the place of a trajectory's `meta`."""
-
-_DEFLATED = (zipfile.ZIP_DEFLATED,)
 
 
 class Mutant(NamedTuple):
@@ -127,7 +111,7 @@ def base_files() -> tuple[bytes, bytes, bytes]:
     none = [0.0] * len(meta["solves"])
     told = {"timings": {}, "build_times": none, "solve_times": none}
     arrays["meta"] = np.array(json.dumps(meta | told))
-    return to_toml(BASE).encode(), torques, _pack(arrays)
+    return to_toml(BASE).encode(), torques, pack(arrays)
 
 
 def draw_mutant(seed: int, number: int) -> Mutant:
@@ -140,7 +124,7 @@ def draw_mutant(seed: int, number: int) -> Mutant:
     elif kind == "torque":
         ending, base, own = ".csv", torques, _mutate_torques
     else:
-        ending, base, own = ".npz", trajectory, _mutate_trajectory
+        ending, base, own = ".npz", trajectory, lambda rng: mutate_archive(rng, trajectory)
     if rng.uniform() < 0.25:
         what, content = _mutate_bytes(rng, base)
     else:
@@ -148,10 +132,6 @@ def draw_mutant(seed: int, number: int) -> Mutant:
     if rng.uniform() < 0.01:
         ending = str(rng.choice([".TOML", ".txt", "", ".npy", ".CSV", ".npz.csv"]))
     return Mutant(kind, what, ending, content)
-
-
-def _pick(rng: np.random.Generator, options: Any) -> Any:
-    return options[int(rng.integers(len(options)))]
 
 
 def _mutate_bytes(rng: np.random.Generator, base: bytes) -> tuple[str, bytes | None]:
@@ -186,46 +166,6 @@ def _mutate_bytes(rng: np.random.Generator, base: bytes) -> tuple[str, bytes | N
     return what, changed[what]
 
 
-def _places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Every path into nested tables and lists."""
-    items: Any = ()
-    if isinstance(value, dict):
-        items = value.items()
-    elif isinstance(value, list):
-        items = enumerate(value)
-    return [place for key, part in items for place in ((*path, key), *_places(part, (*path, key)))]
-
-
-def _parent(table: Any, path: tuple[Any, ...]) -> Any:
-    for key in path[:-1]:
-        table = table[key]
-    return table
-
-
-def change_tree(rng: np.random.Generator, table: Any) -> str:
-    """Change one value or key of nested tables and lists in place; says what."""
-    path = _pick(rng, _places(table))
-    parent, key = _parent(table, path), path[-1]
-    what = str(rng.choice(["delete", "rename", "replace", "replace", "replace", "scale", "double"]))
-    name = ".".join(map(str, path))
-    value = parent[key]
-    if what == "delete":
-        del parent[key]
-    elif what == "rename" and isinstance(parent, dict):
-        parent[_pick(rng, [f"{key}s", str(key).upper(), "", "x y", "\u00e9", "mass"])] = parent.pop(
-            key
-        )
-    elif what == "scale" and isinstance(value, int | float) and not isinstance(value, bool):
-        parent[key] = value * _pick(rng, [-1.0, 0.5, 2.0, 1e3, 1e-3, 1e6, 1e-6, 1e12, 1e-12])
-    elif what == "double" and isinstance(parent, list):
-        parent.insert(int(rng.integers(len(parent) + 1)), copy.deepcopy(value))
-    else:
-        what, new = "replace", _pick(rng, STRANGE)
-        parent[key] = copy.deepcopy(new)
-        return f"{name} becomes {str(new)[:40]}"
-    return f"{what} {name}"
-
-
 def _mutate_problem(rng: np.random.Generator) -> tuple[str, bytes]:
     what = str(rng.choice(["tree", "tree", "tree", "tree", "tree", "line", "text"]))
     if what == "tree":
@@ -247,7 +187,7 @@ def _mutate_problem(rng: np.random.Generator) -> tuple[str, bytes]:
             lines[at] = "# " + lines[at] if how == "comment" else lines[at] + " [ { \" '"
         return f"{how} line {at}", "\n".join(lines).encode()
     deep = int(10.0 ** rng.uniform(1, 5))
-    text = _pick(
+    text = pick(
         rng,
         [
             "a = " + "[" * deep, "a = " + "[" * deep + "]" * deep,
@@ -259,7 +199,7 @@ def _mutate_problem(rng: np.random.Generator) -> tuple[str, bytes]:
             "epsilon = 1_0.0_1", "start = { flush = 0, x = 1979-05-27T07:32:00Z }",
         ],
     )  # fmt: skip
-    where = _pick(rng, [0, len(lines)])
+    where = pick(rng, [0, len(lines)])
     lines.insert(where, text)
     return f"line {where} is {text[:30]!r} of {len(text)}", "\n".join(lines).encode()
 
@@ -272,9 +212,9 @@ def _mutate_torques(rng: np.random.Generator) -> tuple[str, bytes]:
     if how == "cell":
         cells = ["nan", "inf", "-inf", "1e308", "-1e308", "1e-320", "0", "-1", "", "text", "1,5"]
         cells += ["0x10", "1_0", "\u0661", " 1 ", '"1"', "1e999", "--1", "True", "\x00", "1" * 5000]
-        rows[at][column] = _pick(rng, cells)
+        rows[at][column] = pick(rng, cells)
     elif how == "header":
-        rows[0] = _pick(
+        rows[0] = pick(
             rng, [["t", "tau1"], ["T", "tau1", "tau2"], ["t", "t", "t"], ["tau2", "tau1", "t"], []]
         )
     elif how == "delete":
@@ -291,7 +231,7 @@ def _mutate_torques(rng: np.random.Generator) -> tuple[str, bytes]:
     elif how == "column":
         rows = [row[:column] + row[column + 1 :] for row in rows]
     elif how == "scale":
-        factor = _pick(rng, [1e-320, 1e-100, 1e-12, 1e-6, 0.1, 10.0, 1e3, 1e6, 1e100, 1e300, -1.0])
+        factor = pick(rng, [1e-320, 1e-100, 1e-12, 1e-6, 0.1, 10.0, 1e3, 1e6, 1e100, 1e300, -1.0])
         for row in rows[1:]:
             row[column] = repr(float(row[column]) * factor)
     elif how == "few":
@@ -305,115 +245,3 @@ def _mutate_torques(rng: np.random.Generator) -> tuple[str, bytes]:
         where = int(rng.integers(len(text)))
         text = text[:where] + '"' + text[where:]
     return f"{how} in row {at}, column {column}", text.encode("utf-8", "surrogatepass")
-
-
-def _mutate_trajectory(rng: np.random.Generator) -> tuple[str, bytes]:
-    with np.load(io.BytesIO(base_files()[2])) as data:
-        arrays: dict[str, Any] = {name: data[name] for name in data.files}
-    how = str(rng.choice(["array", "array", "array", "meta", "meta", "header", "archive"]))
-    if how == "meta":
-        what, text = _mutate_meta(rng, str(arrays["meta"]))
-        arrays["meta"] = np.array(text)
-        return what, _pack(arrays)
-    if how == "array":
-        name = _pick(rng, list(arrays))
-        what, changed = _mutate_array(rng, arrays[name])
-        if changed is None:
-            arrays[_pick(rng, ["x", "T", "tau"])] = arrays.pop(name)
-            if what == "delete":
-                arrays.popitem()
-        else:
-            arrays[name] = changed
-        return f"{what} {name}", _pack(arrays)
-    if how == "header":
-        name = _pick(rng, list(arrays))
-        shape = _pick(rng, [(10**12,), (10**6, 10**6), (2**62, 4), (-1,), (10**9, 3), (3, 2**40)])
-        kind = _pick(rng, ["<f8", "<i8", "<U1000000", "|O", "<f4", ">f8", "|V1000000000", "<M8[s]"])
-        header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}"
-        raw = (
-            b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode() + b"\0" * 64
-        )
-        return f"{name} claims {shape} of {kind}", _pack(arrays, {name: raw})
-    what = _pick(rng, ["plain", "text", "nested", "twice", "folder", "deflated", "name"])
-    if what == "plain":
-        stream = io.BytesIO()
-        np.save(stream, arrays["t"])
-        return "a plain array", stream.getvalue()
-    if what == "text":
-        return "text", b"t,tau1,tau2\n0,0,0\n1,0,0\n"
-    extra = {"nested": "a/b/t", "twice": "t", "folder": "t/", "name": "../t", "deflated": "x"}[what]
-    return f"archive with {extra}", _pack(
-        arrays, {extra: b"" if what == "folder" else b"abc"}, True
-    )
-
-
-def _pack(arrays: dict[str, Any], raw: dict[str, bytes] | None = None, add: bool = False) -> bytes:
-    """The arrays as an archive, some members with bytes of their own."""
-    import warnings
-
-    stream = io.BytesIO()
-    with warnings.catch_warnings(), zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        warnings.simplefilter("ignore")
-        for name, array in arrays.items():
-            if raw and name in raw and not add:
-                continue
-            member = io.BytesIO()
-            np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=True)
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), member.getvalue(), *_DEFLATED)
-        for name, content in (raw or {}).items():
-            full = name if name.endswith("/") else f"{name}.npy"
-            archive.writestr(zipfile.ZipInfo(full), content, *_DEFLATED)
-    return stream.getvalue()
-
-
-def _mutate_array(rng: np.random.Generator, array: Any) -> tuple[str, Any]:
-    how = str(rng.choice(["delete", "rename", "value", "value", "value", "type", "shape", "order"]))
-    if how in ("delete", "rename"):
-        return how, None
-    number = array.dtype.kind in "iuf"
-    if how == "value" and number and array.size:
-        new = _pick(rng, [np.nan, np.inf, -np.inf, 1e308, -1e308, 0.0, -1.0, 1e30, 1e-30, 7.0])
-        changed = (
-            array.astype(float) if rng.uniform() < 0.8 or not np.isfinite(new) else array.copy()
-        )
-        count = _pick(rng, [1, 1, max(1, array.size // 10), array.size])
-        where = rng.integers(array.size, size=count)
-        with np.errstate(all="ignore"):
-            changed.flat[where] = new if changed.dtype.kind == "f" else int(np.sign(new))
-        return f"{new} in", changed
-    if how == "order" and array.ndim:
-        return "reversed", array[::-1] if rng.uniform() < 0.5 else rng.permutation(array)
-    if how == "type":
-        kinds: list[Callable[[], Any]] = [
-            lambda: array.astype(str), lambda: array.astype(object), lambda: array.astype("S8"),
-            lambda: np.zeros(array.shape, complex), lambda: np.zeros(array.shape, bool),
-            lambda: np.zeros(array.shape, "M8[s]"), lambda: np.zeros(array.shape, "f2"),
-            lambda: np.zeros(array.shape, [("a", "f8")]), lambda: np.zeros(array.shape, ">f8"),
-            lambda: np.zeros(array.shape, np.longdouble), lambda: np.zeros(array.shape, "u1"),
-            lambda: np.array({"a": 1}, dtype=object), lambda: np.array("text"),
-        ]  # fmt: skip
-        made = _pick(rng, kinds)()
-        return f"{made.dtype.str} for", made
-    shapes: list[Callable[[], Any]] = [
-        lambda: array[:1], lambda: array[:-1], lambda: array[:0], lambda: array[None],
-        lambda: array[..., None], lambda: array.T, lambda: array.ravel(),
-        lambda: np.concatenate([array, array]), lambda: array.ravel()[0] if array.size else array,
-        lambda: np.repeat(array, 3, axis=-1), lambda: np.zeros((0, 0)), lambda: np.zeros(()),
-    ]  # fmt: skip
-    if not array.ndim:
-        return "more than one", np.array([array, array])
-    return "another shape of", _pick(rng, shapes)()
-
-
-def _mutate_meta(rng: np.random.Generator, text: str) -> tuple[str, str]:
-    how = str(rng.choice(["tree", "tree", "tree", "tree", "text"]))
-    if how == "tree":
-        meta = json.loads(text)
-        done = change_tree(rng, meta)
-        try:
-            return f"meta: {done}", json.dumps(meta)
-        except (TypeError, ValueError):
-            return "meta: empty", "{}"
-    texts = ("", "null", "[]", "{}", "1", '"text"', text[: len(text) // 2], text + "}", *METAS)
-    new = _pick(rng, texts)
-    return f"meta is {new[:20]!r} of {len(new)}", new

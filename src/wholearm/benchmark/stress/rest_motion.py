@@ -102,6 +102,19 @@ def _ways(slip: Array) -> Iterator[Array]:
         yield np.array([np.cos(angle), np.sin(angle)])
 
 
+def _drive(scene: Scene, touches: list[Touch], N: Array) -> Array:
+    """The equations of motion, shape (5, f + 2 n_c + 3), over the unknowns of `_solve`."""
+    force, scales = scene.scales.force, scene.scales
+    f, n_c = N.shape[1], len(touches)
+    drive = np.zeros((5, f + 2 * n_c + 3))
+    drive[:, :f] = scene.mass_diagonal[:, None] * N * scales.acceleration * scales.length
+    for k, touch in enumerate(touches):
+        drive[:, f + k] = -touch.normal[0] * force
+        drive[:, f + n_c + k] = -touch.tangent[0] * force
+    drive[3:, f + 2 * n_c : -1] = np.diag(scene.dry[3:])
+    return drive
+
+
 def _solve(
     scene: Scene,
     epsilon: float,
@@ -120,22 +133,14 @@ def _solve(
         Rates of contacts and joints, shape (n_c + 2, f), their signs, and rates of other gaps.
     """
     slip, signs, apart = rates
-    force, length = scene.scales.force, scene.scales.length
-    f, n_c = N.shape[1], len(touches)
+    force, f, n_c = scene.scales.force, N.shape[1], len(touches)
     # Unknowns: the acceleration over the scene's, c_n and c_t over the weight, dry friction of the
     # joints over its bound, and the margin.
     total = f + 2 * n_c + 3
-    drive = np.zeros((5, total))
-    drive[:, :f] = scene.mass_diagonal[:, None] * N * scene.scales.acceleration * length
-    for k, touch in enumerate(touches):
-        drive[:, f + k] = -touch.normal[0] * force
-        drive[:, f + n_c + k] = -touch.tangent[0] * force
-    drive[3:, f + 2 * n_c : total - 1] = np.diag(scene.dry[3:])
-    load = scene.applied_force
-    scale = force * np.array([1.0, 1.0, length])
+    drive, load = _drive(scene, touches, N), scene.applied_force
+    scale = force * np.array([1.0, 1.0, scene.scales.length])
     equal, equal_to = [*(drive[:3] / scale[:, None])], [*(load[:3] / scale)]
-    rows: list[Array] = []
-    most: list[float] = []
+    rows, most = list[Array](), list[float]()
 
     def at_least(row: Array, least: float, share: float) -> None:
         rows.append(-row + share * np.eye(total)[-1])
@@ -156,12 +161,11 @@ def _solve(
             equal.append(grip + way[k] * touch.friction * press)
             equal_to.append(0.0)
         else:
-            at_least(touch.friction * press - grip, 0.0, 0.0)
-            at_least(touch.friction * press + grip, 0.0, 0.0)
+            for side in (-grip, grip):
+                at_least(touch.friction * press + side, 0.0, 0.0)
     for joint in range(2):
-        torque = drive[3 + joint] / scene.torque_limit[joint]
-        at_least(-torque, -1.0, 1.0)
-        at_least(torque, -1.0, 1.0)
+        for side in (-1.0, 1.0):
+            at_least(side * drive[3 + joint] / scene.torque_limit[joint], -1.0, 1.0)
         sign = way[n_c + joint]
         bounds.append((sign, sign) if sign else (-1.0, 1.0))
     for row in apart:

@@ -15,6 +15,7 @@ Forces are from bodies and points alone (`benchmark.stress.newton`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ from ...common.arrays import Array
 from ...geometry.closing import Numbers
 from ...problem.definition import Phase
 from ...scene.model import Scene
-from .newton import locate
+from .newton import Touch, locate
 from .tracing import slides
 
 Bounds = list[tuple[float | None, float | None]]
@@ -114,25 +115,48 @@ def fast_margin(
     total = first_c + 2 * (count - 1) * width + 1
     upper, equal = _Rows(total), _Rows(total)
     for side, part in enumerate(forces):
-        node = slots + side
         columns = first_c + (2 * slots + side)[:, None] * width + np.arange(width)
-        for rows, matrix, right in (
-            (equal, part.equal, part.equal_to),
-            (upper, -part.hold, -part.least),
-        ):
-            for m in range(matrix.shape[1]):
-                row = rows.begin(len(slots), right[:, m])
-                slope = matrix[:, m, 0] / (2 * run)
-                rows.add(row, slots + 1, slope)
-                rows.add(row, slots, -slope)
-                rows.add(row, node, matrix[:, m, 1])
-                rows.add(row, count + node, matrix[:, m, 2])
-                for j in range(width):
-                    rows.add(row, columns[:, j], matrix[:, m, 3 + j])
-                if rows is upper:
-                    rows.add(row, np.full(len(slots), total - 1), np.full(len(row), part.share[m]))
+        _add_limits(equal, part.equal, part.equal_to, slots, slots + side, run, columns)
+        first = upper.count
+        _add_limits(upper, -part.hold, -part.least, slots, slots + side, run, columns)
+        row = np.arange(first, upper.count)
+        upper.add(row, np.full(len(row), total - 1), np.repeat(part.share, len(slots)))
     top = _top(scene, z_s) / speed**2
-    nodes = np.arange(count)
+    _add_tangents(upper, top)
+    bounds: Bounds = [(0.0, float(limit)) for limit in top]
+    bounds += [(0.0, None)] * count
+    bounds += [(None, None)] * (total - first_c - 1) + [(None, 1.0)]
+    for end, rest in zip((0, count - 1), rests, strict=True):
+        if rest:
+            bounds[end] = bounds[count + end] = (0.0, 0.0)
+    return _maximise(total, upper, equal, bounds)
+
+
+def _add_limits(
+    rows: _Rows,
+    matrix: Array,
+    right: Array,
+    slots: Numbers,
+    node: Numbers,
+    run: Array,
+    columns: Numbers,
+) -> None:
+    """Rows over (a, b, v, c) at one end of every interval, a being the slope of b along it."""
+    count = len(slots) + 1
+    for m in range(matrix.shape[1]):
+        row = rows.begin(len(slots), right[:, m])
+        slope = matrix[:, m, 0] / (2 * run)
+        rows.add(row, slots + 1, slope)
+        rows.add(row, slots, -slope)
+        rows.add(row, node, matrix[:, m, 1])
+        rows.add(row, count + node, matrix[:, m, 2])
+        for j in range(columns.shape[1]):
+            rows.add(row, columns[:, j], matrix[:, m, 3 + j])
+
+
+def _add_tangents(upper: _Rows, top: Array) -> None:
+    """Rows that keep v below the tangents of sqrt(b), and above its chord up to `top`."""
+    count, nodes = len(top), np.arange(len(top))
     for share in TANGENTS:
         at = share * top
         row = upper.begin(count, np.sqrt(at) / 2)
@@ -141,13 +165,6 @@ def fast_margin(
     row = upper.begin(count, np.zeros(count))
     upper.add(row, nodes, 1 / np.sqrt(top))
     upper.add(row, count + nodes, -np.ones(count))
-    bounds: Bounds = [(0.0, float(limit)) for limit in top]
-    bounds += [(0.0, None)] * count
-    bounds += [(None, None)] * (total - first_c - 1) + [(None, 1.0)]
-    for end, rest in zip((0, count - 1), rests, strict=True):
-        if rest:
-            bounds[end] = bounds[count + end] = (0.0, 0.0)
-    return _maximise(total, upper, equal, bounds)
 
 
 def inertia_ratio(scene: Scene, phase: Phase, z: Array, z_s: Array) -> Array:
@@ -196,16 +213,10 @@ def _limits(
     length, force = scene.scales.length, scene.scales.force
     limit, square = scene.torque_limit, scene.scales.speed**2
     names, rolling = phase.formation.names, phase.formation.rolling_rows
-    pushes, holds, least, share = [], [], [], []
-    width = 3 + len(names) + len(rolling) + (0 if free is None else len(names))
+    holds, least, share = [], [], []
     touches = [locate(scene, name, z) for name in names]
-    for k, touch in enumerate(touches):
-        slip = 0.0 if k in rolling else touch.friction
-        pushes.append(touch.normal - slip * signs[:, [k]] * touch.tangent)
-    pushes += [touches[k].tangent for k in rolling]
-    if free is not None:
-        pushes += [touch.tangent for touch in touches]
-    push = np.stack(pushes, axis=2) * force  # (n, 5, width - 3) per unit of c
+    push = force * _push(touches, rolling, signs, free is not None)
+    width = 3 + push.shape[2]
     mass = scene.mass_diagonal
     drive = np.stack(
         [mass * z_s * square / length, mass * z_ss * square, scene.viscous * z_s * np.sqrt(square)],
@@ -247,6 +258,17 @@ def _limits(
     return Forces(
         equal, equal_to, np.stack(holds, axis=1), np.stack(least, axis=1), np.array(share)
     )
+
+
+def _push(touches: Sequence[Touch], rolling: Sequence[int], signs: Array, loose: bool) -> Array:
+    """What the contact forces push with, shape (n, 5, k): c_n, c_t(rolling), all c_t if `loose`."""
+    pushes = []
+    for k, touch in enumerate(touches):
+        slip = 0.0 if k in rolling else touch.friction
+        pushes.append(touch.normal - slip * signs[:, [k]] * touch.tangent)
+    pushes += [touches[k].tangent for k in rolling]
+    pushes += [touch.tangent for touch in touches] if loose else []
+    return np.stack(pushes, axis=2)
 
 
 def _solve_one(forces: Forces) -> float:
