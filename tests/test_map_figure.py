@@ -26,7 +26,7 @@ from wholearm.results.trajectory import Trajectory
 
 @pytest.fixture(scope="module")
 def chart(heptagon: Problem) -> FormationMap:
-    return build_map(heptagon, resolution=80)
+    return build_map(heptagon, resolution=60)
 
 
 @pytest.fixture(scope="module")
@@ -129,11 +129,12 @@ def test_command_writes_the_figure(
     assert capsys.readouterr().out == "wrote map_heptagon_four_contacts.png\n"
     data = (tmp_path / "map_heptagon_four_contacts.png").read_bytes()
     assert data[:4] == b"\x89PNG"
-    arguments = ["map", str(HEPTAGON), "--phi", "-4,0", "-o", "m.pdf"]
-    assert main([*arguments, "--list", "0.045,-2", "0,-2"]) == 0
+    box = str(HEPTAGON.with_name("box_rolling.toml"))
+    arguments = ["map", box, "--phi", "-4,0", "-o", "m.svg"]
+    assert main([*arguments, "--list", "0.03,-2", "0.02,-2"]) == 0
     captured = capsys.readouterr()
-    assert captured.out.startswith("# from x = 45 mm") and captured.err == "wrote m.pdf\n"
-    assert (tmp_path / "m.pdf").read_bytes()[:4] == b"%PDF"
+    assert "contacts = [" in captured.out and captured.err == "wrote m.svg\n"
+    assert (tmp_path / "m.svg").read_bytes()[:5] == b"<?xml"
 
 
 def test_overlap_of_the_fingers_has_its_own_hatching(figure: Figure) -> None:

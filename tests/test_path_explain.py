@@ -26,8 +26,9 @@ from wholearm.planning.plan import solve
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem
 
-INTERVALS = 30
+INTERVALS = 15
 OPTIONS = PlanOptions(intervals=INTERVALS)
+FINE = PlanOptions(intervals=30)
 NOTHING = "no single limit makes it feasible"
 LIMITS = ("torque limit of finger 1", "torque limit of finger 2", "epsilon")
 SPEEDS = ("speed limit of finger 1", "speed limit of finger 2")
@@ -48,14 +49,16 @@ def edited(limits: dict[str, float], friction: float = 0.1, viscous: float = 0.0
     return build_problem(table)
 
 
-def plan(problem: Problem, phase: int, explained: bool = True) -> None:
+def plan(
+    problem: Problem, phase: int, explained: bool = True, options: PlanOptions = OPTIONS
+) -> None:
     curve = trace_phases(problem)[phase - 1]
-    plan_curves((curve,), problem.epsilon, OPTIONS, (phase,), explained=explained)
+    plan_curves((curve,), problem.epsilon, options, (phase,), explained=explained)
 
 
-def ask(problem: Problem, phase: int) -> str:
+def ask(problem: Problem, phase: int, options: PlanOptions = OPTIONS) -> str:
     with pytest.raises(InfeasibleError) as caught:
-        plan(problem, phase)
+        plan(problem, phase, options=options)
     message = str(caught.value)
     assert message.startswith(f"phase {phase} is infeasible: ") and "\n" not in message
     return message
@@ -78,9 +81,11 @@ def read_advice(message: str) -> dict[str, float]:
     return found
 
 
-def is_feasible(limits: dict[str, float], phase: int, **others: float) -> bool:
+def is_feasible(
+    limits: dict[str, float], phase: int, options: PlanOptions = OPTIONS, **others: float
+) -> bool:
     try:
-        plan(edited(limits, **others), phase, explained=False)
+        plan(edited(limits, **others), phase, explained=False, options=options)
     except WholearmError:
         return False
     return True
@@ -101,13 +106,13 @@ def test_advised_values_are_feasible_and_hardly_larger_than_needed(
     phase: int, limits: dict[str, float], wanted: list[str]
 ) -> None:
     """Checked by planning anew with the limit in the problem file changed."""
-    advised = read_advice(ask(edited(limits), phase))
+    advised = read_advice(ask(edited(limits), phase, FINE))
     assert list(advised) == wanted
     for name, value in advised.items():
         back = 1.03 if name == "epsilon" else 1 / 1.03
         assert (value < limits[name]) == (name == "epsilon")
-        assert is_feasible(limits | {name: value}, phase)
-        assert not is_feasible(limits | {name: back * value}, phase)
+        assert is_feasible(limits | {name: value}, phase, FINE)
+        assert not is_feasible(limits | {name: back * value}, phase, FINE)
 
 
 @pytest.mark.parametrize(

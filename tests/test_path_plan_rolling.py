@@ -112,7 +112,7 @@ def test_the_cone_is_what_holds_the_fastest_motion_back() -> None:
 
 def test_a_slippery_palm_is_named() -> None:
     with pytest.raises(InfeasibleError, match="friction cone of v1-palm") as caught:
-        plan("time", 0.1)
+        plan("time", 0.1, 20)
     text = str(caught.value)
     assert text.startswith("phase 2 is infeasible: ") and "c_t <= 0.1 (c_n - 0.05 N), is " in text
     assert " N short at t = " in text
@@ -120,7 +120,7 @@ def test_a_slippery_palm_is_named() -> None:
 
 def test_an_epsilon_that_cones_allow_is_advised() -> None:
     """Rolling contacts need c_n >= epsilon and a cone that is narrower by mu epsilon."""
-    options, mu, epsilon = PlanOptions(intervals=30), 0.8, 0.7
+    options, mu, epsilon = PlanOptions(intervals=15), 0.8, 0.7
     with pytest.raises(InfeasibleError) as caught:
         plan_path(tip_on(mu), epsilon, options, 2)
     _, found, advised = str(caught.value).rpartition("epsilon = ")

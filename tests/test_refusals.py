@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from shipped import HEPTAGON
@@ -8,22 +10,28 @@ from wholearm.common.errors import InfeasibleError, InputError, JammingError
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem, read_problem
 
-WEAK = {f"fingers.{k}.torque_limit": 0.05 for k in (1, 2)}
+WEAK = {f"fingers.{k}.torque_limit": 0.01 for k in (1, 2)}
 
 
-def test_a_hand_that_is_too_weak_is_confirmed(heptagon: Problem) -> None:
-    weak = heptagon.with_(WEAK)
-    verdict = judge(weak, InfeasibleError("phase 3 is infeasible"), [])
+@pytest.fixture
+def slide(heptagon: Problem) -> Problem:
+    """The first phase alone."""
+    return replace(heptagon, phases=heptagon.phases[:1])
+
+
+def test_a_hand_that_is_too_weak_is_confirmed(slide: Problem) -> None:
+    weak = slide.with_(WEAK)
+    verdict = judge(weak, InfeasibleError("phase 1 is infeasible"), [])
     assert verdict.kind == "confirmed" and "no motion keeps all limits" in verdict.reason
 
 
-def test_a_refusal_of_what_a_slow_motion_does_is_refuted(heptagon: Problem) -> None:
-    verdict = judge(heptagon, InfeasibleError("phase 3 is infeasible"), [])
+def test_a_refusal_of_what_a_slow_motion_does_is_refuted(slide: Problem) -> None:
+    verdict = judge(slide, InfeasibleError("phase 1 is infeasible"), [])
     assert verdict.kind == "refuted" and "slow motion" in verdict.reason
 
 
-def test_jamming_is_confirmed_by_the_determinant(heptagon: Problem) -> None:
-    rough = heptagon.with_({f"friction.{part}": 2.5 for part in ("palm", "finger1", "finger2")})
+def test_jamming_is_confirmed_by_the_determinant(slide: Problem) -> None:
+    rough = slide.with_({f"friction.{part}": 2.5 for part in ("palm", "finger1", "finger2")})
     verdict = judge(rough, JammingError("phase 1 jams at x = ..."), [])
     assert verdict.kind == "confirmed" and "inertia ratio -" in verdict.reason
 

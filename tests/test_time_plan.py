@@ -66,7 +66,7 @@ def gentle() -> Trajectory:
 @once
 def in_time() -> Trajectory:
     """The heptagon's last slide and its flip, which curves are for, in the time domain."""
-    return solve(turning(), transcription="time", time_intervals=16, replay=False).trajectory
+    return solve(turning(), transcription="time", time_intervals=12, replay=False).trajectory
 
 
 @cache
@@ -153,7 +153,7 @@ def test_rolling_contacts_are_planned_like_along_the_curve() -> None:
     """The phase in which the box tips over a vertex."""
     phase = replace(box().phases[1], index=0)
     problem = replace(box(), start=tip().start, phases=(phase,))
-    within = solve(problem, transcription="time", time_intervals=16)
+    within = solve(problem, transcription="time", time_intervals=8)
     # Measured 0.77 % on 32 intervals, half of that on 64.
     assert -1e-4 < within.duration / tipped().meta["phase_durations"][1] - 1 < 1e-2
     rolls = phase.formation.rolling
