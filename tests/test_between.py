@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -152,11 +153,7 @@ def test_limits_rise_by_more_than_they_are_missed() -> None:
 
 def test_tightening_holds_limits_that_points_alone_do_not() -> None:
     problem = landing()
-    search = Search.of(problem, PlanOptions())
-    plans = plan_landing(time_intervals=6)
-    start = plans[0].motion.stages[0].points.nodes[0, 0]
-    stages = guess_stages(problem, problem.phases[4:], start, SCHEME, 6, 2.0)
-    loose = search.solve(stages)
+    search, loose = Search.of(problem, PlanOptions()), solve_at_points()
     held = search.hold(loose)
     assert loose.success and held.success
     worst = []
@@ -221,7 +218,10 @@ def test_raised_rates_are_bounds_of_contacts_and_joints() -> None:
 @lru_cache(maxsize=1)
 def make_way_twice() -> tuple[Trajectory, Trajectory]:
     """Plans of least effort with fingers that pass each other, and with solid ones."""
-    passing, solid = (solve(make_way(solid), "effort").trajectory for solid in (False, True))
+    options: dict[str, Any] = {"time_intervals": 12, "replay": False}
+    passing, solid = (
+        solve(make_way(solid), "effort", **options).trajectory for solid in (False, True)
+    )
     return passing, solid
 
 

@@ -343,7 +343,7 @@ def test_a_limit_breaks_as_soon_as_a_free_link_overlaps(finger: int) -> None:
     """Formations without contacts on a finger: its limits and the measured overlap agree."""
     rng = np.random.default_rng(finger)
     seen = {True: 0, False: 0}
-    for _ in range(30):
+    for _ in range(20):
         scene = make_scene(convex_polygon(rng, 5), length=0.22, base=0.13)
         scene = replace(scene, fingers_collide=False)
         q = random_pose(rng, scene)
@@ -359,7 +359,7 @@ def test_a_limit_breaks_as_soon_as_a_free_link_overlaps(finger: int) -> None:
         clear = bool((formation.evaluate_limits(z[None])[0] > 0).all())
         assert clear == (finger_gap(scene, q, finger, angles[finger])[0] > 0)
         seen[clear] += 1
-    assert min(seen.values()) > 5
+    assert min(seen.values()) > 3
 
 
 @pytest.mark.parametrize("finger", [0, 1])

@@ -72,10 +72,10 @@ def test_a_free_link_and_the_object_overlap_where_a_limit_says_so(
     rng = np.random.default_rng([finger, int(1e3 * radius)])
     broken: set[str] = set()
     seen = {True: 0, False: 0}
-    for _ in range(8):
+    for _ in range(5):
         scene = random_scene(rng, radius, int(rng.integers(3, 9)))
         formation = make_formation(scene, "v0-palm")
-        z = np.array([approach(rng, scene, finger) for _ in range(120)])
+        z = np.array([approach(rng, scene, finger) for _ in range(150)])
         values = formation.evaluate_limits(z)
         for gap, row in zip(link_gaps(scene, finger, z), values, strict=True):
             limits = limits_of(formation, finger, row)

@@ -27,11 +27,11 @@ def test_the_same_generator_gives_the_same_scene_and_route() -> None:
 
 
 def test_scenes_span_sizes_masses_and_kinds_of_fingers() -> None:
-    tables = [random_scene(np.random.default_rng(seed)) for seed in range(24)]
+    tables = [random_scene(np.random.default_rng(seed)) for seed in range(16)]
     thin = [table["fingers"]["1"]["radius"] == 0.0 for table in tables]
-    assert 3 < sum(thin) < 21
+    assert 2 < sum(thin) < 14
     masses = np.log10([table["object"]["mass"] for table in tables])
     sizes = np.log10([build_problem(table).scene.scales.length for table in tables])
     assert np.ptp(masses) > 4 and np.ptp(sizes) > 2
     counts = {len(table["object"]["vertices"]) for table in tables}
-    assert len(counts) >= 8
+    assert len(counts) >= 6

@@ -102,7 +102,7 @@ class Spoiled:
     def __init__(self, problem: Problem, phase: int, cured: int) -> None:
         self.problem, self.phase, self.cured = problem, phase, cured
         self.refined: list[int] = []
-        options = PlanOptions(intervals=20)
+        options = PlanOptions(intervals=10)
         self.planning = plan_blocks(problem, options, lambda _: None)
 
     def build(self, planning: Planning) -> Trajectory:
@@ -141,7 +141,7 @@ def test_only_what_does_not_hold_is_refined(slide: Problem, cured: int) -> None:
     assert verify(slide, trajectory).ok
     # Twice the intervals, but for those of no length where a direction reverses.
     pieces = [len(block.plans[0].torque.coefficients) for block in planning.blocks]
-    assert pieces[1] >= 2**cured * 20 - 2
+    assert pieces[1] >= 2**cured * 10 - 2
 
 
 def jam(phase: int, pieces: int) -> Any:

@@ -44,15 +44,11 @@ def test_a_worker_that_hangs_or_dies_is_replaced() -> None:
     assert answers["die"].result == 3
 
 
-def test_a_scene_is_drawn_alike_whichever_others_are() -> None:
-    one, other = draw_case(0, 2), draw_case(0, 2)
-    assert one == other
-    assert draw_case(0, 3).table != one.table
-    assert one.table["phases"]
-
-
-def test_a_scene_is_the_same_as_a_file() -> None:
-    case = draw_case(0, 2)
+def test_a_scene_is_drawn_alike_whichever_others_are_and_is_the_same_as_a_file() -> None:
+    case, again = draw_case(0, 2), draw_case(0, 2)
+    assert case == again
+    assert draw_case(0, 3).table != case.table
+    assert case.table["phases"]
     assert tomllib.loads(to_toml(case.table)) == case.table
 
 

@@ -120,7 +120,7 @@ def test_advice_is_that_along_the_curve(heptagon: Problem, curves: tuple[Curve, 
     """Two formulations with different unknowns, one of them convex but for viscous friction."""
     problem, phase = change_limit(heptagon, EPSILON, 1.0), heptagon.phases[1]
     start = curves[0].end
-    options, coarse = PlanOptions(time_intervals=6), PlanOptions(intervals=40)
+    options, coarse = PlanOptions(time_intervals=6), PlanOptions(intervals=20)
     texts = [
         why_not(lambda: plan_phases(problem, (problem.phases[1],), start, options)),
         why_not(lambda: plan_path(curves[1], problem.epsilon, coarse, phase.number)),
