@@ -45,13 +45,13 @@ def edited(friction: dict[str, float] | None = None, **joints: float) -> Problem
 )
 def test_extreme_scenes_are_planned(joints: dict[str, Any]) -> None:
     problem = edited(**joints)
-    report = verify(problem, solve(problem))
+    report = verify(problem, solve(problem, intervals=40, replay=False))
     assert report.ok, report.failures
 
 
 def test_strong_drag_bounds_the_speed() -> None:
     """Ten times the drag takes ten times as long: inertia does not matter any more."""
-    times = [solve(edited(viscous=drag)).meta["value"] for drag in (2.3, 23.0)]
+    times = [solve(edited(viscous=drag), intervals=40).meta["value"] for drag in (2.3, 23.0)]
     assert times[1] / times[0] == pytest.approx(10.0, rel=1e-2)
 
 

@@ -4,7 +4,7 @@ import casadi as ca
 import pytest
 
 from wholearm.common.arrays import Expression
-from wholearm.solvers.ipopt import build_solver
+from wholearm.solvers.ipopt import build_solver, record_runs
 
 
 def build(max_iter: int) -> Expression:
@@ -47,3 +47,17 @@ def test_a_solution_is_kept_as_a_start(solver: Expression) -> None:
 def test_failure_is_a_status_and_no_exception(solver: Expression) -> None:
     solver(x0=[3.0, 3.0], lbx=[0.8, 0.8], ubx=[0.9, 0.9], lbg=5.0, ubg=ca.inf)
     assert not solver.stats()["success"]
+
+
+def test_runs_are_recorded_with_their_sizes(solver: Expression) -> None:
+    with record_runs() as runs:
+        solve(solver, x0=[3.0, 3.0])
+        with record_runs() as inner:
+            solve(solver, x0=[0.9, 0.9])
+    solve(solver, x0=[3.0, 3.0])
+    assert len(runs) == 2 and inner == runs[1:]
+    for run in runs:
+        assert (run.unknowns, run.rows) == (2, 1)
+        # The row has both unknowns; the Hessian is diagonal.
+        assert (run.jacobian_nonzeros, run.hessian_nonzeros) == (2, 2)
+        assert run.iterations > 0 and run.seconds >= 0.0

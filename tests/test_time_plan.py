@@ -40,7 +40,7 @@ SLACK = 1e-6
 """What a limit may be missed by between the places that the planner looks at [N or N m]."""
 COARSE = 6
 """Intervals where only what a plan is for is looked at, not how good it is."""
-SCHEMES = [("radau", 2), ("radau", 5), ("legendre", 2), ("legendre", 3)]
+SCHEMES = [("radau", 2), ("radau", 5), ("legendre", 3)]
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +131,7 @@ def test_a_problem_planned_in_the_time_domain_is_carried_out() -> None:
 def test_schemes_and_degrees_agree(
     heptagon: Problem, curves: tuple[Curve, ...], trajectory: Trajectory, name: str, degree: int
 ) -> None:
-    options = PlanOptions(scheme=name, degree=degree, time_intervals=16)
+    options = PlanOptions(scheme=name, degree=degree, time_intervals=12)
     plans = plan_phases(heptagon, (heptagon.phases[3],), curves[2].end, options)
     # Intervals end where torques switch; what is left is that these are linear in between.
     above = total(plans) / trajectory.meta["phase_durations"][3] - 1

@@ -1,4 +1,4 @@
-"""The command ``wholearm bench``: run times of a problem, or the stress study."""
+"""The command ``wholearm bench``: run times of a problem, and other studies."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from .progress import clear_progress, show_progress
 
-STUDIES = ("problem", "stress")
+STUDIES = ("problem", "stress", "guard")
 """What can follow ``bench``; the word ``problem`` may be left out."""
 
 
@@ -46,6 +46,13 @@ def add_bench(bench: argparse.ArgumentParser) -> None:
     stress.add_argument("--again", action="store_true", help="run again what had findings")
     stress.add_argument("-o", "--output", default="results", help="folder for records and table")
     stress.set_defaults(run=_stress)
+
+    text = "count what plans take by other measures than time, and compare with stored counts"
+    guard = studies.add_parser("guard", help=text, description=text)
+    guard.add_argument("problems", nargs="+", metavar="FILE", help="problem files (TOML)")
+    guard.add_argument("--counts", default="results/bench_guard.json", help="file of stored counts")
+    guard.add_argument("--update", action="store_true", help="store the counts anew")
+    guard.set_defaults(run=lambda options: _guard(options, progress))
 
 
 def _measure(options: argparse.Namespace) -> int:
@@ -86,6 +93,22 @@ def _stress(options: argparse.Namespace) -> int:
     print(text)
     print(f"wrote {path}")
     return 1 if count else 0
+
+
+def _guard(options: argparse.Namespace, progress: Callable[[], object]) -> int:
+    from ..benchmark.guard import run_guard
+
+    show = progress()
+    given = (options.problems, options.counts, options.update)
+    grown = run_guard(*given, show or (lambda _: None))  # type: ignore[arg-type]
+    _clear(show)
+    for text in grown:
+        print(text)
+    if options.update:
+        print(f"wrote {options.counts}")
+    elif not grown:
+        print(f"{len(options.problems)} problems: no count has grown")
+    return 1 if grown else 0
 
 
 def _write_scene(seed: int, number: int, folder: str) -> str:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
-from typing import Any
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
 
 import casadi as ca
 
@@ -69,6 +71,41 @@ def build_solver(
     return solver
 
 
+class Run(NamedTuple):
+    """One run of a solver.
+
+    Attributes
+    ----------
+    unknowns, rows : int
+    jacobian_nonzeros, hessian_nonzeros : int
+        Of the rows, and of the upper triangle of the Lagrangian's Hessian.
+    iterations : int
+    seconds : float, [s]
+        Processor time.
+    """
+
+    unknowns: int
+    rows: int
+    jacobian_nonzeros: int
+    hessian_nonzeros: int
+    iterations: int
+    seconds: float
+
+
+_RECORDS: list[list[Run]] = []
+
+
+@contextmanager
+def record_runs() -> Iterator[list[Run]]:
+    """Collect the runs of all solvers until the end of a `with` statement."""
+    runs: list[Run] = []
+    _RECORDS.append(runs)
+    try:
+        yield runs
+    finally:
+        _RECORDS.remove(runs)
+
+
 class Solver:
     """An NLP solver that an interrupt ends: CasADi would stop it and go on as if it had failed."""
 
@@ -87,6 +124,8 @@ class Solver:
         stats = self.function.stats()
         cost = {"iterations": stats["iter_count"], "solve_time": stats["t_wall_total"]}
         book(SolverStatistics(solves=1, **cost))
+        for runs in _RECORDS:
+            runs.append(self._describe_run(stats))
         check()
         if stats["return_status"] == STOPPED:
             raise KeyboardInterrupt
@@ -96,3 +135,16 @@ class Solver:
         """Statistics of the last call."""
         statistics: dict[str, Any] = self.function.stats()
         return statistics
+
+    def _describe_run(self, stats: dict[str, Any]) -> Run:
+        jacobian, hessian = (
+            self.function.get_function(f"nlp_{key}") for key in ("jac_g", "hess_l")
+        )
+        return Run(
+            self.function.size1_in("x0"),
+            self.function.size1_in("lbg"),
+            jacobian.nnz_out(jacobian.n_out() - 1),
+            hessian.nnz_out(0),
+            stats["iter_count"],
+            stats["t_proc_total"],
+        )

@@ -1,0 +1,131 @@
+"""Guarding against growth: counts of each problem's plan that no clock has a part in.
+
+Sizes of the first NLP of every block of phases, and panels of the traced curves, are the same on
+every machine. Iterations of the solver and evaluations in the replay hang on rounding, so that they
+may grow within a band.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from ..common.errors import InputError
+from ..common.files import require_writable, write_whole
+from ..geometry.path_guess import load
+from ..geometry.tracing import trace_phases
+from ..planning.plan import solve
+from ..problem.definition import Problem
+from ..simulation.runge_kutta import NODES
+from ..simulation.simulate import simulate
+from ..solvers.ipopt import Run, record_runs
+
+BANDS = {"iterations": 1.25, "evaluations of the replay": 1.1}
+"""By how much counts may grow that rounding has a part in; others may not grow at all."""
+
+Counts = dict[str, int]
+
+
+def count_all(paths: Sequence[str], progress: Callable[[str], None]) -> dict[str, Counts]:
+    """Counts of every problem, by the names of its file."""
+    found = {}
+    for path in paths:
+        problem, name = load(path), Path(path).stem
+        progress(f"{name}: planning")
+        found[name] = count(problem)
+    return found
+
+
+def count(problem: Problem) -> Counts:
+    """Plan a problem for least time, replay the plan, and count what that takes.
+
+    Returns
+    -------
+    dict
+        By names such as "phase 5-6 of 6: rows"; `BANDS` has those that rounding has a part in.
+    """
+    firsts: dict[str, Run] = {}
+    block, begun = "", 0
+
+    with record_runs() as runs:
+
+        def note(text: str) -> None:
+            nonlocal block, begun
+            if block and len(runs) > begun:
+                firsts.setdefault(block, runs[begun])
+            block, begun = text.removesuffix(": time"), len(runs)
+
+        plan = solve(problem, replay=False, progress=note).trajectory
+        note("")
+    sizes = {
+        f"{name}: {size}": getattr(run, size.replace(" ", "_"))
+        for name, run in firsts.items()
+        for size in ("unknowns", "rows", "jacobian nonzeros", "hessian nonzeros")
+    }
+    replay = simulate(problem, plan.torque)
+    return sizes | {
+        "panels of curves": sum(len(curve.panels) for curve in trace_phases(problem)),
+        "iterations": sum(run.iterations for run in runs),
+        "evaluations of the replay": len(NODES) * (replay.steps + replay.rejected),
+    }
+
+
+def compare(name: str, found: Counts, stored: Counts) -> list[str]:
+    """What has grown over the stored counts of a problem, or is no longer there."""
+    texts = [f"{name}: {key} is not counted any more" for key in stored if key not in found]
+    for key, value in found.items():
+        if key not in stored:
+            texts.append(f"{name}: {key} = {value} is new; --update stores it")
+        elif value > (most := stored[key] * BANDS.get(key, 1.0)):
+            room = f" (allowed: {most:.0f})" if key in BANDS else ""
+            texts.append(f"{name}: {key} has grown from {stored[key]} to {value}{room}")
+    return texts
+
+
+def read_stored(path: str) -> dict[str, Counts]:
+    """The stored counts by problem.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or is not a table of whole numbers.
+    """
+    try:
+        table = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "no JSON"
+        raise InputError(path, "", f"cannot be read: {reason}; --update writes it anew") from None
+    rows = table.values() if isinstance(table, Mapping) else [None]
+    numbers = [n for row in rows for n in (row.values() if isinstance(row, Mapping) else [None])]
+    if not all(type(number) is int for number in numbers):
+        raise InputError(path, "", "holds other things than whole numbers by problem and count")
+    return dict(table)
+
+
+def run_guard(
+    paths: Sequence[str], stored: str, update: bool, progress: Callable[[str], None]
+) -> list[str]:
+    """Count, and store the counts or hold them against those that are stored.
+
+    Returns
+    -------
+    list of str
+        What has grown; nothing if the counts are stored.
+    """
+    known = {} if update and not Path(stored).exists() else read_stored(stored)
+    require_writable(stored)
+    found = count_all(paths, progress)
+    if update:
+        text = json.dumps(known | found, indent=2, sort_keys=True) + "\n"
+        write_whole(stored, lambda stream: stream.write(text.encode()))
+        return []
+    return [
+        text
+        for name, counts in found.items()
+        for text in (
+            compare(name, counts, known[name])
+            if name in known
+            else [f"{name}: no counts are stored; --update stores them"]
+        )
+    ]
