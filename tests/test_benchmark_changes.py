@@ -8,7 +8,8 @@ from shipped import HEPTAGON
 from wholearm.benchmark import changes
 from wholearm.benchmark.changes import measure_stress
 from wholearm.geometry.path_guess import load
-from wholearm.problem.definition import Problem, build_problem
+from wholearm.problem.definition import Problem
+from wholearm.problem.read import build_problem
 
 
 def slide() -> Problem:

@@ -9,7 +9,7 @@ from shipped import FOLDER, HEPTAGON
 from wholearm.benchmark.guard import BANDS, compare, count, read_stored, run_guard
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
-from wholearm.problem.definition import build_problem, read_problem
+from wholearm.problem.read import build_problem, read_problem
 
 STORED = FOLDER.with_name("results") / "bench_guard.json"
 INTERVALS, CONTACTS = 80, 4
@@ -77,7 +77,7 @@ def test_the_command_stores_counts_and_fails_where_they_grow(
     assert capsys.readouterr().out == line
     del stored["slide"]
     counts.write_text(json.dumps(stored))
-    (text,) = run_guard([path], str(counts), False, lambda _: None)
+    (text,) = run_guard([path], str(counts), False)
     assert text.startswith("slide: no counts are stored")
 
 

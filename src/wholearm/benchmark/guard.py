@@ -27,12 +27,15 @@ BANDS = {"iterations": 1.25, "evaluations of the replay": 1.1}
 Counts = dict[str, int]
 
 
-def count_all(paths: Sequence[str], progress: Callable[[str], None]) -> dict[str, Counts]:
+def count_all(
+    paths: Sequence[str], progress: Callable[[str], None] | None = None
+) -> dict[str, Counts]:
     """Counts of every problem, by the names of its file."""
     found = {}
     for path in paths:
         problem, name = load(path), Path(path).stem
-        progress(f"{name}: planning")
+        if progress is not None:
+            progress(f"{name}: planning")
         found[name] = count(problem)
     return found
 
@@ -104,7 +107,7 @@ def read_stored(path: str) -> dict[str, Counts]:
 
 
 def run_guard(
-    paths: Sequence[str], stored: str, update: bool, progress: Callable[[str], None]
+    paths: Sequence[str], stored: str, update: bool, progress: Callable[[str], None] | None = None
 ) -> list[str]:
     """Count, and store the counts or hold them against those that are stored.
 

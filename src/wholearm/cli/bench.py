@@ -52,7 +52,7 @@ def add_bench(bench: argparse.ArgumentParser) -> None:
     guard.add_argument("problems", nargs="+", metavar="FILE", help="problem files (TOML)")
     guard.add_argument("--counts", default="results/bench_guard.json", help="file of stored counts")
     guard.add_argument("--update", action="store_true", help="store the counts anew")
-    guard.set_defaults(run=lambda options: _guard(options, progress))
+    guard.set_defaults(run=_guard)
 
 
 def _measure(options: argparse.Namespace) -> int:
@@ -95,13 +95,11 @@ def _stress(options: argparse.Namespace) -> int:
     return 1 if count else 0
 
 
-def _guard(options: argparse.Namespace, progress: Callable[[], object]) -> int:
+def _guard(options: argparse.Namespace) -> int:
     from ..benchmark.guard import run_guard
 
-    show = progress()
-    given = (options.problems, options.counts, options.update)
-    grown = run_guard(*given, show or (lambda _: None))  # type: ignore[arg-type]
-    _clear(show)
+    grown = run_guard(options.problems, options.counts, options.update, show_progress())
+    clear_progress()
     for text in grown:
         print(text)
     if options.update:
