@@ -4,12 +4,11 @@ import math
 
 import pytest
 
-from wholearm.mechanics.limits import Parameter
+from wholearm.common.shortfalls import Change, Parameter, Place, Shortfall
 from wholearm.planning.advice import (
-    Change,
-    Shortfall,
     bracket,
     describe_changes,
+    describe_shortfalls,
     find_changes,
     rank_shortfalls,
     round_outwards,
@@ -91,9 +90,13 @@ def test_changes_in_words() -> None:
 
 
 def test_shortfalls_are_ranked() -> None:
-    small = Shortfall("torque limit of finger 1 = 2 N m", 0.4, "N m", "t = 0.1000 s, phase 2", 0.2)
-    large = Shortfall("c_n of v3-finger1 >= epsilon = 0.05 N", 0.81234, "N", "t = 0.0000 s", 0.4)
-    assert rank_shortfalls([small, large]) == (
+    late, early = Place(2, 0.1, "t = 0.1000 s, phase 2"), Place(1, 0.0, "t = 0.0000 s")
+    limit = "torque limit of finger 1 = 2 N m"
+    small = Shortfall("torque", "finger 1", limit, 0.4, "N m", late, 0.2)
+    limit = "c_n of v3-finger1 >= epsilon = 0.05 N"
+    large = Shortfall("press", "v3-finger1", limit, 0.81234, "N", early, 0.4)
+    assert rank_shortfalls([small, large]) == [large, small]
+    assert describe_shortfalls([large, small]) == (
         "c_n of v3-finger1 >= epsilon = 0.05 N is 0.812 N short at t = 0.0000 s; "
         "torque limit of finger 1 = 2 N m is 0.4 N m short at t = 0.1000 s, phase 2"
     )

@@ -11,6 +11,7 @@ from plane import SQUARE, make_formation, make_scene
 from tipping import roll
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError
+from wholearm.common.shortfalls import Parameter
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.mechanics import limits as limits_module
@@ -20,7 +21,6 @@ from wholearm.mechanics.limits import (
     SPEED,
     TORQUE,
     MotionLimit,
-    Parameter,
     make_limits,
 )
 from wholearm.planning.options import Objective, PlanOptions
@@ -117,10 +117,9 @@ def list_motors(formation: Formation, _: float) -> list[MotionLimit]:
         rows[0, -4 + k], rows[0, -2 + k] = 1.0, DROOP * scene.scales.torque * scene.scales.time
         key = f"fingers.{k + 1}.torque_limit"
         parameter = Parameter(f"torque limit of finger {k + 1}", limit, "N m", 1, key)
-        most, text = np.array([limit]), f"motor curve of finger {k + 1}"
-        found.append(
-            MotionLimit("motor", text, "N m", rows, -most, most, limit, parameter, np.ones(1))
-        )
+        most, part = np.array([limit]), f"finger {k + 1}"
+        what = ("motor", part, f"motor curve of {part}", "N m")
+        found.append(MotionLimit(*what, rows, -most, most, limit, parameter, np.ones(1)))
     return found
 
 

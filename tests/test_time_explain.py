@@ -153,7 +153,7 @@ def test_shortfalls_are_measured_where_they_are_worst() -> None:
     fewer = forces[..., : problem.phases[1].formation.n_contacts]
     later = replace(stage, phase=1, guess=guess._replace(forces=fewer - 0.1 / scales.force))
     worse, same = list_shortfalls(problem, [stage, later], SCHEME)[:2]
-    assert worse.amount == pytest.approx(0.6) and worse.where == "t = 1.1000 s, phase 2"
+    assert worse.amount == pytest.approx(0.6) and worse.place.text == "t = 1.1000 s, phase 2"
     assert same == second
     assert list_shortfalls(change_limit(problem, EPSILON, 0.0), [outline(problem)], SCHEME) == []
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         SolverError,
         WholearmError,
     )
+    from .common.shortfalls import Change, Shortfall
     from .contacts.elemental import Contact
     from .contacts.formation import Formation
     from .figures import plots
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
+    "Change": "common.shortfalls",
     "Contact": "contacts.elemental",
     "End": "problem.definition",
     "Finger": "scene.model",
@@ -65,6 +67,7 @@ _HOMES = {
     "Report": "results.report",
     "Scene": "scene.model",
     "Simulation": "simulation.events",
+    "Shortfall": "common.shortfalls",
     "SimulationError": "common.errors",
     "SolverError": "common.errors",
     "Status": "planning.result",
@@ -86,6 +89,7 @@ _HOMES = {
 }
 
 __all__ = [
+    "Change",
     "Contact",
     "End",
     "Finger",
@@ -103,6 +107,7 @@ __all__ = [
     "ReplayError",
     "Report",
     "Scene",
+    "Shortfall",
     "Simulation",
     "SimulationError",
     "SolverError",

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any
+
+from .shortfalls import Change, Shortfall
 
 LONGEST = 1000
 """Characters of a message beyond which its middle is left out."""
@@ -65,7 +68,28 @@ def name_source(source: str) -> Iterator[None]:
 
 
 class InfeasibleError(WholearmError):
-    """No motion satisfies the constraints; the message names constraint, phase and place."""
+    """No motion satisfies the constraints; the message names constraint, phase and place.
+
+    Attributes
+    ----------
+    shortfalls : tuple of Shortfall
+        What the motion that misses limits least is short of, the worst first.
+    changes : tuple of Change
+        Changes of a single parameter with which a plan was found.
+    motion : Trajectory or None
+        That motion, of the phases without a plan, where there is one.
+    """
+
+    def __init__(
+        self,
+        text: str,
+        shortfalls: Iterable[Shortfall] = (),
+        changes: Iterable[Change] = (),
+        motion: Any = None,
+    ) -> None:
+        super().__init__(text)
+        self.shortfalls, self.changes = tuple(shortfalls), tuple(changes)
+        self.motion = motion
 
 
 class ReplayError(WholearmError):
@@ -89,7 +113,15 @@ class _PhaseError(WholearmError):
 
 
 class JammingError(_PhaseError):
-    """Friction makes the reduced inertia vanish or turn negative: no forward dynamics."""
+    """Friction makes the reduced inertia vanish or turn negative: no forward dynamics.
+
+    Attributes
+    ----------
+    changes : tuple of Change
+        Changes of a single coefficient of friction with which a plan was found.
+    """
+
+    changes: tuple[Change, ...] = ()
 
 
 class SimulationError(_PhaseError):

@@ -16,12 +16,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
+from ..common.shortfalls import Parameter
 from ..contacts.cones import hold_rows
 from ..contacts.formation import Formation
 
@@ -29,33 +29,6 @@ PRESS, CONE, TORQUE, SPEED = "press", "cone", "torque", "speed"
 """Kinds of limits: least normal forces, friction cones, torques and speeds of the joints."""
 EPSILON = "epsilon"
 """Key of the least normal force."""
-
-
-class Parameter(NamedTuple):
-    """A number that sets limits, and may be changed to let a motion be planned.
-
-    Attributes
-    ----------
-    name : str
-    value : float
-        As it is.
-    unit : str
-    sign : int
-        1 if limits give way as it grows, -1 if as it falls (not below zero).
-    key : str
-        Dotted key of it in a problem.
-    """
-
-    name: str
-    value: float
-    unit: str
-    sign: int
-    key: str = ""
-
-    @property
-    def is_speed(self) -> bool:
-        """Whether it is a speed, of which motions know the square."""
-        return self.unit == "rad/s"
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +39,8 @@ class MotionLimit:
     ----------
     kind : str
         What finds it in a `LimitSet`.
+    part : str
+        The contact or finger that it is about.
     text : str
         The limit in words, with its value.
     unit : str
@@ -82,6 +57,7 @@ class MotionLimit:
     """
 
     kind: str
+    part: str
     text: str
     unit: str
     rows: Array
@@ -194,20 +170,20 @@ def _make_holds(formation: Formation, epsilon: float) -> list[MotionLimit]:
     H = hold_rows(formation)
     H = np.hstack([H, np.zeros((len(H), 4))])
 
-    def make(kind: str, text: str, rows: Array, weight: Array) -> MotionLimit:
+    def make(kind: str, part: str, text: str, rows: Array, weight: Array) -> MotionLimit:
         high = np.full(len(rows), np.inf)
         low = epsilon * weight
-        return MotionLimit(kind, text, "N", rows, low, high, force, parameter, weight)
+        return MotionLimit(kind, part, text, "N", rows, low, high, force, parameter, weight)
 
     least = f"epsilon = {epsilon:g} N"
     found = [
-        make(PRESS, f"c_n of {name} >= {least}", H[k : k + 1], np.ones(1))
+        make(PRESS, name, f"c_n of {name} >= {least}", H[k : k + 1], np.ones(1))
         for k, name in enumerate(formation.names)
     ]
     for k, row in enumerate(formation.rolling_rows):
         mu, name = formation.friction[row], formation.names[row]
         text = f"friction cone of {name}, |c_t| <= {mu:g} (c_n - {epsilon:g} N),"
-        found.append(make(CONE, text, H[[n_c + k, n_c + R + k]], np.full(2, mu)))
+        found.append(make(CONE, name, text, H[[n_c + k, n_c + R + k]], np.full(2, mu)))
     return found
 
 
@@ -222,12 +198,13 @@ def _make_joint_limits(formation: Formation, _: float) -> list[MotionLimit]:
         for k, limit in enumerate(limits.tolist()):
             if not np.isfinite(limit):
                 continue
-            name, key = f"{kind} limit of finger {k + 1}", f"fingers.{k + 1}.{kind}_limit"
+            part, key = f"finger {k + 1}", f"fingers.{k + 1}.{kind}_limit"
+            name = f"{kind} limit of {part}"
             parameter = Parameter(name, limit, unit, 1, key)
             rows, most = np.eye(width)[[first + k]], np.array([limit])
             text = f"{name} = {limit:g} {unit}"
             found.append(
-                MotionLimit(kind, text, unit, rows, -most, most, limit, parameter, np.ones(1))
+                MotionLimit(kind, part, text, unit, rows, -most, most, limit, parameter, np.ones(1))
             )
     return found
 

@@ -15,11 +15,19 @@ from typing import Any, NamedTuple
 
 from ..common.arrays import Array
 from ..common.errors import InfeasibleError, InputError, JammingError, SolverError
-from ..mechanics.limits import LimitSet, Parameter
+from ..common.shortfalls import Change, Parameter, Place, Shortfall
+from ..contacts.formation import Formation
+from ..mechanics.limits import LimitSet
+from ..results.torque import TorqueProfile
+from ..results.trajectory import Motion, Trajectory, assemble
 from ..scene.model import Scene
 
 SHORT = 1e-4
 """Least shortfall that counts, over what is much for a limit."""
+SHORT_OF = "misses limits least"
+"""Status in the `meta` of such a motion."""
+ROWS = 201
+"""Rows of each of its phases."""
 DIGITS = 3
 """Significant digits of what is advised."""
 _BEYOND = (0.0, 0.005, 0.015, 0.05, 0.15, 0.5)
@@ -28,46 +36,15 @@ _CLOSE = 0.02
 """How much more than needed is good enough, relatively."""
 
 
-class Shortfall(NamedTuple):
-    """A limit that cannot be kept.
+class Advice(NamedTuple):
+    """Why there is no plan, in words, and the changes with which there would be one."""
 
-    Attributes
-    ----------
-    limit : str
-        The limit in words, with its value.
-    amount : float
-        By how much it is missed at worst.
-    unit : str
-    where : str
-        Time, and place or phase, of that.
-    share : float
-        The amount over what is much for such a limit, which shortfalls are ranked by.
-    """
-
-    limit: str
-    amount: float
-    unit: str
-    where: str
-    share: float
-
-    def __str__(self) -> str:
-        return f"{self.limit} is {self.amount:.3g} {self.unit} short at {self.where}"
-
-
-class Change(NamedTuple):
-    """A parameter and a value of it that a plan was found with."""
-
-    parameter: Parameter
-    value: float
-
-    def __str__(self) -> str:
-        own = self.parameter
-        value = f"{self.value:g} {own.unit}".rstrip()
-        return f"{own.name} = {value} instead of {own.value:g}"
+    text: str
+    changes: tuple[Change, ...]
 
 
 def list_shortfalls(
-    limits: LimitSet, values: Array, describe: Callable[[int], str]
+    limits: LimitSet, values: Array, locate: Callable[[int], Place]
 ) -> list[Shortfall]:
     """What a motion is short of, each limit where it is worst.
 
@@ -76,8 +53,8 @@ def list_shortfalls(
     limits : LimitSet
     values : ndarray, shape (n, m)
         What the limits are of at n places of the motion.
-    describe : callable
-        Says in words where the k-th place is.
+    locate : callable
+        Says where the k-th place is.
     """
     short = limits.fold(-limits.find_slack(values))
     found = []
@@ -87,8 +64,21 @@ def list_shortfalls(
         amount = float(of_limit[worst])
         if amount > SHORT * limit.scale:
             share = amount / limit.scale
-            found.append(Shortfall(limit.text, amount, limit.unit, describe(worst), share))
+            what = (limit.kind, limit.part, limit.text, amount, limit.unit)
+            found.append(Shortfall(*what, locate(worst), share))
     return found
+
+
+def assemble_least(
+    motions: Sequence[Motion], torques: Sequence[TorqueProfile], formations: Sequence[Formation]
+) -> Trajectory:
+    """The trajectory of a motion that misses limits, of the phases in which it does."""
+    meta = {
+        "status": SHORT_OF,
+        "rolling": [[contact.name for contact in own.rolling] for own in formations],
+        "modes": [[mode.to_dict() for mode in getattr(own, "modes", ())] for own in motions],
+    }
+    return assemble(motions, TorqueProfile.chain(torques), meta, ROWS)
 
 
 def keep_worst(shortfalls: Iterable[Shortfall]) -> list[Shortfall]:
@@ -115,7 +105,7 @@ def advise(
     find_least: Callable[[Parameter], float | None],
     replan: Callable[[Parameter, float], object] | None,
     seconds: float = math.inf,
-) -> str:
+) -> Advice:
     """Why there is no plan, with the changes of a single parameter that make one possible.
 
     Parameters
@@ -132,7 +122,7 @@ def advise(
         Processor time after which no further change is tried.
     """
     if replan is None:
-        return text
+        return Advice(text, ())
     stop, undecided = time.thread_time() + seconds, list[Parameter]()
 
     def look(parameter: Parameter) -> float | None:
@@ -150,8 +140,8 @@ def advise(
 
     changes = find_changes(parameters, look, can_plan)
     if undecided and not changes:
-        return f"{text}; no single limit was found that makes it feasible"
-    return f"{text}; {describe_changes(changes)}"
+        return Advice(f"{text}; no single limit was found that makes it feasible", ())
+    return Advice(f"{text}; {describe_changes(changes)}", tuple(changes))
 
 
 def succeeds(plan: Callable[[], object]) -> bool:
@@ -176,9 +166,14 @@ def change_scene(scene: Scene, key: str, value: float) -> Scene:
     return replace(scene, fingers=(right, left))
 
 
-def rank_shortfalls(shortfalls: Iterable[Shortfall]) -> str:
-    """All shortfalls in one line, the worst first."""
-    return "; ".join(map(str, sorted(shortfalls, key=lambda short: -short.share)))
+def rank_shortfalls(shortfalls: Iterable[Shortfall]) -> list[Shortfall]:
+    """Shortfalls, the worst first."""
+    return sorted(shortfalls, key=lambda short: -short.share)
+
+
+def describe_shortfalls(shortfalls: Iterable[Shortfall]) -> str:
+    """All shortfalls in one line."""
+    return "; ".join(map(str, shortfalls))
 
 
 def find_changes(

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InfeasibleError, name_source
+from ..common.shortfalls import Change, Parameter
 from ..geometry.cost_to_go import CostToGo
 from ..geometry.tracing import runs_on_curve, trace_phase, trace_phases
 from ..mechanics.metric import measure_speed
@@ -343,13 +344,14 @@ def _share_duration(
     times = [plan.motion.duration for plan in least]
     total = 2 * sum(times) if duration is None else duration
     if total <= sum(times):
-        from ..mechanics.limits import Parameter
-        from .advice import Change, describe_changes, round_outwards
+        from .advice import describe_changes, round_outwards
 
         # The least-time plan shows it; a little more leaves something to choose.
-        enough = Change(Parameter("duration", total, "s", 1), round_outwards(1.005 * sum(times), 1))
+        own = Parameter("duration", total, "s", 1, "duration")
+        enough = Change(own, round_outwards(1.005 * sum(times), 1))
         raise InfeasibleError(
             f"duration = {total:g} s is not longer than the least time, {sum(times):.6g} s; "
-            f"{describe_changes([enough])}"
+            f"{describe_changes([enough])}",
+            changes=[enough],
         )
     return [total / sum(times) * own for own in times]

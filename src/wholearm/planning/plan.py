@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from .. import __version__
+from ..common.errors import InfeasibleError
 from ..common.sharing import exclusive
 from ..geometry.tracing import trace_phases
 from ..problem.definition import Problem
@@ -105,7 +106,7 @@ def solve_with(
         report("tracing the phases")
         trace_phases(problem)
         traced = time.perf_counter()
-        planning = plan_blocks(problem, options, report)
+        planning = _plan(problem, options, report)
         trajectory, figures = assemble_plan(planning), None
         planned = time.perf_counter()
         if options.replay:
@@ -141,6 +142,17 @@ def solve_with(
         },
     )
     return replace(plan, trajectory=replace(trajectory, meta=write_meta(plan)))
+
+
+def _plan(problem: Problem, options: PlanOptions, report: Callable[[str], None]) -> Planning:
+    """Plan every block, and let an error's motion carry the problem along like a plan's."""
+    try:
+        return plan_blocks(problem, options, report)
+    except InfeasibleError as error:
+        if error.motion is not None:
+            known = {"name": problem.name, "epsilon": problem.epsilon, "problem": problem.table}
+            error.motion = replace(error.motion, meta=error.motion.meta | known)
+        raise
 
 
 def assemble_plan(planning: Planning) -> Trajectory:

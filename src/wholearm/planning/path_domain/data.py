@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from ...common.arrays import Array
 from ...common.errors import JammingError, SolverError
 from ...common.minima import find_least
+from ...common.shortfalls import Parameter
 from ...geometry.curve import Curve, describe_pose
 from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
-from ...mechanics.limits import PRESS, SPEED, TORQUE, LimitSet, Parameter, make_limits
+from ...mechanics.limits import PRESS, SPEED, TORQUE, LimitSet, make_limits
 from ...results.torque import TorqueProfile
 from .motion import Grid, PathMotion, Profile, directions_of
 

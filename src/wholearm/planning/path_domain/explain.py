@@ -14,21 +14,24 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...common.errors import InfeasibleError, JammingError, SolverError
+from ...common.shortfalls import Parameter, Place, Shortfall
 from ...contacts.formation import Formation
 from ...geometry.curve import Curve, describe_pose
-from ...mechanics.limits import EPSILON, Parameter
+from ...mechanics.limits import EPSILON
+from ...results.trajectory import Trajectory
 from ..advice import (
-    Shortfall,
     advise,
+    assemble_least,
     bracket,
     change_scene,
+    describe_shortfalls,
     list_shortfalls,
     name_phases,
     rank_shortfalls,
     succeeds,
 )
 from ..options import Objective
-from .data import PhaseData, cut, join
+from .data import PhaseData, cut, fit_torque, join
 from .motion import PathMotion, Profile
 from .nlp import (
     Relaxation,
@@ -86,7 +89,7 @@ def explain(
     shortfalls = [
         short
         for part, own, phase in zip(parts, cut(parts, elastic), phases, strict=True)
-        for short in _list_shortfalls(part, own, f", phase {phase}" if len(phases) > 1 else "")
+        for short in _list_shortfalls(part, own, phase, len(phases) > 1)
     ]
     if not shortfalls:
         return SolverError(f"{stopped} although limits can be kept")
@@ -105,8 +108,22 @@ def explain(
     def change(parameter: Parameter, value: float) -> object:
         return _replan_with(curves, data.epsilon, replan, parameter, value)
 
-    text = f"{name_phases(phases, 'infeasible')}: {rank_shortfalls(shortfalls)}"
-    return InfeasibleError(advise(text, may_change, find_least, change))
+    ranked = rank_shortfalls(shortfalls)
+    text = f"{name_phases(phases, 'infeasible')}: {describe_shortfalls(ranked)}"
+    advice = advise(text, may_change, find_least, change)
+    motion = _make_trajectory(parts, cut(parts, elastic))
+    return InfeasibleError(advice.text, ranked, advice.changes, motion)
+
+
+def _make_trajectory(parts: Sequence[PhaseData], profiles: Sequence[Profile]) -> Trajectory | None:
+    """The motion that misses limits least; None if it takes for ever."""
+    pairs = zip(parts, profiles, strict=True)
+    motions = [PathMotion(part.curve, part.grid, own) for part, own in pairs]
+    try:
+        torques = [fit_torque(part, own)[0] for part, own in zip(parts, motions, strict=True)]
+    except SolverError:
+        return None
+    return assemble_least(motions, torques, [part.curve.formation for part in parts])
 
 
 def explain_jam(curve: Curve, epsilon: float, jam: JammingError, replan: Replan) -> JammingError:
@@ -119,7 +136,10 @@ def explain_jam(curve: Curve, epsilon: float, jam: JammingError, replan: Replan)
     def change(parameter: Parameter, value: float) -> object:
         return _replan_with([curve], epsilon, replan, parameter, value)
 
-    return JammingError(advise(str(jam), _list_frictions(curve.formation), find_least, change))
+    advice = advise(str(jam), _list_frictions(curve.formation), find_least, change)
+    error = JammingError(advice.text)
+    error.changes = advice.changes
+    return error
 
 
 def _replan_with(
@@ -212,11 +232,14 @@ def _find_shortfalls(data: PhaseData, profile: Profile) -> Array:
     return data.limits.fold(-data.slack(data.nodes, profile))
 
 
-def _list_shortfalls(data: PhaseData, profile: Profile, suffix: str) -> list[Shortfall]:
+def _list_shortfalls(
+    data: PhaseData, profile: Profile, phase: int, several: bool
+) -> list[Shortfall]:
     times = PathMotion(data.curve, data.grid, profile).times
     z = data.curve.evaluate(data.grid.s).z
 
-    def describe(node: int) -> str:
-        return f"t = {times[node]:.4f} s ({describe_pose(z[node])}){suffix}"
+    def locate(node: int) -> Place:
+        text = f"t = {times[node]:.4f} s ({describe_pose(z[node])})"
+        return Place(phase, float(times[node]), text + (f", phase {phase}" if several else ""))
 
-    return list_shortfalls(data.limits, data.evaluate(data.nodes, profile), describe)
+    return list_shortfalls(data.limits, data.evaluate(data.nodes, profile), locate)

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array, Expression
-from ...mechanics.limits import LimitSet, Parameter
+from ...common.shortfalls import Parameter
+from ...mechanics.limits import LimitSet
 from ...solvers.ipopt import build_solver
 from ...solvers.statistics import SolverStatistics, book
 from ..options import Objective

@@ -16,8 +16,8 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...common.errors import InfeasibleError, JammingError, SolverError, WholearmError
+from ...common.shortfalls import Parameter
 from ...geometry.curve import Curve
-from ...mechanics.limits import Parameter
 from ..advice import describe_changes, find_changes, name_phases
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
@@ -198,10 +198,12 @@ def _explain_duration(task: _Task) -> InfeasibleError | None:
         except SolverError:
             return False
 
-    changes = find_changes([Parameter("duration", duration, "s", 1)], lambda _: least, can_plan)
+    own = Parameter("duration", duration, "s", 1, "duration")
+    changes = find_changes([own], lambda _: least, can_plan)
     return InfeasibleError(
         f"{name_phases(task.phases, 'infeasible')}: duration = {duration:g} s is "
-        f"{least - duration:.3g} s shorter than the least time; {describe_changes(changes)}"
+        f"{least - duration:.3g} s shorter than the least time; {describe_changes(changes)}",
+        changes=changes,
     )
 
 

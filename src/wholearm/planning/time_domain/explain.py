@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from ...common.errors import InfeasibleError, SolverError
+from ...common.shortfalls import Parameter, Place, Shortfall
 from ...geometry.curve import describe_pose
 from ...geometry.path_guess import count_freedoms
-from ...mechanics.limits import EPSILON, Parameter, make_limits
+from ...mechanics.limits import EPSILON, PRESS, make_limits
 from ...problem.definition import Phase, Problem
+from ...results.trajectory import Trajectory
 from ...scene.model import Scales
 from .. import advice
-from ..advice import Shortfall, advise, change_scene, keep_worst, name_phases, rank_shortfalls
+from ..advice import (
+    advise,
+    assemble_least,
+    change_scene,
+    describe_shortfalls,
+    keep_worst,
+    name_phases,
+    rank_shortfalls,
+)
 from ..options import Objective
 from .collocation import Scheme
+from .motion import TimeMotion, make_motions
 from .own_units import to_si
 from .search import Search
 from .stage import Stage
@@ -67,10 +79,14 @@ def refuse(
         return
     where = describe_pose(to_si(stage, problem).guess.nodes[node, 0])
     text = f"phase {phase.number} is infeasible: {say.format(where)}"
+    shortfalls = list[Shortfall]()
     if blocked.contact:
         amount = blocked.short * problem.scene.scales.force
-        least = f"epsilon = {problem.epsilon:g} N"
-        text += f": c_n of {blocked.contact} >= {least} is {amount:.3g} N short at best"
+        limit = f"c_n of {blocked.contact} >= epsilon = {problem.epsilon:g} N"
+        text += f": {limit} is {amount:.3g} N short at best"
+        place = Place(phase.number, math.nan, where)
+        given = (PRESS, blocked.contact, limit, amount, "N", place, blocked.short)
+        shortfalls = [Shortfall(*given)]
     else:
         text += " within the torque limits"
     ends, z = node == -1, stage.guess.nodes[node, 0]
@@ -82,7 +98,7 @@ def refuse(
         value = find_change(stage.formation, z, epsilon, finger, ends)
         return _unit_of(parameter, problem.scene.scales) * value if value else None
 
-    raise _advise(problem, phase, text, find_least, replan)
+    raise _advise(problem, phase, text, find_least, replan, shortfalls)
 
 
 def explain(
@@ -131,8 +147,23 @@ def explain(
         return parameter.value + parameter.sign * unit * solution.cost
 
     ranked = rank_shortfalls(list_shortfalls(problem, elastic, search.scheme))
-    text = f"{name_phases(numbers, 'infeasible')}: {ranked}"
-    return _advise(problem, phases[0], text, find_least, replan)
+    text = f"{name_phases(numbers, 'infeasible')}: {describe_shortfalls(ranked)}"
+    error = _advise(problem, phases[0], text, find_least, replan, ranked)
+    error.motion = _make_trajectory(problem, phases, search, elastic)
+    return error
+
+
+def _make_trajectory(
+    problem: Problem, phases: Sequence[Phase], search: Search, stages: Sequence[Stage]
+) -> Trajectory:
+    """The motion of stages."""
+    solved = [to_si(stage, problem) for stage in stages]
+    pieces = make_motions(solved, search.scheme)
+    motions = [
+        TimeMotion([p for p, own in zip(pieces, solved, strict=True) if own.phase == phase.index])
+        for phase in phases
+    ]
+    return assemble_least(motions, [own.torque for own in motions], [p.formation for p in phases])
 
 
 def _unit_of(parameter: Parameter, scales: Scales) -> float:
@@ -147,6 +178,7 @@ def _advise(
     text: str,
     find_least: Callable[[Parameter], float | None],
     replan: Replan | None,
+    shortfalls: Sequence[Shortfall],
 ) -> InfeasibleError:
     """The error with `text` and what single change of a limit would make a plan possible.
 
@@ -160,6 +192,8 @@ def _advise(
         As for `planning.advice.advise`.
     replan : callable or None
         Without it no change is looked for.
+    shortfalls : sequence of Shortfall
+        What `text` tells of, as data.
     """
 
     def change(parameter: Parameter, value: float) -> object:
@@ -167,7 +201,8 @@ def _advise(
         return replan(change_limit(problem, parameter.key, value))
 
     parameters = make_limits(phase.formation, problem.epsilon).parameters
-    return InfeasibleError(advise(text, parameters, find_least, change if replan else None, ADVICE))
+    found = advise(text, parameters, find_least, change if replan else None, ADVICE)
+    return InfeasibleError(found.text, shortfalls, found.changes)
 
 
 def list_shortfalls(problem: Problem, stages: Sequence[Stage], scheme: Scheme) -> list[Shortfall]:
@@ -199,12 +234,11 @@ def _list_of_stage(
     y = np.concatenate([part.forces[:, pick], tau, part.v[:, pick, 3:]], axis=2)
     middles = passed + part.duration * (part.breaks[:-1] + part.fractions / 2)
 
-    def describe(row: int) -> str:
-        return f"t = {middles[row // len(pick)]:.4f} s, phase {stage.phase + 1}"
+    def locate(row: int) -> Place:
+        t, phase = float(middles[row // len(pick)]), stage.phase + 1
+        return Place(phase, t, f"t = {t:.4f} s, phase {phase}")
 
-    return advice.list_shortfalls(
-        limits, (y @ limits.rows.T).reshape(-1, len(limits.low)), describe
-    )
+    return advice.list_shortfalls(limits, (y @ limits.rows.T).reshape(-1, len(limits.low)), locate)
 
 
 def change_limit(problem: Problem, key: str, value: float) -> Problem:

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ...mechanics.limits import PRESS, SPEED, LimitSet, Parameter, make_limits
+from ...common.shortfalls import Parameter
+from ...mechanics.limits import PRESS, SPEED, LimitSet, make_limits
 from ..options import Objective
 from .assembly import Indices
 from .collocation import Scheme

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ...common.arrays import Array
+from ...common.shortfalls import Parameter
 from ...geometry.cost_to_go import CostToGo
-from ...mechanics.limits import Parameter
 from ...problem.definition import Problem
 from ..options import Objective, PlanOptions
 from .between import Limits, check_between, find_misses, monitor_missed, raise_bounds

@@ -1,0 +1,101 @@
+"""What an error of an infeasible problem knows beside its text."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from shipped import HEPTAGON, problem_of
+from thrown import shove
+from wholearm.common.errors import InfeasibleError, JammingError
+from wholearm.figures import plots
+from wholearm.planning.plan import solve
+from wholearm.problem.definition import Problem
+from wholearm.results.trajectory_file import load_trajectory
+
+
+def refuse(problem: Problem, **options: Any) -> InfeasibleError:
+    with pytest.raises(InfeasibleError) as caught:
+        solve(problem, **options)
+    return caught.value
+
+
+def pressing(epsilon: float) -> Problem:
+    whole = problem_of(HEPTAGON)
+    return replace(whole, phases=whole.phases[:1]).with_(epsilon=epsilon)
+
+
+@pytest.fixture(scope="module")
+def along() -> InfeasibleError:
+    return refuse(pressing(6.0), intervals=20)
+
+
+@pytest.fixture(scope="module")
+def within() -> InfeasibleError:
+    """In the time domain, from where a motion may begin."""
+    return refuse(replace(shove()[0], epsilon=1.2), time_intervals=4)
+
+
+@pytest.mark.parametrize("which", ["along", "within"])
+def test_data_say_what_the_text_says(which: str, request: pytest.FixtureRequest) -> None:
+    error: InfeasibleError = request.getfixturevalue(which)
+    assert error.shortfalls
+    shares = [short.share for short in error.shortfalls]
+    assert shares == sorted(shares, reverse=True)
+    for short in error.shortfalls:
+        assert str(short) in str(error) or f"{short.amount:.3g} {short.unit} short" in str(error)
+        assert short.kind in ("press", "cone", "torque", "speed")
+        assert short.part in short.limit and short.place.phase >= 1
+    for change in error.changes:
+        assert str(change) in str(error)
+
+
+def test_a_change_can_be_made(along: InfeasibleError) -> None:
+    """By the keys that `with_` takes."""
+    assert along.changes
+    for change in along.changes:
+        own = change.parameter
+        assert solve(pressing(6.0).with_({own.key: change.value}), intervals=20).value > 0
+        assert (change.value > own.value) == (own.sign > 0)
+
+
+def test_the_motion_that_misses_least_is_there(along: InfeasibleError, tmp_path: Path) -> None:
+    motion = along.motion
+    # What it is short of most is short by that much in its samples.
+    worst = max((s for s in along.shortfalls if s.kind == "press"), key=lambda s: s.amount)
+    column = motion.contacts.index(worst.part)
+    assert 6.0 - motion.c_n[:, column].min() == pytest.approx(worst.amount, rel=2e-2)
+    at = motion.at(worst.place.time).c_n[0, column]
+    assert 6.0 - at == pytest.approx(worst.amount, rel=1e-3)
+    motion.save(tmp_path / "a.npz")
+    figure = plots.force_margins(load_trajectory(tmp_path / "a.npz"))
+    assert "misses limits least" in figure.texts[0].get_text()
+
+
+def test_errors_pickle_with_their_data(along: InfeasibleError) -> None:
+    again = pickle.loads(pickle.dumps(along))
+    assert str(again) == str(along) and again.changes == along.changes
+    assert again.shortfalls == along.shortfalls
+    np.testing.assert_array_equal(again.motion.c_n, along.motion.c_n)
+
+
+def test_a_duration_that_is_too_short_is_a_change() -> None:
+    error = refuse(pressing(0.05), objective="margin", duration=0.05, intervals=20)
+    (change,) = error.changes
+    assert change.parameter.key == "duration" and change.parameter.value == 0.05
+    solve(pressing(0.05), "margin", duration=change.value, intervals=20)
+
+
+def test_jamming_says_which_friction_would_do() -> None:
+    rough = problem_of(HEPTAGON).with_(friction=1.5)
+    rough = replace(rough, phases=rough.phases[:1])
+    with pytest.raises(JammingError) as caught:
+        solve(rough, intervals=10)
+    assert caught.value.changes
+    for change in caught.value.changes:
+        assert change.parameter.key.startswith("friction.") and str(change) in str(caught.value)
