@@ -1,14 +1,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import pytest
 
 from plane import SQUARE, make_finger, make_scene
 from wholearm.common.errors import InputError
-from wholearm.scene.model import Friction, Scene
+from wholearm.scene.model import Finger, Friction, Scene
 from wholearm.scene.polygon import Polygon
 
 
@@ -98,3 +98,11 @@ def test_without_gravity_the_weaker_finger_sets_the_force() -> None:
     long, short = make_finger([0.1, 0.0], length=0.3), make_finger([-0.1, 0.0], length=0.1)
     scene = replace(make_scene(SQUARE), gravity=0.0, fingers=(long, short))
     assert scene.scales.force == pytest.approx(long.torque_limit / 0.3 / 100, rel=1e-14)
+
+
+def test_every_number_of_a_finger_has_a_unit_of_the_scene() -> None:
+    """Problem files and planning in own units take new fields from here."""
+    scene = make_scene()
+    known = {own.name: own.metadata.get("unit", "") for own in fields(Finger)}
+    assert known.pop("name") == ""
+    assert all(getattr(scene.scales, unit) > 0 for unit in known.values())

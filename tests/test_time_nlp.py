@@ -22,16 +22,10 @@ from wholearm.mechanics.metric import metric_weights
 from wholearm.planning.options import CLEARANCE, OPENING, Objective
 from wholearm.planning.time_domain.between import Limits, raise_bounds
 from wholearm.planning.time_domain.collocation import Scheme, make_scheme
+from wholearm.planning.time_domain.equations import SLIDING, least_rates
 from wholearm.planning.time_domain.layout import MARGIN, V, pack
 from wholearm.planning.time_domain.limits import Target
-from wholearm.planning.time_domain.nlp import (
-    SHORTEST,
-    SLIDING,
-    TimeNLP,
-    bound_unknowns,
-    build_time_nlp,
-    least_rates,
-)
+from wholearm.planning.time_domain.nlp import SHORTEST, TimeNLP, bound_unknowns, build_time_nlp
 from wholearm.planning.time_domain.stage import Stage, StagePoints
 
 PHASE = 3

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, fields
 from typing import Any, TypeVar
 
 import numpy as np
@@ -32,15 +33,11 @@ ROLLING = " rolling"
 _OPTIONAL = {"name", "gravity", "fingers_collide"}
 _TOP = _OPTIONAL | {"epsilon", "object", "fingers", "friction", "start", "phases"}
 _OBJECT = {"vertices", "mass", "inertia"}
+_DEFAULTS = {"radius": 0.0, "viscous": 0.0, "dry": 0.0}
 _FINGER = {
-    "base": True,
-    "length": True,
-    "radius": False,
-    "inertia": True,
-    "viscous": False,
-    "dry": False,
-    "torque_limit": True,
-    "speed_limit": False,
+    own.name: own.default is MISSING and own.name not in _DEFAULTS
+    for own in fields(Finger)
+    if own.metadata
 }
 NAMES = name_keys(_TOP, _FINGER)
 """Short names for `Problem.with_` and the keys that each stands for."""
@@ -135,8 +132,7 @@ def _read_finger(fingers: Mapping[str, Any], key: str) -> Finger:
     name = f"fingers.{key}"
     entry = _table(fingers, key, name)
     _check_keys(entry, name, set(_FINGER), required={k for k, needed in _FINGER.items() if needed})
-    defaults = {"radius": 0.0, "viscous": 0.0, "dry": 0.0}
-    return Finger(**(defaults | dict(entry)), name=name)
+    return Finger(**(_DEFAULTS | dict(entry)), name=name)
 
 
 def _read_start(scene: Scene, start: Mapping[str, Any]) -> Array:

@@ -32,7 +32,7 @@ S. L. Yeap and J. C. Trinkle, "Dynamic Whole-Arm Dexterous Manipulation in the P
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -71,16 +71,20 @@ class Finger:
         Infinite when left out.
     name : str
         Key of this finger in messages.
+
+    Notes
+    -----
+    The unit of a field is that of `Scales` with this name.
     """
 
-    base: ArrayLike
-    length: float
-    radius: float
-    inertia: float
-    viscous: float
-    dry: float
-    torque_limit: float
-    speed_limit: float = math.inf
+    base: ArrayLike = field(metadata={"unit": "length"})
+    length: float = field(metadata={"unit": "length"})
+    radius: float = field(metadata={"unit": "length"})
+    inertia: float = field(metadata={"unit": "inertia"})
+    viscous: float = field(metadata={"unit": "drag"})
+    dry: float = field(metadata={"unit": "torque"})
+    torque_limit: float = field(metadata={"unit": "torque"})
+    speed_limit: float = field(default=math.inf, metadata={"unit": "rate"})
     name: str = "fingers"
 
     def __post_init__(self) -> None:
@@ -137,6 +141,21 @@ class Scales(NamedTuple):
     def torque(self) -> float:
         """Force times length [N m]."""
         return self.force * self.length
+
+    @property
+    def inertia(self) -> float:
+        """Mass times length squared [kg m^2]."""
+        return self.mass * self.length**2
+
+    @property
+    def drag(self) -> float:
+        """Torque times time [N m s]."""
+        return self.torque * self.time
+
+    @property
+    def rate(self) -> float:
+        """One over time [rad/s]."""
+        return 1 / self.time
 
     @property
     def time(self) -> float:

@@ -12,9 +12,10 @@ from ...common.arrays import Array
 from ...common.minima import find_least
 from ...mechanics.limits import PRESS, LimitSet, make_limits
 from ...results.trajectory import Samples
+from .equations import SLIDING, least_rates
 from .limits import bound_by_limits
 from .motion import StageMotion
-from .nlp import SLIDING, TimeNLP, least_rates
+from .nlp import TimeNLP
 from .stage import Stage
 
 MISS = 2.5e-7

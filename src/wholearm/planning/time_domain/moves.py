@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from ...common.arrays import Array
 from ...contacts.formation import Formation
 from .collocation import Scheme
+from .equations import least_rates
 from .modes import drop, link, merge, mode_of, release_earlier, split
-from .nlp import least_rates
 from .stage import Stage
 
 _STALLED = 1e-6

@@ -7,7 +7,7 @@ weighed in the time domain counts in these.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import lru_cache
 
 import numpy as np
@@ -40,22 +40,15 @@ def in_own_units(problem: Problem) -> Problem:
 def _scale_scene(scene: Scene, scales: Scales) -> Scene:
     body = scene.polygon
     assert body.inertia is not None
-    inertia = scales.mass * scales.length**2
     polygon = Polygon(
-        body.vertices / scales.length, body.mass / scales.mass, body.inertia / inertia
+        body.vertices / scales.length, body.mass / scales.mass, body.inertia / scales.inertia
     )
 
     def scale(finger: Finger) -> Finger:
+        measured = {own.name: own.metadata["unit"] for own in fields(finger) if own.metadata}
+        units = {name: getattr(scales, unit) for name, unit in measured.items()}
         return replace(
-            finger,
-            base=np.asarray(finger.base) / scales.length,
-            length=finger.length / scales.length,
-            radius=finger.radius / scales.length,
-            inertia=finger.inertia / inertia,
-            viscous=finger.viscous / (scales.torque * scales.time),
-            dry=finger.dry / scales.torque,
-            torque_limit=finger.torque_limit / scales.torque,
-            speed_limit=finger.speed_limit * scales.time,
+            finger, **{name: getattr(finger, name) / unit for name, unit in units.items()}
         )
 
     right, left = scene.fingers

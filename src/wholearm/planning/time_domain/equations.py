@@ -1,0 +1,229 @@
+"""What holds in a stage of the time-domain NLP, and from one stage to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...common.arrays import Array
+from ...geometry.curve import tangent_basis
+from .assembly import Indices
+from .collocation import Scheme
+from .kernels import (
+    collocation_kernel,
+    end_kernel,
+    goal_kernel,
+    impact_kernel,
+    monitor_kernel,
+    opening_kernel,
+    point_kernel,
+)
+from .layout import MARGIN, StageLayout, V, Z
+from .limits import LimitRows, Target, add_limits
+from .rows import Rows
+from .stage import Stage
+
+SLIDING = 1e-5
+"""Least sliding, over the radius of gyration, and least speed of a joint, in the scene's unit of
+time: what does not move at all would have no sense."""
+EVEN = 0.2
+"""Least duration of an interval that chooses its share over that of its neighbour."""
+
+
+@dataclass(frozen=True, eq=False)
+class StageRows:
+    """Rows of one stage, interval by interval.
+
+    Attributes
+    ----------
+    states : ndarray of int, shape (K, m)
+        How z and z' go on.
+    points : ndarray of int, shape (K, d, m)
+        What holds at the points.
+    senses : ndarray of int, shape (K, d, n_sliding)
+        Of these, the senses of friction of sliding contacts.
+    limits : LimitRows
+    monitor_rows : ndarray of int, shape (K, d, m)
+        Limits of the formation.
+    """
+
+    states: Indices
+    points: Indices
+    senses: Indices
+    limits: LimitRows
+    monitor_rows: Indices
+
+    @property
+    def groups(self) -> tuple[Indices, ...]:
+        """All of them."""
+        return (self.states, self.points, *self.limits.groups, self.monitor_rows)
+
+
+def add_stage(
+    rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool, target: Target
+) -> StageRows:
+    """What holds in a stage."""
+    formation = stage.formation
+    node, coming = layout.nodes[:-1], layout.nodes[1:]
+    chain = rows.linear(*node.shape)
+    rows.add_entries(chain, coming, 1.0)
+    rows.add_entries(chain[:, :MARGIN], layout.ends, -1.0)
+    rows.add_entries(chain[:, MARGIN:], node[:, MARGIN:], -1.0)
+    states = np.hstack([chain, _collocate(rows, stage, layout, scheme)])
+    _share(rows, stage, layout)
+    points, senses = _balance(rows, stage, layout, scheme, last)
+    first = node[:, Z] if formation.rolling else node[:, :0]
+    if not scheme.ends:
+        kernel = end_kernel(formation)
+        own = rows.nonlinear(stage.intervals, kernel.outputs)
+        z, v = layout.ends[:, Z], layout.ends[:, V]
+        rows.add_copies(kernel, kernel.x.join(z=z, v=v, first=first), own)
+        states = np.hstack([states, own])
+    monitor_rows = _add_monitor_rows(rows, stage, layout, scheme)
+    gained = [formation.limits[k].gained for k in stage.released]
+    for contact in [c for c in gained if c is not None and stage.opens]:
+        kernel = opening_kernel(formation, contact)
+        columns = kernel.x.join(z=layout.z[0], v=layout.v[0], a=layout.a[0])
+        own = rows.nonlinear(scheme.degree, kernel.outputs, low=stage.opening, high=np.inf)
+        rows.add_copies(kernel, columns, own)
+    goal = goal_kernel(formation, stage.until, stage.turns, stage.gained)
+    if goal is not None:
+        end = layout.nodes[-1]
+        rows.add_copies(goal, goal.x.join(z=end[Z], v=end[V]), rows.nonlinear(goal.outputs))
+    limits = add_limits(rows, stage, layout, scheme, target)
+    return StageRows(states, points, senses, limits, monitor_rows)
+
+
+def _collocate(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
+    """Collocate z and z' along the tangent space, shape (K, m)."""
+    middles = stage.guess.z[:, scheme.degree // 2]
+    bases = [tangent_basis(stage.formation, z) for z in middles]
+    kernel = collocation_kernel(scheme.name, scheme.degree, bases[0].shape[1])
+    parameters = np.array([N.ravel(order="F") for N in bases])
+    K, collected = stage.intervals, []
+    if not kernel.outputs:
+        return np.zeros((K, 0), dtype=np.int64)
+    for state, rate, part in ((layout.z, layout.v, Z), (layout.v, layout.a, V)):
+        columns = kernel.x.join(
+            start=layout.nodes[:-1, part],
+            points=state.reshape(K, -1),
+            end=layout.ends[:, :0] if scheme.ends else layout.ends[:, part],
+            rates=rate.reshape(K, -1),
+            h=layout.h[:, None],
+        )
+        own = rows.nonlinear(K, kernel.outputs)
+        rows.add_copies(kernel, columns, own, kernel.p.join(N=parameters))
+        collected.append(own)
+    return np.hstack(collected)
+
+
+def _share(rows: Rows, stage: Stage, layout: StageLayout) -> None:
+    """Intervals keep their shares of the stage, or are not too uneven."""
+    before, after = layout.h[:-1], layout.h[1:]
+    if not stage.adapts:
+        own = rows.linear(len(before))
+        # In shares of an even interval, rows are of the size of others.
+        shares = stage.intervals * stage.guess.fractions
+        rows.add_entries(own, before, shares[1:])
+        rows.add_entries(own, after, -shares[:-1])
+        return
+    for shorter, longer in ((before, after), (after, before)):
+        own = rows.linear(len(before), high=np.inf)
+        rows.add_entries(own, shorter, 1.0)
+        rows.add_entries(own, longer, -EVEN)
+
+
+def _balance(
+    rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool
+) -> tuple[Indices, Indices]:
+    """The equations of motion, constraints and senses at every point, shape (K, d, n).
+
+    And the rows of the senses alone, shape (K, d, n_sliding).
+    """
+    formation, shape = stage.formation, layout.z.shape[:2]
+    kernel, node = point_kernel(formation), layout.nodes[:-1, None]
+    columns = kernel.x.join(
+        z=layout.z,
+        v=layout.v,
+        a=layout.a,
+        forces=layout.forces,
+        tau=layout.tau[:, None],
+        first=node[..., Z] if formation.rolling else node[..., :0],
+    )
+    parameters = kernel.p.join(
+        Xi=stage.directions.Xi,
+        sigma=stage.directions.sigma,
+        place=scheme.points[:, None],
+        least=least_rates(stage, stage.guess.places(scheme.points))[..., None],
+    )
+    sliding = [k for k in range(formation.n_contacts) if k not in formation.rolling_rows]
+    still = find_still(stage, last) if scheme.ends else set()
+    senses, low, high = (
+        kernel.y["senses"],
+        np.zeros((*shape, kernel.outputs)),
+        np.zeros(kernel.outputs),
+    )
+    high[senses] = np.inf
+    low[-1, -1, senses] = np.where([k in still for k in sliding], -np.inf, 0.0)
+    own = rows.nonlinear(*shape, kernel.outputs, low=low, high=high)
+    rows.add_copies(kernel, columns, own, parameters)
+    return own, own[..., senses]
+
+
+def least_rates(stage: Stage, places: Array) -> Array:
+    """Least rate at `places`, shares of a stage's duration, in their shape.
+
+    It is nothing where motion starts, stops or turns, and in a stage with one freedom: there all
+    moves together, and friction cannot hold one contact alone.
+    """
+    free = stage.formation.n_constraints < 4
+    return np.asarray(SLIDING * free * np.minimum(1.0, 8 * np.minimum(places, 1 - places)))
+
+
+def find_still(stage: Stage, last: bool) -> set[int]:
+    """Rows of (contacts, joints) that stand still at the end of a stage."""
+    if last:
+        return set(range(stage.formation.n_contacts + 2))
+    coming = stage.gained.rolling if stage.gained else ()
+    rolls = [k for k, c in enumerate(stage.formation.contacts) if c in coming]
+    return {*stage.turns, *rolls}
+
+
+def _add_monitor_rows(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
+    """Keep limits positive, but for the one that is reached at the end, shape (K, d, m)."""
+    formation, (K, d) = stage.formation, layout.z.shape[:2]
+    if not stage.monitored:
+        return np.zeros((K, d, 0), dtype=np.int64)
+    places = stage.guess.places(scheme.points).ravel()
+    low = stage.list_clearances(places, after=1 / 3).reshape(K, d, -1)
+    goal = None if stage.until is None else stage.until.contact
+    reached = [formation.limits[k].gains(goal) for k in stage.monitored]
+    if scheme.ends:
+        low[-1, -1, reached] = -np.inf
+    own = rows.nonlinear(K, d, len(stage.monitored), low=low, high=np.inf)
+    kernel = monitor_kernel(formation, stage.monitored)
+    rows.add_copies(kernel, kernel.x.join(z=layout.z), own)
+    return own
+
+
+def join_stages(
+    rows: Rows, stage: Stage, coming: Stage, layout: StageLayout, first: Indices
+) -> None:
+    """Position and velocity go on from one stage to the next; an impact changes the velocity."""
+    last = layout.nodes[-1]
+    same = (
+        np.setdiff1d(np.arange(len(first)), np.arange(5, 10))
+        if stage.ends_in_impact
+        else slice(None)
+    )
+    own = rows.linear(len(first[same]))
+    rows.add_entries(own, first[same], 1.0)
+    rows.add_entries(own, last[same], -1.0)
+    if stage.ends_in_impact:
+        kernel = impact_kernel(stage.formation, coming.formation)
+        high = np.zeros(kernel.outputs)
+        high[kernel.y["leaving"]] = high[kernel.y["cones"]] = np.inf
+        columns = kernel.x.join(after=first[V], before=last[V], z=last[Z], impulses=layout.impulses)
+        own = rows.nonlinear(kernel.outputs, high=high)
+        rows.add_copies(kernel, columns, own, kernel.p.join(Xi=coming.directions.Xi))
