@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -52,6 +53,24 @@ def test_stretches_of_a_way_keep_their_senses() -> None:
             signs = np.concatenate(part.directions)
             # But for stretches too short to count.
             assert ((along * signs).sum(axis=0) > 0).all()
+
+
+def test_one_thing_turns_at_a_time() -> None:
+    """Where a way turns back everything turns at once; a motion must not have to stop for that."""
+    problem = tipping()
+    (phase,) = problem.phases
+    (nearest,) = guess_phase(phase, problem.start)
+    there = connect(phase.formation, problem.start, nearest.z[-1])
+    back = replace(there, z=np.concatenate([there.z, there.z[-2::-1]]))
+    whole, way = split_way(there), split_way(back)
+    signs = [np.concatenate(part.directions) for part in way]
+    assert len(way) > 2 * len(whole) and (signs[-1] == -signs[0]).all()
+    for part, coming, before, after in zip(way, way[1:], signs, signs[1:], strict=False):
+        turned = np.flatnonzero(before != after)
+        assert part.turns == tuple(turned)
+        assert set(turned) == set(phase.formation.turn_with(int(turned[0])))
+        assert (part.z[-1] == coming.z[0]).all() and len(part.z) > 2
+    assert (way[0].z[0] == problem.start).all() and (way[-1].z[-1] == problem.start).all()
 
 
 def test_margins_are_those_of_newton_and_euler() -> None:

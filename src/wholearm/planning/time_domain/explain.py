@@ -33,8 +33,6 @@ from .own_units import to_si
 from .search import Search
 from .stage import Stage
 
-LONGEST = 1.0
-"""Most processor time [s] of one run of the solver that looks for the least shortfalls."""
 ADVICE = 1.0
 """Processor time [s] after which no further change of a limit is tried."""
 Replan = Callable[[Problem], object]
@@ -43,7 +41,7 @@ Replan = Callable[[Problem], object]
 
 def solve_elastic(search: Search, stages: Sequence[Stage]) -> list[Stage] | None:
     """The motion with the least shortfalls when every limit is soft, or None."""
-    solution = search.aiming(Objective.ELASTIC).solve(list(stages), seconds=LONGEST)
+    solution = search.aiming(Objective.ELASTIC).solve(list(stages))
     return solution.stages if solution.success else None
 
 
@@ -139,7 +137,7 @@ def explain(
 
     def find_least(parameter: Parameter) -> float | None:
         aim = search.aiming(Objective.RELAX, parameter)
-        solution = aim.solve(elastic, seconds=LONGEST)
+        solution = aim.solve(elastic)
         # A limit that may be tighter is not what keeps the others from being kept.
         if not solution.success or solution.cost < 0.0:
             return np.nan

@@ -64,8 +64,6 @@ class TimeNLP:
     assembled : Assembled
     max_iter : int
         Most iterations of the solver.
-    seconds : float, [s]
-        Most processor time of the solver.
     layouts : list of StageLayout
     rows : Rows
     rows_of : list of StageRows
@@ -75,7 +73,6 @@ class TimeNLP:
 
     assembled: Assembled
     max_iter: int
-    seconds: float
     layouts: list[StageLayout]
     rows: Rows
     rows_of: list[StageRows]
@@ -99,7 +96,7 @@ class TimeNLP:
             push,
             built.derivatives,
             max_iter=self.max_iter,
-            max_cpu_time=self.seconds,
+            max_cpu_time=LONGEST,
         )
 
 
@@ -108,7 +105,6 @@ def build_time_nlp(
     scheme: Scheme,
     target: Target,
     max_iter: int,
-    seconds: float = LONGEST,
 ) -> TimeNLP:
     """Build the NLP of stages that follow one another and end at rest.
 
@@ -119,8 +115,6 @@ def build_time_nlp(
     target : Target
     max_iter : int
         Most iterations of the solver.
-    seconds : float, [s]
-        Most processor time of the solver.
     """
     started = time.perf_counter()
     shortfalls = [target.count_shortfalls(stage) for stage in stages]
@@ -147,7 +141,7 @@ def build_time_nlp(
     rows.add_entries(rest[:, None], end[V], N.T)
     built = assemble_nlp(len(cost), rows.triplets, rows.linear_rows, rows.blocks, cost)
     book(SolverStatistics(build_time=time.perf_counter() - started))
-    return TimeNLP(built, max_iter, seconds, layouts, rows, rows_of, duration_row)
+    return TimeNLP(built, max_iter, layouts, rows, rows_of, duration_row)
 
 
 def _add_costs(rows: Rows, cost: Array, stage: Stage, layout: StageLayout, target: Target) -> None:

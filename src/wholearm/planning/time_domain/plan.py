@@ -12,7 +12,6 @@ it is a better guess, or says why there is no plan.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -27,7 +26,6 @@ from ..phase_plan import PhasePlan
 from .ending import choose_end, keep_apart
 from .mode_search import adapt, improve
 from .motion import TimeMotion, make_motions
-from .nlp import LONGEST
 from .own_units import to_si, unit_of
 from .refinement import bisect_intervals
 from .search import Search, Solution
@@ -39,11 +37,10 @@ FIRST = 10
 """Most intervals of a phase to start with."""
 CONVINCING = 2
 """Motions that miss limits least, from different guesses, after which there seems to be no plan."""
-BUDGET = 3.0
-"""Processor time [s] of this thread after which no further guess is begun: of one block."""
-ATTEMPT = 1.5
-"""Most processor time of the first run of the solver from a further guess, in seconds or, if that
-is longer, over the time of the first guess."""
+BUDGET = 300
+"""Iterations of the solver after which no further guess is begun: of one block."""
+ATTEMPT = 100
+"""Most iterations of the first run of the solver from a guess."""
 NEAREST = "the nearest end"
 """Name of the first guess."""
 NEAR = -0.3
@@ -108,7 +105,6 @@ def plan_phases(
             stages[-1] = keep_apart(stages[-1], to_go.phase.until.contact)
         return stages
 
-    started = time.thread_time()
     first = outline(halvings, _PACES[0])
     solution = _solve(search, first, halvings)
     if solution.success:
@@ -120,13 +116,10 @@ def plan_phases(
         return plan_phases(other, own, z, options, explained=False, patient=False)
 
     refuse(search, problem, phases, first, replan if explained else None)
-    spent = time.thread_time() - started
+    spent = search.tried.iterations
     ways = list_ways(problem, phases[0], z, WAYS) if patient and len(phases) == 1 else []
-    # Each further guess has a share of the budget, however long the first took.
-    stop = started + spent + max(BUDGET - spent, BUDGET / 2, spent)
     guesses = _list_guesses(first, halvings, outline if patient else None, ways, len(phases) > 1)
-    attempt = ATTEMPT * max(1.0, spent)
-    found = _try_guesses(search, problem, (first, solution), guesses, ways, (attempt, stop))
+    found = _try_guesses(search, problem, (first, solution), guesses, ways, spent + BUDGET)
     if found.solution.success:
         return _summarise(problem, search, phases, found.solution)
     reason = f"none was found, also of least shortfalls, from {', '.join(found.tried)}"
@@ -147,7 +140,7 @@ def _try_guesses(
     begun: tuple[list[Stage], Solution],
     guesses: Iterator[tuple[str, int, list[Stage]]],
     ways: Sequence[PacedWay],
-    times: tuple[float, float],
+    stop: int,
 ) -> _Found:
     """Solve from one guess after the other, and for least shortfalls where that leads nowhere.
 
@@ -156,12 +149,11 @@ def _try_guesses(
     begun : (list of Stage, Solution)
         The first guess, which is one of them, and what it has led to.
     ways : sequence of PacedWay
-    times : (float, float), [s]
-        Most processor time of the first run from a guess, and when to begin no other one.
+    stop : int
+        Iterations of the solver after which no other guess is begun.
     """
     from .explain import list_shortfalls, solve_elastic
 
-    attempt, stop = times
     # What is far from keeping limits along any way shows at once what is short.
     far = bool(ways) and all(way.margin <= NEAR for way in ways)
     first, solution = begun
@@ -169,7 +161,7 @@ def _try_guesses(
     for name, halvings, guess in guesses:
         tried[name] = None
         if guess is not first and not far:
-            solution = _solve(search, guess, halvings, attempt)
+            solution = _solve(search, guess, halvings)
         elastic = None
         if not solution.success:
             # What coarse intervals are not short of, finer ones may be.
@@ -181,11 +173,11 @@ def _try_guesses(
             and elastic is not None
             and not list_shortfalls(problem, elastic, search.scheme)
         ):
-            solution = _solve(search, elastic, halvings, attempt)
+            solution = _solve(search, elastic, halvings)
             elastic = None if solution.success else solve_elastic(search, _halve(search, elastic))
         if elastic is not None and list_shortfalls(problem, elastic, search.scheme):
             short.append(elastic)
-        late = time.thread_time() > stop
+        late = search.tried.iterations > stop
         if solution.success or late or len(short) == (1 if far else CONVINCING):
             break
     if not solution.success and not short and (elastic := solve_elastic(search, first)) is not None:
@@ -232,11 +224,9 @@ def _choose_intervals(phases: Sequence[Phase]) -> int:
     return 32 if len(phases) == 1 and phases[0].formation.n_constraints == 4 else 10
 
 
-def _solve(
-    search: Search, stages: list[Stage], halvings: int, seconds: float = LONGEST
-) -> Solution:
+def _solve(search: Search, stages: list[Stage], halvings: int) -> Solution:
     """Solve, find modes and intervals, halve these, and make limits hold in between."""
-    solution = search.solve(stages, seconds=seconds)
+    solution = search.solve(stages, most=ATTEMPT)
     if not solution.success:
         return solution
     plain = not search.options.mode_search or search.is_enough(solution)

@@ -18,7 +18,7 @@ from .collocation import Scheme, make_scheme
 from .layout import pack, unpack
 from .limits import Target
 from .motion import make_motions
-from .nlp import LONGEST, TimeNLP, bound_unknowns, build_time_nlp
+from .nlp import TimeNLP, bound_unknowns, build_time_nlp
 from .own_units import in_own_units, scale_options, unit_lengths, unit_of
 from .refinement import adopt, bisect_intervals, count_halvings, monitor_violated, settle
 from .stage import Stage
@@ -32,7 +32,7 @@ MOST = 64
 """Intervals of each phase from which on none is halved."""
 _PATIENCE = 80
 """Most iterations of one solve on finer intervals, that starts from a solution."""
-_ITERATIONS = {Objective.ELASTIC: 300, Objective.RELAX: 150}
+_ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 60}
 """Most iterations of one solve, if not 150."""
 _DEARER = 0.2
 """How much dearer, relatively, a plan may get by tightening before it counts as lost."""
@@ -42,10 +42,21 @@ _COARSE = 0.1
 
 @dataclass
 class Tried:
-    """How many sequences of modes were tried, and whether the search for them was complete."""
+    """What a search has done.
+
+    Attributes
+    ----------
+    sequences : int
+        Of modes that were tried.
+    complete : bool
+        Whether none was left to try.
+    iterations : int
+        Of the solver.
+    """
 
     sequences: int = 1
     complete: bool = True
+    iterations: int = 0
 
 
 class Price(NamedTuple):
@@ -176,7 +187,6 @@ class Search:
         stages: list[Stage],
         before: Solution | None = None,
         most: int = 150,
-        seconds: float = LONGEST,
     ) -> Solution:
         """Solve from the stages' guesses, until no limit is broken at the points.
 
@@ -184,11 +194,9 @@ class Search:
         ----------
         most : int
             Most iterations.
-        seconds : float, [s]
-            Most processor time of each run of the solver.
         """
         while True:
-            nlp = self.build(stages, most, seconds)
+            nlp = self.build(stages, most)
             multipliers = None
             if before is not None and before.monitored == [stage.monitored for stage in stages]:
                 multipliers = carry_multipliers(
@@ -202,14 +210,14 @@ class Search:
                 return solution
             stages = monitoring
 
-    def build(self, stages: Sequence[Stage], most: int = 150, seconds: float = LONGEST) -> TimeNLP:
+    def build(self, stages: Sequence[Stage], most: int = 150) -> TimeNLP:
         """Build the NLP."""
         gradient = self.price.gradient if self.price else None
         target = Target(
             self.goal, self.problem.epsilon, self.options.time_weight, self.relaxation, gradient
         )
         most = _ITERATIONS.get(self.goal, most)
-        return build_time_nlp(stages, self.scheme, target, most, seconds)
+        return build_time_nlp(stages, self.scheme, target, most)
 
     def run(
         self,
@@ -234,6 +242,7 @@ class Search:
             **(multipliers or first_multipliers((low, high), (low_g, high_g), FIRST_SIZE)),
         )
         stats = solver.stats()
+        self.tried.iterations += stats["iter_count"]
         x, cost = result["x"].full()[:, 0], float(result["f"])
         cost -= float(self.price.gradient @ self.price.origin) if self.price else 0.0
         return Solution(

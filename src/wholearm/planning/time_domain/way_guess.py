@@ -8,12 +8,14 @@ best of them are bent.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from ...common.arrays import Array
+from ...contacts.formation import Formation
 from ...geometry.curve import tangent_basis
 from ...geometry.explore import close_contacts, is_inside
 from ...geometry.path_guess import PathGuess, connect, guess_phase, list_ends
@@ -36,7 +38,7 @@ CLOSE = -0.2
 """Margin from which on it is worth to go on."""
 BENDS = ((0.4, 0.0), (-0.4, 0.0), (0.8, 0.0), (-0.8, 0.0), (0.0, 0.3), (0.0, -0.3))
 """How ways are bent: parts of one arc and of two, over their length."""
-_STRETCHES = 4
+_STRETCHES = 6
 """Most stretches of a way, between which something turns."""
 _SHORTEST = 2
 """Fewest configurations, after its first, of a stretch that is not merged into another."""
@@ -164,11 +166,15 @@ def list_goals(phase: Phase, z: Array, nearest: Array) -> list[Array]:
 
 
 def split_way(outline: PathGuess) -> Way:
-    """A way as stretches without a reversal."""
+    """A way as stretches without a reversal, between which one thing turns at a time.
+
+    Where two turned at once a motion with two freedoms would have to stop.
+    """
     z, formation = outline.z, outline.formation
     steps, middles = np.diff(z, axis=0), (z[1:] + z[:-1]) / 2
     slip = np.einsum("nij,nj->ni", formation.evaluate(middles, steps).A_t, steps)
-    signs = np.where(np.hstack([slip, steps[:, 3:]]) < 0, -1.0, 1.0)
+    rates = np.hstack([slip, steps[:, 3:]])
+    signs = np.where(rates < 0, -1.0, 1.0)
     signs[:, list(formation.rolling_rows)] = 1.0
     cuts = [0]
     for k in range(1, len(signs)):
@@ -179,12 +185,45 @@ def split_way(outline: PathGuess) -> Way:
                 cuts.append(k)
     if len(signs) - cuts[-1] < _SHORTEST and len(cuts) > 1:
         signs[cuts.pop() :] = signs[cuts[-1]]
-    n_c, way = formation.n_contacts, list[PathGuess]()
+    way, part = list[PathGuess](), z[:1]
     for begin, stop in pairwise([*cuts, len(signs)]):
-        own = signs[begin]
-        turns: tuple[int, ...] = ()
+        own, part = signs[begin].copy(), np.concatenate([part, z[begin + 1 : stop]])
+        turning = list[tuple[int, ...]]()
         if stop < len(signs):
-            turns = tuple(np.flatnonzero(own != signs[stop]).tolist())
-        directions = Directions(own[:n_c].copy(), own[n_c:].copy())
-        way.append(PathGuess(formation, z[begin : stop + 1], directions, turns))
+            turning = _order_turns(formation, own, signs[stop], rates[stop - 1 : stop + 1])
+        # They turn within the steps before and after the cut.
+        places = stop - 0.5 + (np.arange(len(turning)) + 1) / (len(turning) + 1)
+        for rows, place in zip(turning, places, strict=True):
+            end = _interpolate(z, place) if len(turning) > 1 else z[stop]
+            if len(part) == 1:
+                part = np.stack([part[0], (part[0] + end) / 2])
+            way.append(_make_stretch(formation, np.vstack([part, end]), own, rows))
+            own[list(rows)] *= -1
+            part = end[None]
+    way.append(_make_stretch(formation, np.vstack([part, z[-1:]]), own, ()))
     return way
+
+
+def _make_stretch(formation: Formation, z: Array, signs: Array, rows: Sequence[int]) -> PathGuess:
+    n_c = formation.n_contacts
+    directions = Directions(signs[:n_c].copy(), signs[n_c:].copy())
+    return PathGuess(formation, z, directions, tuple(rows))
+
+
+def _order_turns(
+    formation: Formation, before: Array, after: Array, rates: Array
+) -> list[tuple[int, ...]]:
+    """Rows that turn between two stretches, those together that have to, the first ones first."""
+    rows = np.flatnonzero(before != after).tolist()
+    groups = {tuple(i for i in formation.turn_with(k) if i in rows) for k in rows}
+
+    def cross(group: tuple[int, ...]) -> float:
+        first, last = rates[:, group[0]]
+        return float(first / (first - last)) if first * last < 0 else 0.5
+
+    return sorted(groups, key=lambda group: (cross(group), group))
+
+
+def _interpolate(z: Array, place: float) -> Array:
+    index = int(place)
+    return np.asarray(z[index] + (place - index) * (z[index + 1] - z[index]))
