@@ -14,6 +14,7 @@ from wholearm.common.errors import InfeasibleError
 from wholearm.common.shortfalls import Parameter
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
+from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics import limits as limits_module
 from wholearm.mechanics.limits import (
     CONE,
@@ -211,3 +212,42 @@ def test_another_limit_is_short_and_gives_way(heptagon: Problem, curves: tuple[C
     }
     assert set(short) == {"torque limit of finger 1 = 0.2 N m", "motor curve of finger 1"}
     assert max(short.values()) == pytest.approx(least - 0.2, rel=1e-3)
+
+
+def test_speed_limits_hold_between_collocation_points(
+    heptagon: Problem, curves: tuple[Curve, ...]
+) -> None:
+    """As fast as along the curve, but no faster than allowed anywhere."""
+    plain = plan_path(curves[PHASE], EPSILON, PlanOptions(intervals=40), 2)
+    t = np.linspace(0.0, plain.motion.duration, 501)
+    fastest = 0.6 * np.abs(plain.motion.evaluate(t).z_dot[:, 4]).max()
+    problem = heptagon.with_(speed_limit2=fastest)
+    curve = trace_phases(problem)[PHASE]
+    along = plan_path(curve, EPSILON, PlanOptions(intervals=40), 2)
+    start = curves[PHASE - 1].end
+    (over,) = plan_phases(problem, problem.phases[PHASE : PHASE + 1], start, COARSE)
+    t = np.linspace(0.0, over.motion.duration, 2001)
+    rates = np.abs(over.motion.evaluate(t).z_dot[:, 4])
+    assert 0.999 * fastest < rates.max() < fastest * (1 + 1e-6)
+    assert over.value == pytest.approx(along.value, rel=0.02) and along.value > 1.02 * plain.value
+
+
+def test_a_speed_limit_gives_way_over_time_as_along_a_curve(heptagon: Problem) -> None:
+    problem = heptagon.with_(epsilon=0.6, speed_limit1=0.3)
+    curves = trace_phases(problem)
+    with pytest.raises(InfeasibleError) as caught:
+        plan_path(curves[2], problem.epsilon, PlanOptions(intervals=20), 3)
+    advised = re.search("speed limit of finger 1 = (.*?) rad/s instead of 0.3", str(caught.value))
+    assert advised
+    search = Search.of(problem, COARSE)
+    stages = guess_stages(problem, problem.phases[2:3], curves[1].end, search.scheme, 6, 2.0)
+    (parameter,) = make_limits(stages[0].formation, search.problem.epsilon).only(SPEED).parameters
+    elastic = solve_elastic(search, stages)
+    assert elastic is not None and list_shortfalls(problem, elastic, search.scheme) != []
+    relaxed = search.aiming(Objective.RELAX, parameter).solve(elastic)
+    assert relaxed.success
+    least = 0.3 + relaxed.cost / problem.scene.scales.time
+    assert least == pytest.approx(float(advised[1]), rel=0.1)
+    assert list_shortfalls(problem, relaxed.stages, search.scheme)[0].limit == (
+        "speed limit of finger 1 = 0.3 rad/s"
+    )

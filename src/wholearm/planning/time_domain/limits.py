@@ -146,6 +146,25 @@ def bound_by_limits(
             high[unknowns] = np.minimum(high[unknowns], values[side] - more)
 
 
+def price_sides(rows: LimitRows, layout: StageLayout, on_x: Array, on_g: Array) -> Array:
+    """What raising each side of the limits costs in each interval, shape (K, n_sides).
+
+    Parameters
+    ----------
+    on_x, on_g : ndarray
+        Sizes of the multipliers of the unknowns' bounds and of the rows.
+    """
+    own, n_forces = rows.limits.sides[0], layout.forces.shape[2]
+    single = find_single(rows.limits, n_forces)[own]
+    price = np.zeros((len(layout.h), len(own)))
+    c_n = layout.forces[..., : rows.presses.shape[2]]
+    price[:, rows.pressed] = on_x[c_n].sum(axis=1) + on_g[rows.presses].sum(axis=1)
+    price[:, rows.sides] = on_g[rows.others].sum(axis=1)
+    for side in rows.bounded:
+        price[:, side] = on_x[_find_unknowns(layout, n_forces, single[side])].sum(axis=1)
+    return price
+
+
 def _list_gives(limits: LimitSet, layout: StageLayout, target: Target) -> list[_Gives | None]:
     """By what each row gives way, if it does."""
     gives: list[_Gives | None] = [None] * len(limits.low)

@@ -16,7 +16,7 @@ from ..options import Objective, PlanOptions
 from .between import Limits, check_between, find_misses, monitor_missed, raise_bounds
 from .collocation import Scheme, make_scheme
 from .layout import pack, unpack
-from .limits import Target
+from .limits import Target, price_sides
 from .motion import make_motions
 from .nlp import TimeNLP, bound_unknowns, build_time_nlp
 from .own_units import in_own_units, scale_options, unit_lengths, unit_of
@@ -232,6 +232,9 @@ class Search:
         low_g, high_g = raise_bounds(nlp, stages, limits, (low, high))
         if self.duration is not None and nlp.duration_row >= 0:
             high_g[nlp.duration_row] = self.duration
+        if (low > high).any():
+            status = "limits that hold between points too leave nothing"
+            return Solution(list(stages), np.inf, 0.0, status, False, nlp, {})
         solver = nlp.first_solver if multipliers is None else nlp.solver
         result = solver(
             x0=pack([stage.guess for stage in stages], nlp.layouts, margin),
@@ -259,12 +262,9 @@ class Search:
         """What raising limits by their misses would cost in each interval, over the cost, (K,)."""
         on_x, on_g = (np.abs(solution.multipliers[key]) for key in ("lam_x0", "lam_g0"))
         prices = []
-        for k, (stage, miss) in enumerate(zip(solution.stages, misses, strict=True)):
+        for k, miss in enumerate(misses):
             layout, rows = solution.nlp.layouts[k], solution.nlp.rows_of[k].limits
-            c_n = layout.forces[..., : stage.formation.n_contacts]
-            price = np.zeros_like(miss.held)
-            price[:, rows.pressed] = on_x[c_n].sum(axis=1) + on_g[rows.presses].sum(axis=1)
-            price[:, rows.sides] = on_g[rows.others].sum(axis=1)
+            price = price_sides(rows, layout, on_x, on_g)
             spans = rows.limits.scales[rows.limits.sides[0]]
             cost = (price * miss.held * spans).sum(axis=1)
             prices.append(np.asarray(cost / max(abs(solution.cost), 1e-300)))
