@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 from itertools import pairwise
 from typing import Any, cast
 
@@ -190,6 +191,19 @@ def test_torques_beyond_their_limit_are_a_warning() -> None:
     report = verify(dataclasses.replace(problem, scene=weak), trajectory.torque)
     assert report.ok
     assert any("above its limit 1 N m" in text for text in report.warnings)
+
+
+def test_speeds_beyond_their_limit_are_a_warning() -> None:
+    problem, trajectory = plan()
+    rates = np.abs(trajectory.theta_dot[:, 0])
+    limit = float(f"{0.9 * rates.max():.4g}")
+    report = verify(problem.with_(speed_limit1=limit), trajectory.torque)
+    assert report.ok
+    (text,) = (text for text in report.warnings if text.startswith("speed limit of finger 1 = "))
+    over, when = re.findall(r"exceeded by (\S+) rad/s at t = (\S+) s, phase \d$", text)[0]
+    assert float(over) == pytest.approx(rates.max() - limit, rel=5e-3)
+    assert float(when) == pytest.approx(trajectory.t[rates.argmax()], abs=0.01)
+    assert not verify(problem.with_(speed_limit1=1.2 * limit), trajectory.torque).warnings
 
 
 def test_text_and_values() -> None:

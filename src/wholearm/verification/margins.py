@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..contacts.cones import slip_margins
 from ..contacts.links import evaluate_finger_gap
+from ..mechanics.limits import CONE, PRESS, TORQUE, make_limits
 from ..problem.definition import Phase, Problem
 from ..results.report import ContactMargin, FingerGap, SlipMargin
+from ..results.torque import TorqueProfile
 from ..scene.model import Scene
 from ..simulation.events import EventKind, Simulation
 from ..simulation.tolerances import SETTLING
@@ -19,6 +21,9 @@ from ..simulation.tolerances import SETTLING
 SHORTEST = 2 * SETTLING
 """Interval below which forces may jump, and rounding spoils a parabola, relative to the scene's
 time."""
+
+MISSED = 1e-6
+"""Miss of a limit, over what is much for it, from which on it is reported."""
 
 
 def list_contact_margins(
@@ -56,6 +61,31 @@ def list_slip_margins(
             least, time = slipped[name].value, slipped[name].time
         margins.append(SlipMargin(name, least, time))
     return tuple(margins)
+
+
+def describe_misses(
+    phase: Phase, simulation: Simulation, rows: NDArray[np.int64], torque: TorqueProfile
+) -> list[str]:
+    """Sentences on limits other than those of forces and torques alone that a phase exceeds."""
+    formation, t = phase.formation, simulation.t[rows]
+    limits = make_limits(formation, 0.0).without(PRESS, CONE, TORQUE)
+    if not limits.limits:
+        return []
+    columns = [simulation.contacts.index(name) for name in formation.names]
+    rolling = [columns[row] for row in formation.rolling_rows]
+    c = [simulation.c_n[rows][:, columns], simulation.c_t[rows][:, rolling]]
+    y = np.nan_to_num(np.hstack([*c, torque.at(t), simulation.z_dot[rows, 3:]]))
+    short = limits.fold(-limits.find_slack(y @ limits.rows.T))
+    texts = []
+    for k, limit in enumerate(limits.limits):
+        amounts = short[:, limits.owners == k].max(axis=1)
+        worst = int(amounts.argmax())
+        if amounts[worst] > MISSED * limit.scale:
+            over = f"{amounts[worst]:.3g} {limit.unit}"
+            texts.append(
+                f"{limit.text} is exceeded by {over} at t = {t[worst]:.5g} s, phase {phase.number}"
+            )
+    return texts
 
 
 def find_finger_gap(scene: Scene, simulation: Simulation, breaks: Array) -> FingerGap | None:

@@ -24,7 +24,13 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..simulation.events import Event, EventKind, Simulation
 from ..simulation.simulate import simulate
-from .margins import find_finger_gap, list_contact_margins, list_slip_margins
+from .margins import (
+    MISSED,
+    describe_misses,
+    find_finger_gap,
+    list_contact_margins,
+    list_slip_margins,
+)
 from .reduced import list_reduced_states
 from .verdict import (
     DEPARTURE,
@@ -114,6 +120,9 @@ def inspect(
     failures += describe_overlap(problem.scene, phases, gap) if reached else []
     thin = describe_thin_margins(problem, phases, simulation, allowance)
     warnings = _describe_torques(problem, torque)
+    for phase in problem.phases[: len(phases)]:
+        rows = np.flatnonzero(simulation.phase == phase.index)
+        warnings += describe_misses(phase, simulation, rows, torque)
     if plan is not None:
         failures += thin + describe_departures(problem, phases, allowance)
     else:
@@ -233,7 +242,7 @@ def _describe_torques(problem: Problem, torque: TorqueProfile) -> list[str]:
     texts = []
     for joint, limit in enumerate(problem.scene.torque_limit):
         piece = int(peaks[:, joint].argmax())
-        if peaks[piece, joint] > limit * (1 + 1e-6):
+        if peaks[piece, joint] > limit * (1 + MISSED):
             texts.append(
                 f"tau_{joint + 1} reaches {peaks[piece, joint]:.3g} N m, above its limit "
                 f"{limit:g} N m, near t = {torque.breaks[piece]:.5g} s"
