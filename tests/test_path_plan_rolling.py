@@ -114,7 +114,7 @@ def test_a_slippery_palm_is_named() -> None:
     with pytest.raises(InfeasibleError, match="friction cone of v1-palm") as caught:
         plan("time", 0.1, 20)
     text = str(caught.value)
-    assert text.startswith("phase 2 is infeasible: ") and "c_t <= 0.1 (c_n - 0.05 N), is " in text
+    assert text.startswith("phase 2 is infeasible: ") and "|c_t| <= 0.1 (c_n - 0.05 N), is " in text
     assert " N short at t = " in text
 
 

@@ -89,20 +89,24 @@ class _Solution(NamedTuple):
     multipliers: dict[str, Array]
 
 
-class _StoppedError(Exception):
-    """The solver has stopped without an answer."""
+class _Stuck(NamedTuple):
+    """What has come instead of a plan.
+
+    Attributes
+    ----------
+    parts : list of PhaseData
+        The phases on their grids.
+    reason : str
+    between : bool
+        Whether limits can be kept at the nodes, but not between them on so coarse a grid.
+    """
+
+    parts: list[PhaseData]
+    reason: str
+    between: bool
 
 
-class _StuckError(SolverError):
-    """A solve that failed, with the phases that it failed for."""
-
-    def __init__(self, parts: Sequence[PhaseData], message: str) -> None:
-        self.parts = parts
-        super().__init__(message)
-
-
-class _TightError(_StuckError):
-    """Limits can be kept at the nodes, but not between them on so coarse a grid."""
+_Plans = list[PhasePlan[PathMotion]]
 
 
 def plan_path(
@@ -153,7 +157,7 @@ def plan_curves(
     task = _Task(curves, epsilon, options, phases, duration)
 
     def replan(changed: Sequence[Curve], least: float) -> object:
-        return _plan(replace(task, curves=changed, epsilon=least))
+        return _insist(_plan(replace(task, curves=changed, epsilon=least)))
 
     try:
         plans = _plan_finer(task)
@@ -163,15 +167,15 @@ def plan_curves(
         from .explain import explain_jam
 
         raise explain_jam(curves[0], epsilon, jam, replan) from None
-    except _StuckError as stuck:
+    if isinstance(plans, _Stuck):
         if not explained:
-            raise
+            raise SolverError(plans.reason)
         from .explain import explain
 
-        guessed = guess_slowly(join(stuck.parts))
+        guessed = guess_slowly(join(plans.parts))
         raise _explain_duration(task) or explain(
-            stuck.parts, *guessed, phases, str(stuck), replan
-        ) from None
+            plans.parts, *guessed, phases, plans.reason, replan
+        )
     if options.goal is Objective.MARGIN and plans[0].value < task.lost:
         late = _explain_duration(task)
         raise late or SolverError(f"{task.name}: the margin found is below epsilon")
@@ -185,7 +189,7 @@ def _explain_duration(task: _Task) -> InfeasibleError | None:
         return None
     fastest = replace(task.options, objective=Objective.TIME, duration=None)
     try:
-        plans = _plan(replace(task, options=fastest, duration=None))
+        plans = _insist(_plan(replace(task, options=fastest, duration=None)))
     except WholearmError:
         return None
     least = sum(plan.value for plan in plans)
@@ -194,7 +198,7 @@ def _explain_duration(task: _Task) -> InfeasibleError | None:
 
     def can_plan(_: Parameter, value: float) -> bool:
         try:
-            return _plan(replace(task, duration=value))[0].value >= task.epsilon
+            return _insist(_plan(replace(task, duration=value)))[0].value >= task.epsilon
         except SolverError:
             return False
 
@@ -207,21 +211,27 @@ def _explain_duration(task: _Task) -> InfeasibleError | None:
     )
 
 
-def _plan_finer(task: _Task) -> list[PhasePlan[PathMotion]]:
+def _insist(found: _Plans | _Stuck) -> _Plans:
+    """The plans, or an error."""
+    if isinstance(found, _Stuck):
+        raise SolverError(found.reason)
+    return found
+
+
+def _plan_finer(task: _Task) -> _Plans | _Stuck:
     """Plan, on a finer grid where limits that hold between the nodes leave nothing."""
     for finer in _FINER:
-        try:
-            own = replace(task.options, intervals=finer * task.options.intervals)
-            plans = _plan(replace(task, options=own))
-            below = own.goal is Objective.MARGIN and plans[0].value < task.lost
-            if not below or finer == _FINER[-1]:
-                return plans
-        except _TightError as error:
-            tight = error
-    raise tight
+        own = replace(task.options, intervals=finer * task.options.intervals)
+        found = _plan(replace(task, options=own))
+        if isinstance(found, _Stuck):
+            if not found.between:
+                break
+        elif own.goal is not Objective.MARGIN or found[0].value >= task.lost:
+            break
+    return found
 
 
-def _plan(task: _Task) -> list[PhasePlan[PathMotion]]:
+def _plan(task: _Task) -> _Plans | _Stuck:
     """Solve, redistribute nodes once and tighten limits until they hold between nodes too."""
     options = task.options
     parts = task.prepare(make_grid(curve, options.intervals) for curve in task.curves)
@@ -231,11 +241,10 @@ def _plan(task: _Task) -> list[PhasePlan[PathMotion]]:
     tightening = Tightening.none(data, task.duration)
     solution = _Solution(profile, 0.0, first_multipliers(nlp, data, profile, units))
     for solves in range(1, ROUNDS + 1):
-        try:
-            solution = _solve(nlp, data, units, tightening, solution, options.time_weight)
-        except _StoppedError as stop:
-            kind = _StuckError if solves == 1 else _TightError
-            raise kind(parts, f"{task.name}: {stop}") from None
+        found = _solve(nlp, data, units, tightening, solution, options.time_weight)
+        if isinstance(found, str):
+            return _Stuck(parts, f"{task.name}: {found}", between=solves > 1)
+        solution = found
         pairs = zip(parts, cut(parts, solution.profile), strict=True)
         motions = [PathMotion(part.curve, part.grid, own) for part, own in pairs]
         misses = _Misses.of(data, solution, motions, task.duration)
@@ -255,7 +264,7 @@ def _plan(task: _Task) -> list[PhasePlan[PathMotion]]:
             solution = solution._replace(profile=moved, multipliers=multipliers)
         else:
             tightening = misses.tighten(data, tightening, solution)
-    raise _TightError(parts, f"{task.name}: {misses.describe(data)}")
+    return _Stuck(parts, f"{task.name}: {misses.describe(data)}", between=True)
 
 
 class _Misses(NamedTuple):
@@ -305,9 +314,9 @@ def _summarise(
     parts: Sequence[PhaseData],
     motions: Sequence[PathMotion],
     solution: _Solution,
-) -> list[PhasePlan[PathMotion]]:
+) -> _Plans:
     """The plan of each phase."""
-    plans: list[PhasePlan[PathMotion]] = []
+    plans: _Plans = []
     for part, motion in zip(parts, motions, strict=True):
         torque, squares = fit_torque(part, motion)
         value = {
@@ -334,10 +343,11 @@ def _solve(
     tightening: Tightening,
     start: _Solution,
     time_weight: float,
-) -> _Solution:
+) -> _Solution | str:
+    """Solve once; the solution, or in words how the solver ended."""
     bounds = make_bounds(nlp, data, units, tightening)
     if (bounds["lbg"] > bounds["ubg"]).any():
-        raise _StoppedError("limits that hold between the nodes too leave nothing")
+        return "limits that hold between the nodes too leave nothing"
     result = nlp.solver(
         x0=pack(nlp, start.profile, units, start.margin),
         p=parameters(nlp, data, units, time_weight),
@@ -346,7 +356,7 @@ def _solve(
     )
     stats = nlp.solver.stats()
     if not stats["success"]:
-        raise _StoppedError(f"Ipopt stopped with {stats['return_status']}")
+        return f"Ipopt stopped with {stats['return_status']}"
     profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], units)
     multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
     return _Solution(profile, margin, multipliers)
