@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from shipped import HEPTAGON, TWICE, problem_of
+from wholearm.geometry.tracing import trace_phases
 from wholearm.planning import blocks
 from wholearm.planning.blocks import Planning, plan_alone
 from wholearm.planning.options import Objective, PlanOptions
@@ -15,7 +16,7 @@ from wholearm.planning.path_domain.sequence_plan import plan_sequence
 
 def planning_of(problem: Any) -> Planning:
     none: list[float | None] = [None] * len(problem.phases)
-    return Planning(problem, PlanOptions(), (), none, none)
+    return Planning(problem, (), PlanOptions(), (), none, none)
 
 
 def test_blocks_are_planned_alone_only_where_that_is_another_plan(
@@ -46,7 +47,8 @@ def test_no_phase_has_to_press_much_more_than_those_before_it(
         return plans
 
     monkeypatch.setattr(blocks, "plan_sequence", record)
-    blocks.plan_blocks(problem, PlanOptions("margin", intervals=20), lambda _: None)
+    options = PlanOptions("margin", intervals=20)
+    blocks.plan_blocks(problem, trace_phases(problem), options, lambda _: None)
     pressed = [(own.enough, value) for own, value in given if own.goal is Objective.MARGIN]
     assert len(pressed) == len(problem.phases) and pressed[0][0] == math.inf
     for index in range(1, len(pressed)):

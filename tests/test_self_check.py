@@ -10,6 +10,7 @@ from planned import change, plan, plan_landing
 from shipped import HEPTAGON, problem_of
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, JammingError, ReplayError, SolverError
+from wholearm.geometry.tracing import trace_phases
 from wholearm.planning import self_check
 from wholearm.planning.blocks import Planning, plan_blocks
 from wholearm.planning.options import PlanOptions
@@ -103,7 +104,7 @@ class Spoiled:
         self.problem, self.phase, self.cured = problem, phase, cured
         self.refined: list[int] = []
         options = PlanOptions(intervals=10)
-        self.planning = plan_blocks(problem, options, lambda _: None)
+        self.planning = plan_blocks(problem, trace_phases(problem), options, lambda _: None)
 
     def build(self, planning: Planning) -> Trajectory:
         from wholearm.planning.plan import assemble_plan

@@ -15,18 +15,19 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InfeasibleError, name_source
-from ..common.shortfalls import Change, Parameter
 from ..geometry.cost_to_go import CostToGo
-from ..geometry.tracing import runs_on_curve, trace_phase, trace_phases
+from ..geometry.curve import Curve
+from ..geometry.tracing import runs_on_curve, trace_phase
 from ..mechanics.metric import measure_speed
 from ..problem.definition import End, Phase, Problem
 from ..results.trajectory import Motion
 from ..scene.model import Scene
 from ..solvers.statistics import charge
+from .durations import share_again, share_duration
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence
 from .path_domain.sequence_plan import plan_sequence
-from .phase_plan import PhasePlan, add_up
+from .phase_plan import add_up
 from .stops import Plans
 
 PLAIN = -1
@@ -96,6 +97,8 @@ class Planning:
     Attributes
     ----------
     problem : Problem
+    curves : tuple of Curve
+        Those of the first phases: as far as geometry alone says where phases end.
     options : PlanOptions
     blocks : tuple of BlockPlan
     shares, allowed : list of float or None, [s]
@@ -109,6 +112,7 @@ class Planning:
     """
 
     problem: Problem
+    curves: tuple[Curve, ...]
     options: PlanOptions
     blocks: tuple[BlockPlan, ...]
     shares: list[float | None]
@@ -134,8 +138,22 @@ def split_blocks(problem: Problem) -> list[tuple[Phase, ...]]:
     return blocks
 
 
-def plan_blocks(problem: Problem, options: PlanOptions, report: Callable[[str], None]) -> Planning:
+def plan_blocks(
+    problem: Problem,
+    curves: tuple[Curve, ...],
+    options: PlanOptions,
+    report: Callable[[str], None],
+) -> Planning:
     """Plan every block of a problem, each from where the one before ends.
+
+    Parameters
+    ----------
+    problem : Problem
+    curves : tuple of Curve
+        Those of its first phases, as `trace_phases` finds them.
+    options : PlanOptions
+    report : callable
+        Told in a few words what is being done.
 
     Raises
     ------
@@ -144,11 +162,11 @@ def plan_blocks(problem: Problem, options: PlanOptions, report: Callable[[str], 
     """
     count = len(split_blocks(problem))
     none: list[float | None] = [None] * len(problem.phases)
-    planning = Planning(problem, options, (), none, none)
+    planning = Planning(problem, curves, options, (), none, none)
     if options.goal is Objective.MARGIN:
         first = replace(planning, options=_for_time(options), ahead=False)
         least = plan_each(first, [0] * count, report).plans
-        planning = replace(planning, shares=_share_duration(least, options.duration), least=least)
+        planning = replace(planning, shares=share_duration(least, options.duration), least=least)
     return _require_margin(plan_each(planning, [0] * count, report))
 
 
@@ -156,7 +174,7 @@ def plan_alone(planning: Planning, report: Callable[[str], None]) -> Planning | 
     """Plan without regard to what follows a block; None if that has made no difference."""
     problem, options = planning.problem, planning.options
     blocks = split_blocks(problem)
-    if not planning.ahead or all(_look_ahead(problem, own, options) is None for own in blocks):
+    if not planning.ahead or all(_look_ahead(planning, own, options) is None for own in blocks):
         return None
     alone = replace(planning, blocks=(), ahead=False)
     return _require_margin(plan_each(alone, [0] * len(blocks), report))
@@ -196,9 +214,9 @@ def plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str], 
         moved = known is None or _distance(problem.scene, known.start, z) > MOVED
         fastest: Plans = [] if moved or known is None else known.fastest
         if moved and least and _starts_off(problem.scene, least[phases[0].index].motion, z):
-            fastest = _plan_block(problem, phases, z, _for_time(options), None)[0]
+            fastest = _plan_block(planning, phases, z, _for_time(options), None)[0]
         if fastest:
-            _share_again(allowed, phases, least, fastest)
+            share_again(allowed, phases, least, fastest)
         duration = add_up(phases, allowed)
         wanted = finer[index], duration
         if known is None or moved or (known.finer, known.duration) != wanted:
@@ -207,9 +225,9 @@ def plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str], 
             own = _refine(options, known, finer[index])
             if options.goal is Objective.MARGIN:
                 own = replace(own, enough=_find_enough(blocks))
-            to_go = _look_ahead(problem, phases, own) if planning.ahead else None
+            to_go = _look_ahead(planning, phases, own) if planning.ahead else None
             with name_source(problem.source):
-                made = _plan_block(problem, phases, z, own, allowed, to_go)
+                made = _plan_block(planning, phases, z, own, allowed, to_go)
             known = BlockPlan(phases, z, *wanted, fastest, *made)
         blocks.append(known)
         z = known.end
@@ -234,7 +252,7 @@ def _refine(options: PlanOptions, known: BlockPlan | None, finer: int) -> PlanOp
 
 
 def _plan_block(
-    problem: Problem,
+    planning: Planning,
     block: Sequence[Phase],
     z: Array,
     options: PlanOptions,
@@ -243,6 +261,7 @@ def _plan_block(
 ) -> tuple[Plans, ImpactSequence | None]:
     """Plan a block from `z`, along its curves or in the time domain; also its curves."""
     plans: Plans = []
+    problem, known = planning.problem, planning.curves
     allowed = [None] * len(problem.phases) if allowed is None else allowed
     if not runs_along_curves(block, options):
         from .time_domain.impacts import plan_with_impacts
@@ -250,7 +269,7 @@ def _plan_block(
         with charge(block[0].number):
             plans += plan_with_impacts(problem, block, z, options, add_up(block, allowed), to_go)
         return plans, None
-    curves, known = [], trace_phases(problem)
+    curves = []
     for phase in block:
         traced, later = phase.index < len(known), problem.phases[phase.index + 1 :]
         curves.append(known[phase.index] if traced else trace_phase(phase, z, later))
@@ -262,8 +281,11 @@ def _plan_block(
     return plans, chain
 
 
-def _look_ahead(problem: Problem, block: Sequence[Phase], options: PlanOptions) -> CostToGo | None:
+def _look_ahead(
+    planning: Planning, block: Sequence[Phase], options: PlanOptions
+) -> CostToGo | None:
     """What follows a block in the time domain, if that decides where on a curve it should end."""
+    problem = planning.problem
     index = block[-1].index + 1
     if runs_along_curves(block, options) or index == len(problem.phases):
         return None
@@ -280,7 +302,7 @@ def _look_ahead(problem: Problem, block: Sequence[Phase], options: PlanOptions) 
         return None
 
     def value(z: Array) -> float:
-        return sum(plan.value for plan in _plan_block(problem, following, z, options, None)[0])
+        return sum(plan.value for plan in _plan_block(planning, following, z, options, None)[0])
 
     return CostToGo(phase, value)
 
@@ -312,46 +334,3 @@ def _distance(scene: Scene, one: Array, other: Array) -> float:
 def _starts_off(scene: Scene, motion: Motion, z: Array) -> bool:
     """Whether a motion starts somewhere else than at `z`."""
     return _distance(scene, motion.evaluate(np.zeros(1)).z[0], z) > MOVED
-
-
-def _share_again(
-    allowed: list[float | None],
-    block: Sequence[Phase],
-    least: Sequence[PhasePlan[Motion]],
-    fastest: Sequence[PhasePlan[Motion]],
-) -> None:
-    """Give a block its share for another least duration, at the cost of the phases after it."""
-    later = range(block[-1].index + 1, len(allowed))
-    rest = sum(allowed[k] or 0.0 for k in later)
-    if not rest:
-        return
-    gain = 0.0
-    for phase, plan in zip(block, fastest, strict=True):
-        own = allowed[phase.index]
-        if own is not None:
-            ratio = plan.motion.duration / least[phase.index].motion.duration
-            gain += own * (ratio - 1)
-            allowed[phase.index] = own * ratio
-    for k in later:
-        own = allowed[k]
-        allowed[k] = None if own is None else own * (1 - gain / rest)
-
-
-def _share_duration(
-    least: Sequence[PhasePlan[Motion]], duration: float | None
-) -> list[float | None]:
-    """Longest duration of each phase [s]: the whole, shared in proportion to the least times."""
-    times = [plan.motion.duration for plan in least]
-    total = 2 * sum(times) if duration is None else duration
-    if total <= sum(times):
-        from .advice import describe_changes, round_outwards
-
-        # The least-time plan shows it; a little more leaves something to choose.
-        own = Parameter("duration", total, "s", 1, "duration")
-        enough = Change(own, round_outwards(1.005 * sum(times), 1))
-        raise InfeasibleError(
-            f"duration = {total:g} s is not longer than the least time, {sum(times):.6g} s; "
-            f"{describe_changes([enough])}",
-            changes=[enough],
-        )
-    return [total / sum(times) * own for own in times]

@@ -14,6 +14,7 @@ import numpy as np
 from .. import __version__
 from ..common.errors import InfeasibleError
 from ..common.sharing import exclusive
+from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phases
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
@@ -104,9 +105,9 @@ def solve_with(
     with open_ledger() as ledger:
         started = time.perf_counter()
         report("tracing the phases")
-        trace_phases(problem)
+        curves = trace_phases(problem)
         traced = time.perf_counter()
-        planning = _plan(problem, options, report)
+        planning = _plan(problem, curves, options, report)
         trajectory, figures = assemble_plan(planning), None
         planned = time.perf_counter()
         if options.replay:
@@ -144,10 +145,15 @@ def solve_with(
     return replace(plan, trajectory=replace(trajectory, meta=write_meta(plan)))
 
 
-def _plan(problem: Problem, options: PlanOptions, report: Callable[[str], None]) -> Planning:
+def _plan(
+    problem: Problem,
+    curves: tuple[Curve, ...],
+    options: PlanOptions,
+    report: Callable[[str], None],
+) -> Planning:
     """Plan every block, and let an error's motion carry the problem along like a plan's."""
     try:
-        return plan_blocks(problem, options, report)
+        return plan_blocks(problem, curves, options, report)
     except InfeasibleError as error:
         if error.motion is not None:
             known = {"name": problem.name, "epsilon": problem.epsilon, "problem": problem.table}
