@@ -23,6 +23,7 @@ from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
 from .data import PhaseData, cut, fit_torque, join, prepare
 from .first_guess import guess, guess_slowly
+from .misses import MISS, ROUNDS, Misses, PathSolution
 from .motion import Grid, PathMotion, Profile, make_grid, redistribute_nodes
 from .nlp import (
     PathNLP,
@@ -38,13 +39,6 @@ from .nlp import (
 )
 from .terms import LimitShape
 
-MISS = 2.5e-7
-"""Largest miss of a limit between nodes.
-
-Over the scene's force for contact forces, relative for torques, the square of speeds and time.
-"""
-ROUNDS = 40
-"""Most times that the NLP is solved for one phase."""
 _COARSE = 1.5e-4
 """Miss, over the typical force or torque, above which the grid is drawn together."""
 _FAST = 1e-2
@@ -53,8 +47,6 @@ _LEVER = 30.0
 """Lever at which the typical force makes the typical torque, in radii of gyration."""
 _FINER = (1, 2, 4)
 """Intervals to try, over those that are asked for."""
-_OVER = 1.05
-"""How much more than the miss a limit is tightened."""
 
 
 @dataclass(frozen=True)
@@ -81,12 +73,6 @@ class _Task:
         """What each phase gives the NLP on its grid."""
         given = zip(self.curves, grids, self.phases, strict=True)
         return [prepare(curve, self.epsilon, grid, phase) for curve, grid, phase in given]
-
-
-class _Solution(NamedTuple):
-    profile: Profile
-    margin: float
-    multipliers: dict[str, Array]
 
 
 class _Stuck(NamedTuple):
@@ -239,7 +225,7 @@ def _plan(task: _Task) -> _Plans | _Stuck:
     nlp = build_path_nlp(LimitShape.of(data.limits), len(data.grid.steps), options.goal)
     profile, units = guess(data, options.time_weight)
     tightening = Tightening.none(data, task.duration)
-    solution = _Solution(profile, 0.0, first_multipliers(nlp, data, profile, units))
+    solution = PathSolution(profile, 0.0, first_multipliers(nlp, data, profile, units))
     for solves in range(1, ROUNDS + 1):
         found = _solve(nlp, data, units, tightening, solution, options.time_weight)
         if isinstance(found, str):
@@ -247,7 +233,7 @@ def _plan(task: _Task) -> _Plans | _Stuck:
         solution = found
         pairs = zip(parts, cut(parts, solution.profile), strict=True)
         motions = [PathMotion(part.curve, part.grid, own) for part, own in pairs]
-        misses = _Misses.of(data, solution, motions, task.duration)
+        misses = Misses.of(data, solution, motions, task.duration)
         if misses.find_worst(data) <= MISS:
             return _summarise(task, parts, motions, solution)
         coarse = _weigh(data, misses, units)
@@ -267,53 +253,11 @@ def _plan(task: _Task) -> _Plans | _Stuck:
     return _Stuck(parts, f"{task.name}: {misses.describe(data)}", between=True)
 
 
-class _Misses(NamedTuple):
-    """What limits miss between nodes: see `PhaseData.misses`; and the duration, relatively."""
-
-    short: Array
-    speeding: Array
-    late: float
-
-    @staticmethod
-    def of(
-        data: PhaseData,
-        solution: _Solution,
-        motions: Sequence[PathMotion],
-        duration: float | None,
-    ) -> _Misses:
-        total = sum(motion.duration for motion in motions)
-        late = max(0.0, total / duration - 1) if duration else 0.0
-        return _Misses(*data.misses(solution.profile, solution.margin), late)
-
-    def find_worst(self, data: PhaseData) -> float:
-        """The largest, over what is much."""
-        return float(max((self.short / data.spans).max(), self.speeding.max(), self.late))
-
-    def tighten(self, data: PhaseData, tightening: Tightening, solution: _Solution) -> Tightening:
-        """Limits that are tightened by somewhat more than they miss."""
-        reach = data.slack_at_neighbours(solution.profile, solution.margin, self.short)
-        short, speeding = data.spread_to_nodes(self.short), data.spread_to_nodes(self.speeding)
-        return tightening.by(
-            data.spread_to_nodes(reach), _OVER * short, _OVER * speeding, _OVER * self.late
-        )
-
-    def describe(self, data: PhaseData) -> str:
-        """What is still missed after all solves."""
-        worst = int((self.short / data.spans).max(axis=0).argmax())
-        limits = data.limits
-        unit = limits.limits[limits.owners[limits.sides[0][worst]]].unit
-        missed = f"limits are still missed by {self.short[:, worst].max():.2g} {unit} between nodes"
-        if (self.short / data.spans).max() <= MISS:
-            over = max(self.speeding.max(), self.late)
-            missed = f"the speed limit or the duration is still exceeded by {over:.2g} of it"
-        return f"after {ROUNDS} solves {missed}; plan with more intervals"
-
-
 def _summarise(
     task: _Task,
     parts: Sequence[PhaseData],
     motions: Sequence[PathMotion],
-    solution: _Solution,
+    solution: PathSolution,
 ) -> _Plans:
     """The plan of each phase."""
     plans: _Plans = []
@@ -328,7 +272,7 @@ def _summarise(
     return plans
 
 
-def _weigh(data: PhaseData, misses: _Misses, units: Units) -> Array:
+def _weigh(data: PhaseData, misses: Misses, units: Units) -> Array:
     """How much each solid interval misses of what draws the grid together, shape (n_solid,)."""
     lever = _LEVER * data.curve.formation.scene.scales.length
     of_torque = np.isin(data.limits.sides[0], np.flatnonzero(data.limits.columns[1].any(axis=1)))
@@ -341,9 +285,9 @@ def _solve(
     data: PhaseData,
     units: Units,
     tightening: Tightening,
-    start: _Solution,
+    start: PathSolution,
     time_weight: float,
-) -> _Solution | str:
+) -> PathSolution | str:
     """Solve once; the solution, or in words how the solver ended."""
     bounds = make_bounds(nlp, data, units, tightening)
     if (bounds["lbg"] > bounds["ubg"]).any():
@@ -359,4 +303,4 @@ def _solve(
         return f"Ipopt stopped with {stats['return_status']}"
     profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], units)
     multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
-    return _Solution(profile, margin, multipliers)
+    return PathSolution(profile, margin, multipliers)

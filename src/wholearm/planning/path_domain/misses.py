@@ -1,0 +1,74 @@
+"""What limits miss between the nodes of a solution, and how they are tightened by that."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from ...common.arrays import Array
+from .data import PhaseData
+from .motion import PathMotion, Profile
+from .nlp import Tightening
+
+MISS = 2.5e-7
+"""Largest miss of a limit between nodes.
+
+Over the scene's force for contact forces, relative for torques, the square of speeds and time.
+"""
+ROUNDS = 40
+"""Most times that the NLP is solved for one phase."""
+OVER = 1.05
+"""How much more than the miss a limit is tightened."""
+
+
+class PathSolution(NamedTuple):
+    """What the solver has found: a motion, the margin over epsilon, and multipliers."""
+
+    profile: Profile
+    margin: float
+    multipliers: dict[str, Array]
+
+
+class Misses(NamedTuple):
+    """What limits miss between nodes: see `PhaseData.misses`; and the duration, relatively."""
+
+    short: Array
+    speeding: Array
+    late: float
+
+    @staticmethod
+    def of(
+        data: PhaseData,
+        solution: PathSolution,
+        motions: Sequence[PathMotion],
+        duration: float | None,
+    ) -> Misses:
+        """Misses of a solution, which is one motion for each phase."""
+        total = sum(motion.duration for motion in motions)
+        late = max(0.0, total / duration - 1) if duration else 0.0
+        return Misses(*data.misses(solution.profile, solution.margin), late)
+
+    def find_worst(self, data: PhaseData) -> float:
+        """The largest, over what is much."""
+        return float(max((self.short / data.spans).max(), self.speeding.max(), self.late))
+
+    def tighten(
+        self, data: PhaseData, tightening: Tightening, solution: PathSolution
+    ) -> Tightening:
+        """Limits that are tightened by somewhat more than they miss."""
+        reach = data.slack_at_neighbours(solution.profile, solution.margin, self.short)
+        short, speeding = data.spread_to_nodes(self.short), data.spread_to_nodes(self.speeding)
+        return tightening.by(
+            data.spread_to_nodes(reach), OVER * short, OVER * speeding, OVER * self.late
+        )
+
+    def describe(self, data: PhaseData) -> str:
+        """What is still missed after all solves."""
+        worst = int((self.short / data.spans).max(axis=0).argmax())
+        limits = data.limits
+        unit = limits.limits[limits.owners[limits.sides[0][worst]]].unit
+        missed = f"limits are still missed by {self.short[:, worst].max():.2g} {unit} between nodes"
+        if (self.short / data.spans).max() <= MISS:
+            over = max(self.speeding.max(), self.late)
+            missed = f"the speed limit or the duration is still exceeded by {over:.2g} of it"
+        return f"after {ROUNDS} solves {missed}; plan with more intervals"
