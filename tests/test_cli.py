@@ -217,6 +217,18 @@ def test_an_impulse_that_pulls_has_exit_status_1(
     )
 
 
+def test_files_of_an_earlier_run_are_left_and_named(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("a.npz").write_bytes(b"old")
+    options = ["-o", "a.npz", "--torques", "a.csv", "--objective", "margin", "--duration", "1e-3"]
+    assert main(["solve", str(HEPTAGON), *options]) == 1
+    stale, reason = capsys.readouterr().err.splitlines()
+    assert stale == "wholearm: a.npz: left as it was, from an earlier run"
+    assert "duration = 0.001 s" in reason
+    assert Path("a.npz").read_bytes() == b"old" and not Path("a.csv").exists()
+
+
 def test_a_phase_is_planned_in_the_time_domain_when_asked(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -123,8 +123,15 @@ def _solve(options: argparse.Namespace) -> int:
             require_ending(path, ending)
     _check_sampling(options)
     problem = load(options.problem)
-    plan = solve_with(problem, plan_options, show_progress())
-    table = None if options.torques is None else _make_table(options, plan)
+    try:
+        plan = solve_with(problem, plan_options, show_progress())
+        table = None if options.torques is None else _make_table(options, plan)
+    except WholearmError:
+        clear_progress()
+        for path in filter(None, (output, options.torques)):
+            if os.path.exists(path):
+                _complain(f"{path}: left as it was, from an earlier run")
+        raise
     with together():
         plan.save(output)
         if table is not None:

@@ -94,6 +94,13 @@ class Check(NamedTuple):
         assert self.report.failed_phase is not None
         return self.report.failed_phase, self.report.reason
 
+    @property
+    def is_final(self) -> bool:
+        """Whether it fails however many instants are looked at, and whatever is allowed."""
+        if self.residual.size > RESIDUAL or not isinstance(self.report, Report):
+            return True
+        return not self.report.reached
+
     def find_culprit(self, scales: Scales, allowance: Allowance, durations: Array) -> int:
         """Number of the phase to refine: the first that departs or does not stop, or that fails.
 
@@ -150,11 +157,11 @@ def replay_plan(
         every = choose_times(trajectory.torque, trajectory)
         for times in (None, pick_times(trajectory, _CLOSER * PIECES), every):
             check = check_plan(problem, trajectory, strict, times)
-            if check.failure is None:
+            if check.failure is None or check.is_final:
                 break
         if check.failure is None:
             break
-        accepted = check_plan(problem, trajectory, usual, every)
+        accepted = check if check.is_final else check_plan(problem, trajectory, usual, every)
         durations = np.diff(trajectory.phase_starts)
         number = check.find_culprit(problem.scene.scales, strict, durations)
         index = next(

@@ -284,6 +284,10 @@ def choose_sampling(nodes: int) -> Sampling:
     return Sampling(np.linspace(0.0, 1.0, knots), (1 - np.cos(angles)) / 2)
 
 
+class StalledError(SolverError):
+    """The motion takes no time, or for ever, between two nodes: the grid is too coarse."""
+
+
 def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, float]:
     """Torque of a motion as one polynomial in time per interval, through its values at the knots.
 
@@ -292,7 +296,7 @@ def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, floa
 
     Raises
     ------
-    SolverError
+    StalledError
         If the motion takes no time, or for ever, between two nodes.
     """
     knots, checks = data.sampling
@@ -314,7 +318,7 @@ def _fit(data: PhaseData, motion: PathMotion, places: Places, fractions: Array) 
     values = places.forces.tau(*data.spread(motion.profile, fractions))
     spans = motion.durations(fractions)[k]
     if not (np.isfinite(spans).all() and (np.diff(spans, axis=1) > 0).all()):
-        raise SolverError("the motion all but stops between two nodes; plan with more intervals")
+        raise StalledError("the motion all but stops between two nodes; plan with more intervals")
     x = 2 * spans / spans[:, -1:] - 1
     vandermonde = x[..., None] ** np.arange(len(fractions))
     coefficients = np.linalg.solve(vandermonde, values.reshape(len(k), len(fractions), 2))

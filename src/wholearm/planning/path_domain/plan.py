@@ -21,7 +21,7 @@ from ...geometry.curve import Curve
 from ..advice import describe_changes, find_changes, name_phases
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
-from .data import PhaseData, cut, fit_torque, join, prepare
+from .data import PhaseData, StalledError, cut, fit_torque, join, prepare
 from .first_guess import guess, guess_slowly
 from .misses import MISS, ROUNDS, Misses, PathSolution
 from .motion import Grid, PathMotion, Profile, make_grid, redistribute_nodes
@@ -205,7 +205,7 @@ def _insist(found: _Plans | _Stuck) -> _Plans:
 
 
 def _plan_finer(task: _Task) -> _Plans | _Stuck:
-    """Plan, on a finer grid where limits that hold between the nodes leave nothing."""
+    """Plan, on a finer grid where limits that hold between the nodes leave nothing, or no time."""
     for finer in _FINER:
         own = replace(task.options, intervals=finer * task.options.intervals)
         found = _plan(replace(task, options=own))
@@ -235,7 +235,10 @@ def _plan(task: _Task) -> _Plans | _Stuck:
         motions = [PathMotion(part.curve, part.grid, own) for part, own in pairs]
         misses = Misses.of(data, solution, motions, task.duration)
         if misses.find_worst(data) <= MISS:
-            return _summarise(task, parts, motions, solution)
+            try:
+                return _summarise(task, parts, motions, solution)
+            except StalledError as stall:
+                return _Stuck(parts, f"{task.name}: {stall}", between=True)
         coarse = _weigh(data, misses, units)
         if solves == 1 and coarse.max() > 1:
             old = data.grid
