@@ -21,10 +21,12 @@ from wholearm.mechanics.dynamics import Directions
 from wholearm.problem.definition import Phase, Problem, Until
 from wholearm.results.torque import TorqueProfile
 from wholearm.scene.model import Finger, Friction, Scene
+from wholearm.simulation import simulate as simulation_module
 from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.simulation.simulate import simulate
 from wholearm.simulation.statics import balances
 from wholearm.simulation.sticking import find_rest
+from wholearm.simulation.within import fill
 
 
 def pick(index: int) -> tuple[Problem, CosineMotion]:
@@ -202,6 +204,40 @@ def test_states_do_not_depend_on_the_times_asked_for() -> None:
         assert np.allclose(few.at(t), many.at(t), atol=1e-9, rtol=0)
     with pytest.raises(ValueError, match="not recorded"):
         few.at(0.1234)
+
+
+def test_looks_are_as_good_as_steps_and_end_none() -> None:
+    problem, motion = pick(1)
+    torque = motion.fit(1, 24)
+    times = np.linspace(0.03, 0.4, 60)
+    reference = simulate(problem, torque, tolerance=1e-13, times=times)
+    bare = simulate(problem, torque, tolerance=1e-9)
+    looked = simulate(problem, torque, tolerance=1e-9, looks=times)
+    assert (looked.steps, looked.outcome) == (bare.steps, bare.outcome)
+    for name, bound in (("z", 1e-7), ("z_dot", 1e-7), ("z_ddot", 1e-5), ("c_n", 1e-5)):
+        own, exact = (
+            np.array([getattr(run, name)[np.flatnonzero(run.t == t)[-1]] for t in times])
+            for run in (looked, reference)
+        )
+        assert np.allclose(own, exact, rtol=0, atol=bound * (1 + np.nanmax(np.abs(exact))))
+    # They are moved onto the contacts, however far the interpolation leaves them.
+    formation = problem.phases[0].formation
+    rows = [np.flatnonzero(looked.t == t)[-1] for t in times]
+    assert np.abs(formation.evaluate(looked.z[rows], looked.z_dot[rows]).C).max() < 1e-14
+
+
+def test_what_happens_between_the_ends_of_steps_is_not_missed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where a look shows something that no step has ended at, steps end at looks."""
+    problem, trajectory = plan()
+    times = np.linspace(0.05, 1.9, 50)
+    close = simulate(problem, trajectory, times=times)
+    answers = iter([False, True])
+    monkeypatch.setattr(simulation_module, "fill", lambda pairs: fill(pairs) and next(answers))
+    again = simulate(problem, trajectory, looks=times)
+    assert again.steps == close.steps
+    np.testing.assert_array_equal(again.z, close.z)
 
 
 def test_energy_is_conserved_without_friction() -> None:

@@ -215,6 +215,9 @@ class Section:
         Layout of the rows.
     times, rows, impacts : list
         Instants [s], packed outputs, and the energy lost to impacts so far [J].
+    within : list of (ndarray, ndarray)
+        Steps that rows lie within which are still to be evaluated (`within.fill`): the packed
+        inputs of the step, and the numbers of the rows.
     """
 
     phase: Phase
@@ -222,6 +225,7 @@ class Section:
     times: list[float] = field(default_factory=list)
     rows: list[Array] = field(default_factory=list)
     impacts: list[float] = field(default_factory=list)
+    within: list[tuple[Array, NDArray[np.int64]]] = field(default_factory=list)
 
 
 def collect(

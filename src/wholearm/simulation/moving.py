@@ -26,6 +26,7 @@ from .locate import find_first
 from .replay import Replay
 from .runge_kutta import ORDER
 from .tolerances import REACHED, SHORTEST_STEP, SLOW, measure_units
+from .within import keep_wanted
 
 
 def move(run: Replay) -> Ending:
@@ -34,7 +35,9 @@ def move(run: Replay) -> Ending:
     run.h = min(run.h, run.tolerances.first_step)
     while True:
         outputs, to = run.stepper.outputs, run.stepper.to
-        target = min(run.breaks[run.piece + 1], run.wanted[run.next_wanted])
+        while run.ends[run.next_end] <= run.t:
+            run.next_end += 1
+        target = min(run.breaks[run.piece + 1], run.ends[run.next_end])
         h, whole = _try_step(run, target)
         if outputs[to.worst] < 0 and not (whole and _is_at_end(run, target)):
             ending = _stop_at_event(run, start, h)
@@ -42,16 +45,20 @@ def move(run: Replay) -> Ending:
                 return ending
             start = run.stepper.outputs.copy()
             continue
-        start = run.accept(target if whole else run.t + h)
-        if not whole:
-            continue
-        if target == run.wanted[run.next_wanted]:
-            run.next_wanted += 1
-        if target == run.breaks[run.piece + 1]:
+        start = _accept(run, target if whole else run.t + h)
+        if whole and target == run.breaks[run.piece + 1]:
             ending = _pass_break(run)
             if ending is not None:
                 return ending
             start = run.stepper.outputs.copy()
+
+
+def _accept(run: Replay, t: float) -> Array:
+    """Take the step just made, to time `t`, and what is wanted within it."""
+    keep_wanted(run, t)
+    if run.wanted[run.next_wanted] == t:
+        run.next_wanted += 1
+    return run.accept(t)
 
 
 def _try_step(run: Replay, target: float) -> tuple[float, bool]:
@@ -124,7 +131,7 @@ def _stop_at_event(run: Replay, start: Array, h: float) -> Ending | None:
     s = run.stepper
     rows = s.rows
     kinds = find_first(run, start, h)
-    run.accept(run.t + float(s.inputs[s.at.h]))
+    _accept(run, run.t + float(s.inputs[s.at.h]))
     if rows.until in kinds:
         return _pass_on(run) if run.phase.end is End.SMOOTH or _strikes(run) else _reach(run)
     if rows.speed in kinds:

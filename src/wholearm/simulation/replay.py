@@ -51,6 +51,9 @@ class Replay:
         Unit of the distance to the end of the phase.
     moving : bool
         Whether the motion goes on into the phase that is entered.
+    wanted, ends : list of float
+        Instants that are to be recorded, and those of them at which steps have to end; infinity is
+        last.
     stuck : set of int
         Contacts, then joints, of the phase's formation that stay while the rest moves.
     """
@@ -68,17 +71,20 @@ class Replay:
         torque: TorqueProfile,
         tolerance: float,
         wanted: Array,
+        ends: Array,
     ) -> None:
-        self.problem, self.tolerance = problem, tolerance
+        self.problem, self.torques, self.tolerance = problem, torque, tolerance
         self.tolerances = find_tolerances(problem.scene)
         self.until_unit = 1.0
         self.breaks = [float(b) for b in torque.breaks]
         self.coefficients = torque.coefficients
         self.steps_at = _find_steps(torque, self.tolerances.torque_step)
         self.step_times = [b for b, s in zip(self.breaks, self.steps_at, strict=False) if s]
-        inside = wanted[(wanted >= self.breaks[0]) & (wanted <= self.breaks[-1])]
-        self.wanted = [*inside.tolist(), math.inf]
-        self.next_wanted = 0
+        self.wanted, self.ends = (
+            [*times[(times >= self.breaks[0]) & (times <= self.breaks[-1])].tolist(), math.inf]
+            for times in (wanted, ends)
+        )
+        self.next_wanted = self.next_end = 0
         self.t, self.piece = self.breaks[0], 0
         self.y = np.zeros(STATE)
         self.y[:5] = problem.start
@@ -92,6 +98,7 @@ class Replay:
         self.ways: dict[str, float] = {}
         self.decided = (-math.inf, 0)
         self.sections: list[Section] = []
+        self.steppers: list[Stepper] = []
         self.events: list[Event] = []
         self.steps = self.rejected = 0
 
@@ -101,6 +108,7 @@ class Replay:
         formation, until = self.phase.formation, self.phase.until
         self.stepper = s = build_stepper(formation, until, self.side, degree, grips)
         self.sections.append(Section(self.phase, s.to))
+        self.steppers.append(s)
         s.inputs[s.at.tolerance] = self.tolerance
         s.inputs[s.at.kept] = s.mode.read_kept(self.y[:5])
         self.load_piece()

@@ -24,11 +24,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..common.arrays import Array
 from ..common.errors import InputError, JammingError, SimulationError
 from ..common.sharing import exclusive
 from ..problem.definition import End, Phase, Problem
 from ..results.narrow import Torques, narrow
-from ..results.torque import TorqueProfile
 from .events import EventKind, Outcome, OutcomeKind, Simulation, collect
 from .jumps import Arrival, Ending, Released, Rested, Switched, is_there
 from .moving import move
@@ -36,6 +36,7 @@ from .replay import Replay
 from .starting import Departure
 from .sticking import Collapse, Rest, find_rest
 from .transitions import collide, enter, go_on, set_off
+from .within import fill
 
 
 @exclusive
@@ -45,6 +46,7 @@ def simulate(
     *,
     tolerance: float = 1e-9,
     times: ArrayLike | None = None,
+    looks: ArrayLike | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Simulation:
     """Replay joint torques open loop from the problem's start at rest.
@@ -59,6 +61,9 @@ def simulate(
     times : array_like, shape (n,), optional, [s]
         Instants at which the state is wanted; steps end there. Those outside the torques' time
         are left out.
+    looks : array_like, shape (n,), optional, [s]
+        More of them, for which no step has to end: there the state has some ten times the error of
+        a step, at a tenth of the cost.
     progress : callable, optional
         Receives a line at the start of each phase.
 
@@ -80,11 +85,28 @@ def simulate(
     profile, _ = narrow(torque)
     if not 1e-14 <= tolerance <= 1e-2:
         raise InputError("", "tolerance", f"{tolerance!r} is not between 1e-14 and 1e-2")
-    wanted = np.sort(np.asarray([] if times is None else times, dtype=float).ravel())
-    if not np.isfinite(wanted).all():
-        raise InputError("", "times", "holds numbers that are not finite")
-    wanted = wanted[np.diff(wanted, prepend=-np.inf) > 0]
-    run = Replay(problem, profile, tolerance, wanted)
+    ends, inner = (_sort_times(name, given) for name, given in (("times", times), ("looks", looks)))
+    wanted = np.union1d(ends, inner)
+    run = Replay(problem, profile, tolerance, wanted, ends)
+    # Where something shows within a step that its end does not show, steps are to end there.
+    found = _simulate(run, progress)
+    if found is None:
+        found = _simulate(Replay(problem, profile, tolerance, wanted, wanted), None)
+    assert found is not None
+    return found
+
+
+def _sort_times(name: str, given: ArrayLike | None) -> Array:
+    """Instants that are asked for, increasing, shape (n,) [s]."""
+    times = np.unique(np.asarray([] if given is None else given, dtype=float))
+    if not np.isfinite(times).all():
+        raise InputError("", name, "holds numbers that are not finite")
+    return times
+
+
+def _simulate(run: Replay, progress: Callable[[str], None] | None) -> Simulation | None:
+    """Simulate phase after phase; None if something within a step has been missed."""
+    problem = run.problem
     for phase, following in zip(problem.phases, [*problem.phases[1:], None], strict=True):
         if progress is not None:
             progress(f"simulating phase {phase.number} of {len(problem.phases)}")
@@ -94,10 +116,14 @@ def simulate(
             error.phase = phase.number
             raise
         if outcome is not None:
-            return _collect(run, profile, outcome)
-    goal = problem.phases[-1].until
-    text = f"{goal} is reached at t = {run.t:.5g} s, the end of phase {len(problem.phases)}"
-    return _collect(run, profile, Outcome(OutcomeKind.GOAL_REACHED, text))
+            break
+    else:
+        goal = problem.phases[-1].until
+        text = f"{goal} is reached at t = {run.t:.5g} s, the end of phase {len(problem.phases)}"
+        outcome = Outcome(OutcomeKind.GOAL_REACHED, text)
+    if not fill(zip(run.sections, run.steppers, strict=True)):
+        return None
+    return _collect(run, outcome)
 
 
 def _play(run: Replay, phase: Phase, following: Phase | None) -> Outcome | None:
@@ -229,13 +255,13 @@ def _collapse(run: Replay, rest: Rest, change: Collapse) -> Released | Switched 
     return run.lose(change.contact, change.c_n)
 
 
-def _collect(run: Replay, torque: TorqueProfile, outcome: Outcome) -> Simulation:
+def _collect(run: Replay, outcome: Outcome) -> Simulation:
     """Put everything recorded together."""
     missed = 0.0 if outcome.reached else run.value(run.stepper.rows.until)
     if run.phase.until.is_release:
         missed = math.nan
     counts = (run.steps, run.rejected)
-    return collect(run.problem, run.sections, run.events, torque, outcome, missed, counts)
+    return collect(run.problem, run.sections, run.events, run.torques, outcome, missed, counts)
 
 
 __all__ = ["simulate"]

@@ -7,21 +7,62 @@ from, is one CasADi function of one packed vector, so that a step costs one call
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
+from ..common.batch import Batch
 from ..contacts.elemental import GapLimit, build_features, build_gap
 from ..contacts.formation import Formation
 from ..problem.definition import Until
 from .layout import STATE, EventRows, Inputs, Outputs, lay_out
 from .mode_equations import Mechanics, share_mechanics
 from .modes import FREE, Grips, Mode
-from .runge_kutta import build_step
+from .runge_kutta import build_extension, build_step
 from .tolerances import find_tolerances
+
+
+@dataclass(frozen=True, eq=False)
+class Compiled:
+    """What all steppers of a formation share.
+
+    Attributes
+    ----------
+    equations : _Equations
+    at, to : Inputs, Outputs
+        Layouts of the packed vectors.
+    rows : EventRows
+    slack : ndarray, shape (n_events,)
+        How far below zero each event value counts as rounding.
+    step, look : casadi.Function
+        Of the packed inputs.
+    """
+
+    equations: _Equations
+    at: Inputs
+    to: Outputs
+    rows: EventRows
+    slack: Array
+    step: Expression
+    look: Expression
+
+    @cached_property
+    def extend(self) -> Batch:
+        """Terms of the continuous extensions of steps, shape (STATE, 7): of their packed inputs."""
+        own = self.equations
+        y, t, h = (own.packed[place] for place in (self.at.y, self.at.t, self.at.h))
+        terms = build_extension(own.rate, y, t, h)
+        return Batch(ca.Function("extend", [own.packed], [ca.densify(terms)]))
+
+    @cached_property
+    def sample(self) -> Batch:
+        """Outputs at many states within steps: of (packed, state, time), shape (to.size, 1)."""
+        own, state, time = self.equations, ca.MX.sym("state", STATE), ca.MX.sym("time")
+        outputs = own.report(own.project(state), time, 0, 0)
+        return Batch(ca.Function("sample", [own.packed, state, time], [outputs]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +83,7 @@ class Stepper:
         How far below zero each event value counts as rounding.
     step, look : callable
         A step of length h; the same outputs at the state given, without a step.
+    compiled : Compiled
     """
 
     mode: Mode
@@ -53,6 +95,7 @@ class Stepper:
     slack: Array
     step: Any
     look: Any
+    compiled: Compiled
     _keep: Any
 
     @property
@@ -83,57 +126,73 @@ def build_stepper(
     grips : Grips
         What friction holds meanwhile.
     """
-    mode, functions, at, to, rows, slack = _compile(formation, until, side, degree, grips)
-    inputs, results = np.zeros(at.size), np.zeros(to.size)
-    buffers = [function.buffer() for function in functions]
+    c = _compile(formation, until, side, degree, grips)
+    inputs, results = np.zeros(c.at.size), np.zeros(c.to.size)
+    buffers = [function.buffer() for function in (c.step, c.look)]
     for buffer, _ in buffers:
         buffer.set_arg(0, inputs.data)
         buffer.set_res(0, results.data)
     step, look = (call for _, call in buffers)
-    return Stepper(mode, inputs, results, at, to, rows, slack, step, look, buffers)
+    known = c.equations.mode, inputs, results, c.at, c.to, c.rows, c.slack
+    return Stepper(*known, step, look, c, buffers)
+
+
+class _Equations:
+    """Equations of a formation, as expressions of one packed vector.
+
+    They only say what calls what, which is quicker to compile than writing out every stage.
+    """
+
+    def __init__(
+        self, formation: Formation, until: Until, side: float, degree: int, grips: Grips
+    ) -> None:
+        self.mode = mode = Mode(formation, grips)
+        self.mechanics = share_mechanics(mode, degree)
+        self.short = find_tolerances(formation.scene).short
+        self._measure = _build_measure(formation, until, side, self.short)
+        self._stage = _build_stage(mode, self.mechanics)
+        self.packed = ca.MX.sym("packed", self.mechanics.at.size)
+        self.forces: list[Expression] = []
+
+    def rate(self, state: Expression, time: Expression) -> Expression:
+        """Rates of the state; the least that holds it is appended to `forces`."""
+        rates, force = self._stage(state, time, self.packed)
+        self.forces.append(force)
+        return rates
+
+    def report(self, state: Expression, time: Expression, *errors: Expression) -> Expression:
+        """Outputs at a state, with the error of the step that led there and its dip."""
+        mechanics, packed = self.mechanics, self.packed
+        _, *constraints = self.mode.build_constraints(state[:5], state[5:10])
+        outputs, events, speed, least = mechanics.report(state, time, packed, *constraints)
+        values, distance, approach, closest = self._measure(state[:5], state[5:10])
+        error, dip = errors
+        worst = ca.fmin(least, closest)
+        return ca.vertcat(outputs, error, worst, dip, approach, events, values, distance, speed)
+
+    def project(self, state: Expression) -> Expression:
+        """The state moved onto the contacts and what friction keeps."""
+        return _project(self.mode, self.mechanics, state, self.packed[self.mechanics.at.kept])
 
 
 @lru_cache(maxsize=64)
 def _compile(
     formation: Formation, until: Until, side: float, degree: int, grips: Grips
-) -> tuple[Mode, list[Expression], Inputs, Outputs, EventRows, Array]:
-    mode = Mode(formation, grips)
-    mechanics = share_mechanics(mode, degree)
+) -> Compiled:
+    own = _Equations(formation, until, side, degree, grips)
+    mechanics, mode, packed = own.mechanics, own.mode, own.packed
     at, n_c, held = mechanics.at, formation.n_contacts, len(mode.holders)
     limits = len(open_limits(formation, until))
     rows = EventRows(*lay_out(n_c, 2 * held, n_c, 2, limits, None, None))
     to = Outputs(*lay_out(STATE, 5, n_c, n_c, 2, 5, None, None, None, None, None, rows.size))
-    short = find_tolerances(formation.scene).short
-    slack = np.concatenate([mechanics.slack, np.full(limits, short), [0.0, mechanics.stall]])
-    measure = _build_measure(formation, until, side, short)
-    # What follows only says what calls what, which is quicker than writing out every stage.
-    packed, forces = ca.MX.sym("packed", at.size), []
+    slack = np.concatenate([mechanics.slack, np.full(limits, own.short), [0.0, mechanics.stall]])
     y, t, h = packed[at.y], packed[at.t], packed[at.h]
-
-    stage = _build_stage(mode, mechanics)
-
-    def rate(state: Expression, time: Expression) -> Expression:
-        rates, force = stage(state, time, packed)
-        forces.append(force)
-        return rates
-
-    def report(state: Expression, time: Expression, *errors: Expression) -> Expression:
-        _, *constraints = mode.build_constraints(state[:5], state[5:10])
-        outputs, events, speed, least = mechanics.report(state, time, packed, *constraints)
-        values, distance, approach, closest = measure(state[:5], state[5:10])
-        error, dip = errors
-        worst = ca.fmin(least, closest)
-        return ca.vertcat(outputs, error, worst, dip, approach, events, values, distance, speed)
-
-    end, fifth, third = build_step(rate, y, t, h)
+    end, fifth, third = build_step(own.rate, y, t, h)
     error = mechanics.error(fifth, third, packed)
-    end = _project(mode, mechanics, end, packed[at.kept])
-    results = {
-        "step": report(end, t + h, error, ca.mmin(ca.vertcat(*forces))),
-        "look": report(y, t, 0, 0),
-    }
-    functions = [ca.Function(name, [packed], [result]) for name, result in results.items()]
-    return mode, functions, at, to, rows, slack
+    dip = ca.mmin(ca.vertcat(*own.forces))
+    step = ca.Function("step", [packed], [own.report(own.project(end), t + h, error, dip)])
+    look = ca.Function("look", [packed], [own.report(y, t, 0, 0)])
+    return Compiled(own, at, to, rows, slack, step, look)
 
 
 def _build_stage(mode: Mode, mechanics: Mechanics) -> Expression:

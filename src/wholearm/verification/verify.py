@@ -108,7 +108,7 @@ def inspect(
     reduced: bool = False,
 ) -> Report:
     """Replay torques, look at what happens at `times` [s] and judge it; see `verify`."""
-    simulation = simulate(problem, torque, tolerance=tolerance, times=times)
+    simulation = simulate(problem, torque, tolerance=tolerance, looks=times)
     phases = tuple(
         _report_phase(problem, simulation, torque, plan, index)
         for index in range(int(simulation.phase[-1]) + 1)
