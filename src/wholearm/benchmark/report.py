@@ -51,13 +51,17 @@ def write_results(name: str, rows: Sequence[Row], stem: str) -> list[str]:
     return paths
 
 
-def format_markdown(name: str, rows: Sequence[Row]) -> str:
-    """Tables of all studies as Markdown, stamped with versions."""
-    stamp = (
+def stamp() -> str:
+    """Versions and cores that a table is stamped with."""
+    return (
         f"wholearm {__version__}, casadi {ca.__version__}, numpy {np.__version__}, "
         f"Python {platform.python_version()}, {os.cpu_count()} cores"
     )
-    lines = [f"# Run time against error: {name}", "", stamp, ""]
+
+
+def format_markdown(name: str, rows: Sequence[Row]) -> str:
+    """Tables of all studies as Markdown, stamped with versions."""
+    lines = [f"# Run time against error: {name}", "", stamp(), ""]
     for study in dict.fromkeys(row.study for row in rows):
         lines += [f"## {study[0].upper()}{study[1:]}", ""]
         lines += ["| method | setting | seconds | error | note |", "|---|---:|---:|---:|---|"]

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from .progress import clear_progress, show_progress
 
-STUDIES = ("problem", "stress", "guard")
+STUDIES = ("problem", "stress", "guard", "skip")
 """What can follow ``bench``; the word ``problem`` may be left out."""
 
 
@@ -53,6 +53,12 @@ def add_bench(bench: argparse.ArgumentParser) -> None:
     guard.add_argument("--counts", default="results/bench_guard.json", help="file of stored counts")
     guard.add_argument("--update", action="store_true", help="store the counts anew")
     guard.set_defaults(run=_guard)
+
+    text = "measure what each part of the model costs when a scene has it and when it has not"
+    skip = studies.add_parser("skip", help=text, description=text)
+    skip.add_argument("--problems", default="problems", help="folder of problem files (problems)")
+    skip.add_argument("-o", "--output", default="results", help="folder for the table")
+    skip.set_defaults(run=_skip)
 
 
 def _measure(options: argparse.Namespace) -> int:
@@ -107,6 +113,15 @@ def _guard(options: argparse.Namespace) -> int:
     elif not grown:
         print(f"{len(options.problems)} problems: no count has grown")
     return 1 if grown else 0
+
+
+def _skip(options: argparse.Namespace) -> int:
+    from ..benchmark.skip import run_skip
+
+    path = run_skip(options.problems, options.output, show_progress())
+    clear_progress()
+    print(f"wrote {path}")
+    return 0
 
 
 def _write_scene(seed: int, number: int, folder: str) -> str:

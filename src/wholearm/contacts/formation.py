@@ -111,6 +111,12 @@ class Formation(Keeper):
         """Which contacts roll, in the order of every array over rolling contacts."""
         return tuple(self.contacts.index(c) for c in self.contacts if c in self.rolling)
 
+    @cached_property
+    def rubbing_rows(self) -> tuple[int, ...]:
+        """Which contacts slide with friction: those whose sliding direction matters."""
+        rubs = self.friction > 0
+        return tuple(np.flatnonzero(rubs & ~np.isin(range(len(rubs)), self.rolling_rows)).tolist())
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the contacts."""

@@ -130,9 +130,9 @@ def _find_slack(stage: Stage, limits: LimitSet, samples: Samples, margin: float)
 
 
 def _measure_senses(stage: Stage, samples: Samples) -> Array:
-    """Rates in a stage's directions, shape (n, n_c + 2); those of rolling contacts are 1."""
-    senses = stage.measure_senses(samples.z, samples.z_dot)
-    senses[:, list(stage.formation.rolling_rows)] = 1.0
+    """Rates in a stage's directions, shape (n, n_c + 2); 1 for contacts that do not rub."""
+    senses, formation = stage.measure_senses(samples.z, samples.z_dot), stage.formation
+    senses[:, np.setdiff1d(range(formation.n_contacts), formation.rubbing_rows)] = 1.0
     return senses
 
 
@@ -172,9 +172,7 @@ def raise_bounds(
         low[own.limits.others] = ((signs * values)[others] + more[:, others])[:, None]
         bound_by_limits(own.limits, layout, bounds, more)
         low[own.monitor_rows] += raised.gap[:, None]
-        formation = stage.formation
-        sliding = [i for i in range(formation.n_contacts) if i not in formation.rolling_rows]
-        low[own.senses] += raised.sense[:, None, sliding]
+        low[own.senses] += raised.sense[:, None, list(stage.formation.rubbing_rows)]
         for joint, sigma in enumerate(stage.directions.sigma):
             rates, faster = layout.v[..., 3 + joint], raised.sense[:, -2 + joint, None]
             low_x[rates] += faster * (sigma > 0)

@@ -41,8 +41,8 @@ class StageRows:
         How z and z' go on.
     points : ndarray of int, shape (K, d, m)
         What holds at the points.
-    senses : ndarray of int, shape (K, d, n_sliding)
-        Of these, the senses of friction of sliding contacts.
+    senses : ndarray of int, shape (K, d, n_rubbing)
+        Of these, the senses of contacts that slide with friction.
     limits : LimitRows
     monitor_rows : ndarray of int, shape (K, d, m)
         Limits of the formation.
@@ -139,7 +139,7 @@ def _balance(
 ) -> tuple[Indices, Indices]:
     """The equations of motion, constraints and senses at every point, shape (K, d, n).
 
-    And the rows of the senses alone, shape (K, d, n_sliding).
+    And the rows of the senses alone, shape (K, d, n_rubbing).
     """
     formation, shape = stage.formation, layout.z.shape[:2]
     kernel, node = point_kernel(formation), layout.nodes[:-1, None]
@@ -157,7 +157,6 @@ def _balance(
         place=scheme.points[:, None],
         least=least_rates(stage, stage.guess.places(scheme.points))[..., None],
     )
-    sliding = [k for k in range(formation.n_contacts) if k not in formation.rolling_rows]
     still = find_still(stage, last) if scheme.ends else set()
     senses, low, high = (
         kernel.y["senses"],
@@ -165,7 +164,7 @@ def _balance(
         np.zeros(kernel.outputs),
     )
     high[senses] = np.inf
-    low[-1, -1, senses] = np.where([k in still for k in sliding], -np.inf, 0.0)
+    low[-1, -1, senses] = np.where([k in still for k in formation.rubbing_rows], -np.inf, 0.0)
     own = rows.nonlinear(*shape, kernel.outputs, low=low, high=high)
     rows.add_copies(kernel, columns, own, parameters)
     return own, own[..., senses]

@@ -80,7 +80,7 @@ def point_kernel(formation: Formation) -> NamedKernel:
     `tau` is that at the start and the end of the interval, `first` z at its start if a contact
     rolls, `place` the point's place in it and `least` the least rate. The contacts' constraints, in
     position, velocity and acceleration, and the five equations of motion are zero; the senses of
-    friction of the sliding contacts must not be negative.
+    contacts that slide with friction must not be negative.
     """
     scene, n_c, rolls = formation.scene, formation.n_contacts, bool(formation.rolling)
     x = Columns(z=5, v=5, a=5, forces=formation.n_constraints, tau=4, first=5 * rolls)
@@ -95,7 +95,6 @@ def point_kernel(formation: Formation) -> NamedKernel:
         - ca.DM(scene.dry) * ca.vertcat(0, 0, 0, p.sigma)
         + build_force_rows(formation, P, A_t, p.Xi).T @ s.forces
     )
-    sliding = [k for k in range(n_c) if k not in formation.rolling_rows]
     return _name(
         s,
         p,
@@ -104,7 +103,7 @@ def point_kernel(formation: Formation) -> NamedKernel:
         bends=P @ s.a + P_dot_v,
         balance=ca.DM(scene.mass_diagonal) * s.a + ca.DM(scene.viscous) * s.v - applied,
         # With `:`, no rows of a single one are no rows, and not a row without columns.
-        senses=(p.Xi * (A_t @ s.v) - p.least)[sliding, :],
+        senses=(p.Xi * (A_t @ s.v) - p.least)[list(formation.rubbing_rows), :],
     )
 
 

@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shipped import FOLDER
+from wholearm.benchmark import skip
+from wholearm.benchmark.alone import Cost, measure_alone
+from wholearm.benchmark.skip import Expense, Pair, format_pair, list_pairs, run_skip, spend
+
+INTERVALS, TIME_INTERVALS, POINTS, CONTACTS = 10, 4, 3, 4
+ABSENT = ("friction of joints", "speed limits that never bind")
+"""Parts that are coefficients and bounds, where they are."""
+
+
+@pytest.fixture(scope="module")
+def pairs() -> dict[str, Pair]:
+    every = list_pairs(
+        str(FOLDER), intervals=INTERVALS, time_intervals=TIME_INTERVALS, mode_search=False
+    )
+    return {pair.part: pair for pair in every}
+
+
+def measure_rows(contacts: int, rolling: int) -> int:
+    """Rows along a curve.
+
+    How the speed goes on, the acceleration at both ends, and at each node contact forces, both
+    sides of the cones of rolling contacts, and torques.
+    """
+    return INTERVALS + 2 + (contacts + 2 * rolling + 2) * (INTERVALS + 1)
+
+
+@pytest.mark.parametrize("part", ["friction of contacts", *ABSENT])
+def test_friction_and_limits_are_free_along_curves(pairs: dict[str, Pair], part: str) -> None:
+    pair = pairs[f"{part}, along curves"]
+    # Speed, acceleration and squeeze at each node, but for the speed at both ends, where it is 0.
+    bare = (3 * (INTERVALS + 1) - 2, measure_rows(CONTACTS, 0))
+    assert spend(pair.without)[:2] == spend(pair.having)[:2] == bare
+
+
+def test_over_time_friction_adds_a_sense_for_each_contact_and_point(pairs: dict[str, Pair]) -> None:
+    own = [pairs[f"{part}, over time"] for part in ("friction of contacts", *ABSENT)]
+    full, smooth, free, limited = (
+        spend(case) for case in (own[0].having, own[0].without, own[1].without, own[2].having)
+    )
+    # What else there is, are coefficients and bounds.
+    assert full[:2] == free[:2] == limited[:2]
+    assert full.unknowns == smooth.unknowns
+    intervals, rest = divmod(full.rows - smooth.rows, CONTACTS * POINTS)
+    # Where a direction turns, a stage ends and an interval is divided.
+    assert TIME_INTERVALS <= intervals < 2 * TIME_INTERVALS and rest == 0
+
+
+def test_a_rolling_contact_has_two_rows_more_than_a_sliding_one_along_a_curve(
+    pairs: dict[str, Pair],
+) -> None:
+    tip = pairs["a second freedom"].without
+    (phase,) = tip.problem.phases
+    assert (phase.formation.n_contacts, phase.formation.n_rolling) == (3, 1)
+    assert spend(tip).rows == measure_rows(3, 1)
+
+
+def test_phases_that_stop_are_problems_of_their_own(pairs: dict[str, Pair]) -> None:
+    pair = pairs["a transition at speed"]
+    stopped, joined = spend(pair.without), spend(pair.having)
+    assert stopped.rows == measure_rows(CONTACTS, 0)
+    # Both phases, an interval of no length between them, and no more: without the ends of one.
+    nodes = 2 * (INTERVALS + 1)
+    assert joined.unknowns == 3 * nodes - 2
+    assert joined.rows == nodes - 1 + 2 + (CONTACTS + 2) * nodes
+
+
+def test_the_table_has_a_row_for_each_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pairs: dict[str, Pair]
+) -> None:
+    chosen = pairs["a figure"]
+    monkeypatch.setattr(skip, "list_pairs", lambda _: [chosen])
+    monkeypatch.setattr(skip, "REPEATS", 1)
+    monkeypatch.setattr(skip, "measure_alone", lambda work, case: Cost(work(case), 0.0, 0.0))
+    path = run_skip("anywhere", str(tmp_path))
+    *_, row = Path(path).read_text(encoding="utf-8").splitlines()
+    name, *cells = [cell.strip() for cell in row.strip("|").split("|")]
+    assert name == "a figure" and len(cells) == 8
+    assert cells[0] == cells[1] and cells[2] == cells[3]
+    # Drawing costs, and nothing of it is run where no figure is wanted.
+    assert int(cells[5]) > int(cells[4])
+    assert format_pair("a", Expense(1, 2, 0.1, 0.2), Expense(3, 4, 0.3, 0.4)) == (
+        "| a | 1 | 3 | 2 | 4 | 100 | 300 | 200 | 400 |"
+    )
+
+
+def test_what_work_takes_is_that_of_its_own_process() -> None:
+    cost = measure_alone(np.ones, 6_000_000)
+    assert len(cost.answer) == 6_000_000 and cost.seconds > 0
+    # Eight bytes each [MB].
+    assert 40 < cost.memory < 100
