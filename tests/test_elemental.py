@@ -26,7 +26,7 @@ from wholearm.contacts.elemental import (
     candidate_contacts,
     parse_contact,
 )
-from wholearm.contacts.limits import build_limits
+from wholearm.contacts.limits import build_clearance, build_limits
 from wholearm.problem.definition import Problem
 from wholearm.scene.model import Scene
 
@@ -263,3 +263,30 @@ def test_features_last_as_long_as_their_scene(heptagon: Problem) -> None:
     ]
     assert len({id(build_features(scene)) for scene in others}) == len(others)
     assert build_features(heptagon.scene) is first
+
+
+@pytest.mark.parametrize("count", [3, 4, 9])
+def test_a_tip_farther_outside_another_edge_cannot_touch_this_one(count: int) -> None:
+    """The largest gap of all other edges, against plain maxima at random places."""
+    rng = np.random.default_rng(count)
+    angles = 2 * np.pi * np.arange(count) / count
+    scene = make_scene(0.05 * np.column_stack([np.cos(angles), np.sin(angles)]))
+    features = build_features(scene)
+    for link in features.links:
+        function = ca.Function("gaps", [features.z], [link.edge_gap, ca.horzcat(*link.other_gap)])
+        for _ in range(20):
+            own, others = (part.full()[0] for part in function(rng.uniform(-0.3, 0.3, 5)))
+            np.testing.assert_array_equal(others, [np.delete(own, k).max() for k in range(count)])
+
+
+def test_clearances_grow_in_proportion_to_the_vertices() -> None:
+    """Operations in the clearances of all contacts that an object can have."""
+    sizes = []
+    for count in (12, 24, 48):
+        angles = 2 * np.pi * np.arange(count) / count
+        scene = make_scene(0.05 * np.column_stack([np.cos(angles), np.sin(angles)]))
+        every = [contact for part in (None, 0, 1) for contact in candidate_contacts(scene, part)]
+        values = [build_clearance(contact, scene, touching=False).value for contact in every]
+        function = ca.Function("all", [build_features(scene).z], [ca.vertcat(*values)])
+        sizes.append(function.n_instructions())
+    assert sizes[1] < 2.1 * sizes[0] and sizes[2] < 2.1 * sizes[1]

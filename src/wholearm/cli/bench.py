@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from .progress import clear_progress, show_progress
 
-STUDIES = ("problem", "stress", "guard", "skip")
+STUDIES = ("problem", "stress", "guard", "skip", "growth")
 """What can follow ``bench``; the word ``problem`` may be left out."""
 
 
@@ -59,6 +59,12 @@ def add_bench(bench: argparse.ArgumentParser) -> None:
     skip.add_argument("--problems", default="problems", help="folder of problem files (problems)")
     skip.add_argument("-o", "--output", default="results", help="folder for the table")
     skip.set_defaults(run=_skip)
+
+    text = "measure how cost and memory grow with intervals, phases and vertices"
+    growth = studies.add_parser("growth", help=text, description=text)
+    growth.add_argument("problem", help="problem file (TOML) whose first phase is made larger")
+    growth.add_argument("-o", "--output", default="results", help="folder for table and figure")
+    growth.set_defaults(run=_grow)
 
 
 def _measure(options: argparse.Namespace) -> int:
@@ -121,6 +127,16 @@ def _skip(options: argparse.Namespace) -> int:
     path = run_skip(options.problems, options.output, show_progress())
     clear_progress()
     print(f"wrote {path}")
+    return 0
+
+
+def _grow(options: argparse.Namespace) -> int:
+    from ..benchmark.growth import run_growth
+
+    written = run_growth(options.problem, options.output, show_progress())
+    clear_progress()
+    for path in written:
+        print(f"wrote {path}")
     return 0
 
 

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import NamedTuple
 
 import casadi as ca
@@ -88,6 +89,8 @@ class LinkFeatures(NamedTuple):
         Joint [m], centre of the tip [m], and the normal of the link's touching side.
     vertex_gap, vertex_run : expression, shape (1, n_v), [m]
         C-function of each vertex with the side, and how far along the link the vertex is.
+    other_gap : list of expression, [m]
+        The largest `edge_gap` of all other edges, for each edge.
     edge_gap, edge_run : expression, shape (1, n_v), [m]
         C-function of the tip with each edge, and how far along the edge the tip is.
     arc_gap, arc_run : expression, shape (1, n_v), [m]
@@ -99,6 +102,7 @@ class LinkFeatures(NamedTuple):
     normal: Expression
     vertex_gap: Expression
     vertex_run: Expression
+    other_gap: list[Expression]
     edge_gap: Expression
     edge_run: Expression
     arc_gap: Expression
@@ -258,17 +262,27 @@ def _build_link(
     count = vertices.shape[1]
     from_base = vertices - ca.repmat(base, 1, count)
     to_tip = ca.repmat(tip, 1, count) - vertices
+    edge_gap = -ca.sum1(edge_normals * to_tip) - link.radius
     return LinkFeatures(
         base=base,
         tip=tip,
         normal=normal,
         vertex_gap=normal.T @ from_base - link.radius,
         vertex_run=axis.T @ from_base,
-        edge_gap=-ca.sum1(edge_normals * to_tip) - link.radius,
+        other_gap=_find_largest_others(ca.horzsplit(edge_gap)),
+        edge_gap=edge_gap,
         edge_run=ca.sum1(along * to_tip),
         arc_gap=ca.sqrt(ca.sum1(to_tip**2)) - link.radius,
         arc_run=-axis.T @ to_tip,
     )
+
+
+def _find_largest_others(values: list[Expression]) -> list[Expression]:
+    """The largest of all other values, for each one, from running maxima of both sides."""
+    before = list(accumulate(values[:-1], ca.fmax))
+    after = list(accumulate(values[:0:-1], ca.fmax))[::-1]
+    inner = [ca.fmax(*pair) for pair in zip(before[:-1], after[1:], strict=True)]
+    return [after[0], *inner, before[-1]]
 
 
 def build_gap(contact: Contact, scene: Scene) -> Expression:

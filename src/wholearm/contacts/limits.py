@@ -118,10 +118,8 @@ def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
     gap = own = build_gap(contact, scene)
     text = f"{contact.corner} touches {contact.part}"
     if contact.feature == "e" and contact.finger is not None and not touching:
-        gaps = build_features(scene).links[contact.finger].edge_gap
-        for other in range(scene.polygon.n_vertices):
-            if other != contact.index:
-                gap = ca.fmax(gap, gaps[other] - own)
+        others = build_features(scene).links[contact.finger].other_gap
+        gap = ca.fmax(gap, others[contact.index] - own)
     if contact.finger is not None and not (touching and contact.surface == "finger"):
         for limit in build_limits(contact, scene):
             gap = ca.fmax(gap, -limit.value)

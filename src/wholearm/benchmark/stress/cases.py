@@ -107,9 +107,9 @@ def can_move(problem: Problem, stretches: Sequence[Stretch]) -> bool:
 
 def _refit(table: Table) -> Table:
     """A scene whose first phase names what touches at the start."""
-    from .scenes import _name_first
+    from .scenes import name_first
 
-    return {**table, "phases": [{"contacts": _name_first(table), "until": {"x": 0.0}}]}
+    return {**table, "phases": [{"contacts": name_first(table), "until": {"x": 0.0}}]}
 
 
 def _keep(rng: np.random.Generator, table: Table) -> Table:

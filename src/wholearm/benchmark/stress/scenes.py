@@ -49,7 +49,7 @@ def random_scene(rng: np.random.Generator) -> Table:
         for _ in range(TRIES):
             table = _draw_hand(rng, body, size)
             try:
-                names = _name_first(table)
+                names = name_first(table)
                 table["phases"] = [{"contacts": names, "until": {"x": table["start"]["x"]}}]
                 build_problem(table)
             except InputError:
@@ -104,7 +104,7 @@ def _draw_hand(rng: np.random.Generator, body: Table, size: float) -> Table:
     }
 
 
-def _name_first(table: Table) -> list[str]:
+def name_first(table: Table) -> list[str]:
     """Names of the contacts that touch at the start."""
     body, fingers = table["object"], table["fingers"]
     polygon = Polygon(body["vertices"], body["mass"])

@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shipped import HEPTAGON
+from wholearm.benchmark import growth
+from wholearm.benchmark.alone import Cost
+from wholearm.benchmark.growth import (
+    SIZES,
+    WORK,
+    Point,
+    draw_growth,
+    fit_exponent,
+    format_growth,
+    run_growth,
+    run_work,
+)
+from wholearm.problem.read import read_problem
+from wholearm.solvers.ipopt import record_runs
+
+
+def make_points() -> list[Point]:
+    """Times that grow with the square of sizes, and memory in proportion to them."""
+    return [
+        Point(grows, work, size, 1e-3 * size**2, 0.1 * size)
+        for grows, sizes in SIZES.items()
+        for work in WORK[grows]
+        for size in sizes
+    ]
+
+
+def test_exponents_are_those_of_powers_where_small_sizes_cost_the_same() -> None:
+    sizes = [10, 20, 40, 80, 160, 320]
+    for power in (0.5, 1.0, 2.0):
+        costs = np.maximum(np.power(sizes, power), np.power(80.0, power)).tolist()
+        assert fit_exponent(sizes, costs) == pytest.approx(power)
+
+
+def test_sizes_reach_what_is_asked() -> None:
+    assert {grows: max(sizes) for grows, sizes in SIZES.items()} == {
+        "intervals": 3200, "phases": 50, "vertices": 100
+    }  # fmt: skip
+
+
+def test_the_table_has_every_measurement_and_exponent() -> None:
+    text = format_growth(make_points())
+    rows = iter(line for line in text.splitlines() if " [s] | " in line)
+    for grows, sizes in SIZES.items():
+        assert f"## {grows.capitalize()}" in text
+        for work in WORK[grows]:
+            row = next(rows)
+            assert row.startswith(f"| {work} [s] | ") and row.endswith(" 2.00 |")
+            assert row.count("|") == len(sizes) + 3
+    assert text.count("[MB]") == text.count(" 1.00 |") == sum(map(len, WORK.values()))
+
+
+def test_axes_are_logarithmic_with_names_and_units() -> None:
+    figure = draw_growth(make_points())
+    assert len(figure.axes) == 2 * len(SIZES)
+    for axes, grows in zip(figure.axes, [*SIZES, *SIZES], strict=True):
+        assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
+        assert axes.get_xlabel() == f"{grows} [-]" and axes.get_ylabel().endswith(("[s]", "[MB]"))
+        assert len(axes.lines) == len(WORK[grows])
+
+
+def test_work_is_as_large_as_is_asked() -> None:
+    table = dict(read_problem(str(HEPTAGON)).table)
+    for size in (10, 20):
+        with record_runs() as runs:
+            run_work(table, "intervals", "least time", size)
+        assert runs[0].unknowns == 3 * (size + 1) - 2
+    with record_runs() as runs:
+        run_work(table, "intervals", "margin", 20)
+    assert max(run.unknowns for run in runs) > 3 * 21 - 2
+    run_work(table, "vertices", "reading", 5)
+
+
+def test_everything_is_measured_and_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[tuple[object, ...]] = []
+
+    def measure(_: object, table: object, *what: object) -> Cost:
+        given.append(what)
+        return Cost(None, 1.0, 2.0)
+
+    monkeypatch.setattr(growth, "measure_alone", measure)
+    paths = run_growth(str(HEPTAGON), str(tmp_path))
+    assert given == [(point.grows, point.work, point.size) for point in make_points()]
+    assert [Path(path).suffix for path in paths] == [".md", ".csv", ".png"]
+    lines = Path(paths[1]).read_text(encoding="utf-8").splitlines()
+    assert lines[:2] == ["grows,work,size,seconds,memory", "intervals,least time,50,1.0,2.0"]
+    assert len(lines) == len(given) + 1
