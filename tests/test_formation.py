@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import gc
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -17,7 +19,7 @@ from plane import (
 )
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
-from wholearm.contacts.elemental import parse_contact
+from wholearm.contacts.elemental import build_features, parse_contact
 from wholearm.contacts.formation import (
     Formation,
     close_finger,
@@ -395,3 +397,28 @@ def test_a_joint_right_above_the_object_is_refused() -> None:
         assert caught.value.key == "fingers.1.base"
     beside = close_finger(scene, np.array([-0.06, 0.01, 0.0]), 0)
     assert abs(finger_gap(scene, np.array([-0.06, 0.01, 0.0]), 0, beside)[0]) < 1e-12
+
+
+def test_limits_are_expressions_of_the_scene_that_they_belong_to() -> None:
+    """Whichever scenes of the same shape have come and gone."""
+
+    def hold(torque: float) -> Formation:
+        scene = make_scene(SQUARE, base=0.0813)
+        right, left = scene.fingers
+        scene = replace(scene, fingers=(replace(right, torque_limit=torque), left))
+        return make_formation(scene, "v0-palm v2-finger1")
+
+    first = hold(1.0)
+    assert first.limits
+    second = hold(2.0)
+    assert second.limits
+    del first
+    gc.collect()
+    third = hold(3.0)
+    for formation in (second, third):
+        z = build_features(formation.scene).z
+        values = [limit.value for limit in formation.limits]
+        function = ca.Function("limits", [z], [ca.vertcat(*values)])
+        given = np.array([0.01, 0.05, 0.1, 1.2, 2.0])
+        found = formation.evaluate_limits(given[None])[0]
+        np.testing.assert_allclose(function(given).full()[:, 0], found, rtol=0, atol=1e-15)

@@ -178,15 +178,15 @@ class Formation(Keeper):
     def _roll_batch(self) -> Batch:
         return Batch(self.roll_function)
 
-    @property
+    @kept_property
     def limits(self) -> tuple[GapLimit, ...]:
-        """Where this formation stops being valid."""
-        return _LIMITS(self)[0]
+        """Where this formation stops being valid, as expressions of its own scene's z."""
+        return tuple(list_limits(self.scene, self.contacts))
 
     @property
     def limit_function(self) -> Expression:
         """CasADi function z -> values of `limits`, shape (n_limits,) [m]."""
-        return _LIMITS(self)[1]
+        return _LIMIT_FUNCTIONS(self)
 
     @kept_property
     def _limit_batch(self) -> Batch:
@@ -352,16 +352,16 @@ def _build_roll_function(formation: Formation) -> Expression:
     return ca.Function("roll", [z, v], [ca.densify(slip), ca.densify(bend)])
 
 
-def _build_limits(formation: Formation) -> tuple[tuple[GapLimit, ...], Expression]:
-    limits = tuple(list_limits(formation.scene, formation.contacts))
-    values = ca.densify(ca.vertcat(*(limit.value for limit in limits)))
-    return limits, ca.Function("limits", [build_features(formation.scene).z], [values])
+def _build_limit_function(formation: Formation) -> Expression:
+    values = ca.densify(ca.vertcat(*(limit.value for limit in formation.limits)))
+    return ca.Function("limits", [build_features(formation.scene).z], [values])
 
 
 _FUNCTIONS = Store(_build_function, lambda own: (own.scene.shape, own.contacts))
 _ROLL_FUNCTIONS = Store(
     _build_roll_function, lambda own: (own.scene.shape, own.contacts, own.rolling)
 )
-_LIMITS = Store(
-    _build_limits, lambda own: (own.scene.shape, own.scene.fingers_collide, own.contacts)
+_LIMIT_FUNCTIONS = Store(
+    _build_limit_function,
+    lambda own: (own.scene.shape, own.scene.fingers_collide, own.contacts),
 )
