@@ -20,8 +20,9 @@ from wholearm.solvers.statistics import SolverStatistics, book, charge, open_led
 from wholearm.verification.verify import verify
 
 NOT_IN_0_1_0 = (
-    "rolling", "modes", "sequences", "complete", "transcription", "duration", "time_intervals",
-    "degree", "scheme", "opening", "clearance", "samples", "mode_search", "build_times",
+    "rolling", "modes", "sequences", "complete", "attempts", "transcription", "duration",
+    "time_intervals", "degree", "scheme", "opening", "clearance", "samples", "mode_search",
+    "build_times",
     "solve_times", "transitions", "replay",
 )  # fmt: skip
 

@@ -28,6 +28,8 @@ class PhasePlan(NamedTuple, Generic[M_co]):
         along curves.
     complete : bool
         Whether the search for contact modes has tried all that promised to be better.
+    attempt : str
+        Name of the guess that led to it; none along curves.
     """
 
     motion: M_co
@@ -35,6 +37,7 @@ class PhasePlan(NamedTuple, Generic[M_co]):
     value: float
     sequences: int = 0
     complete: bool = True
+    attempt: str = ""
 
 
 def add_up(phases: Sequence[Phase], allowed: Sequence[float | None]) -> float | None:

@@ -183,6 +183,7 @@ def _list_phases(planning: Planning, ledger: Ledger) -> tuple[PlannedPhase, ...]
             getattr(plan.motion, "modes", ()),
             plan.sequences,
             plan.complete,
+            plan.attempt,
             ledger.of(phase.number),
         )
         for phase, plan in zip(planning.problem.phases, planning.plans, strict=True)

@@ -58,6 +58,8 @@ class PlannedPhase(NamedTuple):
         Sequences of modes that were tried; of phases planned as one booked to the first.
     complete : bool
         Whether every sequence of modes that promised to be better was tried.
+    attempt : str
+        The guess that it was found from, in the time domain.
     statistics : SolverStatistics
         Everything that was solved for this phase, or for phases planned as one from this one on:
         for the plan itself and on the way to it, for its refinement and to assess its impacts.
@@ -70,6 +72,7 @@ class PlannedPhase(NamedTuple):
     modes: tuple[ModeSpan, ...]
     sequences: int
     complete: bool
+    attempt: str
     statistics: SolverStatistics
 
 

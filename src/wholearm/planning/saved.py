@@ -39,6 +39,7 @@ def write_meta(plan: Plan) -> dict[str, Any]:
         "modes": [[mode.to_dict() for mode in phase.modes] for phase in phases],
         "sequences": [phase.sequences for phase in phases],
         "complete": [phase.complete for phase in phases],
+        "attempts": [phase.attempt for phase in phases],
         "phase_durations": [phase.duration for phase in phases],
         **{name: getattr(options, name) for name in _OPTIONS},
         "iterations": [phase.statistics.iterations for phase in phases],
@@ -107,6 +108,7 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
             tuple(map(ModeSpan.of, column("modes", ())[k])),
             int(column("sequences", 0)[k]),
             bool(column("complete", True)[k]),
+            str(column("attempts", "")[k]),
             statistics[k],
         )
         for k in range(count)

@@ -1,0 +1,124 @@
+"""Guesses that phases are planned from, one after the other, each with a name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+from ...common.arrays import Array
+from ...geometry.cost_to_go import CostToGo
+from ...problem.definition import Phase, Problem
+from .ending import keep_apart
+from .search import Search
+from .stage import Stage
+from .staging import guess_stages
+from .way_guess import PacedWay, list_ways
+
+FIRST = 10
+"""Most intervals of a phase to start with."""
+NEAREST = "the nearest end"
+"""Name of the first guess."""
+NEAR = -0.3
+"""Margin of a way from which on a motion beside it may keep its limits."""
+WAYS = 3
+"""Most ways along which a motion is guessed."""
+PACES = (2.0, 4.0, 1.0)
+"""Guessed durations to try, in units of that of a fall."""
+
+
+class Attempt(NamedTuple):
+    """A guess to plan from.
+
+    Attributes
+    ----------
+    name : str
+    halvings : int
+        How often its intervals are to be halved.
+    stages : list of Stage
+    """
+
+    name: str
+    halvings: int
+    stages: list[Stage]
+
+
+@dataclass(frozen=True, eq=False)
+class Attempts:
+    """The attempts to plan phases as one NLP, in their order.
+
+    Attributes
+    ----------
+    problem : Problem
+    phases : sequence of Phase
+    z : ndarray, shape (5,)
+        Where they start.
+    search : Search
+    to_go : CostToGo or None
+        What follows them.
+    patient : bool
+        Whether there are others after the first.
+    """
+
+    problem: Problem
+    phases: Sequence[Phase]
+    z: Array
+    search: Search
+    to_go: CostToGo | None
+    patient: bool
+
+    @cached_property
+    def first(self) -> Attempt:
+        """To the nearest end."""
+        return Attempt(NEAREST, self._halvings, self._guess(self._halvings, PACES[0]))
+
+    @cached_property
+    def ways(self) -> list[PacedWay]:
+        """Ways that a single phase may take, the best first."""
+        if not self.patient or len(self.phases) > 1:
+            return []
+        return list_ways(self.problem, self.phases[0], self.z, WAYS)
+
+    @property
+    def are_far(self) -> bool:
+        """Whether no way comes near to keeping limits, which shows at once what is short."""
+        return bool(self.ways) and all(way.margin <= NEAR for way in self.ways)
+
+    def __iter__(self) -> Iterator[Attempt]:
+        """Along ways, to the nearest end, and there or further ahead at other paces."""
+        for way in [way for way in self.ways if way.margin > NEAR] or self.ways[:1]:
+            name = f"a way with the margin {way.margin:.3g}"
+            yield Attempt(name, self._halvings, self._guess(self._halvings, PACES[0], way=way))
+        yield self.first
+        onwards = len(self.phases) > 1
+        for halvings in dict.fromkeys((self._halvings, 0)) if self.patient else ():
+            for pace in PACES:
+                if onwards or halvings != self._halvings or pace != PACES[0]:
+                    end = "an end ahead" if onwards else NEAREST
+                    name = f"{end} at {pace:g} times the duration of a fall"
+                    yield Attempt(name, halvings, self._guess(halvings, pace, onwards))
+
+    @property
+    def _intervals(self) -> int:
+        """Intervals of each phase: a phase with one freedom has fewer unknowns in each."""
+        alone = len(self.phases) == 1 and self.phases[0].formation.n_constraints == 4
+        return self.search.options.time_intervals or (32 if alone else 10)
+
+    @property
+    def _halvings(self) -> int:
+        return max(0, math.ceil(math.log2(self._intervals / FIRST)))
+
+    def _guess(
+        self, halvings: int, pace: float, onwards: bool = False, way: PacedWay | None = None
+    ) -> list[Stage]:
+        count, options = math.ceil(self._intervals / 2**halvings), self.search.options
+        given = (self.problem, self.phases, self.z, self.search.scheme, count, pace, onwards)
+        stages = [
+            replace(stage, opening=options.opening, clearance=options.clearance)
+            for stage in guess_stages(*given, way=way)
+        ]
+        if self.to_go is not None:
+            stages[-1] = keep_apart(stages[-1], self.to_go.phase.until.contact)
+        return stages

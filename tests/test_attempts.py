@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from shipped import HEPTAGON, problem_of
+from thrown import shove
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.plan import solve
+from wholearm.planning.time_domain import plan as time_plan
+from wholearm.planning.time_domain.attempts import NEAREST, PACES, Attempt, Attempts
+from wholearm.planning.time_domain.plan import plan_phases
+from wholearm.planning.time_domain.search import Search, Solution
+from wholearm.problem.definition import Problem
+
+OPTIONS = PlanOptions(time_intervals=12, transcription="time")
+
+
+def list_attempts(problem: Problem, count: int, patient: bool = True) -> Attempts:
+    search = Search.of(problem, OPTIONS)
+    return Attempts(problem, problem.phases[:count], problem.start, search, None, patient)
+
+
+def test_a_single_phase_is_tried_along_ways_and_at_several_paces() -> None:
+    attempts = list_attempts(problem_of(HEPTAGON), 1)
+    found = list(attempts)
+    names = [attempt.name for attempt in found]
+    assert len(set(names)) < len(names) and found.count(attempts.first) == 1
+    at = found.index(attempts.first)
+    assert all(name.startswith("a way with the margin ") for name in names[:at])
+    assert at <= len(attempts.ways)
+    # The same guess again on finer intervals counts as another, and the first one is not repeated.
+    paces = [name for name in names[at + 1 :] if name.startswith(f"{NEAREST} at ")]
+    assert len(paces) == len(names) - at - 1 == 2 * len(PACES) - 1
+    for attempt in found:
+        halved = 12 / 2**attempt.halvings
+        assert all(stage.intervals <= halved + 1e-9 for stage in attempt.stages)
+
+
+def test_phases_in_motion_are_tried_ahead() -> None:
+    problem, _ = shove()
+    attempts = list_attempts(problem, 2)
+    assert attempts.ways == [] and not attempts.are_far
+    names = [attempt.name for attempt in attempts]
+    assert names[0] == NEAREST and all(name.startswith("an end ahead at ") for name in names[1:])
+
+
+def test_where_patience_is_not_asked_for_there_is_one_attempt() -> None:
+    attempts = list_attempts(problem_of(HEPTAGON), 1, patient=False)
+    assert list(attempts) == [attempts.first]
+
+
+def test_a_plan_names_the_attempt_that_led_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the first one is lost, the next one that leads to a plan."""
+    problem, _ = shove()
+    plan = solve(problem, time_intervals=4, replay=False)
+    assert {phase.attempt for phase in plan.phases} == {NEAREST}
+    assert plan.meta["attempts"] == [NEAREST] * len(problem.phases)
+    tried: list[str] = []
+    run = time_plan.solve_attempt
+
+    def lose_first(search: Search, attempt: Attempt) -> Solution:
+        tried.append(attempt.name)
+        solution = run(search, attempt)
+        return solution._replace(success=False, status="lost") if len(tried) == 1 else solution
+
+    monkeypatch.setattr(time_plan, "solve_attempt", lose_first)
+    options = replace(OPTIONS, time_intervals=4)
+    (first, *_) = plan_phases(problem, problem.phases, problem.start, options)
+    assert tried[0] == NEAREST and first.attempt == tried[-1] != NEAREST
