@@ -143,7 +143,7 @@ def plan_curves(
     task = _Task(curves, epsilon, options, phases, duration)
 
     def replan(changed: Sequence[Curve], least: float) -> object:
-        return _insist(_plan(replace(task, curves=changed, epsilon=least)))
+        return _insist(_plan_finer(replace(task, curves=changed, epsilon=least)))
 
     try:
         plans = _plan_finer(task)
