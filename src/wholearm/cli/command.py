@@ -103,11 +103,10 @@ class _Version(argparse.Action):
 def _solve(options: argparse.Namespace) -> int:
     from dataclasses import fields
 
-    from ..common.files import require_ending, require_writable, together, write_text
+    from ..common.files import require_ending, require_writable, together
     from ..geometry.path_guess import load
     from ..planning.options import PlanOptions
     from ..planning.plan import solve_with
-    from ..results.torque_table import format_rows
     from .summary import summarise
 
     output = options.output or _stem(options.problem) + ".npz"
@@ -135,7 +134,7 @@ def _solve(options: argparse.Namespace) -> int:
     with together():
         plan.save(output)
         if table is not None:
-            write_text(options.torques, format_rows(table.rows))
+            table.save(options.torques)
     clear_progress()
     figures = None if table is None else {"file": options.torques, **table.figures}
     if options.json:
@@ -148,14 +147,14 @@ def _solve(options: argparse.Namespace) -> int:
 
 def _check_sampling(options: argparse.Namespace) -> None:
     """Check what is asked of a table before anything is planned for it."""
-    from ..results.torque_table import require_sampling
-
     if options.sample_rate is None:
         if options.interpolation is not None:
             raise InputError("", "--interpolation", "is for tables with a --sample-rate")
         return
     if options.torques is None:
         raise InputError("", "--sample-rate", "needs --torques FILE, the table to write")
+    from ..results.torque_table import require_sampling
+
     require_sampling(options.sample_rate, options.interpolation or "linear")
 
 

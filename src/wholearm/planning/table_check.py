@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import JammingError, ReplayError, SimulationError
+from ..common.files import write_text
 from ..problem.definition import Problem
 from ..results.report import Report
-from ..results.torque_table import ERROR, place_rows, read_rows, sample_rows
+from ..results.torque_table import ERROR, format_rows, place_rows, read_rows, sample_rows
 from ..results.trajectory import Trajectory
 from ..verification.verdict import Allowance, find_least_force
 from ..verification.verify import inspect
@@ -37,6 +39,10 @@ class Table(NamedTuple):
 
     rows: Array
     figures: dict[str, Any]
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the rows as CSV."""
+        write_text(path, format_rows(self.rows))
 
 
 def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) -> Table:
