@@ -81,7 +81,7 @@ def run_work(table: dict[str, Any], grows: str, work: str, size: int) -> None:
         angles = 2 * np.pi * np.arange(size) / size
         corners = RADIUS * np.column_stack([np.cos(angles), np.sin(angles)])
         table = {**table, "object": {**table["object"], "vertices": corners.tolist()}}
-        table["start"] = {"flush": 0, "x": 0.0}
+        table |= {"start": {"flush": 0, "x": 0.0}, "fingers_collide": False}
         end = {"x": -0.01}
         phase = {"contacts": name_first(table), "until": end}
         problem = build_problem({**table, "phases": [phase]})
