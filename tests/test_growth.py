@@ -15,6 +15,7 @@ from wholearm.benchmark.growth import (
     draw_growth,
     fit_exponent,
     format_growth,
+    list_work,
     run_growth,
     run_work,
 )
@@ -25,10 +26,7 @@ from wholearm.solvers.ipopt import record_runs
 def make_points() -> list[Point]:
     """Times that grow with the square of sizes, and memory in proportion to them."""
     return [
-        Point(grows, work, size, 1e-3 * size**2, 0.1 * size)
-        for grows, sizes in SIZES.items()
-        for work in WORK[grows]
-        for size in sizes
+        Point(grows, work, size, 1e-3 * size**2, 0.1 * size) for grows, work, size in list_work()
     ]
 
 

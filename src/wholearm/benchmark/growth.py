@@ -39,6 +39,8 @@ WORK = {
     "vertices": ("reading", "map"),
 }
 """What is measured for each."""
+LARGEST = {"map": 50}
+"""Sizes from which on some work would take minutes."""
 RADIUS = 0.05
 """Of the regular polygons [m]."""
 TURNS = (0.04, 0.045)
@@ -99,18 +101,27 @@ def run_work(table: dict[str, Any], grows: str, work: str, size: int) -> None:
     solve(problem, goal, intervals=size, replay=False, duration=duration)
 
 
+def list_work() -> list[tuple[str, str, int]]:
+    """Everything that is measured: what grows, what is done, and the size."""
+    return [
+        (grows, work, size)
+        for grows, sizes in SIZES.items()
+        for work in WORK[grows]
+        for size in sizes
+        if size <= LARGEST.get(work, size)
+    ]
+
+
 def measure_growth(
     table: dict[str, Any], progress: Callable[[str], None] | None = None
 ) -> list[Point]:
     """Measure every work at every size."""
     points = []
-    for grows, sizes in SIZES.items():
-        for work in WORK[grows]:
-            for size in sizes:
-                if progress is not None:
-                    progress(f"{work} with {size} {grows}")
-                cost = measure_alone(run_work, table, grows, work, size)
-                points.append(Point(grows, work, size, cost.seconds, cost.memory))
+    for grows, work, size in list_work():
+        if progress is not None:
+            progress(f"{work} with {size} {grows}")
+        cost = measure_alone(run_work, table, grows, work, size)
+        points.append(Point(grows, work, size, cost.seconds, cost.memory))
     return points
 
 
@@ -135,9 +146,11 @@ def format_growth(points: Sequence[Point]) -> str:
                 ("s", [point.seconds for point in own]),
                 ("MB", [point.memory for point in own]),
             ):
-                shown = " | ".join(f"{value:.3g}" for value in values)
-                exponent = fit_exponent(sizes, [max(value, 1e-3) for value in values])
-                lines.append(f"| {work} [{unit}] | {shown} | {exponent:.2f} |")
+                shown = [f"{value:.3g}" for value in values] + [""] * (len(sizes) - len(values))
+                exponent = fit_exponent(
+                    [point.size for point in own], [max(value, 1e-3) for value in values]
+                )
+                lines.append(f"| {work} [{unit}] | {' | '.join(shown)} | {exponent:.2f} |")
         lines.append("")
     return "\n".join(lines)
 

@@ -257,6 +257,9 @@ def _build_border(problem: Problem, piece: Piece) -> Border:
     scene = problem.scene
     x, phi = piece.track.pose(piece.places)
     z = close_fingers(scene, x, phi).z
+    # Right at an end, rounding may leave a finger no way to close.
+    closed = np.isfinite(z).all(axis=1)
+    x, phi, z = x[closed], phi[closed], z[closed]
     flush = piece.track.flush
     along = "x" if flush is not None and flush[0] is None else "phi"
     label = piece.label[piece.label != NOWHERE]
