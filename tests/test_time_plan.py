@@ -3,6 +3,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,11 +28,12 @@ from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
-from wholearm.planning.options import PlanOptions
+from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain.motion import StageMotion, TimeMotion
 from wholearm.planning.time_domain.plan import plan_phases
+from wholearm.planning.time_domain.search import Search, Solution
 from wholearm.problem.definition import Problem
 from wholearm.results.trajectory import Trajectory
 from wholearm.verification.verify import verify
@@ -358,6 +360,27 @@ def test_the_effort_of_a_gentle_plan_is_least(
     assert total(coarse) < sum(stage.duration for stage in stages)
     least = min(stage.evaluate(instants(stage, 12)).c_n.min() for stage in stages)
     assert least > landing().epsilon - SLACK
+
+
+def test_a_margin_below_epsilon_is_planned_again_from_the_least_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem, least = shove()
+    options, allowed = PlanOptions("margin", time_intervals=COARSE), 4.0 * least
+
+    def plan() -> PhasePlan[TimeMotion]:
+        return plan_phases(problem, problem.phases, problem.start, options, allowed)[0]
+
+    usual, solve_once, goals = plan(), Search.solve, list[Objective]()
+
+    def press_too_little(search: Search, *given: Any, **named: Any) -> Solution:
+        goals.append(search.goal)
+        solution = solve_once(search, *given, **named)
+        return solution._replace(margin=-1.0) if len(goals) == 1 else solution
+
+    monkeypatch.setattr(Search, "solve", press_too_little)
+    assert plan().value == pytest.approx(usual.value, rel=1e-3)
+    assert goals[:2] == [Objective.MARGIN, Objective.TIME] and usual.value > problem.epsilon
 
 
 def test_torques_switch_as_often_where_collocation_is_more_exact() -> None:

@@ -26,7 +26,7 @@ from .ending import choose_end
 from .mode_search import adapt, improve
 from .motion import TimeMotion, make_motions
 from .own_units import to_si, unit_of
-from .refinement import bisect_intervals
+from .refinement import bisect_intervals, settle
 from .search import Search, Solution
 from .stage import Stage
 
@@ -36,6 +36,8 @@ BUDGET = 300
 """Iterations of the solver after which no further guess is begun: of one block."""
 ATTEMPT = 100
 """Most iterations of the first run of the solver from a guess."""
+ROUNDING = 5e-7
+"""How far below epsilon a margin may be by rounding, over the weight of the object."""
 _EXACT = 3
 """Points of an interval beyond which collocation is so exact that intervals would stay as they are,
 too long for torques that are linear in each."""
@@ -80,6 +82,8 @@ def plan_phases(
     search = Search.of(problem, options, duration, to_go)
     attempts = Attempts(problem, phases, z, search, to_go, patient)
     begun = solve_attempt(search, attempts.first)
+    if search.goal is Objective.MARGIN and not begun.success:
+        begun = _solve_from_fastest(search, attempts.first) or begun
     if begun.success:
         return _summarise(problem, search, phases, begun, attempts.first.name)
     from .explain import explain, refuse
@@ -179,6 +183,9 @@ def _find_short(
 def solve_attempt(search: Search, attempt: Attempt) -> Solution:
     """Solve, find modes and intervals, halve these, and make limits hold in between."""
     solution = search.solve(attempt.stages, most=ATTEMPT)
+    if solution.success and solution.margin < -ROUNDING:
+        # A way that presses too little may be far from one that presses enough.
+        return solution._replace(success=False, status="the largest c_n is below epsilon")
     if not solution.success:
         return solution
     plain = not search.options.mode_search or search.is_enough(solution)
@@ -188,6 +195,20 @@ def solve_attempt(search: Search, attempt: Attempt) -> Solution:
         if solution.success:
             solution = search.solve(_halve(search, solution.stages), solution)
     return search.hold(solution) if solution.success else solution
+
+
+def _solve_from_fastest(search: Search, attempt: Attempt) -> Solution | None:
+    """Solve for the largest margin from the motion of least time, or take that one.
+
+    It keeps epsilon within any duration that is no shorter, and is a plan if nothing better is
+    found. None if it takes longer.
+    """
+    fastest = solve_attempt(search.aiming(Objective.TIME), attempt)
+    lasts = sum(stage.guess.duration for stage in fastest.stages)
+    if not fastest.success or search.duration is None or lasts > search.duration:
+        return None
+    better = solve_attempt(search, Attempt(attempt.name, 0, settle(fastest.stages)))
+    return better if better.success else fastest._replace(margin=0.0)
 
 
 def _halve(search: Search, stages: list[Stage]) -> list[Stage]:
