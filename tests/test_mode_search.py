@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import wholearm.planning.time_domain.attempts as attempts
 import wholearm.planning.time_domain.mode_search as mode_search
-import wholearm.planning.time_domain.plan as time_plan
 from plane import make_formation, measure_gaps, measure_slip
 from thrown import parting, raised
 from timed import instants, landing, plan_landing, total
@@ -67,7 +67,7 @@ def test_plans_are_the_same_whichever_way_a_joint_is_guessed(
         return turn_joint(guess_stages(*given, **named), 1)  # type: ignore[arg-type]
 
     (right,) = plan_phases(problem, problem.phases, problem.start, OPTIONS)
-    monkeypatch.setattr(time_plan, "guess_stages", guess_wrong)
+    monkeypatch.setattr(attempts, "guess_stages", guess_wrong)
     (plan,) = plan_phases(problem, problem.phases, problem.start, OPTIONS)
     assert plan.sequences > 1
     assert plan.motion.duration == pytest.approx(right.motion.duration, rel=1e-3)
