@@ -16,6 +16,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from ..common.files import require_writable, together, write_whole
 from ..figures.plots import save
@@ -169,6 +170,11 @@ def draw_growth(points: Sequence[Point]) -> Figure:
                 colour, marker = _LOOKS[work]
                 name = f"{work}, exponent {fit_exponent(sizes, values):.2f}"
                 axes.loglog(sizes, values, color=colour, marker=marker, label=name)
+            axes.set_xticks(SIZES[grows], map(str, SIZES[grows]))
+            low, high = (np.log10(limit) for limit in axes.get_ylim())
+            axes.set_ylim(10.0 ** np.floor(low), 10.0 ** np.ceil(high))
+            for axis in (axes.xaxis, axes.yaxis):
+                axis.set_minor_formatter(NullFormatter())
             axes.set_xlabel(f"{grows} [-]")
             axes.set_ylabel(label)
             axes.grid(True, which="major", color="#c4c9d0", linewidth=0.6)
