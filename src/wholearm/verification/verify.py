@@ -48,6 +48,9 @@ _ENDS = (EventKind.ARRIVAL, EventKind.RELEASE)
 _CHANGES = {EventKind.STICK: "sticks", EventKind.SLIP: "slips", EventKind.REVERSAL: "reverses"}
 SAMPLES = 2000
 """About how many instants normal forces are looked at, besides the simulation's own steps."""
+MANY = 150
+"""Instants of a phase from which on it costs less to evaluate them within steps than to end steps
+there: what evaluates them is compiled for each formation."""
 
 
 @exclusive
@@ -108,7 +111,9 @@ def inspect(
     reduced: bool = False,
 ) -> Report:
     """Replay torques, look at what happens at `times` [s] and judge it; see `verify`."""
-    simulation = simulate(problem, torque, tolerance=tolerance, looks=times)
+    none = times[:0]
+    ends, looks = (times, none) if len(times) <= MANY * len(problem.phases) else (none, times)
+    simulation = simulate(problem, torque, tolerance=tolerance, times=ends, looks=looks)
     phases = tuple(
         _report_phase(problem, simulation, torque, plan, index)
         for index in range(int(simulation.phase[-1]) + 1)
