@@ -44,6 +44,13 @@ def test_a_worker_that_hangs_or_dies_is_replaced() -> None:
     assert answers["die"].result == 3
 
 
+def test_tasks_of_one_kind_come_after_another_in_one_worker() -> None:
+    """A worker keeps what it has drawn for a scene until another one comes."""
+    tasks = ["a1", "b1", "a2", "b2", "c1", "a3"]
+    answers = run_tasks(misbehave, tasks, 1, 20.0, lambda task: task[0])
+    assert [answer.task for answer in answers] == ["a1", "a2", "a3", "b1", "b2", "c1"]
+
+
 def test_a_scene_is_drawn_alike_whichever_others_are_and_is_the_same_as_a_file() -> None:
     case, again = draw_case(0, 2), draw_case(0, 2)
     assert case == again

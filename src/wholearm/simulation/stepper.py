@@ -212,7 +212,8 @@ def _build_measure(formation: Formation, until: Until, side: float, short: float
     elif until.contact is None:
         distance = side * (z[0 if until.coordinate == "x" else 2] - until.value)
     elif gained:
-        distance = gained[0].value
+        # A pointed tip comes to a vertex along the edge, or turns onto it with its link.
+        distance = ca.mmin(ca.vertcat(*(limit.value for limit in gained)))
     else:
         distance = build_gap(until.contact, formation.scene)
     values = ca.vertcat(*(limit.value for limit in open_limits(formation, until)))

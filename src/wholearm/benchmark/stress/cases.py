@@ -8,6 +8,7 @@ import math
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,7 @@ class Case:
     stops: list[tuple[float, float]]
 
 
+@lru_cache(maxsize=2)
 def draw_case(seed: int, number: int) -> Case:
     """Draw case `number` of a seed: always the same one, whichever others are drawn."""
     rng = np.random.default_rng([seed, number])

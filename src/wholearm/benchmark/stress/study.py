@@ -88,7 +88,8 @@ def run_stress(
     stamp = {"study": "stress", "seed": options.seed, "version": __version__}
     journal = Journal(f"{stem}.jsonl", stamp, options.fresh, options.again)
     report = progress or (lambda _: None)
-    _run_part(journal, "scene", run_scene, _scenes(options), SCENE_BOUND, options, report)
+    scenes = _scenes(options)
+    _run_part(journal, "scene", run_scene, scenes, SCENE_BOUND, options, report, _find_scene)
     _run_part(journal, "file", run_file, _files(options), FILE_BOUND, options, report)
     trials = {tuple(trial): trial for trial in list_trials(list(options.problems))}
     _run_part(journal, "problem", run_trial, trials, TRIAL_BOUND, options, report)
@@ -104,13 +105,18 @@ def run_only(options: StressOptions) -> list[dict[str, Any]]:
     """Run one scene in workers of its own and return its records."""
     assert options.only is not None
     tasks = [(options.seed, options.only, objective) for objective in OBJECTIVES]
-    answers = run_tasks(run_scene, tasks, options.jobs, SCENE_BOUND)
+    answers = run_tasks(run_scene, tasks, options.jobs, SCENE_BOUND, _find_scene)
     return [_record("scene", list(answer.task[1:]), answer) for answer in answers]
 
 
 def _scenes(options: StressOptions) -> dict[Any, Any]:
     numbers = range(options.scenes)
     return {(k, goal): (options.seed, k, goal) for k in numbers for goal in OBJECTIVES}
+
+
+def _find_scene(task: tuple[int, int, str]) -> int:
+    """Number of a task's scene: a worker that goes on with it need not draw it again."""
+    return task[1]
 
 
 def _files(options: StressOptions) -> dict[Any, Any]:
@@ -125,6 +131,7 @@ def _run_part(
     bound: float,
     options: StressOptions,
     report: Callable[[str], None],
+    *kind: Callable[[Any], Any],
 ) -> None:
     """Run the tasks that have no record yet."""
     names = {task: name for name, task in tasks.items()}
@@ -134,7 +141,7 @@ def _run_part(
     show = partial(_draw_bar, key, len(tasks), time.monotonic(), len(left))
     if left:
         report(show(0, found))
-    for count, answer in enumerate(run_tasks(run, left, options.jobs, bound), start=1):
+    for count, answer in enumerate(run_tasks(run, left, options.jobs, bound, *kind), start=1):
         record = _record(key, names[answer.task], answer)
         found += len(record["findings"])
         journal.add(record)

@@ -68,8 +68,37 @@ class _Worker:
         self.pipe.close()
 
 
+class _Queue:
+    """Tasks that wait: a worker takes those that are alike, before it begins with others."""
+
+    def __init__(self, tasks: Sequence[Any], kind: Callable[[Any], Any]) -> None:
+        self.bundles: dict[Any, list[Any]] = {}
+        for task in tasks:
+            self.bundles.setdefault(kind(task), []).append(task)
+        self.kind = kind
+        self.begun: set[Any] = set()
+
+    def __bool__(self) -> bool:
+        return bool(self.bundles)
+
+    def take(self, before: Any = None) -> Any:
+        """The next task of a worker that has done another, or none, before."""
+        own = None if before is None else self.kind(before)
+        new = (kind for kind in self.bundles if kind not in self.begun)
+        kind = own if own in self.bundles else next(new, next(iter(self.bundles)))
+        self.begun.add(kind)
+        task = self.bundles[kind].pop(0)
+        if not self.bundles[kind]:
+            del self.bundles[kind]
+        return task
+
+
 def run_tasks(
-    run: Callable[[Any], Any], tasks: Sequence[Any], jobs: int, bound: float
+    run: Callable[[Any], Any],
+    tasks: Sequence[Any],
+    jobs: int,
+    bound: float,
+    kind: Callable[[Any], Any] = lambda task: task,
 ) -> Iterator[Answer]:
     """Run tasks in worker processes and give their answers as they come.
 
@@ -83,14 +112,16 @@ def run_tasks(
         Number of workers.
     bound : float, [s]
         Processor time that a task may take. By the wall clock it may take `PATIENCE` times that.
+    kind : callable, optional
+        Of a task: one worker runs those of one kind, as far as others have something else to do.
     """
     context = mp.get_context("spawn")
-    waiting = list(reversed(tasks))
+    waiting = _Queue(tasks, kind)
     workers: list[_Worker] = []
     try:
         for _ in range(min(jobs, len(tasks))):
             workers.append(_Worker(context, run, bound))
-            workers[-1].give(waiting.pop())
+            workers[-1].give(waiting.take())
         while any(worker.busy for worker in workers):
             for k, worker in enumerate(workers):
                 answer = _look(worker, bound) if worker.busy else None
@@ -101,7 +132,7 @@ def run_tasks(
                     workers[k] = worker = _Worker(context, run, bound)
                 worker.busy = False
                 if waiting:
-                    worker.give(waiting.pop())
+                    worker.give(waiting.take(answer.task))
                 yield answer
             wait([worker.pipe for worker in workers if worker.busy], timeout=0.2)
     finally:
