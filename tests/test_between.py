@@ -54,7 +54,7 @@ def in_newtons(stage: Stage, misses: Limits, kind: str) -> Array:
     )
 
 
-def look(stage: Stage, motion: StageMotion, *least: float) -> Limits:
+def check(stage: Stage, motion: StageMotion, *least: float) -> Limits:
     return find_misses(stage, check_between(stage, motion), *least)
 
 
@@ -73,7 +73,7 @@ def heaved() -> StageMotion:
 
 def test_what_a_plan_misses_is_within_what_is_allowed() -> None:
     for motion in landed():
-        misses = look(as_stage(motion), motion, EPSILON)
+        misses = check(as_stage(motion), motion, EPSILON)
         assert misses.held.shape == (len(motion.points.fractions), motion.formation.n_contacts + 4)
         assert misses.worst <= 1
 
@@ -85,14 +85,14 @@ def test_forces_are_missed_by_what_their_least_value_lacks() -> None:
         t = motion.duration * motion.points.places(inside).ravel()
         dense = motion.evaluate(t).c_n.reshape(stage.intervals, 401, -1)
         asked = float(np.median(dense))
-        misses = look(stage, motion, asked)
+        misses = check(stage, motion, asked)
         expected = np.maximum(asked - dense.min(axis=1), 0.0)
-        # Parabolas through 25 looks, of forces that are smooth inside an interval.
+        # Parabolas through 25 checks, of forces that are smooth inside an interval.
         pressed = in_newtons(stage, misses, PRESS)
         np.testing.assert_allclose(pressed, expected, atol=1e-3 * np.ptp(dense))
         assert misses.worst == pytest.approx(misses.held.max() / MISS)
         # A margin asks for as much as a larger epsilon.
-        same = look(stage, motion, EPSILON, asked - EPSILON)
+        same = check(stage, motion, EPSILON, asked - EPSILON)
         again = in_newtons(stage, same, PRESS)
         np.testing.assert_allclose(again, pressed, atol=1e-12 * asked)
 
@@ -105,12 +105,12 @@ def test_cones_are_missed_by_what_epsilon_takes_from_them_but_the_margin_does_no
     dense = motion.evaluate(instants(motion, 200))
     grip = mu * dense.c_n[:, row] - np.abs(dense.c_t[:, row])
     least = grip.reshape(stage.intervals, 200).min(axis=1)
-    assert not in_newtons(stage, look(stage, motion, EPSILON), CONE).any()
+    assert not in_newtons(stage, check(stage, motion, EPSILON), CONE).any()
     large = 1.0 + least.min() / mu
-    misses = in_newtons(stage, look(stage, motion, large), CONE).max(axis=1)
+    misses = in_newtons(stage, check(stage, motion, large), CONE).max(axis=1)
     np.testing.assert_allclose(misses, np.maximum(mu * large - least, 0), atol=0.02)
     assert misses.max() > 1.0
-    assert not in_newtons(stage, look(stage, motion, EPSILON, large), CONE).any()
+    assert not in_newtons(stage, check(stage, motion, EPSILON, large), CONE).any()
 
 
 def test_released_contacts_have_to_be_clear_in_the_second_half() -> None:
@@ -122,7 +122,7 @@ def test_released_contacts_have_to_be_clear_in_the_second_half() -> None:
     gaps = make_formation(formation.scene, "v3-finger1")
     fields = {"monitored": (k,), "released": (k,), "opens": True}
     stage = as_stage(motion, **fields)
-    assert look(stage, motion, EPSILON).gap.max() <= GRAZE
+    assert check(stage, motion, EPSILON).gap.max() <= GRAZE
     # Played backwards it is clear at first, and touches at the end.
     part = motion.points
     back = part._replace(
@@ -134,7 +134,7 @@ def test_released_contacts_have_to_be_clear_in_the_second_half() -> None:
         tau=part.tau[::-1, ::-1],
     )
     reverse = replace(motion, points=back)
-    misses = look(as_stage(reverse, **fields), reverse, EPSILON).gap[:, 0]
+    misses = check(as_stage(reverse, **fields), reverse, EPSILON).gap[:, 0]
     end = measure_gaps(gaps, reverse.evaluate(np.array([motion.duration])).z[0])[0]
     assert misses[-1] == pytest.approx(CLEARANCE / 2 - end, abs=1e-7)
     assert misses[0] == 0.0
@@ -154,7 +154,7 @@ def test_limits_rise_by_more_than_they_are_missed() -> None:
 def test_tightening_holds_limits_that_points_alone_do_not() -> None:
     problem = landing()
     search, loose = Search.of(problem, PlanOptions()), solve_at_points()
-    held = search.hold(loose)
+    held = search.enforce_between(loose)
     assert loose.success and held.success
     worst = []
     for solution in (loose, held):
@@ -249,8 +249,8 @@ def test_what_is_broken_between_points_is_watched() -> None:
         assert isinstance(whole, TimeMotion)
         motions = [replace(part, formation=formation) for part in whole.stages]
         stages = [as_stage(part) for part in motions]
-        looks = [check_between(*pair) for pair in zip(stages, motions, strict=True)]
-        found = monitor_missed(stages, looks)
+        checks = [check_between(*pair) for pair in zip(stages, motions, strict=True)]
+        found = monitor_missed(stages, checks)
         assert {k for stage in found or stages for k in stage.monitored} == set(monitored)
         assert (found is None) == (monitored == ())
 

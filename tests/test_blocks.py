@@ -11,7 +11,7 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.planning import blocks
 from wholearm.planning.blocks import Planning, plan_alone
 from wholearm.planning.options import Objective, PlanOptions
-from wholearm.planning.path_domain.sequence_plan import plan_sequence
+from wholearm.planning.time_domain import impacts
 
 
 def planning_of(problem: Any) -> Planning:
@@ -39,18 +39,21 @@ def test_blocks_are_planned_alone_only_where_that_is_another_plan(
 def test_no_phase_has_to_press_much_more_than_those_before_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    problem, given = problem_of(HEPTAGON), list[tuple[PlanOptions, float]]()
+    """Plans along curves stand for those over time, which are told what is ample."""
+    problem, given = problem_of(HEPTAGON), list[tuple[float, float]]()
+    curves, options = trace_phases(problem), PlanOptions("margin", intervals=20)
+    known = blocks.plan_blocks(problem, curves, options, lambda _: None).plans
 
-    def record(*of: Any) -> Any:
-        plans = plan_sequence(*of)
-        given.append((of[2], min(plan.value for plan in plans)))
-        return plans
+    def plan_with_impacts(*of: Any) -> Any:
+        plan = known[of[1][0].index]
+        if of[3].goal is Objective.MARGIN:
+            given.append((of[6], plan.value))
+        return [plan]
 
-    monkeypatch.setattr(blocks, "plan_sequence", record)
-    options = PlanOptions("margin", intervals=20)
-    blocks.plan_blocks(problem, trace_phases(problem), options, lambda _: None)
-    pressed = [(own.enough, value) for own, value in given if own.goal is Objective.MARGIN]
-    assert len(pressed) == len(problem.phases) and pressed[0][0] == math.inf
-    for index in range(1, len(pressed)):
-        before = min(value for _, value in pressed[:index])
-        assert pressed[index][0] == pytest.approx(blocks.AMPLE * before)
+    monkeypatch.setattr(impacts, "plan_with_impacts", plan_with_impacts)
+    over_time = replace(options, transcription="time")
+    blocks.plan_blocks(problem, curves, over_time, lambda _: None)
+    assert len(given) == len(problem.phases) and given[0][0] == math.inf
+    for index in range(1, len(given)):
+        before = min(value for _, value in given[:index])
+        assert given[index][0] == pytest.approx(blocks.AMPLE * before)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from plane import with_speed_limit
 from wholearm.common.arrays import Array
 from wholearm.common.errors import JammingError
-from wholearm.common.minima import find_least
+from wholearm.common.minima import find_minima
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.mechanics.dynamics import PathForces, inverse
@@ -86,13 +86,13 @@ def test_least_values_between_looks() -> None:
     rng = np.random.default_rng(6)
     places, heights = rng.uniform(0.1, 0.9, 50), rng.uniform(-1, 1, 50)
     parabolas = 3 * (x - places[:, None]) ** 2 + heights[:, None]
-    least = find_least(parabolas[:, :, None])[:, 0]
+    least = find_minima(parabolas[:, :, None])[:, 0]
     np.testing.assert_allclose(least, heights, rtol=0, atol=1e-14)
     # Without a dip it is the lesser end; a kink is met at least where it was looked at.
     lines = np.outer(rng.uniform(-1, 1, 50), x)
-    np.testing.assert_array_equal(find_least(lines[:, :, None])[:, 0], lines.min(axis=1))
+    np.testing.assert_array_equal(find_minima(lines[:, :, None])[:, 0], lines.min(axis=1))
     kinks = np.abs(x - places[:, None])
-    assert (find_least(kinks[:, :, None])[:, 0] <= kinks.min(axis=1)).all()
+    assert (find_minima(kinks[:, :, None])[:, 0] <= kinks.min(axis=1)).all()
 
 
 def test_slack_is_in_its_order(curves: tuple[Curve, ...]) -> None:
@@ -116,7 +116,9 @@ def test_a_planted_miss_is_found(
     short, speeding = data.misses(motion.profile, 0.0)
     assert short.max() <= 5e-7 and speeding.max() == 0.0
     row = min(row, len(data.checks.rates) - 1)
-    here = data.slack(data.checks, data.spread(motion.profile, data.sampling.checks))[row, contact]
+    here = data.slack(data.checks, data.interpolate(motion.profile, data.sampling.checks))[
+        row, contact
+    ]
     C0 = data.checks.forces.C0.copy()
     C0[row, contact] -= here + 0.25
     planted = data._replace(checks=Places(data.checks.forces._replace(C0=C0), data.checks.rates))
@@ -136,7 +138,7 @@ def test_misses_of_the_margin_and_of_torques(curves: tuple[Curve, ...]) -> None:
     assert both.any()
     np.testing.assert_allclose((high - low)[:, :4][both], 10.0, rtol=1e-12)
     np.testing.assert_array_equal(low[:, 4:], high[:, 4:])
-    checks = data.slack(data.checks, data.spread(profile, data.sampling.checks))
+    checks = data.slack(data.checks, data.interpolate(profile, data.sampling.checks))
     worst = np.maximum(-checks, 0).reshape(len(data.nonempty), -1, 8).max(axis=1)
     assert (low >= worst).all()
     np.testing.assert_allclose(low, worst, rtol=0, atol=1e-4)
@@ -145,12 +147,12 @@ def test_misses_of_the_margin_and_of_torques(curves: tuple[Curve, ...]) -> None:
 def test_spread_is_exact_at_nodes_and_between(curves: tuple[Curve, ...]) -> None:
     data = prepare(curves[0], EPSILON, make_grid(curves[0], 30), 1)
     profile, k, h = random_profile(data, 3), data.nonempty, data.grid.steps[data.nonempty]
-    ends = data.spread(profile, np.array([0.0, 1.0]))
+    ends = data.interpolate(profile, np.array([0.0, 1.0]))
     # b' = 2 a has been integrated with the same rule.
     for found, exact in zip(ends, profile, strict=True):
         pairs = np.column_stack([exact[k], exact[k + 1]]).ravel()
         np.testing.assert_allclose(found, pairs, rtol=0, atol=1e-14 * np.abs(exact).max())
-    part = data.spread(profile, np.array([0.4, 0.4 + 1e-4]))
+    part = data.interpolate(profile, np.array([0.4, 0.4 + 1e-4]))
     slope = np.diff(part.b.reshape(-1, 2))[:, 0] / (1e-4 * h)
     middle = part.a.reshape(-1, 2).mean(axis=1)
     # A central difference of a quadratic is exact but for rounding of b over the step.
@@ -174,7 +176,7 @@ def test_speed_limits_bound_b(curves: tuple[Curve, ...]) -> None:
     np.testing.assert_allclose(np.abs(data.nodes.rates[:, 0]) * np.sqrt(largest), 1.5, rtol=1e-12)
     profile = random_profile(data, 5)
     _, speeding = data.misses(profile, 0.0)
-    b = data.spread(profile, data.sampling.checks).b.reshape(len(data.nonempty), -1)
+    b = data.interpolate(profile, data.sampling.checks).b.reshape(len(data.nonempty), -1)
     rates = data.checks.rates[:, 0].reshape(b.shape)
     over = np.maximum(b * rates**2 / 1.5**2 - 1, 0.0).max(axis=1)
     # Parabolas see a little more than places do.
@@ -225,6 +227,6 @@ def test_dips_next_to_rest_are_found(nodes: int, deepest: float) -> None:
     x = choose_sampling(nodes).checks
     values = x - 2 * np.sqrt(deepest * x)
     for sampled in (values, values[::-1]):
-        least = find_least(sampled[None, :, None])[0, 0]
+        least = find_minima(sampled[None, :, None])[0, 0]
         # A look next to the dip, and the parabola through it, miss little of it.
         assert least == pytest.approx(-deepest, rel=0.1)

@@ -212,7 +212,7 @@ def test_looks_are_as_good_as_steps_and_end_none() -> None:
     times = np.linspace(0.03, 0.4, 60)
     reference = simulate(problem, torque, tolerance=1e-13, times=times)
     bare = simulate(problem, torque, tolerance=1e-9)
-    looked = simulate(problem, torque, tolerance=1e-9, looks=times)
+    looked = simulate(problem, torque, tolerance=1e-9, within=times)
     assert (looked.steps, looked.outcome) == (bare.steps, bare.outcome)
     for name, bound in (("z", 1e-7), ("z_dot", 1e-7), ("z_ddot", 1e-5), ("c_n", 1e-5)):
         own, exact = (
@@ -235,7 +235,7 @@ def test_what_happens_between_the_ends_of_steps_is_not_missed(
     close = simulate(problem, trajectory, times=times)
     answers = iter([False, True])
     monkeypatch.setattr(simulation_module, "fill", lambda pairs: fill(pairs) and next(answers))
-    again = simulate(problem, trajectory, looks=times)
+    again = simulate(problem, trajectory, within=times)
     assert again.steps == close.steps
     np.testing.assert_array_equal(again.z, close.z)
 

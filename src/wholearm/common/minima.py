@@ -7,7 +7,7 @@ import numpy as np
 from .arrays import Array
 
 
-def find_least(values: Array) -> Array:
+def find_minima(values: Array) -> Array:
     """Least value along the middle axis of evenly spaced values, also between them (parabolas)."""
     before, here, after = values[:, :-2], values[:, 1:-1], values[:, 2:]
     bend = before - 2 * here + after

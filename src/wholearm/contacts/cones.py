@@ -8,7 +8,7 @@ from ..common.arrays import Array
 from .formation import Formation
 
 
-def hold_rows(formation: Formation) -> Array:
+def force_limit_rows(formation: Formation) -> Array:
     """H, shape (n_c + 2 R, n_c + R): every c_n, then both sides of every rolling contact's cone."""
     unit = np.eye(formation.n_constraints)
     normal, tangential = unit[: formation.n_contacts], unit[formation.n_contacts :]

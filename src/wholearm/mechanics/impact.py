@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.arrays import Array
-from ..contacts.cones import hold_rows
+from ..contacts.cones import force_limit_rows
 from ..contacts.formation import Formation
 from .dynamics import Directions, force_rows, reduced_inertia
 from .metric import measure_speed, metric_weights
@@ -161,7 +161,7 @@ def _compute_impact(before: Formation, after: Formation, z: Array, v: Array, Xi:
     speed = measure_speed(after.scene, v)
     momentum = float(np.abs(mass * v / np.sqrt(metric_weights(after.scene))).max())
     rolls = [after.names[row] for row in after.rolling_rows]
-    normal, cones = np.split(hold_rows(after) @ p, [after.n_contacts])
+    normal, cones = np.split(force_limit_rows(after) @ p, [after.n_contacts])
     found = [
         *_list(
             ViolationKind.HELD, after.names, Xi * (kinematics.A_t[0] @ v_after), ROUNDING * speed

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..common.shortfalls import Parameter
-from ..contacts.cones import hold_rows
+from ..contacts.cones import force_limit_rows
 from ..contacts.formation import Formation
 
 PRESS, CONE, TORQUE, SPEED = "press", "cone", "torque", "speed"
@@ -163,11 +163,11 @@ def make_limits(formation: Formation, epsilon: float) -> LimitSet:
     return LimitSet(tuple(limit for limit in made if len(limit.low)))
 
 
-def _make_holds(formation: Formation, epsilon: float) -> list[MotionLimit]:
+def _make_force_limits(formation: Formation, epsilon: float) -> list[MotionLimit]:
     """Contacts press, and what rolls does not slip."""
     parameter = Parameter(EPSILON, epsilon, "N", -1, EPSILON)
     force, n_c, R = formation.scene.scales.force, formation.n_contacts, formation.n_rolling
-    H = hold_rows(formation)
+    H = force_limit_rows(formation)
     H = np.hstack([H, np.zeros((len(H), 4))])
 
     def make(kind: str, part: str, text: str, rows: Array, weight: Array) -> MotionLimit:
@@ -209,5 +209,5 @@ def _make_joint_limits(formation: Formation, _: float) -> list[MotionLimit]:
     return found
 
 
-MAKERS: list[Maker] = [_make_holds, _make_joint_limits]
+MAKERS: list[Maker] = [_make_force_limits, _make_joint_limits]
 """What makes the limits of a formation."""

@@ -102,7 +102,7 @@ def name_phases(phases: Sequence[int], what: str = "") -> str:
 def advise(
     text: str,
     parameters: Iterable[Parameter],
-    find_least: Callable[[Parameter], float | None],
+    find_value: Callable[[Parameter], float | None],
     replan: Callable[[Parameter, float], object] | None,
     seconds: float = math.inf,
 ) -> Advice:
@@ -114,7 +114,7 @@ def advise(
         What cannot be kept.
     parameters : iterable of Parameter
         What may be changed.
-    find_least : callable
+    find_value : callable
         As of `find_changes`; NaN where it cannot tell.
     replan : callable or None
         Plans with another value of a parameter, or raises; without it no change is looked for.
@@ -126,7 +126,7 @@ def advise(
     stop, undecided = time.thread_time() + seconds, list[Parameter]()
 
     def look(parameter: Parameter) -> float | None:
-        least = math.nan if time.thread_time() > stop else find_least(parameter)
+        least = math.nan if time.thread_time() > stop else find_value(parameter)
         if least is not None and math.isnan(least):
             undecided.append(parameter)
             return None
@@ -178,7 +178,7 @@ def describe_shortfalls(shortfalls: Iterable[Shortfall]) -> str:
 
 def find_changes(
     parameters: Iterable[Parameter],
-    find_least: Callable[[Parameter], float | None],
+    find_value: Callable[[Parameter], float | None],
     can_plan: Callable[[Parameter, float], bool],
 ) -> list[Change]:
     """Find the changes of a single parameter with which there is a plan.
@@ -186,7 +186,7 @@ def find_changes(
     Parameters
     ----------
     parameters : iterable of Parameter
-    find_least : callable
+    find_value : callable
         The value of a parameter at which its limits just let the others be kept, or None if none
         does.
     can_plan : callable
@@ -199,7 +199,7 @@ def find_changes(
     """
     changes = []
     for parameter in parameters:
-        least = find_least(parameter)
+        least = find_value(parameter)
         if least is None:
             continue
         value = _find_enough(least, parameter.sign, partial(can_plan, parameter))

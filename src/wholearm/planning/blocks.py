@@ -35,7 +35,7 @@ PLAIN = -1
 FINEST = 64
 """Most intervals of a phase in the time domain that refining asks for."""
 AMPLE = 1.1
-"""How many times the least normal force of other phases is more than enough."""
+"""Ratio to the least normal force of other phases from which on more decides nothing."""
 MOVED = 1e-9
 """Distance from which on a block starts somewhere else, in radii of gyration or radians."""
 SHORT = 5e-7
@@ -223,18 +223,16 @@ def plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str], 
             numbers = "-".join(str(phase.number) for phase in phases)
             report(f"phase {numbers} of {len(problem.phases)}: {options.goal.value}")
             own = _refine(options, known, finer[index])
-            if options.goal is Objective.MARGIN:
-                own = replace(own, enough=_find_enough(blocks))
             to_go = _look_ahead(planning, phases, own) if planning.ahead else None
             with name_source(problem.source):
-                made = _plan_block(planning, phases, z, own, allowed, to_go)
+                made = _plan_block(planning, phases, z, own, allowed, to_go, find_ample(blocks))
             known = BlockPlan(phases, z, *wanted, fastest, *made)
         blocks.append(known)
         z = known.end
     return replace(planning, blocks=tuple(blocks), allowed=allowed)
 
 
-def _find_enough(blocks: Sequence[BlockPlan]) -> float:
+def find_ample(blocks: Sequence[BlockPlan]) -> float:
     """Least normal force [N] that decides nothing in a block, as blocks before it keep less."""
     return AMPLE * min((plan.value for block in blocks for plan in block.plans), default=math.inf)
 
@@ -258,6 +256,7 @@ def _plan_block(
     options: PlanOptions,
     allowed: Sequence[float | None] | None,
     to_go: CostToGo | None = None,
+    ample: float = math.inf,
 ) -> tuple[Plans, ImpactSequence | None]:
     """Plan a block from `z`, along its curves or in the time domain; also its curves."""
     plans: Plans = []
@@ -267,7 +266,8 @@ def _plan_block(
         from .time_domain.impacts import plan_with_impacts
 
         with charge(block[0].number):
-            plans += plan_with_impacts(problem, block, z, options, add_up(block, allowed), to_go)
+            duration = add_up(block, allowed)
+            plans += plan_with_impacts(problem, block, z, options, duration, to_go, ample)
         return plans, None
     curves = []
     for phase in block:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from enum import Enum
 
@@ -73,9 +72,6 @@ class PlanOptions:
     mode_search : bool
         Whether contact modes are changed, in the time domain, for as long as that makes a plan
         better.
-    enough : float, [N]
-        Largest least normal force from which on they are left as they come, for the objective
-        `margin`: another phase keeps less anyway.
 
     Raises
     ------
@@ -96,7 +92,6 @@ class PlanOptions:
     scheme: str = "radau"
     replay: bool = True
     mode_search: bool = True
-    enough: float = math.inf
 
     def __post_init__(self) -> None:
         given = self.objective
@@ -123,8 +118,6 @@ class PlanOptions:
         for key in ("opening", "clearance"):
             value = require_number(getattr(self, key), key, nonnegative=True)
             object.__setattr__(self, key, value)
-        if self.enough != math.inf:
-            object.__setattr__(self, "enough", require_number(self.enough, "enough"))
         weight = require_number(self.time_weight, "time_weight", positive=True)
         object.__setattr__(self, "time_weight", weight)
         if self.duration is not None:

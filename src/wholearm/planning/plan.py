@@ -73,8 +73,6 @@ def solve(
     mode_search : bool
         Whether contact modes are changed, in the time domain, for as long as that makes the plan
         better; True by default.
-    enough : float, [N]
-        Largest least normal force from which on they are left as they come, for `margin`.
     replay : bool
         Whether to replay the plan, to refine what does not hold and to return only what does; True
         by default.

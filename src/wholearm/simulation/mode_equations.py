@@ -113,7 +113,7 @@ class _Model:
         stall = tolerances.speed * scene.scales.mass**0.5
         slack = np.concatenate(
             [
-                ROUNDING_FORCE * self.mode.hold_units,
+                ROUNDING_FORCE * self.mode.force_limit_units,
                 np.full(self.mode.formation.n_contacts, tolerances.speed),
                 np.full(2, tolerances.turning),
             ]
@@ -121,7 +121,7 @@ class _Model:
         inputs = [self.y, self.t, self.packed, *self.rows]
         rates, c, v_t, tau, K, P = self._move()
         held = self._hold(c)
-        least = ca.mmin(held / self.mode.hold_units)
+        least = ca.mmin(held / self.mode.force_limit_units)
         report = self._report(rates, c, v_t, tau, K, P, held, slack, stall)
         return Mechanics(
             self.at,
@@ -135,7 +135,7 @@ class _Model:
 
     def _hold(self, c: Expression) -> Expression:
         """What has to be positive for everything to hold, from the forces c."""
-        H, h = self.mode.hold_rows
+        H, h = self.mode.force_limit_rows
         return ca.sparsify(ca.DM(H)) @ c + ca.DM(h)
 
     def _torque(self) -> Expression:

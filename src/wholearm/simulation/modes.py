@@ -132,7 +132,7 @@ class Mode:
         return self.holders[holder][0] in self.formation.rolling_rows
 
     @cached_property
-    def hold_rows(self) -> tuple[Array, Array]:
+    def force_limit_rows(self) -> tuple[Array, Array]:
         """H, shape (n_c + 2 K, n_c + K), and h: the contacts hold where H c + h >= 0.
 
         Every c_n, then both sides of the cones of the K that are held (see `EventRows.cone`).
@@ -150,7 +150,7 @@ class Mode:
         return H, np.concatenate([np.zeros(count), most, most])
 
     @cached_property
-    def hold_units(self) -> Array:
+    def force_limit_units(self) -> Array:
         """The scene's units of H c + h, shape (n_c + 2 K,) [N, N m]."""
         scales, count = self.formation.scene.scales, self.formation.n_contacts
         held = [scales.force if rows[0] < count else scales.torque for rows in self.holders]
@@ -263,7 +263,7 @@ def respond(mode: Mode, signs: Array, rows: Rows, v: Array) -> Response | None:
     acceleration = inverse_mass[:, None] * (applied + G.T @ c)
     rates = np.vstack([rows.A_t @ acceleration, acceleration[3:]])
     rates[:count, 0] += rows.A_t_dot_v
-    H, h = mode.hold_rows
+    H, h = mode.force_limit_rows
     holds = H @ c
     holds[:, 0] += h
     return Response(acceleration, rates, holds, ratio)

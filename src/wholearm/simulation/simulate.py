@@ -46,7 +46,7 @@ def simulate(
     *,
     tolerance: float = 1e-9,
     times: ArrayLike | None = None,
-    looks: ArrayLike | None = None,
+    within: ArrayLike | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Simulation:
     """Replay joint torques open loop from the problem's start at rest.
@@ -61,7 +61,7 @@ def simulate(
     times : array_like, shape (n,), optional, [s]
         Instants at which the state is wanted; steps end there. Those outside the torques' time
         are left out.
-    looks : array_like, shape (n,), optional, [s]
+    within : array_like, shape (n,), optional, [s]
         More of them, for which no step has to end: there the state has some ten times the error of
         a step, at a tenth of the cost.
     progress : callable, optional
@@ -85,7 +85,9 @@ def simulate(
     profile, _ = narrow(torque)
     if not 1e-14 <= tolerance <= 1e-2:
         raise InputError("", "tolerance", f"{tolerance!r} is not between 1e-14 and 1e-2")
-    ends, inner = (_sort_times(name, given) for name, given in (("times", times), ("looks", looks)))
+    ends, inner = (
+        _sort_times(name, given) for name, given in (("times", times), ("within", within))
+    )
     wanted = np.union1d(ends, inner)
     run = Replay(problem, profile, tolerance, wanted, ends)
     # Where something shows within a step that its end does not show, steps are to end there.

@@ -302,11 +302,11 @@ def _build_pattern(
     if response is None:
         return None
     declared = np.array([mode.declares(k) for k in range(len(mode.holders))] * 2, dtype=bool)
-    cones, cone_units = response.holds[count:], mode.hold_units[count:]
+    cones, cone_units = response.holds[count:], mode.force_limit_units[count:]
     tolerances, length = find_tolerances(formation.scene), formation.scene.scales.length
     slips = signs[:, None] * response.rates
     graze = _GRAZE * np.repeat([1.0, length], [count, 2]) @ slips
-    units = np.concatenate([mode.hold_units[:count], cone_units[declared]])
+    units = np.concatenate([mode.force_limit_units[:count], cone_units[declared]])
     slack = Slack(
         drive=tolerances.drive,
         slips=np.repeat([tolerances.still, tolerances.still_joint], [count, 2]),

@@ -32,7 +32,7 @@ from .tolerances import find_tolerances, measure_units
 
 _AHEAD = 1e-5
 """How far ahead along the free direction signs and gaps are looked for, in units of the scene."""
-_LOOKS = 9
+_CHECKS = 9
 """At how many places of a piece that is not linear forces at rest are looked at."""
 _CLEAR = 1e3
 """Acceleration halfway to the next change with which a motion starts, over that which is rounding:
@@ -177,7 +177,7 @@ class Rest:
 
         Torques that balance form a convex set: the ends of a linear piece speak for it all.
         """
-        places = np.linspace(x, 1.0, 2 if coefficients.shape[1] <= 2 else _LOOKS).tolist()
+        places = np.linspace(x, 1.0, 2 if coefficients.shape[1] <= 2 else _CHECKS).tolist()
         low = x
         for high in places:
             if not self._balances(coefficients, high):

@@ -112,8 +112,8 @@ def inspect(
 ) -> Report:
     """Replay torques, look at what happens at `times` [s] and judge it; see `verify`."""
     none = times[:0]
-    ends, looks = (times, none) if len(times) <= MANY * len(problem.phases) else (none, times)
-    simulation = simulate(problem, torque, tolerance=tolerance, times=ends, looks=looks)
+    ends, within = (times, none) if len(times) <= MANY * len(problem.phases) else (none, times)
+    simulation = simulate(problem, torque, tolerance=tolerance, times=ends, within=within)
     phases = tuple(
         _report_phase(problem, simulation, torque, plan, index)
         for index in range(int(simulation.phase[-1]) + 1)

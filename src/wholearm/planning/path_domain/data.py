@@ -1,7 +1,7 @@
 """What phases give the planner: forces along their curves, at nodes and between them.
 
 Forces are evaluated at the nodes and at a few places of every interval, the knots. They are smooth
-there, so polynomials through the knots carry them to all places where limits are looked at.
+there, so polynomials through the knots give them at all places where limits are checked.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...common.arrays import Array
 from ...common.errors import JammingError, SolverError
-from ...common.minima import find_least
+from ...common.minima import find_minima
 from ...common.shortfalls import Parameter
 from ...geometry.curve import Curve, describe_pose
 from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
@@ -75,7 +75,7 @@ class PhaseData(NamedTuple):
     knots : Places
         At the knots of every solid interval, interval by interval.
     checks : Places
-        At the looks of every solid interval, interval by interval.
+        At the checks of every solid interval, interval by interval.
     nonempty : ndarray of int
         The intervals that have a length.
     """
@@ -152,7 +152,7 @@ class PhaseData(NamedTuple):
                 rates = places.rates @ limit.rows[0, -2:] / limit.high[0]
         return rates
 
-    def spread(self, profile: Profile, fractions: Array) -> Profile:
+    def interpolate(self, profile: Profile, fractions: Array) -> Profile:
         """The profile at `fractions` of every solid interval, interval by interval."""
         k, x, h = self.nonempty, fractions, self.grid.steps[self.nonempty, None]
         a, rise = profile.a[k, None], (profile.a[k + 1] - profile.a[k])[:, None]
@@ -165,10 +165,10 @@ class PhaseData(NamedTuple):
 
         And how far b is beyond what the speed limits allow, shape (n_solid,), relative.
         """
-        here = self.spread(profile, self.sampling.checks)
+        here = self.interpolate(profile, self.sampling.checks)
         speed_slack = 1 - here.b / self.largest_b(self.checks)
         slack = np.column_stack([self.slack(self.checks, here, margin), speed_slack])
-        least = find_least(slack.reshape(len(self.nonempty), len(self.sampling.checks), -1))
+        least = find_minima(slack.reshape(len(self.nonempty), len(self.sampling.checks), -1))
         short = np.maximum(-least, 0.0)
         return short[:, :-1], short[:, -1]
 
@@ -220,14 +220,16 @@ def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
 
     powers = np.arange(len(sampling.knots))
     # Powers on [-1, 1]: on [0, 1] thirteen knots would cost nine digits.
-    looks_x, knots_x = 2 * sampling.checks - 1, 2 * sampling.knots - 1
-    carrier = looks_x[:, None] ** powers @ np.linalg.inv(knots_x[:, None] ** powers)
+    checks_x, knots_x = 2 * sampling.checks - 1, 2 * sampling.knots - 1
+    through = checks_x[:, None] ** powers @ np.linalg.inv(knots_x[:, None] ** powers)
 
-    def carry(values: Array) -> Array:
+    def interpolate(values: Array) -> Array:
         table = values.reshape(len(nonempty), len(sampling.knots), -1)
-        return (carrier @ table).reshape(len(nonempty) * len(sampling.checks), -1)
+        return (through @ table).reshape(len(nonempty) * len(sampling.checks), -1)
 
-    checks = Places(PathForces(*(carry(part) for part in knots.forces)), carry(knots.rates))
+    checks = Places(
+        PathForces(*(interpolate(part) for part in knots.forces)), interpolate(knots.rates)
+    )
     nodes = every.pick(slice(None, len(grid.s)))
     limits = make_limits(formation, epsilon)
     kept = limits.without(SPEED), limits.only(SPEED)
@@ -274,7 +276,7 @@ def cut(parts: Sequence[PhaseData], profile: Profile) -> list[Profile]:
 
 
 def choose_sampling(nodes: int) -> Sampling:
-    """Choose more knots and looks where intervals are long.
+    """Choose more knots and checks where intervals are long.
 
     Looks are as the cosine of evenly spaced angles: near rest the speed, and with it viscous
     friction, goes with the root of the way.
@@ -302,7 +304,7 @@ def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, floa
     knots, checks = data.sampling
     torque = _fit(data, motion, data.knots, knots)
     times = motion.times[data.nonempty, None] + motion.durations(checks)[data.nonempty]
-    wanted = data.checks.forces.tau(*data.spread(motion.profile, checks))
+    wanted = data.checks.forces.tau(*data.interpolate(motion.profile, checks))
     inner = np.tile((checks > 0) & (checks < 1), len(data.nonempty))
     misfit = torque.at(times.ravel()[inner]) - wanted[inner]
     if np.abs(misfit / data.torque_limit).max() > TORQUE_ERROR and len(knots) < PLACES:
@@ -315,7 +317,7 @@ def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, floa
 def _fit(data: PhaseData, motion: PathMotion, places: Places, fractions: Array) -> TorqueProfile:
     """Polynomials through the torques at `fractions` of every solid interval."""
     k = data.nonempty
-    values = places.forces.tau(*data.spread(motion.profile, fractions))
+    values = places.forces.tau(*data.interpolate(motion.profile, fractions))
     spans = motion.durations(fractions)[k]
     if not (np.isfinite(spans).all() and (np.diff(spans, axis=1) > 0).all()):
         raise StalledError("the motion all but stops between two nodes; plan with more intervals")

@@ -100,7 +100,7 @@ def explain(
         may_change += _list_frictions(data.curve.formation)
     curves = [part.curve for part in parts]
 
-    def find_least(parameter: Parameter) -> float | None:
+    def find_value(parameter: Parameter) -> float | None:
         if parameter.key.startswith(FRICTION):
             return _search_friction(parameter, partial(change, parameter))
         return _relax(data, elastic, units, parameter)
@@ -110,7 +110,7 @@ def explain(
 
     ranked = rank_shortfalls(shortfalls)
     text = f"{name_phases(phases, 'infeasible')}: {describe_shortfalls(ranked)}"
-    advice = advise(text, may_change, find_least, change)
+    advice = advise(text, may_change, find_value, change)
     motion = _make_trajectory(parts, cut(parts, elastic))
     return InfeasibleError(advice.text, ranked, advice.changes, motion)
 
@@ -129,14 +129,14 @@ def _make_trajectory(parts: Sequence[PhaseData], profiles: Sequence[Profile]) ->
 def explain_jam(curve: Curve, epsilon: float, jam: JammingError, replan: Replan) -> JammingError:
     """Add to an error which single friction would let a phase be planned."""
 
-    def find_least(parameter: Parameter) -> float | None:
+    def find_value(parameter: Parameter) -> float | None:
         lower = parameter.sign < 0
         return _search_friction(parameter, partial(change, parameter)) if lower else None
 
     def change(parameter: Parameter, value: float) -> object:
         return _replan_with([curve], epsilon, replan, parameter, value)
 
-    advice = advise(str(jam), _list_frictions(curve.formation), find_least, change)
+    advice = advise(str(jam), _list_frictions(curve.formation), find_value, change)
     error = JammingError(advice.text)
     error.changes = advice.changes
     return error

@@ -294,14 +294,14 @@ def unpack(nlp: PathNLP, grid: Grid, x: Array, units: Units) -> tuple[Profile, f
 def move_multipliers(
     nlp: PathNLP, multipliers: dict[str, Array], old: Grid, new: Grid
 ) -> dict[str, Array]:
-    """Carry multipliers from one grid to another with the same segments."""
+    """Interpolate multipliers from one grid to another with the same segments."""
     nodes = np.arange(len(old.s))
     place = np.empty(len(nodes))
     for segment in range(int(old.segment[-1]) + 1):
         mine = old.segment == segment
         place[mine] = np.interp(new.s[mine], old.s[mine], nodes[mine])
 
-    def carry(table: Array) -> Array:
+    def interpolate(table: Array) -> Array:
         columns = [np.interp(place, nodes, column) for column in table.T]
         return np.column_stack(columns)
 
@@ -313,5 +313,5 @@ def move_multipliers(
     for name in ("links", "chain"):
         if rows.sizes[name]:
             blocks[name] = np.interp(middles, nodes[:-1] + 0.5, blocks[name])
-    blocks["limits"] = carry(blocks["limits"].reshape(len(nodes), -1)).ravel()
-    return {"lam_x0": carry(table)[nlp.free], "lam_g0": rows.join(**blocks)}
+    blocks["limits"] = interpolate(blocks["limits"].reshape(len(nodes), -1)).ravel()
+    return {"lam_x0": interpolate(table)[nlp.free], "lam_g0": rows.join(**blocks)}

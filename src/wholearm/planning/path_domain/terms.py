@@ -175,11 +175,11 @@ def _write_values(shape: LimitShape, given: Symbols, motion: tuple[Expression, .
     a, b, squeeze, speed = motion
     n, m, fast = a.numel(), shape.rows, list(shape.fast)
 
-    def spread(name: str, column: Expression, count: int) -> Expression:
+    def scale(name: str, column: Expression, count: int) -> Expression:
         return ca.reshape(getattr(given, name), n, count) * ca.repmat(column, 1, count)
 
-    values = spread("a", a, m) + spread("b", b, m) + spread("squeeze", squeeze, m)
-    values[:, fast] += spread("speed", speed, len(fast))
+    values = scale("a", a, m) + scale("b", b, m) + scale("squeeze", squeeze, m)
+    values[:, fast] += scale("speed", speed, len(fast))
     return values
 
 

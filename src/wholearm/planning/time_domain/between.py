@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.minima import find_least
+from ...common.minima import find_minima
 from ...mechanics.limits import PRESS, LimitSet, make_limits
 from ...results.trajectory import Samples
 from .equations import SLIDING, least_rates
@@ -23,12 +23,12 @@ MISS = 2.5e-7
 GRAZE = 3e-7
 """Deepest overlap between points, over the radius of gyration."""
 FALTER = 0.1
-"""How far a rate may fall below half of the least one between points, over the least one: what
-turned there for an instant might be held by friction in a replay."""
-LOOKS = 25
-"""Places per interval at which limits are looked at."""
+"""Deepest fall of a rate below half of the least one between points, over the least one: friction
+might hold in a replay what turns there for an instant."""
+CHECKS = 25
+"""Places per interval at which limits are checked."""
 _OVER = 1.5
-"""How much more than the miss a limit is tightened."""
+"""Factor on the miss by which a limit is tightened."""
 
 
 class Limits(NamedTuple):
@@ -67,15 +67,15 @@ class Limits(NamedTuple):
 
 
 class CheckPlaces(NamedTuple):
-    """A stage at `LOOKS` places of each of its K intervals, one after the other.
+    """A stage at `CHECKS` places of each of its K intervals, one after the other.
 
     Attributes
     ----------
-    places : ndarray, shape (K LOOKS,)
+    places : ndarray, shape (K CHECKS,)
         Shares of the duration.
     samples : Samples
         Motion and forces there.
-    limits : ndarray, shape (K LOOKS, n_limits), [m]
+    limits : ndarray, shape (K CHECKS, n_limits), [m]
         Values of every limit of the formation.
     """
 
@@ -85,13 +85,13 @@ class CheckPlaces(NamedTuple):
 
 
 def check_between(stage: Stage, motion: StageMotion) -> CheckPlaces:
-    """Look at a stage between its points."""
-    places = stage.guess.places(np.linspace(1e-9, 1 - 1e-9, LOOKS)).ravel()
+    """Motion, forces and limits of a stage at the checks between its points."""
+    places = stage.guess.places(np.linspace(1e-9, 1 - 1e-9, CHECKS)).ravel()
     samples = motion.evaluate(places * motion.duration)
     return CheckPlaces(places, samples, stage.formation.evaluate_limits(samples.z))
 
 
-def find_misses(stage: Stage, look: CheckPlaces, epsilon: float, margin: float = 0.0) -> Limits:
+def find_misses(stage: Stage, check: CheckPlaces, epsilon: float, margin: float = 0.0) -> Limits:
     """By how much limits are missed in each interval, at worst.
 
     Parameters
@@ -99,18 +99,18 @@ def find_misses(stage: Stage, look: CheckPlaces, epsilon: float, margin: float =
     epsilon, margin : float
         Least c_n, and what c_n but no friction cone has to exceed it by.
     """
-    samples, limits = look.samples, make_limits(stage.formation, epsilon)
-    clear = stage.list_clearances(look.places, after=1 / 2) / 2
+    samples, limits = check.samples, make_limits(stage.formation, epsilon)
+    clear = stage.list_clearances(check.places, after=1 / 2) / 2
     # What a stage is short of where it starts, no bound within it can mend.
-    values = look.limits[:, list(stage.monitored)]
+    values = check.limits[:, list(stage.monitored)]
     values = values - np.minimum(values[:1], 0.0)
     tables = (
         _find_slack(stage, limits, samples, margin),
         values - clear,
-        _measure_senses(stage, samples) - 0.5 * least_rates(stage, look.places)[:, None],
+        _measure_senses(stage, samples) - 0.5 * least_rates(stage, check.places)[:, None],
     )
-    shape = (stage.intervals, LOOKS)
-    slack = (find_least(table.reshape(*shape, table.shape[1])) for table in tables)
+    shape = (stage.intervals, CHECKS)
+    slack = (find_minima(table.reshape(*shape, table.shape[1])) for table in tables)
     return Limits(*(np.maximum(-part, 0.0) for part in slack))
 
 
@@ -136,13 +136,13 @@ def _measure_senses(stage: Stage, samples: Samples) -> Array:
     return senses
 
 
-def monitor_missed(stages: Sequence[Stage], looks: Sequence[CheckPlaces]) -> list[Stage] | None:
-    """Stages that also watch the limits which are broken between points; None if none is."""
+def monitor_missed(stages: Sequence[Stage], checks: Sequence[CheckPlaces]) -> list[Stage] | None:
+    """Stages that also monitor the limits which are broken between points; None if none is."""
     changed = []
-    for stage, look in zip(stages, looks, strict=True):
-        values = look.limits.reshape(stage.intervals, LOOKS, -1)
+    for stage, check in zip(stages, checks, strict=True):
+        values = check.limits.reshape(stage.intervals, CHECKS, -1)
         deepest = -GRAZE * stage.formation.scene.scales.length
-        broken = np.flatnonzero(find_least(values).min(axis=0) < deepest).tolist()
+        broken = np.flatnonzero(find_minima(values).min(axis=0) < deepest).tolist()
         changed.append(replace(stage, monitored=tuple(sorted({*stage.monitored, *broken}))))
     news = [one.monitored != other.monitored for one, other in zip(changed, stages, strict=True)]
     return changed if any(news) else None

@@ -89,14 +89,14 @@ def refuse(
         text += " within the torque limits"
     ends, z = node == -1, stage.guess.nodes[node, 0]
 
-    def find_least(parameter: Parameter) -> float | None:
+    def find_value(parameter: Parameter) -> float | None:
         if parameter.is_speed:
             return None
         finger = None if parameter.key == EPSILON else int(parameter.key.split(".")[1]) - 1
         value = find_change(stage.formation, z, epsilon, finger, ends)
         return _unit_of(parameter, problem.scene.scales) * value if value else None
 
-    raise _advise(problem, phase, text, find_least, replan, shortfalls)
+    raise _advise(problem, phase, text, find_value, replan, shortfalls)
 
 
 def explain(
@@ -135,7 +135,7 @@ def explain(
 
     elastic = min(short, key=sum_up)
 
-    def find_least(parameter: Parameter) -> float | None:
+    def find_value(parameter: Parameter) -> float | None:
         aim = search.aiming(Objective.RELAX, parameter)
         solution = aim.solve(elastic)
         # A limit that may be tighter is not what keeps the others from being kept.
@@ -146,7 +146,7 @@ def explain(
 
     ranked = rank_shortfalls(list_shortfalls(problem, elastic, search.scheme))
     text = f"{name_phases(numbers, 'infeasible')}: {describe_shortfalls(ranked)}"
-    error = _advise(problem, phases[0], text, find_least, replan, ranked)
+    error = _advise(problem, phases[0], text, find_value, replan, ranked)
     error.motion = _make_trajectory(problem, phases, search, elastic)
     return error
 
@@ -174,7 +174,7 @@ def _advise(
     problem: Problem,
     phase: Phase,
     text: str,
-    find_least: Callable[[Parameter], float | None],
+    find_value: Callable[[Parameter], float | None],
     replan: Replan | None,
     shortfalls: Sequence[Shortfall],
 ) -> InfeasibleError:
@@ -186,7 +186,7 @@ def _advise(
     phase : Phase
         One of those that have no plan.
     text : str
-    find_least : callable
+    find_value : callable
         As for `planning.advice.advise`.
     replan : callable or None
         Without it no change is looked for.
@@ -199,7 +199,7 @@ def _advise(
         return replan(change_limit(problem, parameter.key, value))
 
     parameters = make_limits(phase.formation, problem.epsilon).parameters
-    found = advise(text, parameters, find_least, change if replan else None, ADVICE)
+    found = advise(text, parameters, find_value, change if replan else None, ADVICE)
     return InfeasibleError(found.text, shortfalls, found.changes)
 
 

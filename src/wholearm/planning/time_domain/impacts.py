@@ -6,6 +6,7 @@ from there stay stops, and the phases beside the others are planned as one.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -35,6 +36,7 @@ def plan_with_impacts(
     options: PlanOptions,
     duration: float | None,
     to_go: CostToGo | None = None,
+    ample: float = math.inf,
 ) -> Plans:
     """Plan a block with the impacts that are possible, or else with stops.
 
@@ -48,6 +50,8 @@ def plan_with_impacts(
         Longest duration of the block, for the objective `margin`.
     to_go : CostToGo, optional
         What follows a block without impacts.
+    ample : float, [N]
+        As of `plan_phases`.
 
     Raises
     ------
@@ -56,8 +60,8 @@ def plan_with_impacts(
     """
     ends = _find_impacts(block)
     if not ends:
-        return [*plan_phases(problem, block, z, options, duration, to_go=to_go)]
-    explained = plan_parts_of(problem, block, explained=True)
+        return [*plan_phases(problem, block, z, options, duration, to_go=to_go, ample=ample)]
+    explained = plan_parts_of(problem, block, ample, explained=True)
     # A duration that is too short for stops need not be so without them.
     probe = (
         options if duration is None else replace(options, objective=Objective.TIME, duration=None)
@@ -69,7 +73,7 @@ def plan_with_impacts(
     if len(blocked) < len(ends):
         bounds = [0, *blocked, len(block)]
         try:
-            return plan_stops(plan_parts_of(problem, block), bounds, z, options, duration)
+            return plan_stops(plan_parts_of(problem, block, ample), bounds, z, options, duration)
         except (InfeasibleError, SolverError):
             pass
     if duration is None:
@@ -77,14 +81,17 @@ def plan_with_impacts(
     return plan_stops(explained, [0, *ends, len(block)], z, options, duration)
 
 
-def plan_parts_of(problem: Problem, block: Sequence[Phase], explained: bool = False) -> PlanPart:
+def plan_parts_of(
+    problem: Problem, block: Sequence[Phase], ample: float = math.inf, explained: bool = False
+) -> PlanPart:
     """How parts of a block are planned; `explained`: finding out why where there is no plan."""
 
     def plan_part(
         start: int, stop: int, z: Array, options: PlanOptions, duration: float | None
     ) -> Plans:
         part = block[start:stop]
-        return [*plan_phases(problem, part, z, options, duration, explained=explained)]
+        plans = plan_phases(problem, part, z, options, duration, ample=ample, explained=explained)
+        return [*plans]
 
     return plan_part
 

@@ -92,7 +92,7 @@ class StageMotion:
 
         The accelerations at an interval's points are integrated twice from its start, and those
         that follow there by forward dynamics again, until they are one motion. What is left at
-        the end, the error of collocation, is spread over the interval.
+        the end, the error of collocation, is distributed over the interval.
         """
         nodes, half = self.points.nodes, np.diff(self.breaks)[:, None, None] / 2
         z, v = nodes[:, 0], nodes[:, 1]
@@ -163,8 +163,8 @@ def _integrate(powers: Array, scale: Array, start: Array) -> Array:
 
 def _lift(P: Array, metric: Array, residual: Array) -> Array:
     """Shortest changes of z, shape (n, 5), that change the constraints by `residual`, (n, n_p)."""
-    spread = (P / metric).transpose(0, 2, 1)
-    return np.asarray((spread @ np.linalg.solve(P @ spread, residual[..., None]))[..., 0])
+    weighted = (P / metric).transpose(0, 2, 1)
+    return np.asarray((weighted @ np.linalg.solve(P @ weighted, residual[..., None]))[..., 0])
 
 
 @dataclass(frozen=True, eq=False)

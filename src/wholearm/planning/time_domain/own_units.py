@@ -71,8 +71,7 @@ def scale_state(z: Array, scales: Scales) -> Array:
 
 def scale_options(options: PlanOptions, scales: Scales) -> PlanOptions:
     """Options in own units."""
-    weight, enough = options.time_weight / scales.torque**2, options.enough / scales.force
-    return replace(options, time_weight=weight, enough=enough)
+    return replace(options, time_weight=options.time_weight / scales.torque**2)
 
 
 def unit_of(goal: Objective, scales: Scales) -> float:

@@ -11,6 +11,7 @@ it is a better guess, or says why there is no plan.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -51,6 +52,7 @@ def plan_phases(
     duration: float | None = None,
     *,
     to_go: CostToGo | None = None,
+    ample: float = math.inf,
     explained: bool = True,
     patient: bool = True,
 ) -> list[PhasePlan[TimeMotion]]:
@@ -67,6 +69,9 @@ def plan_phases(
         Longest duration of all these phases, for the objective `margin`.
     to_go : CostToGo, optional
         What follows, where the phases leave open where they end.
+    ample : float, [N]
+        Least normal force from which on more decides nothing, for the objective `margin`: another
+        phase keeps less anyway.
     explained : bool
         Whether to look for a change that would make a plan possible, where there is none.
     patient : bool
@@ -79,7 +84,7 @@ def plan_phases(
     InfeasibleError, SolverError
         If there is no plan.
     """
-    search = Search.of(problem, options, duration, to_go)
+    search = Search.of(problem, options, duration, to_go, ample)
     attempts = Attempts(problem, phases, z, search, to_go, patient)
     begun = solve_attempt(search, attempts.first)
     if search.goal is Objective.MARGIN and not begun.success:
@@ -188,13 +193,13 @@ def solve_attempt(search: Search, attempt: Attempt) -> Solution:
         return solution._replace(success=False, status="the largest c_n is below epsilon")
     if not solution.success:
         return solution
-    plain = not search.options.mode_search or search.is_enough(solution)
+    plain = not search.options.mode_search or search.has_ample(solution)
     better = solution if plain else improve(search, solution)
     search, solution = choose_end(search, adapt(search, better))
     for _ in range(max(attempt.halvings, search.scheme.degree > _EXACT)):
         if solution.success:
             solution = search.solve(_halve(search, solution.stages), solution)
-    return search.hold(solution) if solution.success else solution
+    return search.enforce_between(solution) if solution.success else solution
 
 
 def _solve_from_fastest(search: Search, attempt: Attempt) -> Solution | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -128,6 +129,8 @@ class Search:
     to_go : callable or None
         What follows costs from where stages end, and its gradient, each by the objective.
     price : Price or None
+    ample : float
+        Least normal force from which on more decides nothing, for the objective `margin`.
     tried : Tried
         Shared by all searches for one plan.
     """
@@ -140,6 +143,7 @@ class Search:
     relaxation: Parameter | None = None
     to_go: Callable[[Array], tuple[float, Array]] | None = None
     price: Price | None = None
+    ample: float = math.inf
     tried: Tried = field(default_factory=Tried)
 
     @staticmethod
@@ -148,8 +152,9 @@ class Search:
         options: PlanOptions,
         duration: float | None = None,
         to_go: CostToGo | None = None,
+        ample: float = math.inf,
     ) -> Search:
-        """A search for a problem, options, a longest duration and a cost-to-go in SI units."""
+        """A search for what `plan_phases` is given, in SI units."""
         scales = problem.scene.scales
         lengths, unit = unit_lengths(scales), unit_of(options.goal, scales)
 
@@ -165,6 +170,7 @@ class Search:
             None if duration is None else duration / scales.time,
             options.goal,
             to_go=expand if to_go else None,
+            ample=ample / scales.force,
         )
 
     def aiming(self, goal: Objective, relaxation: Parameter | None = None) -> Search:
@@ -177,9 +183,9 @@ class Search:
         """What it costs to end at `z`, shape (5,)."""
         return float(self.price.gradient @ (z - self.price.origin)) if self.price else 0.0
 
-    def is_enough(self, solution: Solution) -> bool:
+    def has_ample(self, solution: Solution) -> bool:
         """Whether c_n is as large as another phase allows anyway, for the objective `margin`."""
-        most = self.options.enough - self.problem.epsilon
+        most = self.ample - self.problem.epsilon
         return self.goal is Objective.MARGIN and solution.margin > most
 
     def solve(
@@ -270,17 +276,17 @@ class Search:
             prices.append(np.asarray(cost / max(abs(solution.cost), 1e-300)))
         return prices
 
-    def hold(self, solution: Solution) -> Solution:
+    def enforce_between(self, solution: Solution) -> Solution:
         """Go on from a solution until limits hold between points too."""
         refined, first = 0, solution.cost
         limits = [Limits.none(stage) for stage in solution.stages]
         for _ in range(ROUNDS):
             motions = make_motions(solution.stages, self.scheme)
-            looks = [
+            checks = [
                 check_between(stage, motion)
                 for stage, motion in zip(solution.stages, motions, strict=True)
             ]
-            monitoring = monitor_missed(solution.stages, looks)
+            monitoring = monitor_missed(solution.stages, checks)
             if monitoring is not None:
                 solution = self.solve(monitoring, solution)
                 if not solution.success:
@@ -288,8 +294,8 @@ class Search:
                 limits = [Limits.none(stage) for stage in solution.stages]
                 continue
             misses = [
-                find_misses(stage, look, self.problem.epsilon, solution.margin)
-                for stage, look in zip(solution.stages, looks, strict=True)
+                find_misses(stage, check, self.problem.epsilon, solution.margin)
+                for stage, check in zip(solution.stages, checks, strict=True)
             ]
             worst = max(miss.worst for miss in misses)
             prices = self.price_misses(solution, misses)
