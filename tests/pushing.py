@@ -11,7 +11,8 @@ import numpy as np
 
 from plane import accelerate, make_formation, make_scene, rotate, stack_rows
 from wholearm.common.arrays import Array
-from wholearm.contacts.formation import Formation, close_finger, place_flush
+from wholearm.contacts.closing import close_finger, place_flush
+from wholearm.contacts.formation import Formation
 from wholearm.problem.definition import Phase, Problem, Until
 from wholearm.results.torque import TorqueProfile
 from wholearm.scene.model import Friction, Scene

@@ -10,8 +10,9 @@ import pytest
 from plane import SQUARE, cross, make_formation, make_scene, rotate
 from pushed import forward
 from wholearm.common.arrays import Array
+from wholearm.contacts.closing import close_finger
 from wholearm.contacts.elemental import Contact, build_features, build_geometry
-from wholearm.contacts.formation import Formation, close_finger
+from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import (

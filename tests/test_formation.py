@@ -19,13 +19,12 @@ from plane import (
 )
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
+from wholearm.contacts.closing import close_finger, place_flush
 from wholearm.contacts.elemental import build_features, parse_contact
 from wholearm.contacts.formation import (
     Formation,
-    close_finger,
     describe,
     find_touching,
-    place_flush,
 )
 from wholearm.problem.definition import Problem
 from wholearm.scene.model import Friction, Scene

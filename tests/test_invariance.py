@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from wholearm.benchmark.invariance import (
+from retelling import (
     RETELLINGS,
     Answer,
     Retelling,

@@ -7,8 +7,8 @@ import pytest
 
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
+from wholearm.contacts.closing import close_fingers, contact_table
 from wholearm.contacts.formation import Formation
-from wholearm.geometry.closing import close_fingers, contact_table
 from wholearm.mapping.borders import NOWHERE, flush_track, label_cells
 from wholearm.mapping.legs import split_leg
 from wholearm.mapping.nearby import tolerance

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wholearm.benchmark.invariance import Units, in_units
+from retelling import Units, in_units
 from wholearm.benchmark.stress.scenes import random_scene
 from wholearm.common.errors import InputError
 from wholearm.geometry.path_guess import load

@@ -10,7 +10,8 @@ import pytest
 from plane import convex_polygon, make_scene
 from pushing import evaluate, linear
 from stepping import march
-from wholearm.contacts.formation import Formation, close_finger, find_touching
+from wholearm.contacts.closing import close_finger
+from wholearm.contacts.formation import Formation, find_touching
 from wholearm.problem.definition import Phase, Problem, Until
 from wholearm.results.torque import TorqueProfile
 from wholearm.scene.model import Friction

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 from plane import make_formation, make_scene, measure_slip, place_corners, unbalance
 from tipping import POINTS, box, constant, falling, ramp, roll, tip, tipped
 from wholearm.common.arrays import Array
-from wholearm.contacts.formation import close_finger, place_flush
+from wholearm.contacts.closing import close_finger, place_flush
 from wholearm.mechanics.dynamics import energy
 from wholearm.problem.definition import End, Phase, Problem, Until
 from wholearm.results.trajectory import Samples

@@ -23,8 +23,9 @@ from plane import (
 from tipping import roll, tip
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
+from wholearm.contacts.closing import close_finger, place_flush
 from wholearm.contacts.elemental import Contact
-from wholearm.contacts.formation import Formation, close_finger, find_touching, place_flush
+from wholearm.contacts.formation import Formation, find_touching
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_curve, trace_phases
 from wholearm.mechanics.metric import metric_weights

@@ -10,8 +10,9 @@ from scipy.integrate import quad
 
 from plane import make_scene, rotate
 from wholearm.common.arrays import Array
+from wholearm.contacts.closing import close_finger, place_flush
 from wholearm.contacts.elemental import parse_contact
-from wholearm.contacts.formation import Formation, close_finger, find_touching, place_flush
+from wholearm.contacts.formation import Formation, find_touching
 from wholearm.problem.definition import End, Phase, Problem, Until
 from wholearm.scene.model import Friction, Scene
 

@@ -17,7 +17,6 @@ theta_1,
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,9 +27,8 @@ import numpy as np
 
 from ..common.arrays import Array, Expression
 from ..common.batch import Batch
-from ..common.errors import InputError
 from ..common.sharing import Keeper, Store, exclusive, kept_property
-from ..scene.model import Finger, Scene
+from ..scene.model import Scene
 from .elemental import (
     Contact,
     GapLimit,
@@ -226,62 +224,6 @@ class Formation(Keeper):
         return np.asarray(function(z.T).full()[0])
 
 
-def place_flush(scene: Scene, edge: int, x: float) -> Array:
-    """Pose q with `edge` on the palm and the centroid at `x`, shape (3,) [m, m, rad]."""
-    phi = scene.polygon.flush_angle(edge)
-    height = -_rotate(phi, scene.polygon.vertices[edge])[1]
-    return np.array([x, height, phi])
-
-
-def close_finger(scene: Scene, q: Array, finger: int) -> float:
-    """Joint angle at which a finger, closing from outside, first touches the object at `q` [rad].
-
-    Raises
-    ------
-    InputError
-        If the finger reaches no part of the object, or its joint is in the object or too near.
-    """
-    link = scene.fingers[finger]
-    sign = 1.0 if finger == 0 else -1.0
-    base = np.asarray(link.base)
-    corners = q[:2] + np.array([_rotate(q[2], v) for v in scene.polygon.vertices]) - base
-    if _distance_from_origin(corners) <= link.radius or _hangs_into(link, corners):
-        raise InputError(
-            "",
-            f"fingers.{finger + 1}.base",
-            f"{base.tolist()} is inside the object or nearer to it than the link's radius, "
-            "or right above it",
-        )
-    angles: list[float] = []
-    for corner in corners:
-        distance, bearing = math.hypot(*corner), math.atan2(corner[1], corner[0])
-        run = math.sqrt(distance**2 - link.radius**2)
-        if run <= link.length:
-            angles.append(bearing - sign * math.asin(link.radius / distance))
-        else:
-            reach = (distance**2 + link.length**2 - link.radius**2) / (2 * distance * link.length)
-            if reach <= 1:
-                angles.append(bearing - sign * math.acos(reach))
-    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        along = (end - start) / math.hypot(*(end - start))
-        outward = np.array([along[1], -along[0]])
-        offset = (link.radius + outward @ start) / link.length
-        if abs(offset) <= 1:
-            heading = math.atan2(outward[1], outward[0])
-            for angle in (heading - math.acos(offset), heading + math.acos(offset)):
-                tip = link.length * np.array([math.cos(angle), math.sin(angle)])
-                if 0 <= along @ (tip - start) <= along @ (end - start):
-                    angles.append(angle)
-    if not angles:
-        raise InputError("", "start", f"finger {finger + 1} is too short to reach the object")
-    # A closing finger sweeps from pointing outwards and down, so angles count from there.
-    outside = -math.pi / 2
-    swept = [
-        (sign * (a - (outside if finger == 0 else math.pi - outside))) % math.tau for a in angles
-    ]
-    return (outside if finger == 0 else math.pi - outside) + sign * min(swept)
-
-
 @exclusive
 def find_touching(scene: Scene, z: Array) -> tuple[Contact, ...]:
     """Return the contacts that touch at `z`, in the order palm, finger 1, finger 2."""
@@ -304,31 +246,6 @@ _CLEARANCES = Store(_build_clearances, lambda scene: scene.shape)
 def describe(contacts: Sequence[Contact]) -> str:
     """Names of the contacts in one line."""
     return " ".join(sorted(contact.name for contact in contacts)) or "nothing"
-
-
-def _hangs_into(link: Finger, corners: Array) -> bool:
-    """Whether a link that points down, from where it closes, overlaps the object."""
-    hanging = np.array([0.0, -link.length])
-    for (x, y), (x_after, y_after) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        if abs(x) < link.radius and -link.length < y < 0:
-            return True
-        if x * x_after < 0 and -link.length < y - x * (y_after - y) / (x_after - x) < 0:
-            return True
-    return _distance_from_origin(corners - hanging) < link.radius
-
-
-def _distance_from_origin(corners: Array) -> float:
-    """Distance of a convex anticlockwise polygon from the origin, zero when it is inside."""
-    runs = np.roll(corners, -1, axis=0) - corners
-    if (corners[:, 0] * runs[:, 1] >= corners[:, 1] * runs[:, 0]).all():
-        return 0.0
-    part = np.clip(-(corners * runs).sum(axis=1) / (runs**2).sum(axis=1), 0.0, 1.0)
-    return float(np.hypot(*(corners + part[:, None] * runs).T).min())
-
-
-def _rotate(angle: float, vector: Array) -> Array:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
 
 
 def _build_function(formation: Formation) -> Expression:

@@ -19,8 +19,8 @@ from scipy import ndimage
 
 from ..common.arrays import Array
 from ..common.sharing import exclusive
+from ..contacts.closing import Flags, Numbers
 from ..contacts.elemental import Contact
-from ..geometry.closing import Flags, Numbers
 from ..mapping.formation_map import CROSSED, Border, FormationMap
 from ..mapping.route import trace_problem
 from ..results.trajectory import Trajectory

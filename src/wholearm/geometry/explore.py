@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.arrays import Array
+from ..contacts.closing import close_fingers, lower
 from ..contacts.formation import Formation
 from ..mechanics.metric import metric_weights
-from .closing import close_fingers, lower
 
 GRID = (120, 60)
 """Places across x and phi at which a formation is looked at."""

@@ -21,8 +21,7 @@ from itertools import pairwise
 import numpy as np
 
 from ..common.arrays import Array
-from ..contacts.elemental import Contact
-from ..geometry.closing import (
+from ..contacts.closing import (
     Closed,
     Flags,
     Numbers,
@@ -31,6 +30,7 @@ from ..geometry.closing import (
     lower,
     place_corners,
 )
+from ..contacts.elemental import Contact
 from ..scene.model import Scene
 
 SAME_ANGLE, ROUNDING = 1e-7, 1e-11

@@ -14,8 +14,8 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import InputError
 from ..common.sharing import exclusive
+from ..contacts.closing import Flags, Numbers, close_fingers, contact_table, full_formation, lower
 from ..contacts.elemental import Contact
-from ..geometry.closing import Flags, Numbers, close_fingers, contact_table, full_formation, lower
 from ..problem.definition import Problem
 from ..scene.model import Scene
 from .borders import NOWHERE, Piece, Window, label_cells, label_closed, list_tracks, name_contacts

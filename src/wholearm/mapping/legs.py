@@ -8,9 +8,9 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError
+from ..contacts.closing import Numbers, close_fingers, contact_table, describe_obstacle
 from ..contacts.elemental import Contact
 from ..contacts.formation import find_touching
-from ..geometry.closing import Numbers, close_fingers, contact_table, describe_obstacle
 from ..geometry.curve import describe_pose
 from ..scene.model import Scene
 from .borders import Piece, label_cells, name_contacts

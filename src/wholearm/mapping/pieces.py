@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ..common.arrays import Array
-from ..geometry.closing import Flags, Numbers
+from ..contacts.closing import Flags, Numbers
 from .borders import NOWHERE, Piece, Track, Window
 
 PARTS, DIVISIONS = 16, 13

@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..common.arrays import Array
+from ..contacts.closing import Flags, Numbers, full_formation
 from ..contacts.formation import Formation, Kinematics
-from ..geometry.closing import Flags, Numbers, full_formation
 from ..mechanics.dynamics import Directions, force_rows, inverse, reduced_inertia
 from ..mechanics.metric import metric_weights
 from ..scene.model import Scene

@@ -12,8 +12,8 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import InputError
 from ..common.sharing import exclusive
+from ..contacts.closing import close_finger, place_flush
 from ..contacts.elemental import Contact
-from ..contacts.formation import close_finger, place_flush
 from ..geometry.path_guess import guess_phase
 from ..geometry.tracing import trace_phases
 from ..problem.definition import Problem, Until

@@ -17,8 +17,9 @@ from ..common.arrays import Array
 from ..common.errors import InputError, name_source
 from ..common.require import require_number
 from ..common.sharing import exclusive
+from ..contacts.closing import close_finger, place_flush
 from ..contacts.elemental import Contact, parse_contact
-from ..contacts.formation import Formation, close_finger, place_flush
+from ..contacts.formation import Formation
 from ..scene.model import Finger, Friction, Scene
 from ..scene.polygon import Polygon
 from ..scene.ranges import TURN, check_place, check_ranges

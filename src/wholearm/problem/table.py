@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..common.errors import InputError
-from ..contacts.formation import close_finger, place_flush
+from ..contacts.closing import close_finger, place_flush
 from ..scene.model import Scene
 from ..scene.polygon import Polygon
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...common.errors import InputError
+from ...contacts.closing import close_fingers
 from ...contacts.formation import Formation
-from ...geometry.closing import close_fingers
 from ...mapping.route import Stretch, format_route, list_formations
 from ...problem.definition import Phase, Problem
 from ...problem.read import build_problem

@@ -13,7 +13,8 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...common.errors import InputError
-from ...contacts.formation import close_finger, find_touching, place_flush
+from ...contacts.closing import close_finger, place_flush
+from ...contacts.formation import find_touching
 from ...mapping.borders import NOWHERE, Piece, Window, flush_track, label_cells, palm_track
 from ...mapping.nearby import tolerance
 from ...mapping.pieces import cut

@@ -24,7 +24,7 @@ from scipy.optimize import linprog
 from scipy.sparse import coo_array
 
 from ...common.arrays import Array
-from ...geometry.closing import Numbers
+from ...contacts.closing import Numbers
 from ...problem.definition import Phase
 from ...scene.model import Scene
 from .newton import Touch, locate

@@ -1,8 +1,7 @@
 """Closing palm and fingers on the object at many poses (x, phi) at once.
 
 With the object lowered until it touches the palm and each finger closed until it touches the
-object, a configuration is a function of (x, phi) alone. `contacts.formation.close_finger` does the
-same for one finger at one pose.
+object, a configuration is a function of (x, phi) alone.
 
 Contacts are counted as in `contact_table`: those with the palm, with finger 1 and with finger 2.
 """
@@ -16,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
-from ..contacts.elemental import Contact, candidate_contacts
-from ..contacts.formation import Formation
-from ..contacts.links import FINGERS_TOUCH, evaluate_finger_gap
+from ..common.errors import InputError
 from ..scene.model import Finger, Scene
+from .elemental import Contact, candidate_contacts
+from .formation import Formation
+from .links import FINGERS_TOUCH, evaluate_finger_gap
 
 Numbers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
@@ -96,10 +96,7 @@ def close_fingers(scene: Scene, x: Array, phi: Array) -> Closed:
     touched = np.empty((len(x), 2), dtype=np.int64)
     obstacle = np.zeros((len(x), 2), dtype=np.int64)
     for finger, link in enumerate(scene.fingers):
-        angle, feature = _close_finger(link, finger, corners - np.asarray(link.base))
-        covered = _distance(corners - np.asarray(link.base)) <= link.radius
-        covered |= _hangs_into(link, corners - np.asarray(link.base))
-        obstacle[:, finger] = np.where(covered, JOINT_COVERED, np.where(feature < 0, TOO_SHORT, 0))
+        angle, feature, obstacle[:, finger] = _close_finger(link, finger, corners)
         closed = obstacle[:, finger] == 0
         z[:, 3 + finger] = np.where(closed, angle, np.nan)
         touched[:, finger] = np.where(closed, first_contact(scene, finger) + feature, -1)
@@ -121,8 +118,39 @@ def describe_obstacle(closed: Closed) -> str:
     return text
 
 
-def _close_finger(link: Finger, finger: int, corners: Array) -> tuple[Array, Numbers]:
-    """Angle and first feature (side, edge, arc in the order of candidates) of a closing finger."""
+def place_flush(scene: Scene, edge: int, x: float) -> Array:
+    """Pose q with `edge` on the palm and the centroid at `x`, shape (3,) [m, m, rad]."""
+    phi = np.array([scene.polygon.flush_angle(edge)])
+    return np.array([x, lower(scene, phi)[0][0], phi[0]])
+
+
+def close_finger(scene: Scene, q: Array, finger: int) -> float:
+    """Joint angle at which a finger, closing from outside, first touches the object at `q` [rad].
+
+    Raises
+    ------
+    InputError
+        If the finger reaches no part of the object, or its joint is in the object or too near.
+    """
+    link = scene.fingers[finger]
+    corners = place_corners(scene, *np.asarray(q)[:3, None])
+    angle, _, (obstacle,) = _close_finger(link, finger, corners)
+    if obstacle == JOINT_COVERED:
+        where = "is inside the object or nearer to it than the link's radius, or right above it"
+        raise InputError(
+            "", f"fingers.{finger + 1}.base", f"{np.asarray(link.base).tolist()} {where}"
+        )
+    if obstacle:
+        raise InputError("", "start", f"finger {finger + 1} is too short to reach the object")
+    return float(angle[0])
+
+
+def _close_finger(link: Finger, finger: int, corners: Array) -> tuple[Array, Numbers, Numbers]:
+    """Angle and first feature (side, edge, arc in the order of candidates) of a closing finger.
+
+    And 0, or why it cannot close; `corners` as of `place_corners`.
+    """
+    corners = corners - np.asarray(link.base)
     sign = 1.0 if finger == 0 else -1.0
     outside = -np.pi / 2 if finger == 0 else np.pi + np.pi / 2
     length, radius = link.length, link.radius
@@ -158,7 +186,9 @@ def _close_finger(link: Finger, finger: int, corners: Array) -> tuple[Array, Num
     least = swept[np.arange(len(swept)), feature]
     reached = np.isfinite(least)
     angle = outside + sign * np.where(reached, least, 0.0)
-    return angle, np.where(reached, feature, -1)
+    covered = (_distance(corners) <= link.radius) | _hangs_into(link, corners)
+    obstacle = np.where(covered, JOINT_COVERED, np.where(reached, 0, TOO_SHORT))
+    return angle, np.where(reached, feature, -1), obstacle
 
 
 def _hangs_into(link: Finger, corners: Array) -> Flags:

@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..common.arrays import Array
-from ..contacts.elemental import Contact
-from ..planning.options import Objective
-from ..planning.plan import solve
-from ..problem.definition import Problem
-from ..problem.read import ROLLING, build_problem
-from ..results.trajectory import Trajectory
+from wholearm.common.arrays import Array
+from wholearm.contacts.elemental import Contact
+from wholearm.planning.options import Objective
+from wholearm.planning.plan import solve
+from wholearm.problem.definition import Problem
+from wholearm.problem.read import ROLLING, build_problem
+from wholearm.results.trajectory import Trajectory
 
 Table = Mapping[str, Any]
 _NAME = re.compile(r"([ve])(\d+)-(palm|finger|tip)([12]?)")
