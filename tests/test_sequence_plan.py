@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from plane import measure_gaps, measure_slip, unbalance
-from shipped import IMPACTS, plan_of, problem_of
+from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError
 from wholearm.mechanics.impact import compute_impact
@@ -201,3 +201,27 @@ def test_the_torque_steps_at_an_impact(plans: dict[str, Trajectory]) -> None:
         np.testing.assert_allclose(around, [end.tau[0], begin.tau[0]], rtol=0, atol=1e-4)
         assert start in trajectory.torque.breaks
         assert not np.allclose(unit(end.z_dot[0]), unit(begin.z_dot[0]), atol=1e-2)
+
+
+def slide(*ends: float) -> Problem:
+    """The heptagon slides to x [m] and on to others, joined smoothly."""
+    table = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
+    contacts = table["phases"][0]["contacts"]
+    phases = [{"contacts": contacts, "until": {"x": x}, "end": "smooth"} for x in ends]
+    return build_problem(table | {"phases": [*phases[:-1], phases[-1] | {"end": "rest"}]})
+
+
+def test_a_slide_that_goes_on_smoothly_is_as_fast_as_in_one_piece() -> None:
+    whole, parts = solve(slide(0.02)), solve(slide(0.035, 0.02))
+    assert parts.value == pytest.approx(whole.value, rel=1e-4)
+    end, start = ends_of(parts.trajectory, 0)
+    np.testing.assert_allclose(start.z_dot, end.z_dot, rtol=0, atol=1e-12)
+    assert np.abs(end.z_dot).max() > 0.01
+    assert parts.transitions == ()
+
+
+def test_a_slide_that_turns_back_smoothly_stops_there() -> None:
+    there, back = solve(slide(0.02)), solve(slide(0.02, 0.03))
+    assert back.phases[0].value == pytest.approx(there.value, rel=1e-6)
+    end, start = ends_of(back.trajectory, 0)
+    assert max(np.abs(end.z_dot).max(), np.abs(start.z_dot).max()) < 1e-9

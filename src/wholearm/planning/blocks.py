@@ -1,7 +1,7 @@
 """Blocks of phases that are planned together, and how they are planned one after the other.
 
 Phases joined at rest are problems of their own; those joined smoothly or by impacts are one. Phases
-with one freedom are planned along their curves, unless they pass smoothly into another, and
+with one freedom are planned along their curves, unless they are joined to others with more, and
 anything else in the time domain.
 """
 
@@ -194,9 +194,16 @@ def refine_block(
 
 def runs_along_curves(block: Sequence[Phase], options: PlanOptions) -> bool:
     """Whether phases are planned along their curves: a single one, or several that slide."""
-    if options.transcription != "auto" or not all(map(runs_on_curve, block)):
+    if options.transcription != "auto":
         return False
-    return len(block) == 1 or not any(phase.formation.rolling for phase in block)
+    if len(block) == 1:
+        return runs_on_curve(block[0])
+    return all(
+        phase.formation.n_constraints == 4
+        and not phase.formation.rolling
+        and not phase.until.is_release
+        for phase in block
+    )
 
 
 def plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str], None]) -> Planning:

@@ -1,10 +1,11 @@
-"""One-freedom phases that impacts join: curves that are run through without a stop.
+"""One-freedom phases that impacts or smooth ends join: curves run through without a stop.
 
 At the end of a curve the velocity is z_s s', and the impact makes it a multiple of the next curve's
 tangent, whatever the speed: v+ = ratio s' z_s. So whether an impact is possible is known before
 anything is planned, and with a parameter that runs along the next curve at the pace of `ratio` the
 speed is continuous: the curves are planned as one. Where an impact is not possible the motion has
-to stop, and the chain ends.
+to stop, and the chain ends. A smooth end is passed at speed where the next curve goes on along the
+same tangent.
 """
 
 from __future__ import annotations
@@ -17,13 +18,16 @@ import numpy as np
 from ...geometry.curve import Curve
 from ...mechanics.impact import Impact, compute_impact
 from ...mechanics.metric import metric_weights
-from ...problem.definition import Phase
+from ...problem.definition import End, Phase
 from ..impacts import PER_SPEED
+
+BEND = 1e-6
+"""Largest cosine short of one at which a curve goes on along the tangent of the one before."""
 
 
 @dataclass(frozen=True, eq=False)
 class CurveImpact:
-    """An impact between two curves, for unit speed along the first one.
+    """An impact between two curves, or none if they join smoothly, for unit speed along the first.
 
     Attributes
     ----------
@@ -55,15 +59,20 @@ class CurveImpact:
 def compute_curve_impact(phase: Phase, before: Curve, after: Curve) -> CurveImpact:
     """The impact at the end of a phase, from its curve to the next one's."""
     v = before.evaluate(np.array([before.length])).z_s[0] / before.pace
-    impact = compute_impact(before.formation, after.formation, after.start, v)
     heading = after.evaluate(np.zeros(1)).z_s[0] / after.pace
-    ratio = float(impact.v * metric_weights(after.formation.scene) @ heading)
+    metric = metric_weights(after.formation.scene)
+    if phase.end is End.SMOOTH:
+        none = np.zeros(after.formation.n_contacts)
+        impact = Impact(after.formation, v, none, none, ())
+        return CurveImpact(phase, impact, float(v * metric @ heading > 1 - BEND))
+    impact = compute_impact(before.formation, after.formation, after.start, v)
+    ratio = float(impact.v * metric @ heading)
     return CurveImpact(phase, impact, ratio)
 
 
 @dataclass(frozen=True, eq=False)
 class ImpactSequence:
-    """One-freedom phases, each but the last ended by an impact.
+    """One-freedom phases, each but the last ended by an impact or smoothly.
 
     Attributes
     ----------

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from ...common.arrays import Array
 from ...mechanics.metric import measure_speed
+from ...problem.definition import End
 from ...results.trajectory import Motion
 from ..impacts import BlockImpact
 from ..options import PlanOptions
@@ -54,6 +55,8 @@ def list_impacts(sequence: ImpactSequence, plans: Sequence[PhasePlan[Motion]]) -
     """The impacts of a sequence, with the speeds that its plans pass them at."""
     found = []
     for k, own in enumerate(sequence.impacts):
+        if own.phase.end is not End.IMPACT:
+            continue
         scene = own.phase.formation.scene
         speed = measure_speed(scene, end_of(plans[k])[1]) if own.possible else 0.0
         found.append(BlockImpact(k, own.impact, own.ratio, own.reason, speed))
