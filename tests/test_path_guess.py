@@ -13,7 +13,7 @@ from wholearm.common.errors import InputError
 from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
-from wholearm.geometry.explore import close_contacts
+from wholearm.geometry.explore import close_all, close_contacts
 from wholearm.geometry.path_guess import (
     POINTS,
     RELEASE_AT,
@@ -179,6 +179,16 @@ def test_closing_moves_as_little_as_possible(landing: Problem, released: Array) 
         # The step is normal to what the contacts leave free, but for curvature.
         moved = (z - away) * scale
         assert np.abs(free @ moved).max() < 1e-2 * np.linalg.norm(moved)
+
+
+def test_configurations_are_closed_side_by_side(landing: Problem, released: Array) -> None:
+    formation, phi = landing.phases[5].formation, released[2] - 0.02
+    away = released + np.array([[0.0], [0.1], [1e3]]) * released[0] * np.eye(5)[0]
+    for z, start in zip(close_all(formation, away, np.zeros(0), (2, phi)), away, strict=True):
+        alone = close_contacts(formation, start, np.zeros(0), (2, phi))
+        assert alone is not None and np.abs(z - alone).max() < 1e-12 * (1 + np.abs(z).max())
+        assert z[2] == pytest.approx(phi, abs=1e-12)
+    assert np.isnan(close_all(formation, away, np.zeros(0), (1, 1.0))).all()
 
 
 def test_closing_keeps_what_has_rolled_by(landing: Problem, released: Array) -> None:

@@ -14,6 +14,7 @@ from wholearm.planning.time_domain.refinement import (
     DEFECT,
     adopt,
     bisect_intervals,
+    cap_halvings,
     count_halvings,
     monitor_violated,
     settle,
@@ -103,3 +104,11 @@ def test_halving_by_nothing_keeps_every_table(stages: list[Stage]) -> None:
     for before, after in zip(stages, finer, strict=True):
         for one, other in zip(tables(before.guess), tables(after.guess), strict=True):
             np.testing.assert_array_equal(one, other)
+
+
+def test_intervals_are_quartered_only_where_that_makes_few() -> None:
+    times = [np.array([2, 0, 1]), np.array([2, 2])]
+    for wanted, own in zip(times, cap_halvings(times, 15), strict=True):
+        assert (wanted == own).all()
+    first, second = cap_halvings(times, 14)
+    assert first.tolist() == [1, 0, 1] and second.tolist() == [1, 1]

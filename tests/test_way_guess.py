@@ -100,6 +100,9 @@ def test_a_brisk_motion_keeps_half_the_margin_and_ends_at_rest() -> None:
     assert speeds[[0, -1]].max() < speeds.max()
     # No faster than gravity and the torques allow; no slower than a few falls over its length.
     length = sum(part.length for part in best.stretches)
+    assert pace.forces.shape == (len(pace.t) - 1, problem.phases[0].formation.n_constraints)
+    least = problem.epsilon / problem.scene.scales.force
+    assert pace.forces[:, : problem.phases[0].formation.n_contacts].min() > least - 1e-9
     assert 0.1 < pace.t[-1] / np.sqrt(length / problem.scene.gravity) < 20.0
 
 

@@ -119,12 +119,29 @@ def close_contacts(
     fixed: tuple[int, float] | None = None,
     active: tuple[int, ...] = (),
 ) -> Array | None:
-    """Nearest configuration with all contacts closed, by Gauss-Newton; None if there is none.
+    """Nearest configuration with all contacts closed, shape (5,); None if there is none.
+
+    Parameters are those of `close_all`, but for `z`, shape (5,).
+    """
+    closed = close_all(formation, z[None], slip, fixed, active)[0]
+    return closed if np.isfinite(closed).all() else None
+
+
+def close_all(
+    formation: Formation,
+    z: Array,
+    slip: Array,
+    fixed: tuple[int, float] | None = None,
+    active: tuple[int, ...] = (),
+) -> Array:
+    """Nearest configurations with all contacts closed, by Gauss-Newton, shape (n, 5).
+
+    Those are NaN to which there is none.
 
     Parameters
     ----------
     formation : Formation
-    z : ndarray, shape (5,)
+    z : ndarray, shape (n, 5)
         Where to start.
     slip : ndarray, shape (R,), [m]
         Slip coordinates that rolling contacts keep.
@@ -139,24 +156,30 @@ def close_contacts(
     if fixed is not None:
         sizes = np.append(sizes, rho if fixed[0] == 0 else 1.0)
     sizes = np.append(sizes, np.full(len(active), rho))
+    found, z, left = np.full(z.shape, np.nan), z.copy(), np.arange(len(z))
     for _ in range(50):
-        kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
-        slipped = formation.evaluate_slip(z[None])[0] - slip
-        residual, rows = np.append(kinematics.C[0], slipped), kinematics.P[0]
+        kinematics = formation.evaluate(z, np.zeros(z.shape))
+        residual = np.hstack([kinematics.C, formation.evaluate_slip(z) - slip])
+        rows = kinematics.P
         if fixed is not None:
-            residual = np.append(residual, z[fixed[0]] - fixed[1])
-            rows = np.vstack([rows, np.eye(5)[fixed[0]]])
+            residual = np.column_stack([residual, z[:, fixed[0]] - fixed[1]])
+            one = np.broadcast_to(np.eye(5)[fixed[0]], (len(z), 1, 5))
+            rows = np.concatenate([rows, one], axis=1)
         if active:
-            residual = np.append(residual, formation.evaluate_limits(z[None])[0, active])
-            around = formation.evaluate_limits(z + np.vstack([steps, -steps]))[:, active]
-            ahead, behind = np.split(around, 2)
-            rows = np.vstack([rows, (ahead - behind).T / (2 * steps.diagonal())])
+            residual = np.hstack([residual, formation.evaluate_limits(z)[:, active]])
+            near = (z[:, None] + np.vstack([steps, -steps])).reshape(-1, 5)
+            around = formation.evaluate_limits(near)[:, active].reshape(len(z), 2, 5, -1)
+            slopes = (around[:, 0] - around[:, 1]) / (2 * steps.diagonal()[:, None])
+            rows = np.concatenate([rows, slopes.swapaxes(1, 2)], axis=1)
         rows, residual = rows / sizes[:, None], residual / sizes
-        lift = (rows / metric).T
-        change = lift @ np.linalg.lstsq(rows @ lift, residual, rcond=1e-12)[0]
+        lift = (rows / metric).swapaxes(1, 2)
+        change = (lift @ np.linalg.pinv(rows @ lift, rcond=1e-12) @ residual[..., None])[..., 0]
         # Long steps overshoot where links turn; a tenth of a radian keeps to one branch.
-        change *= min(1.0, 0.1 / max(np.abs(change[2:]).max(), 1e-12))
-        z = z - change
-        if np.abs(residual).max() < CLOSED:
-            return z
-    return None
+        turned = np.abs(change[:, 2:]).max(axis=1, keepdims=True)
+        z = z - change * np.minimum(1.0, 0.1 / np.maximum(turned, 1e-12))
+        closed = np.abs(residual).max(axis=1) < CLOSED
+        found[left[closed]] = z[closed]
+        z, left = z[~closed], left[~closed]
+        if not len(left):
+            break
+    return found

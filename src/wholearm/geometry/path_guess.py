@@ -17,7 +17,7 @@ from ..mechanics.metric import metric_weights
 from ..problem.definition import Phase, Problem
 from ..problem.read import read_problem
 from .curve import Curve, tangent_basis
-from .explore import Ending, close_contacts, explore, is_inside
+from .explore import Ending, close_all, close_contacts, explore, is_inside
 from .tracing import require_touching, runs_on_curve, trace_phase, trace_phases
 
 POINTS = 25
@@ -267,13 +267,14 @@ def connect(
     bends : (float, float)
         How far it bends to one side in one arc and in two, over its length; with two freedoms.
     """
-    points, slip = [start], formation.evaluate_slip(start[None])[0]
+    slip = formation.evaluate_slip(start[None])[0]
     aside = _find_side(formation, start, goal) if any(bends) else np.zeros(5)
-    for x in np.linspace(0.0, 1.0, POINTS)[1:]:
-        off = bends[0] * np.sin(np.pi * x) + bends[1] * np.sin(2 * np.pi * x)
-        point = close_contacts(formation, start + x * (goal - start) + off * aside, slip)
-        points.append(points[-1] if point is None else point)
-    z = np.array(points)
+    x = np.linspace(0.0, 1.0, POINTS)[1:, None]
+    off = bends[0] * np.sin(np.pi * x) + bends[1] * np.sin(2 * np.pi * x)
+    z = np.vstack([start, close_all(formation, start + x * (goal - start) + off * aside, slip)])
+    # Where contacts do not close, the way waits.
+    last = np.maximum.accumulate(np.where(np.isfinite(z).all(axis=1), np.arange(len(z)), 0))
+    z = z[last]
     speed = np.gradient(z, axis=0)
     slip = np.einsum("nij,nj->ni", formation.evaluate(z, speed).A_t, speed)
     rates = np.hstack([slip, speed[:, 3:]]).sum(axis=0)

@@ -11,7 +11,7 @@ from .stage import Stage
 
 MOST = 12
 """Most sequences of modes to try from one start."""
-PATIENCE = 60
+PATIENCE = 48
 """Most iterations of one of them."""
 STRETCH = 1e-3
 """What it costs all intervals to change their durations by as much as they are, over the cost: of

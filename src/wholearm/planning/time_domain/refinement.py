@@ -60,6 +60,12 @@ def count_halvings(prices: Array, defects: Array, scheme: Scheme) -> NDArray[np.
     return np.asarray(np.clip(np.ceil(times), 0, AT_ONCE), dtype=np.int64)
 
 
+def cap_halvings(times: list[NDArray[np.int64]], most: int) -> list[NDArray[np.int64]]:
+    """How often to halve intervals: once at most, if there would be more than `most` of them."""
+    wanted = sum(int((2**mine).sum()) for mine in times)
+    return times if wanted <= most else [np.minimum(mine, 1) for mine in times]
+
+
 def settle(stages: Sequence[Stage]) -> list[Stage]:
     """Stages whose intervals keep the shares of the duration that they have."""
     return [replace(stage, adapts=0.0) if stage.adapts else stage for stage in stages]

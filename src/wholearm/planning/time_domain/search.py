@@ -21,7 +21,14 @@ from .limits import Target, price_sides
 from .motion import make_motions
 from .nlp import TimeNLP, bound_unknowns, build_time_nlp
 from .own_units import in_own_units, scale_options, unit_lengths, unit_of
-from .refinement import adopt, bisect_intervals, count_halvings, monitor_violated, settle
+from .refinement import (
+    adopt,
+    bisect_intervals,
+    cap_halvings,
+    count_halvings,
+    monitor_violated,
+    settle,
+)
 from .stage import Stage
 from .warm_start import FIRST_SIZE, Multipliers, carry_multipliers, first_multipliers
 
@@ -33,7 +40,7 @@ MOST = 64
 """Intervals of each phase from which on none is halved."""
 _PATIENCE = 80
 """Most iterations of one solve on finer intervals, that starts from a solution."""
-_ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 60}
+_ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 40}
 """Most iterations of one solve, if not 150."""
 _DEARER = 0.2
 """How much dearer, relatively, a plan may get by tightening before it counts as lost."""
@@ -299,12 +306,15 @@ class Search:
             ]
             worst = max(miss.worst for miss in misses)
             prices = self.price_misses(solution, misses)
-            times = [
-                count_halvings(price, motion.defects, self.scheme)
-                for price, motion in zip(prices, motions, strict=True)
-            ]
-            phases = len({stage.phase for stage in solution.stages})
-            few = sum(stage.intervals for stage in solution.stages) < MOST * phases
+            most = MOST * len({stage.phase for stage in solution.stages})
+            times = cap_halvings(
+                [
+                    count_halvings(price, motion.defects, self.scheme)
+                    for price, motion in zip(prices, motions, strict=True)
+                ],
+                most,
+            )
+            few = sum(stage.intervals for stage in solution.stages) < most
             if few and refined < REFINEMENTS and any(mine.any() for mine in times):
                 refined += 1
                 finer = self.solve(

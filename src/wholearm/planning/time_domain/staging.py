@@ -147,8 +147,15 @@ def _guess(
         )
         return z, slope * rate, slope * gain + bend * rate**2
 
-    z, v, a = follow(breaks[:-1, None] + scheme.points / count)
-    forces, tau = _balance(outline, z, v, a)
+    at = breaks[:-1, None] + scheme.points / count
+    z, v, a = follow(at)
+    if pace is None:
+        forces = _press(outline, z, v, a)
+    else:
+        passed = clock[0] + at * (clock[1] - clock[0])
+        own = np.searchsorted(pace.t / pace.t[-1], passed) - 1
+        forces = pace.forces[np.clip(own, 0, len(pace.forces) - 1)]
+    tau = _balance(outline, z, v, a, forces)
     return StagePoints(
         total * (clock[1] - clock[0]),
         np.full(count, 1 / count),
@@ -179,18 +186,21 @@ def _run_at(pace: Pace, passed: Array) -> tuple[Array, Array, Array]:
     return place, rate, gain
 
 
-def _balance(outline: PathGuess, z: Array, v: Array, a: Array) -> tuple[Array, Array]:
-    """Forces of a motion, shape (K, d, n_c + R), and torques, shape (K, 2, 2), within limits.
+def _lack(outline: PathGuess, z: Array, v: Array, a: Array) -> tuple[Array, Array]:
+    """What contact forces c and torques have to do, G^T c + S tau: rows of G, and the sum."""
+    scene, flat = outline.formation.scene, [table.reshape(-1, 5) for table in (z, v, a)]
+    G = force_rows(outline.formation, outline.formation.evaluate(*flat[:2]), outline.directions)
+    applied = scene.applied_force - scene.dry * np.append(np.zeros(3), outline.directions.sigma)
+    return G, scene.mass_diagonal * flat[2] + scene.viscous * flat[1] - applied
+
+
+def _press(outline: PathGuess, z: Array, v: Array, a: Array) -> Array:
+    """Forces of a motion, shape (K, d, n_c + R).
 
     The object's equations of motion leave forces of which the ones nearest to a light press are
-    taken; the joints' then give the torques.
+    taken.
     """
-    formation, scene = outline.formation, outline.formation.scene
-    flat = [table.reshape(-1, 5) for table in (z, v, a)]
-    sigma = outline.directions.sigma
-    G = force_rows(formation, formation.evaluate(*flat[:2]), outline.directions)
-    applied = scene.applied_force - scene.dry * np.append(np.zeros(3), sigma)
-    needed = scene.mass_diagonal * flat[2] + scene.viscous * flat[1] - applied
+    formation, (G, needed) = outline.formation, _lack(outline, z, v, a)
     light = np.zeros(formation.n_constraints)
     light[: formation.n_contacts] = PRESS
     forces = []
@@ -199,11 +209,16 @@ def _balance(outline: PathGuess, z: Array, v: Array, a: Array) -> tuple[Array, A
         forces.append(light + np.linalg.lstsq(rows.T, missing, rcond=1e-6)[0])
     c = np.array(forces)
     c[:, : formation.n_contacts] = np.clip(c[:, : formation.n_contacts], 0.1 * PRESS, 20.0)
+    return c.reshape(*z.shape[:2], -1)
+
+
+def _balance(outline: PathGuess, z: Array, v: Array, a: Array, forces: Array) -> Array:
+    """Torques of a motion with contact forces, shape (K, 2, 2), within limits."""
+    limit, (G, needed) = outline.formation.scene.torque_limit, _lack(outline, z, v, a)
+    c = forces.reshape(len(G), -1)
     tau = needed[:, 3:] - np.einsum("nij,ni->nj", G[:, :, 3:], c)
-    tau = np.clip(tau, -0.9 * scene.torque_limit, 0.9 * scene.torque_limit)
-    count, degree = z.shape[:2]
-    tau = tau.reshape(count, degree, 2)
-    return c.reshape(count, degree, -1), np.stack([tau[:, 0], tau[:, -1]], axis=1)
+    tau = np.clip(tau, -0.9 * limit, 0.9 * limit).reshape(*z.shape[:2], 2)
+    return np.stack([tau[:, 0], tau[:, -1]], axis=1)
 
 
 def _go_straight(phase: Phase, nearest: list[PathGuess], before: PathGuess) -> list[PathGuess]:

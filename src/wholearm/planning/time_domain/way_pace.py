@@ -42,10 +42,13 @@ class Pace(NamedTuple):
     t : ndarray, shape (n,), [s]
     s : ndarray, shape (n,)
         Share of the length.
+    forces : ndarray, shape (n - 1, n_c + R)
+        In between, over the weight of the object.
     """
 
     t: Array
     s: Array
+    forces: Array
 
 
 class WayForces:
@@ -118,7 +121,8 @@ class WayForces:
         v = np.sqrt(self.square * np.maximum(x[: len(self.top)], 0.0))
         steps = 2 * self.runs / np.maximum(v[1:] + v[:-1], np.sqrt(LEAST * self.square))
         length = np.append(0.0, np.cumsum(self.runs))
-        return Pace(np.append(0.0, np.cumsum(steps)), length / length[-1])
+        forces = x[len(self.top) : -1].reshape(len(steps), -1)
+        return Pace(np.append(0.0, np.cumsum(steps)), length / length[-1], forces)
 
     def _maximise(self, gain: Array, least: float) -> Array | None:
         from scipy.optimize import linprog
