@@ -9,7 +9,7 @@ from thrown import shove
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain import plan as time_plan
-from wholearm.planning.time_domain.attempts import NEAREST, PACES, Attempt, Attempts
+from wholearm.planning.time_domain.attempts import FALLS, NEAREST, Attempt, Attempts
 from wholearm.planning.time_domain.plan import plan_phases
 from wholearm.planning.time_domain.search import Search, Solution
 from wholearm.problem.definition import Problem
@@ -32,7 +32,7 @@ def test_a_single_phase_is_tried_along_ways_and_at_several_paces() -> None:
     assert at <= len(attempts.ways)
     # The same guess again on finer intervals counts as another, and the first one is not repeated.
     paces = [name for name in names[at + 1 :] if name.startswith(f"{NEAREST} at ")]
-    assert len(paces) == len(names) - at - 1 == 2 * len(PACES) - 1
+    assert len(paces) == len(names) - at - 1 == 2 * len(FALLS) - 1
     for attempt in found:
         halved = 12 / 2**attempt.halvings
         assert all(stage.intervals <= halved + 1e-9 for stage in attempt.stages)

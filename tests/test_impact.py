@@ -318,13 +318,15 @@ def test_paces_make_the_speed_continuous(rough: ImpactSequence) -> None:
     """A velocity of z_s on one curve becomes z_s on the next."""
     part = rough.split()[0]
     continuous_curves = part.continuous_curves
-    assert continuous_curves[0].pace == 1.0
+    assert continuous_curves[0].speed_ratio == 1.0
     for join, before, after in zip(
         part.impacts, continuous_curves[:-1], continuous_curves[1:], strict=True
     ):
         v = before.evaluate(np.array([before.length])).z_s[0]
         v_after = after.evaluate(np.zeros(1)).z_s[0]
-        check_momenta(replace(join.impact, v=v_after, p=before.pace * join.impact.p), before.end, v)
+        check_momenta(
+            replace(join.impact, v=v_after, p=before.speed_ratio * join.impact.p), before.end, v
+        )
 
 
 def test_backwards_is_not_possible(rough: ImpactSequence) -> None:

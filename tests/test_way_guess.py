@@ -13,7 +13,7 @@ from wholearm.benchmark.stress.tracing import weights
 from wholearm.geometry.path_guess import connect, guess_phase
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.time_domain.plan import plan_phases
-from wholearm.planning.time_domain.way_guess import AMPLE, list_goals, list_ways, split_way
+from wholearm.planning.time_domain.way_guess import SURE, list_goals, list_ways, split_way
 from wholearm.planning.time_domain.way_pace import WayForces
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem, read_problem
@@ -77,7 +77,7 @@ def test_margins_are_those_of_newton_and_euler() -> None:
     problem = tipping()
     (phase,) = problem.phases
     best, *_ = list_ways(problem, phase, problem.start, 3)
-    assert best.margin > AMPLE
+    assert best.margin > SURE
     part = best.stretches[0]
     s = np.append(0.0, np.cumsum(np.sqrt(np.diff(part.z, axis=0) ** 2 @ weights(problem.scene))))
     course = s, part.z, np.gradient(part.z, s, axis=0, edge_order=2)

@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -120,27 +121,32 @@ def measure_planner(problem: Problem) -> list[Row]:
     fine = _plan_times(problem, curves, FINE)
     rows = []
     for intervals in INTERVALS:
-        seconds = []
-        for _ in range(REPEATS):
-            build_path_nlp.cache_clear()
-            started = time.perf_counter()
-            times = _plan_times(problem, curves, intervals)
-            seconds.append(time.perf_counter() - started)
+        plan_all = partial(_plan_times, problem, curves, intervals)
+        median, times = _time_runs(plan_all, build_path_nlp.cache_clear)
         trajectory = solve(problem, intervals=intervals).trajectory
         ends = trajectory.phase_starts[1:]
         simulation = simulate(problem, trajectory.torque, tolerance=1e-11, times=ends)
         missed = 0.0
         for index, end in enumerate(ends):
-            planned = trajectory.motions[index].evaluate(
-                np.array([end]) - ends[index - 1] * (index > 0)
-            )
+            start = ends[index - 1] if index else 0.0
+            planned = trajectory.motions[index].evaluate(np.array([end - start]))
             nearest = np.flatnonzero(simulation.phase == index)[-1]
             missed = max(missed, float(np.abs(planned.z[0] - simulation.z[nearest]).max()))
         error = float(np.abs(times / fine - 1).max())
-        median = statistics.median(seconds)
         rows.append(Row("planner: phase time", "path NLP", str(intervals), median, error))
         rows.append(Row("planner: simulated end", "path NLP", str(intervals), median, missed))
     return rows
+
+
+def _time_runs(run: Callable[[], Any], before: Callable[[], object] = int) -> tuple[float, Any]:
+    """Median of the seconds of some runs, and what the last one gave."""
+    seconds, result = [], None
+    for _ in range(REPEATS):
+        before()
+        started = time.perf_counter()
+        result = run()
+        seconds.append(time.perf_counter() - started)
+    return statistics.median(seconds), result
 
 
 def _plan_times(problem: Problem, curves: Sequence[Curve], intervals: int) -> Array:
@@ -182,20 +188,17 @@ def _replay(
     The error is the largest of any z or z' shortly before the end of a stretch between reversals.
     """
     marks = _find_marks(motions)
-    looks = marks[:-1] + 0.95 * np.diff(marks)
-    times = np.sort(np.concatenate([marks, looks]))
+    checks = marks[:-1] + 0.95 * np.diff(marks)
+    times = np.sort(np.concatenate([marks, checks]))
     exact = simulate(problem, torque, tolerance=FINEST, times=times)
-    wanted, starts = _states_at(exact, looks), _states_at(exact, marks[:-1])
+    wanted, starts = _states_at(exact, checks), _states_at(exact, marks[:-1])
     stretches = [(i, part) for i, motion in enumerate(motions) for part in motion.curve.segments]
     rows = []
     for tolerance in tolerances:
-        seconds = []
-        for _ in range(REPEATS):
-            started = time.perf_counter()
-            run = simulate(problem, torque, tolerance=tolerance, times=looks)
-            seconds.append(time.perf_counter() - started)
-        error = float(np.abs(_states_at(run, looks) - wanted).max())
-        median = statistics.median(seconds)
+        median, run = _time_runs(
+            partial(simulate, problem, torque, tolerance=tolerance, times=checks)
+        )
+        error = float(np.abs(_states_at(run, checks) - wanted).max())
         rows.append(Row(study, "wholearm", f"{tolerance:g}", median, error, f"{run.steps} steps"))
     import scipy.integrate  # noqa: F401 -- so that no timing below includes it
 
@@ -211,7 +214,7 @@ def _replay(
                 starts[k, 5:],
                 part.Xi,
                 part.sigma,
-                (marks[k], looks[k]),
+                (marks[k], checks[k]),
                 rtol=tolerance,
                 atol=tolerance,
                 method=method,
@@ -268,9 +271,8 @@ def measure_baseline(problem: Problem) -> list[Row]:
     The error is that of the phase time against a fine solution; a negative one is a time that
     limits do not allow. The note has the least c_n of an open-loop replay of the phase.
     """
-    rows = []
     options, fine = PlanOptions(), PlanOptions(intervals=FINE)
-    ours, theirs = 0.0, 0.0
+    rows, ours, theirs = list[Row](), 0.0, 0.0
     build_path_nlp.cache_clear()
     for phase, curve in zip(problem.phases, trace_phases(problem), strict=True):
         started = time.perf_counter()
@@ -290,8 +292,7 @@ def measure_baseline(problem: Problem) -> list[Row]:
             weakest = min(contact.least for contact in margins)
             note = f"T = {duration:.6f} s, {iterations} iterations, least c_n {weakest:.4f} N"
             rows.append(Row("least time", method, number, seconds, duration / least - 1, note))
-        ours += elapsed
-        theirs += took
+        ours, theirs = ours + elapsed, theirs + took
     note = f"{ours / theirs:.4f} of plain Opti"
     rows.append(Row("least time", "path NLP", "all phases", ours, None, note))
     note = f"{theirs / ours:.0f} x path NLP"
@@ -304,13 +305,8 @@ def measure_parts(problem: Problem) -> list[Row]:
     rows = []
 
     def timed(name: str, run: Callable[[], Any], before: Callable[[], object] = int) -> Any:
-        seconds, result = [], None
-        for _ in range(REPEATS):
-            before()
-            started = time.perf_counter()
-            result = run()
-            seconds.append(time.perf_counter() - started)
-        rows.append(Row("parts", name, "", statistics.median(seconds), None))
+        median, result = _time_runs(run, before)
+        rows.append(Row("parts", name, "", median, None))
         return result
 
     def forget() -> None:

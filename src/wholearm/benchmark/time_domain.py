@@ -27,7 +27,7 @@ SCHEMES = (("radau", 2), ("radau", 3), ("radau", 4), ("legendre", 2), ("legendre
 """Schemes whose order is measured."""
 ORDER_INTERVALS = (4, 8, 16, 32)
 TIME_INTERVALS = (8, 16, 32, 64)
-_PACE = 2.0
+_FALLS = 2.0
 
 
 def measure_order(problem: Problem) -> list[Row]:
@@ -74,7 +74,7 @@ def find_end_error(problem: Problem, name: str, degree: int, intervals: int) -> 
     """Largest difference of any z between simulation and collocation at the end, or NaN."""
     scheme = make_scheme(name, degree)
     search = Search.of(problem, PlanOptions(Objective.EFFORT, scheme=name, degree=degree))
-    stages = guess_stages(problem, problem.phases, problem.start, scheme, intervals, _PACE)
+    stages = guess_stages(problem, problem.phases, problem.start, scheme, intervals, _FALLS)
     found = [to_si(stage, problem) for stage in search.solve(stages).stages]
     torque = TimeMotion(make_motions(found, scheme)).torque
     simulation = simulate(problem, torque, tolerance=1e-13, times=torque.breaks[-1:])

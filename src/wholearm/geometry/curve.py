@@ -4,7 +4,7 @@ The parameter is the arc length s in metres, in the metric
 
     ds^2 = dx^2 + dy^2 + rho^2 (dphi^2 + dtheta_1^2 + dtheta_2^2),
 
-rho being the object's radius of gyration, unless the curve has a pace of its own.
+rho being the object's radius of gyration, unless the curve has a speed ratio of its own.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class Curve:
         What happens at the end, in words.
     reached : bool
         Whether that is what the curve was traced for.
-    pace : float
+    speed_ratio : float
         Arc length per unit of the parameter s, hence the length of its tangents.
     """
 
@@ -114,7 +114,7 @@ class Curve:
     length: float
     ending: str
     reached: bool
-    pace: float = 1.0
+    speed_ratio: float = 1.0
 
     def evaluate(self, s: Array) -> CurvePoint:
         """Return z, its tangent z_s and its curvature z_ss at the places `s`, shape (n,)."""
@@ -123,7 +123,7 @@ class Curve:
         kinematics = formation.evaluate(z, tangent)
         metric = metric_weights(formation.scene)
         z_s, z_ss = _solve_tangent(kinematics.P, kinematics.P_dot_v, tangent, metric)
-        return CurvePoint(z, z_s * self.pace, z_ss * self.pace**2, kinematics)
+        return CurvePoint(z, z_s * self.speed_ratio, z_ss * self.speed_ratio**2, kinematics)
 
     def _interpolate(self, s: Array) -> tuple[Array, Array]:
         starts = np.array([panel.s[0] for panel in self.panels])
@@ -135,11 +135,11 @@ class Curve:
                 z[mine], tangent[mine] = panel.interpolate(s[mine])
         return z, tangent
 
-    def with_speed_ratio(self, pace: float) -> Curve:
-        """Return the same curve with a parameter that runs through it at another pace."""
-        share = self.pace / pace
+    def with_speed_ratio(self, ratio: float) -> Curve:
+        """Return the same curve with a parameter that runs through it at another ratio."""
+        share = self.speed_ratio / ratio
         panels = tuple(Panel(share * panel.s, panel.z, panel.z_s) for panel in self.panels)
-        return replace(self, panels=panels, length=share * self.length, pace=pace)
+        return replace(self, panels=panels, length=share * self.length, speed_ratio=ratio)
 
     @property
     def start(self) -> Array:

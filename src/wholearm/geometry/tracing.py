@@ -114,11 +114,8 @@ def require_touching(phase: Phase, z: Array) -> None:
         ]
         when = f"at the end of phase {phase.index}" if phase.index else "at the start"
         found = describe(find_touching(formation.scene, z))
-        raise InputError(
-            "",
-            key,
-            f"{', '.join(missing)} does not touch {when}; touching are {found}",
-        )
+        text = f"{', '.join(missing)} does not touch {when}; touching are {found}"
+        raise InputError("", key, text)
     limits = formation.evaluate_limits(z[None])[0]
     if limits.min() < -touching:
         text = formation.limits[int(limits.argmin())].text
@@ -136,11 +133,8 @@ def _trace_phase(phase: Phase, z: Array) -> Curve:
         if curve.reached and _is_regular(curve):
             return curve
         reason.append(curve.ending)
-    raise InputError(
-        "",
-        key,
-        f"{until} is never reached: going one way {reason[0]}, going the other way {reason[1]}",
-    )
+    text = f"going one way {reason[0]}, going the other way {reason[1]}"
+    raise InputError("", key, f"{until} is never reached: {text}")
 
 
 def _holds(formation: Formation, until: Until, z: Array) -> bool:
@@ -209,8 +203,7 @@ def trace_curve(formation: Formation, z: Array, heading: Array, until: Until) ->
         side = float(np.sign(until_distance(formation, until, z[None])[0])) or 1.0
     panels: list[Panel] = []
     slip = formation.evaluate_slip(z[None])[0]
-    step, start = rho, 0.0
-    tangent = heading
+    step, start, tangent = rho, 0.0, heading
     while start < LONGEST * rho:
         panel = _build_panel(formation, slip, z, tangent, start, step)
         if panel is None:
@@ -279,9 +272,8 @@ def _first_crossing(
             roots[int(k)] = find_root(margin, grid[row - 1], grid[row])
     first = min(roots.values())
     closed = np.abs(margins(panel.interpolate(np.array([first]))[0])[0]) < TOUCHING
-    return first, sorted(
-        set(np.flatnonzero(closed).tolist()) | {k for k in roots if roots[k] == first}
-    )
+    active = {*np.flatnonzero(closed).tolist(), *(k for k in roots if roots[k] == first)}
+    return first, sorted(active)
 
 
 def _look_closer(grid: Array, values: Array) -> Array:

@@ -125,6 +125,11 @@ class Planning:
         """One for each phase."""
         return [plan for block in self.blocks for plan in block.plans]
 
+    def find_block(self, number: int) -> int:
+        """Index of the block with the phase of a number, counted from 1."""
+        ends = [block.phases[-1].number for block in self.blocks]
+        return next(k for k, end in enumerate(ends) if number <= end)
+
 
 def split_blocks(problem: Problem) -> list[tuple[Phase, ...]]:
     """Phases that have to be planned together: those joined smoothly or by impacts."""

@@ -37,41 +37,7 @@ CLEARANCE = 5e-4
 
 @dataclass(frozen=True)
 class PlanOptions:
-    """Options of the planner.
-
-    Attributes
-    ----------
-    objective : Objective or str
-        ``"time"``, ``"effort"`` or ``"margin"``.
-    intervals : int
-        Intervals of the grid of each phase, at least 10.
-    time_weight : float, [(N m)^2]
-        Weight of the duration against the effort.
-    duration : float, optional, [s]
-        What `margin` may take for all phases together; twice the least time when left out.
-    samples : int
-        Rows per phase of the trajectory file, at least 2.
-    transcription : str
-        ``"auto"`` plans phases with one freedom that are joined at rest or by impacts along their
-        curves and others in the time domain; ``"time"`` plans all in the time domain.
-    opening : float
-        Least acceleration, over gravity, with which the gap of a contact that a smooth phase lets
-        go opens in the time domain.
-    clearance : float
-        What that gap is at least, over the object's radius of gyration, from a third of the first
-        stage without the contact on.
-    time_intervals : int, optional
-        Intervals of each phase in the time domain, at least 4; when left out, 32 for a phase with
-        one freedom that is planned alone and 10 for others.
-    degree : int
-        Collocation points per interval in the time domain, from 2 to 6.
-    scheme : str
-        Which points: ``"radau"`` or ``"legendre"``.
-    replay : bool
-        Whether to replay the plan, to refine what does not hold and to return only what does.
-    mode_search : bool
-        Whether contact modes are changed, in the time domain, for as long as that makes a plan
-        better.
+    """Options of the planner, each as `wholearm.solve` documents it.
 
     Raises
     ------

@@ -46,36 +46,31 @@ def solve(
         largest least normal force within `duration`.
     progress : callable, optional
         Told in a few words what is being done.
-    intervals : int
-        Intervals of the grid of each phase along a curve, at least 10; 80 by default.
-    time_weight : float, [(N m)^2]
-        Weight of the duration against the effort, for `effort`; 1 by default.
+    intervals : int, default 80
+        Intervals of the grid of each phase along a curve, at least 10.
+    time_weight : float, default 1, [(N m)^2]
+        Weight of the duration against the effort, for `effort`.
     duration : float, optional, [s]
-        What `margin` may take for all phases together; twice the least time by default.
-    samples : int
-        Rows per phase of the trajectory, at least 2; 201 by default.
+        What `margin` may take for all phases together; by default twice the least time.
+    samples : int, default 201
+        Rows per phase of the trajectory, at least 2.
     transcription : {"auto", "time"}
-        Phases with one freedom along their curves where that is possible, or all in the time
-        domain.
+        ``"auto"`` plans phases with one freedom that are joined at rest or by impacts along their
+        curves and others in the time domain; ``"time"`` plans all in the time domain.
     time_intervals : int, optional
         Intervals of each phase in the time domain, at least 4; by default 32 for a phase with one
         freedom that is planned alone and 10 for others.
-    degree : int
-        Collocation points per interval in the time domain, from 2 to 6; 3 by default.
-    scheme : {"radau", "legendre"}
-        Which points.
-    opening : float
-        Least acceleration, over gravity, with which the gap of a contact that is let go opens in
-        the time domain; 0.01 by default.
-    clearance : float
-        What that gap is at least, over the object's radius of gyration, from a third of the first
-        stage on; 5e-4 by default.
-    mode_search : bool
-        Whether contact modes are changed, in the time domain, for as long as that makes the plan
-        better; True by default.
-    replay : bool
-        Whether to replay the plan, to refine what does not hold and to return only what does; True
-        by default.
+    degree, scheme : int, default 3; {"radau", "legendre"}
+        Number of collocation points per interval in the time domain, from 2 to 6, and which.
+    opening : float, default 0.01
+        Least acceleration, over gravity, with which the gap of a contact that a smooth phase lets
+        go opens in the time domain.
+    clearance : float, default 5e-4
+        Least such gap over the object's radius of gyration, from a third of the first stage on.
+    mode_search : bool, default True
+        Whether contact modes are changed, in the time domain, for as long as that betters a plan.
+    replay : bool, default True
+        Whether to replay the plan, to refine what does not hold and to return only what does.
 
     Returns
     -------

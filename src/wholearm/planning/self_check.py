@@ -164,30 +164,33 @@ def replay_plan(
         accepted = check if check.is_final else check_plan(problem, trajectory, usual, every)
         durations = np.diff(trajectory.phase_starts)
         number = check.find_culprit(problem.scene.scales, strict, durations)
-        index = next(
-            k
-            for k, block in enumerate(planning.blocks)
-            if number in [phase.number for phase in block.phases]
-        )
-        alone = plan_alone(planning, report) if accepted.failure is not None else None
-        if alone is not None:
-            # Short phases that a landing leaves magnify what is left of the speed at its stop.
-            planning, trajectory = alone, build(alone)
-            continue
-        block = planning.blocks[index]
-        most = 1 if accepted.failure is None else REFINEMENTS if block.chain else ROUGH
-        refined = None
-        if PLAIN != block.finer < most and not block.is_finest:
-            refined = _refine(planning, index, report)
-        if refined is None and accepted.failure and not block.chain and block.finer != PLAIN:
-            refined = _refine(planning, index, report, plain=True)
-        if refined is None and accepted.failure is None:
+        better = _improve(planning, number, accepted.failure is not None, report)
+        if better is None and accepted.failure is None:
             check = accepted
             break
-        if refined is None:
-            raise ReplayError(_describe(planning.blocks[index], number, accepted))
-        planning, trajectory = refined, build(refined)
+        if better is None:
+            block = planning.blocks[planning.find_block(number)]
+            raise ReplayError(_describe(block, number, accepted))
+        planning, trajectory = better, build(better)
     return planning, trajectory, _collect_figures(planning, check)
+
+
+def _improve(
+    planning: Planning, number: int, fails: bool, report: Callable[[str], None]
+) -> Planning | None:
+    """Another plan of the block with phase `number`, if any; `fails`: the plan is not accepted."""
+    alone = plan_alone(planning, report) if fails else None
+    if alone is not None:
+        # Short phases that a landing leaves magnify what is left of the speed at its stop.
+        return alone
+    index = planning.find_block(number)
+    block, refined = planning.blocks[index], None
+    most = (REFINEMENTS if block.chain else ROUGH) if fails else 1
+    if PLAIN != block.finer < most and not block.is_finest:
+        refined = _refine(planning, index, report)
+    if refined is None and fails and not block.chain and block.finer != PLAIN:
+        refined = _refine(planning, index, report, plain=True)
+    return refined
 
 
 def check_plan(

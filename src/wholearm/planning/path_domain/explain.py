@@ -184,8 +184,8 @@ def _quicken(data: PhaseData, units: Units) -> Units:
     would outweigh what is relaxed.
     """
     length, scales = float(data.grid.s[-1]), data.curve.formation.scene.scales
-    pace = float(np.sqrt(length / scales.acceleration))
-    return units._replace(time=min(units.time, pace), force=min(units.force, _FORCE * scales.force))
+    fall = float(np.sqrt(length / scales.acceleration))
+    return units._replace(time=min(units.time, fall), force=min(units.force, _FORCE * scales.force))
 
 
 def _solve_elastic(data: PhaseData, profile: Profile, units: Units) -> Profile | None:

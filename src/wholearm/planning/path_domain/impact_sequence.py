@@ -2,7 +2,7 @@
 
 At the end of a curve the velocity is z_s s', and the impact makes it a multiple of the next curve's
 tangent, whatever the speed: v+ = ratio s' z_s. So whether an impact is possible is known before
-anything is planned, and with a parameter that runs along the next curve at the pace of `ratio` the
+anything is planned, and with a parameter that runs `ratio` times as fast on the next curve the
 speed is continuous: the curves are planned as one. Where an impact is not possible the motion has
 to stop, and the chain ends. A smooth end is passed at speed where the next curve goes on along the
 same tangent.
@@ -58,8 +58,8 @@ class CurveImpact:
 
 def compute_curve_impact(phase: Phase, before: Curve, after: Curve) -> CurveImpact:
     """The impact at the end of a phase, from its curve to the next one's."""
-    v = before.evaluate(np.array([before.length])).z_s[0] / before.pace
-    heading = after.evaluate(np.zeros(1)).z_s[0] / after.pace
+    v = before.evaluate(np.array([before.length])).z_s[0] / before.speed_ratio
+    heading = after.evaluate(np.zeros(1)).z_s[0] / after.speed_ratio
     metric = metric_weights(after.formation.scene)
     if phase.end is End.SMOOTH:
         none = np.zeros(after.formation.n_contacts)
@@ -101,11 +101,11 @@ class ImpactSequence:
 
     @property
     def continuous_curves(self) -> tuple[Curve, ...]:
-        """The curves at such paces that the speed is the same on both sides of a join."""
-        paces = np.cumprod([1.0, *(join.ratio for join in self.impacts)])
+        """The curves with such speed ratios that the speed is the same on both sides of a join."""
+        ratios = np.cumprod([1.0, *(join.ratio for join in self.impacts)])
         return tuple(
-            curve.with_speed_ratio(float(pace)) if pace != 1 else curve
-            for curve, pace in zip(self.curves, paces, strict=True)
+            curve.with_speed_ratio(float(ratio)) if ratio != 1 else curve
+            for curve, ratio in zip(self.curves, ratios, strict=True)
         )
 
 

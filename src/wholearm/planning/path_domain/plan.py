@@ -119,7 +119,7 @@ def plan_curves(
     Parameters
     ----------
     curves : sequence of Curve
-        At such paces that the speed is the same on both sides of where two of them meet.
+        With such speed ratios that the speed is the same on both sides of where two of them meet.
     epsilon : float, [N]
         Least normal force.
     options : PlanOptions

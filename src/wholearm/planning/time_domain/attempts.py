@@ -25,8 +25,8 @@ NEAR = -0.3
 """Margin of a way from which on a motion beside it may keep its limits."""
 WAYS = 3
 """Most ways along which a motion is guessed."""
-PACES = (2.0, 4.0, 1.0)
-"""Guessed durations to try, in units of that of a fall."""
+FALLS = (2.0, 4.0, 1.0)
+"""Guessed durations to try, over that of a fall over the length of the outlines."""
 
 
 class Attempt(NamedTuple):
@@ -72,7 +72,7 @@ class Attempts:
     @cached_property
     def first(self) -> Attempt:
         """To the nearest end."""
-        return Attempt(NEAREST, self._halvings, self._guess(self._halvings, PACES[0]))
+        return Attempt(NEAREST, self._halvings, self._guess(self._halvings, FALLS[0]))
 
     @cached_property
     def ways(self) -> list[PacedWay]:
@@ -87,18 +87,18 @@ class Attempts:
         return bool(self.ways) and all(way.margin <= NEAR for way in self.ways)
 
     def __iter__(self) -> Iterator[Attempt]:
-        """Along ways, to the nearest end, and there or further ahead at other paces."""
+        """Along ways, to the nearest end, and there or further ahead of other durations."""
         for way in [way for way in self.ways if way.margin > NEAR] or self.ways[:1]:
             name = f"a way with the margin {way.margin:.3g}"
-            yield Attempt(name, self._halvings, self._guess(self._halvings, PACES[0], way=way))
+            yield Attempt(name, self._halvings, self._guess(self._halvings, FALLS[0], way=way))
         yield self.first
         onwards = len(self.phases) > 1
         for halvings in dict.fromkeys((self._halvings, 0)) if self.patient else ():
-            for pace in PACES:
-                if onwards or halvings != self._halvings or pace != PACES[0]:
+            for falls in FALLS:
+                if onwards or halvings != self._halvings or falls != FALLS[0]:
                     end = "an end ahead" if onwards else NEAREST
-                    name = f"{end} at {pace:g} times the duration of a fall"
-                    yield Attempt(name, halvings, self._guess(halvings, pace, onwards))
+                    name = f"{end} at {falls:g} times the duration of a fall"
+                    yield Attempt(name, halvings, self._guess(halvings, falls, onwards))
 
     @property
     def _intervals(self) -> int:
@@ -111,10 +111,10 @@ class Attempts:
         return max(0, math.ceil(math.log2(self._intervals / FIRST)))
 
     def _guess(
-        self, halvings: int, pace: float, onwards: bool = False, way: PacedWay | None = None
+        self, halvings: int, falls: float, onwards: bool = False, way: PacedWay | None = None
     ) -> list[Stage]:
         count, options = math.ceil(self._intervals / 2**halvings), self.search.options
-        given = (self.problem, self.phases, self.z, self.search.scheme, count, pace, onwards)
+        given = (self.problem, self.phases, self.z, self.search.scheme, count, falls, onwards)
         stages = [
             replace(stage, opening=options.opening, clearance=options.clearance)
             for stage in guess_stages(*given, way=way)

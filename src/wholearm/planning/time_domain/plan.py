@@ -60,18 +60,16 @@ def plan_phases(
 
     Parameters
     ----------
-    problem : Problem
+    problem, options : Problem, PlanOptions
     phases : sequence of Phase
         All but the last one end in motion.
     z : ndarray, shape (5,)
-    options : PlanOptions
     duration : float, optional, [s]
         Longest duration of all these phases, for the objective `margin`.
     to_go : CostToGo, optional
         What follows, where the phases leave open where they end.
     ample : float, [N]
-        Least normal force from which on more decides nothing, for the objective `margin`: another
-        phase keeps less anyway.
+        Least normal force from which on more decides nothing, as other phases keep less anyway.
     explained : bool
         Whether to look for a change that would make a plan possible, where there is none.
     patient : bool
@@ -97,8 +95,7 @@ def plan_phases(
         own = [other.phases[phase.index] for phase in phases]
         return plan_phases(other, own, z, options, explained=False, patient=False)
 
-    asked = replan if explained else None
-    refuse(search, problem, phases, attempts.first.stages, asked)
+    refuse(search, problem, phases, attempts.first.stages, replan if explained else None)
     outcomes = _try_all(search, problem, attempts, begun)
     last = outcomes[-1]
     if last.solution.success:
@@ -106,7 +103,7 @@ def plan_phases(
     tried = dict.fromkeys([NEAREST, *(outcome.name for outcome in outcomes)])
     reason = f"none was found, also of least shortfalls, from {', '.join(tried)}"
     short = [outcome.short for outcome in outcomes if outcome.short]
-    raise explain(search, problem, phases, short, reason, asked)
+    raise explain(search, problem, phases, short, reason, replan if explained else None)
 
 
 class _Outcome(NamedTuple):

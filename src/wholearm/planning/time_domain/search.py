@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...common.arrays import Array
 from ...common.shortfalls import Parameter
@@ -18,7 +19,7 @@ from .between import Limits, check_between, find_misses, monitor_missed, raise_b
 from .collocation import Scheme, make_scheme
 from .layout import pack, unpack
 from .limits import Target, price_sides
-from .motion import make_motions
+from .motion import StageMotion, make_motions
 from .nlp import TimeNLP, bound_unknowns, build_time_nlp
 from .own_units import in_own_units, scale_options, unit_lengths, unit_of
 from .refinement import (
@@ -283,6 +284,20 @@ class Search:
             prices.append(np.asarray(cost / max(abs(solution.cost), 1e-300)))
         return prices
 
+    def _choose_halvings(
+        self, solution: Solution, motions: Sequence[StageMotion], misses: Sequence[Limits]
+    ) -> list[NDArray[np.int64]]:
+        """How often to halve each interval for what its misses cost; none if there are many."""
+        most = MOST * len({stage.phase for stage in solution.stages})
+        if sum(stage.intervals for stage in solution.stages) >= most:
+            return []
+        prices = self.price_misses(solution, misses)
+        times = [
+            count_halvings(price, motion.defects, self.scheme)
+            for price, motion in zip(prices, motions, strict=True)
+        ]
+        return cap_halvings(times, most)
+
     def enforce_between(self, solution: Solution) -> Solution:
         """Go on from a solution until limits hold between points too."""
         refined, first = 0, solution.cost
@@ -305,17 +320,9 @@ class Search:
                 for stage, check in zip(solution.stages, checks, strict=True)
             ]
             worst = max(miss.worst for miss in misses)
-            prices = self.price_misses(solution, misses)
-            most = MOST * len({stage.phase for stage in solution.stages})
-            times = cap_halvings(
-                [
-                    count_halvings(price, motion.defects, self.scheme)
-                    for price, motion in zip(prices, motions, strict=True)
-                ],
-                most,
-            )
-            few = sum(stage.intervals for stage in solution.stages) < most
-            if few and refined < REFINEMENTS and any(mine.any() for mine in times):
+            halved = refined < REFINEMENTS
+            times = self._choose_halvings(solution, motions, misses) if halved else []
+            if any(mine.any() for mine in times):
                 refined += 1
                 finer = self.solve(
                     bisect_intervals(solution.stages, self.scheme, times), solution, most=_PATIENCE

@@ -33,63 +33,36 @@ def guess_stages(
     z: Array,
     scheme: Scheme,
     intervals: int,
-    pace: float,
+    falls: float,
     onwards: bool = False,
     release_at: float = RELEASE_AT,
     way: PacedWay | None = None,
 ) -> list[Stage]:
     """Stages of phases that are planned as one, with a first guess, in the scene's own units.
 
-    The guessed duration is `pace` times that of a fall over the length of the outlines. With
+    The guessed duration is `falls` times that of a fall over the length of the outlines. With
     `onwards`, phases that go on in motion may end farther away where that takes fewer reversals.
     A phase that ends by a release is guessed to do so at the share `release_at` of its curve.
     A single phase may be guessed to go a way of its own instead, at the pace of that.
     """
-    parts: list[tuple[Phase, PathGuess, bool]] = []
-    for k, phase in enumerate(phases):
-        later = phases[k + 1 :]
-        outlines = list(way.stretches if way else guess_phase(phase, z, later, release_at))
-        if parts and parts[-1][0].end is End.SMOOTH:
-            outlines = [*_turn_first(outlines[0], parts[-1][1]), *outlines[1:]]
-            if onwards:
-                outlines = _go_straight(phase, outlines, parts[-1][1])
-        parts += [(phase, outline, outline is outlines[-1]) for outline in outlines]
-        z = outlines[-1].z[-1]
-    own, scales = in_own_units(problem), problem.scene.scales
-    phases = [own.phases[phase.index] for phase in phases]
-    parts = [
-        (
-            own.phases[phase.index],
-            replace(
-                outline,
-                formation=own.phases[phase.index].formation,
-                z=scale_state(outline.z, scales),
-            ),
-            last,
-        )
-        for phase, outline, last in parts
-    ]
+    parts = _list_parts(problem, phases, z, onwards, release_at, way)
     lengths = np.array([outline.length for _, outline, _ in parts])
-    total = pace * float(np.sqrt(lengths.sum()))
     ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
     # The guess runs as (1 - cos) over all stages, so each has its own share of the time.
-    own_pace = None if way is None else way.pace
-    if own_pace is not None:
-        total = float(own_pace.t[-1]) / scales.time
-        clock = np.interp(ends, own_pace.s, own_pace.t / own_pace.t[-1])
-    else:
-        clock = np.arccos(1 - 2 * np.clip(ends, 0.0, 1.0)) / np.pi
-    longest = {phase.index: lengths[[p is phase for p, _, _ in parts]].sum() for phase in phases}
+    total, pace = falls * float(np.sqrt(lengths.sum())), None if way is None else way.pace
+    clock = np.arccos(1 - 2 * np.clip(ends, 0.0, 1.0)) / np.pi
+    if pace is not None:
+        total = float(pace.t[-1]) / problem.scene.scales.time
+        clock = np.interp(ends, pace.s, pace.t / pace.t[-1])
     stages: list[Stage] = []
     released: tuple[int, ...] = ()
     for k, (phase, outline, last) in enumerate(parts):
-        count = max(LEAST_INTERVALS, round(lengths[k] / longest[phase.index] * intervals))
-        following = own.phases[phase.index + 1] if phase is not phases[-1] and last else None
-        ends_in_impact = following is not None and phase.end is End.IMPACT
-        clocks, spans = (clock[k], clock[k + 1]), (ends[k], ends[k + 1])
-        guess = _guess(outline, scheme, count, clocks, spans, total, own_pace)
-        if ends_in_impact and following is not None:
-            guess = guess._replace(impulses=np.zeros(following.formation.n_constraints))
+        whole = lengths[[own is phase for own, _, _ in parts]].sum()
+        count = max(LEAST_INTERVALS, round(lengths[k] / whole * intervals))
+        guess = _guess(outline, scheme, count, clock[k : k + 2], ends[k : k + 2], total, pace)
+        ends_in_impact = last and phase.end is End.IMPACT and k + 1 < len(parts)
+        if ends_in_impact:
+            guess = guess._replace(impulses=np.zeros(parts[k + 1][0].formation.n_constraints))
         opens = k > 0 and parts[k - 1][0] is not phase
         if opens:
             touching = np.abs(phase.formation.evaluate_limits(outline.z[:1])[0]) < _TOUCHES
@@ -110,24 +83,51 @@ def guess_stages(
     return link(stages)
 
 
+def _list_parts(
+    problem: Problem,
+    phases: Sequence[Phase],
+    z: Array,
+    onwards: bool,
+    release_at: float,
+    way: PacedWay | None,
+) -> list[tuple[Phase, PathGuess, bool]]:
+    """Phases with their outlines, in own units, and whether each is the last of its phase."""
+    parts: list[tuple[Phase, PathGuess, bool]] = []
+    for k, phase in enumerate(phases):
+        outlines = list(
+            way.stretches if way else guess_phase(phase, z, phases[k + 1 :], release_at)
+        )
+        if parts and parts[-1][0].end is End.SMOOTH:
+            outlines = [*_turn_first(outlines[0], parts[-1][1]), *outlines[1:]]
+            if onwards:
+                outlines = _go_straight(phase, outlines, parts[-1][1])
+        parts += [(phase, outline, outline is outlines[-1]) for outline in outlines]
+        z = outlines[-1].z[-1]
+    own, scaled = in_own_units(problem), []
+    for phase, outline, last in parts:
+        scaled_phase, z = own.phases[phase.index], scale_state(outline.z, problem.scene.scales)
+        scaled.append((scaled_phase, replace(outline, formation=scaled_phase.formation, z=z), last))
+    return scaled
+
+
 def _guess(
     outline: PathGuess,
     scheme: Scheme,
     count: int,
-    clock: tuple[float, float],
-    ends: tuple[float, float],
+    clock: Array,
+    ends: Array,
     total: float,
-    pace: Pace | None = None,
+    pace: Pace | None,
 ) -> StagePoints:
     """Motion along an outline, without accelerations and with every contact pressed alike.
 
     Parameters
     ----------
-    clock, ends : tuple of float
+    clock, ends : ndarray, shape (2,)
         Shares of all stages' time and length at the start and the end.
     total : float, [s]
         Duration of all stages.
-    pace : Pace, optional
+    pace : Pace or None
         When they are where, if not as (1 - cos).
     """
     knots = np.linspace(0.0, 1.0, len(outline.z))

@@ -43,7 +43,7 @@ _STRETCHES = 6
 _SHORTEST = 2
 """Fewest configurations, after its first, of a stretch that is not merged into another."""
 
-AMPLE = 1e-3
+SURE = 1e-3
 """Margin from which a motion surely keeps its limits."""
 
 Way = list[PathGuess]
@@ -70,7 +70,7 @@ class _Bent(NamedTuple):
     def rank(self) -> tuple[float, float]:
         """Ways that keep limits are better the shorter they are, others the less they miss."""
         length = float(self.forces.runs.sum())
-        return (-AMPLE, length) if self.margin > AMPLE else (-self.margin, length)
+        return (-SURE, length) if self.margin > SURE else (-self.margin, length)
 
 
 def list_ways(problem: Problem, phase: Phase, z: Array, most: int) -> list[PacedWay]:
@@ -103,7 +103,7 @@ def list_ways(problem: Problem, phase: Phase, z: Array, most: int) -> list[Paced
     for turn, scale in enumerate(SCALES):
         found.sort(key=lambda bent: bent.rank)
         near = bool(found) and (turn < 2 or found[0].margin > CLOSE)
-        if not near or found[0].margin > AMPLE:
+        if not near or found[0].margin > SURE:
             break
         for bent in found[: BENT if turn < 2 else 1]:
             for first, second in BENDS:
