@@ -88,7 +88,7 @@ def simulate(
     ends, inner = (
         _sort_times(name, given) for name, given in (("times", times), ("within", within))
     )
-    wanted = np.union1d(ends, inner)
+    wanted = _sort_times("looks", np.concatenate([ends, inner]))
     run = Replay(problem, profile, tolerance, wanted, ends)
     # Where something shows within a step that its end does not show, steps are to end there.
     found = _simulate(run, progress)
@@ -100,10 +100,11 @@ def simulate(
 
 def _sort_times(name: str, given: ArrayLike | None) -> Array:
     """Instants that are asked for, increasing, shape (n,) [s]."""
-    times = np.unique(np.asarray([] if given is None else given, dtype=float))
+    times = np.sort(np.asarray([] if given is None else given, dtype=float).ravel())
     if not np.isfinite(times).all():
         raise InputError("", name, "holds numbers that are not finite")
-    return times
+    # NumPy would import its masked arrays for that.
+    return times[np.diff(times, prepend=-np.inf) > 0]
 
 
 def _simulate(run: Replay, progress: Callable[[str], None] | None) -> Simulation | None:

@@ -17,6 +17,8 @@ from .stepper import Stepper
 
 def keep_wanted(run: Replay, stop: float) -> None:
     """Set aside the instants that are wanted within the step just made, which ends at `stop`."""
+    if run.wanted[run.next_wanted] >= stop:
+        return
     section = run.sections[-1]
     first, blank = len(section.times), np.full(section.to.size, np.nan)
     while run.wanted[run.next_wanted] < stop:
@@ -24,8 +26,7 @@ def keep_wanted(run: Replay, stop: float) -> None:
         section.rows.append(blank)
         section.impacts.append(run.impact)
         run.next_wanted += 1
-    if len(section.times) > first:
-        section.within.append((run.stepper.inputs.copy(), np.arange(first, len(section.times))))
+    section.within.append((run.stepper.inputs.copy(), np.arange(first, len(section.times))))
 
 
 def fill(sections: Iterable[tuple[Section, Stepper]]) -> bool:

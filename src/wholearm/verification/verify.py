@@ -18,6 +18,7 @@ from ..results.report import (
     LeastImpulse,
     ModeChange,
     PhaseReport,
+    ReducedState,
     Report,
 )
 from ..results.torque import TorqueProfile
@@ -31,7 +32,6 @@ from .margins import (
     list_contact_margins,
     list_slip_margins,
 )
-from .reduced import list_reduced_states
 from .verdict import (
     DEPARTURE,
     REST_SPEED,
@@ -151,9 +151,15 @@ def inspect(
             for e in simulation.events
             if e.kind in _CHANGES and e.contact
         ),
-        reduced=list_reduced_states(problem, simulation) if reduced else (),
+        reduced=_list_reduced(problem, simulation) if reduced else (),
         replay=simulation,
     )
+
+
+def _list_reduced(problem: Problem, simulation: Simulation) -> tuple[ReducedState, ...]:
+    from .reduced import list_reduced_states
+
+    return list_reduced_states(problem, simulation)
 
 
 def choose_times(torque: TorqueProfile, plan: Trajectory | None) -> Array:
