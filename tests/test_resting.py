@@ -9,7 +9,7 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.time_domain.own_units import in_own_units, scale_state
 from wholearm.planning.time_domain.plan import plan_phases
-from wholearm.planning.time_domain.resting import find_block, list_ways
+from wholearm.planning.time_domain.resting import find_block, list_headings, list_ways
 
 COARSE = PlanOptions(time_intervals=4)
 
@@ -51,6 +51,18 @@ def test_a_finger_that_would_have_to_pull_is_named() -> None:
     with pytest.raises(InfeasibleError, match="no motion begins in any contact mode: c_n of v"):
         plan_phases(feeble, feeble.phases[4:], start, COARSE, explained=False)
     assert plan_landing(time_intervals=6)
+
+
+def test_motions_head_where_contacts_press() -> None:
+    problem = landing()
+    z = scale_state(problem.start, problem.scene.scales)
+    own = in_own_units(problem)
+    formation = own.phases[0].formation
+    headings = list_headings(formation, z, own.epsilon)
+    assert headings and list_headings(formation, z, 50.0) == []
+    for way in headings:
+        assert np.linalg.norm(way) > 1e-3
+        assert np.abs(formation.evaluate(z[None], way[None]).A[0] @ way).max() < 1e-9
 
 
 @pytest.mark.parametrize("phase", range(4))

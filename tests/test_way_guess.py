@@ -120,6 +120,21 @@ def test_ways_bend_to_one_side_and_to_the_other() -> None:
     assert off[0] @ off[1] < 0 and np.linalg.norm(off[0]) > 0.1 * nearest.length
 
 
+def test_a_way_sets_out_as_it_is_told() -> None:
+    problem = tipping()
+    (phase,) = problem.phases
+    start, formation = problem.start, phase.formation
+    (nearest,) = guess_phase(phase, start)
+    goal, metric = nearest.z[-1], np.sqrt(weights(problem.scene))
+    straight = connect(formation, start, goal).z
+    back = straight[0] - straight[1]
+    z = connect(formation, start, goal, heading=back).z
+    assert (z[0] == start).all() and np.abs(z[-1] - goal).max() < 1e-9
+    assert np.abs(formation.evaluate(z, z).C).max() < 1e-9
+    first = (z[1] - z[0]) * metric
+    assert first @ (back * metric) > 0.9 * np.linalg.norm(first) * np.linalg.norm(back * metric)
+
+
 def test_a_way_that_slides_while_it_tips_is_planned() -> None:
     problem = tipping()
     (plan,) = plan_phases(

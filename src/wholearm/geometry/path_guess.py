@@ -256,7 +256,11 @@ def _look_around(formation: Formation, ending: Formation, z: Array, slip: Array)
 
 
 def connect(
-    formation: Formation, start: Array, goal: Array, bends: tuple[float, float] = (0.0, 0.0)
+    formation: Formation,
+    start: Array,
+    goal: Array,
+    bends: tuple[float, float] = (0.0, 0.0),
+    heading: Array | None = None,
 ) -> PathGuess:
     """A straight line, pulled onto the contacts, with the directions of its middle.
 
@@ -266,12 +270,20 @@ def connect(
     start, goal : ndarray, shape (5,)
     bends : (float, float)
         How far it bends to one side in one arc and in two, over its length; with two freedoms.
+    heading : ndarray, shape (5,), optional
+        Which way it sets out, if not straight to the goal.
     """
     slip = formation.evaluate_slip(start[None])[0]
     aside = _find_side(formation, start, goal) if any(bends) else np.zeros(5)
     x = np.linspace(0.0, 1.0, POINTS)[1:, None]
     off = bends[0] * np.sin(np.pi * x) + bends[1] * np.sin(2 * np.pi * x)
-    z = np.vstack([start, close_all(formation, start + x * (goal - start) + off * aside, slip)])
+    line = goal - start
+    places = start + x * line + off * aside
+    if heading is not None:
+        metric = np.sqrt(metric_weights(formation.scene))
+        length = np.linalg.norm(line * metric) / np.linalg.norm(heading * metric)
+        places += x * (1 - x) ** 2 * (length * heading - line)
+    z = np.vstack([start, close_all(formation, places, slip)])
     # Where contacts do not close, the way waits.
     last = np.maximum.accumulate(np.where(np.isfinite(z).all(axis=1), np.arange(len(z)), 0))
     z = z[last]

@@ -133,12 +133,12 @@ def _try_all(
         What the first attempt has led to.
     """
     stop = search.tried.iterations + BUDGET
-    far, outcomes = attempts.are_far, list[_Outcome]()
+    far, count, outcomes = attempts.are_far, 0, list[_Outcome]()
     for attempt in attempts:
-        # What is far from any plan is only asked what it is short of.
-        known = begun if far or attempt is attempts.first else None
+        # What is far from any plan, or like what is short, is first asked what it is short of.
+        known = begun if far or count or attempt is attempts.first else None
         outcomes.append(_try(search, problem, attempt, known))
-        count = sum(bool(outcome.short) for outcome in outcomes)
+        count += bool(outcomes[-1].short)
         late = search.tried.iterations > stop
         if outcomes[-1].solution.success or late or count == (1 if far else CONVINCING):
             break

@@ -24,6 +24,10 @@ from ...geometry.curve import tangent_basis
 
 MOVES = 1e-5
 """Least sum of accelerations, over the scene's own, that counts as a motion."""
+BEGINS = 0.3
+"""Sum of accelerations with which a motion sets out, over the scene's own."""
+_SAME = 1e-9
+"""Difference of two forces, over the scene's own, below which they are those of one motion."""
 _STILL = 1e-9
 """Rate over the largest one below which something does not move."""
 _PROBE = 1e-6
@@ -95,6 +99,16 @@ def find_change(
     return max(values) if finger is None else min(values)
 
 
+def list_headings(formation: Formation, z: Array, epsilon: float) -> list[Array]:
+    """Ways in which motions begin from rest at `z`, shape (5,), those that press most first."""
+    found: list[tuple[float, Array]] = []
+    for mode in _list_modes(formation, z, epsilon, ends=False):
+        answer = mode.find_heading()
+        if answer is not None and all(abs(answer[0] - margin) > _SAME for margin, _ in found):
+            found.append(answer)
+    return [way for _, way in sorted(found, key=lambda one: -one[0])]
+
+
 def list_ways(rates: Array) -> list[Array]:
     """Accelerations, shape (f,), one for each way to set things in motion, from rates (n, f)."""
     if rates.shape[1] == 1:
@@ -151,7 +165,7 @@ class _Programme:
         opens: Array,
     ) -> None:
         scene, n_c, f = formation.scene, formation.n_contacts, N.shape[1]
-        self.names, self.epsilon = formation.names, epsilon
+        self.names, self.epsilon, self.N = formation.names, epsilon, N
         mu = formation.friction
         sticks = np.flatnonzero(signs[:n_c] == 0)
         held = np.flatnonzero(signs[n_c:] == 0)
@@ -219,6 +233,15 @@ class _Programme:
             return None
         worst = int(np.argmin(answer[own]))
         return Blocked(self.names[worst], float(answer[-1]))
+
+    def find_heading(self) -> tuple[float, Array] | None:
+        """The largest least c_n with a speed of `BEGINS`, over epsilon, and which way that is."""
+        self.speed *= MOVES / BEGINS
+        wide = np.hstack([self.rows, np.zeros((len(self.rows), 1))])
+        own = slice(self.f, self.f + self.n_c)
+        answer = self._minimise(-1.0, wide, self.most, self._press(1.0, self.epsilon), own)
+        self.speed *= BEGINS / MOVES
+        return None if answer is None else (float(answer[-1]), self.N @ answer[: self.f])
 
     def find_limit(self, finger: int | None) -> float | None:
         """The least torque limit of a finger, or the largest epsilon, with which things move."""

@@ -22,6 +22,8 @@ from ...geometry.path_guess import PathGuess, connect, guess_phase, list_ends
 from ...mechanics.dynamics import Directions
 from ...mechanics.metric import metric_weights
 from ...problem.definition import Phase, Problem
+from .own_units import in_own_units, scale_state
+from .resting import list_headings
 from .way_pace import Pace, WayForces
 
 STEP = 0.15
@@ -30,6 +32,8 @@ GROWTH = 1.2
 """By how much more each of these is apart from the one before."""
 STEPS = 12
 """Most ends on either side of the nearest one."""
+HEADINGS = 1
+"""In how many other ways motions are looked at that set out."""
 BENT = 4
 """How many of the best ways are bent, twice; the best one alone after that."""
 SCALES = (1.0, 0.4, 0.3, 0.2, 0.1)
@@ -62,6 +66,7 @@ class _Bent(NamedTuple):
 
     goal: Array
     bends: tuple[float, float]
+    heading: Array | None
     way: Way
     forces: WayForces
     margin: float
@@ -92,14 +97,20 @@ def list_ways(problem: Problem, phase: Phase, z: Array, most: int) -> list[Paced
     (nearest,) = guess_phase(phase, z)
     found: list[_Bent] = []
 
-    def look(goal: Array, bends: tuple[float, float]) -> None:
-        way = split_way(connect(formation, z, goal, bends))
+    def look(goal: Array, bends: tuple[float, float], heading: Array | None = None) -> None:
+        way = split_way(connect(formation, z, goal, bends, heading))
         forces = WayForces(way, problem.epsilon) if _is_free(way) else None
         if forces is not None and np.isfinite(margin := forces.find_margin()):
-            found.append(_Bent(goal, bends, way, forces, margin))
+            found.append(_Bent(goal, bends, heading, way, forces, margin))
 
-    for goal in list_goals(phase, z, nearest.z[-1]):
+    goals = list_goals(phase, z, nearest.z[-1])
+    for goal in goals:
         look(goal, (0.0, 0.0))
+    if all(bent.margin <= AMPLE for bent in found):
+        # Contacts may keep motions from setting out straight.
+        for heading in _list_headings(problem, phase, z)[:HEADINGS]:
+            for goal in goals:
+                look(goal, (0.0, 0.0), heading)
     for turn, scale in enumerate(SCALES):
         found.sort(key=lambda bent: bent.rank)
         near = bool(found) and (turn < 2 or found[0].margin > CLOSE)
@@ -108,7 +119,8 @@ def list_ways(problem: Problem, phase: Phase, z: Array, most: int) -> list[Paced
         for bent in found[: BENT if turn < 2 else 1]:
             for first, second in BENDS:
                 own, other = bent.bends
-                look(bent.goal, (own + scale * first, other + scale * second))
+                bends = own + scale * first, other + scale * second
+                look(bent.goal, bends, bent.heading)
     found.sort(key=lambda bent: bent.rank)
     best: dict[tuple[float, ...], _Bent] = {}
     for bent in found:
@@ -118,6 +130,14 @@ def list_ways(problem: Problem, phase: Phase, z: Array, most: int) -> list[Paced
         PacedWay(bent.way, bent.margin, bent.forces.find_pace(bent.margin))
         for bent in list(best.values())[:most]
     ]
+
+
+def _list_headings(problem: Problem, phase: Phase, z: Array) -> list[Array]:
+    """Ways in which motions begin at `z`, those that press most first."""
+    own, scales = in_own_units(problem), problem.scene.scales
+    formation = own.phases[phase.index].formation
+    units = np.array([scales.length, scales.length, 1.0, 1.0, 1.0])
+    return [units * way for way in list_headings(formation, scale_state(z, scales), own.epsilon)]
 
 
 def _is_free(way: Way) -> bool:
