@@ -106,7 +106,7 @@ def list_ways(problem: Problem, phase: Phase, z: Array, most: int) -> list[Paced
     goals = list_goals(phase, z, nearest.z[-1])
     for goal in goals:
         look(goal, (0.0, 0.0))
-    if all(bent.margin <= AMPLE for bent in found):
+    if all(bent.margin <= SURE for bent in found):
         # Contacts may keep motions from setting out straight.
         for heading in _list_headings(problem, phase, z)[:HEADINGS]:
             for goal in goals:
