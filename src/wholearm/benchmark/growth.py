@@ -9,23 +9,22 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from ..common.files import require_writable, together, write_whole
+from ..common.files import require_writable, together, write_text
 from ..figures.plots import save
 from ..geometry.path_guess import load
 from ..mapping.formation_map import build_map
 from ..planning.plan import solve
 from ..problem.read import build_problem, read_problem
 from .alone import measure_alone
-from .report import stamp
+from .report import finish_axes, stamp
 from .stress.scenes import name_first
 
 SIZES = {
@@ -39,15 +38,15 @@ WORK = {
     "phases": ("least time",),
     "vertices": ("reading", "map"),
 }
-"""What is measured for each."""
+"""Kinds of work that are measured for each."""
 LARGEST = {"map": 50}
 """Sizes from which on some work would take minutes."""
 RADIUS = 0.05
-"""Of the regular polygons [m]."""
+"""Radius of the regular polygons [m]."""
 TURNS = (0.04, 0.045)
 """Places between which the phases go back and forth [m]."""
 FIELDS = {"seconds": "processor time [s]", "memory": "rise of memory [MB]"}
-"""What is drawn."""
+"""Quantities that are drawn, and their labels."""
 _LOOKS = {
     "least time": ("#0072B2", "o"),
     "margin": ("#D55E00", "s"),
@@ -177,14 +176,8 @@ def draw_growth(points: Sequence[Point]) -> Figure:
                 axis.set_minor_formatter(NullFormatter())
             axes.set_xlabel(f"{grows} [-]")
             axes.set_ylabel(label)
-            axes.grid(True, which="major", color="#c4c9d0", linewidth=0.6)
-            axes.spines[["top", "right"]].set_visible(False)
-            axes.legend(frameon=False, fontsize=8)
+            finish_axes(axes, fontsize=8)
     return figure
-
-
-def _write(content: bytes, stream: BinaryIO) -> None:
-    stream.write(content)
 
 
 def run_growth(path: str, output: str, progress: Callable[[str], None] | None = None) -> list[str]:
@@ -198,6 +191,6 @@ def run_growth(path: str, output: str, progress: Callable[[str], None] | None = 
     csv.writer(stream, lineterminator="\n").writerows([Point._fields, *points])
     with together():
         for each, text in zip(paths, (format_growth(points), stream.getvalue()), strict=False):
-            write_whole(each, partial(_write, text.encode()))
+            write_text(each, text)
         save(draw_growth(points), paths[2])
     return paths

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from ..common.errors import InputError
-from ..common.files import require_writable, write_whole
+from ..common.files import require_writable, write_text
 from ..geometry.path_guess import load
 from ..geometry.tracing import trace_phases
 from ..planning.plan import solve
@@ -22,7 +22,7 @@ from ..simulation.simulate import simulate
 from ..solvers.ipopt import Run, record_runs
 
 BANDS = {"iterations": 1.25, "evaluations of the replay": 1.1}
-"""By how much counts may grow that rounding has a part in; others may not grow at all."""
+"""Largest ratio to the stored counts of those in which rounding has a part; others may not grow."""
 
 Counts = dict[str, int]
 
@@ -120,8 +120,7 @@ def run_guard(
     require_writable(stored)
     found = count_all(paths, progress)
     if update:
-        text = json.dumps(known | found, indent=2, sort_keys=True) + "\n"
-        write_whole(stored, lambda stream: stream.write(text.encode()))
+        write_text(stored, json.dumps(known | found, indent=2, sort_keys=True) + "\n")
         return []
     return [
         text

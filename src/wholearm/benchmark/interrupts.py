@@ -18,9 +18,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 SOON = 1.0
-"""How long a command may take to end [s]."""
+"""Longest time that a command may take to end [s]."""
 STARTED = "import wholearm.__main__ as m; print('ready', flush=True); m.run()"
-"""What runs a command, and says when the interpreter is up: before, nobody can catch a signal."""
+"""Code that runs a command, and says when the interpreter is up: before, nobody can catch a
+signal."""
 
 
 class Trial(NamedTuple):

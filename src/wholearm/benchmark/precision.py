@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InputError, WholearmError
+from ..common.errors import WholearmError
+from ..common.files import make_folder
 from ..common.sharing import exclusive
 from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phases
@@ -75,10 +76,7 @@ def run_bench(
     InputError
         If the folder cannot be made or written.
     """
-    try:
-        os.makedirs(folder, exist_ok=True)
-    except OSError as error:
-        raise InputError(folder, "", f"cannot be made: {error.strerror}") from None
+    make_folder(folder)
     report = progress or (lambda _: None)
     curves = keep_curves(problem)
     studies: list[tuple[Callable[[Problem], list[Row]], Problem | None]] = [

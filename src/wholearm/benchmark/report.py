@@ -17,7 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from .. import __version__
-from ..common.files import together, write_whole
+from ..common.files import together, write_text
 from ..figures.plots import save
 
 _LOOKS = {
@@ -45,8 +45,8 @@ def write_results(name: str, rows: Sequence[Row], stem: str) -> list[str]:
     """Write all measurements as Markdown, CSV and PNG; return the files' paths."""
     paths = [f"{stem}.{ending}" for ending in ("md", "csv", "png")]
     with together():
-        write_whole(paths[0], lambda stream: stream.write(format_markdown(name, rows).encode()))
-        write_whole(paths[1], lambda stream: stream.write(format_csv(rows).encode()))
+        write_text(paths[0], format_markdown(name, rows))
+        write_text(paths[1], format_csv(rows))
         save(draw_run_times(rows), paths[2])
     return paths
 
@@ -103,10 +103,15 @@ def draw_run_times(rows: Sequence[Row]) -> Figure:
             axes.set_xscale("log")
             axes.set_yscale("log")
             axes.set_ylabel("run time [s]")
-            axes.grid(True, which="major", color="#c4c9d0", linewidth=0.6)
-            axes.spines[["top", "right"]].set_visible(False)
-            axes.legend(frameon=False)
+            finish_axes(axes)
     return figure
+
+
+def finish_axes(axes: Axes, **legend: Any) -> None:
+    """Give axes a grid, no frame and a legend."""
+    axes.grid(True, which="major", color="#c4c9d0", linewidth=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, **legend)
 
 
 def _draw_study(axes: Axes, rows: Sequence[Row], study: str, method: str, label: str) -> None:

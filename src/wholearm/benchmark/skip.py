@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..common.files import require_writable, write_whole
+from ..common.files import require_writable, write_text
 from ..geometry.path_guess import load
 from ..geometry.tracing import trace_phases
 from ..planning.plan import solve
@@ -27,9 +27,9 @@ from .report import stamp
 REPEATS = 3
 """Runs of which the medians are taken."""
 PUSHED = 0.03
-"""Where the object is pushed to by one finger or by both [m]."""
+"""Place that the object is pushed to by one finger or by both [m]."""
 AWAY = np.array([0.0, 0.0, 0.0, 0.0, 0.6])
-"""By how much a finger that is idle is turned away [m, rad]."""
+"""Change of the start that turns an idle finger away [m, rad]."""
 HEAD = (
     "# What each part costs",
     "",
@@ -157,7 +157,7 @@ def run_skip(folder: str, output: str, progress: Callable[[str], None] | None = 
             runs = [measure_alone(spend, case).answer for _ in range(REPEATS)]
             cells.append(Expense(*(median(column) for column in zip(*runs, strict=True))))
         lines.append(format_pair(pair.part, *cells))
-    write_whole(path, lambda stream: stream.write(("\n".join(lines) + "\n").encode()))
+    write_text(path, "\n".join(lines) + "\n")
     return path
 
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from .progress import clear_progress, show_progress
 
 STUDIES = ("problem", "stress", "guard", "skip", "growth")
-"""What can follow ``bench``; the word ``problem`` may be left out."""
+"""Words that can follow ``bench``; the word ``problem`` may be left out."""
 
 
 def name_study(arguments: Sequence[str]) -> list[str]:
@@ -71,11 +71,7 @@ def _measure(options: argparse.Namespace) -> int:
     from ..benchmark.precision import run_bench
     from ..geometry.path_guess import load
 
-    written = run_bench(load(options.problem), options.output, progress=show_progress())
-    clear_progress()
-    for path in written:
-        print(f"wrote {path}")
-    return 0
+    return _say(run_bench(load(options.problem), options.output, progress=show_progress()))
 
 
 def _stress(options: argparse.Namespace) -> int:
@@ -124,16 +120,17 @@ def _guard(options: argparse.Namespace) -> int:
 def _skip(options: argparse.Namespace) -> int:
     from ..benchmark.skip import run_skip
 
-    path = run_skip(options.problems, options.output, show_progress())
-    clear_progress()
-    print(f"wrote {path}")
-    return 0
+    return _say([run_skip(options.problems, options.output, show_progress())])
 
 
 def _grow(options: argparse.Namespace) -> int:
     from ..benchmark.growth import run_growth
 
-    written = run_growth(options.problem, options.output, show_progress())
+    return _say(run_growth(options.problem, options.output, show_progress()))
+
+
+def _say(written: Sequence[str]) -> int:
+    """Say which files a study has written; returns the exit status."""
     clear_progress()
     for path in written:
         print(f"wrote {path}")
@@ -144,14 +141,9 @@ def _write_scene(seed: int, number: int, folder: str) -> str:
     """Write the problem file of a scene."""
     from ..benchmark.stress.cases import draw_case
     from ..benchmark.stress.toml import to_toml
-    from ..common.errors import InputError
-    from ..common.files import write_whole
+    from ..common.files import make_folder, write_text
 
-    try:
-        os.makedirs(folder, exist_ok=True)
-    except OSError as error:
-        raise InputError(folder, "", f"cannot be made: {error.strerror}") from None
+    make_folder(folder)
     path = os.path.join(folder, f"stress_{seed}_{number}.toml")
-    text = to_toml(draw_case(seed, number).table)
-    write_whole(path, lambda stream: stream.write(text.encode()))
+    write_text(path, to_toml(draw_case(seed, number).table))
     return path

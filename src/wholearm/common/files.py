@@ -97,6 +97,20 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     write_whole(path, lambda stream: stream.write(text.encode()))
 
 
+def make_folder(path: str) -> None:
+    """Make a folder if it is not there.
+
+    Raises
+    ------
+    InputError
+        If it cannot be made.
+    """
+    try:
+        os.makedirs(path, exist_ok=True)
+    except OSError as error:
+        raise InputError(path, "", f"cannot be made: {error.strerror}") from None
+
+
 def _is_special(target: str) -> bool:
     return os.path.exists(target) and not os.path.isfile(target) and not os.path.isdir(target)
 

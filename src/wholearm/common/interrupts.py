@@ -20,7 +20,7 @@ from types import FrameType
 from typing import TextIO
 
 PATIENCE = 0.45
-"""How long a command may take to clean up [s]."""
+"""Longest time that a command may take to clean up [s]."""
 _WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 ENDED = tuple(128 + number for number in _WORDS)
 """Exit statuses of commands that a signal ended."""

@@ -25,9 +25,9 @@ Numbers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 TOO_SHORT, JOINT_COVERED, FINGERS_CROSS = 1, 2, 3
-"""Why a finger cannot close: it reaches no part of the object; its joint is in the object or right
-above it, so that the link overlaps the object before it closes; the other finger, closed, is in its
-way."""
+"""Reasons why a finger cannot close: it reaches no part of the object; its joint is in the object
+or right above it, so that the link overlaps the object before it closes; the other finger is closed
+in its way."""
 
 
 class Closed(NamedTuple):

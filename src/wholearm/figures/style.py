@@ -11,7 +11,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 
 SIZE = (10.0, 8.2)
-"""Of a figure [in]."""
+"""Width and height of a figure [in]."""
 # Okabe and Ito's colours without yellow and black, which here are Tol's wine and a grey.
 PALETTE = (
     "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#882255", "#56B4E9", "#D55E00", "#777777",

@@ -23,13 +23,13 @@ from .tracing import require_touching, runs_on_curve, trace_phase, trace_phases
 POINTS = 25
 """Configurations along an outline."""
 RELEASE_AT = 0.8
-"""Where on a curve without an end of its own a release is guessed."""
+"""Share of a curve without an end of its own at which a release is guessed."""
 _MOST_ACTIVE = 2
 """Most limits that a phase's end may be right on."""
 _AHEAD = (0.25, 0.5, 1.0, 2.0)
-"""How far ahead ends are looked for, over the distance to the nearest."""
+"""Distances ahead at which ends are looked for, over that to the nearest."""
 _TURNS = np.linspace(-1.0, 1.0, 21)
-"""How far the object is turned to look for an end that is not the nearest [rad]."""
+"""Turns of the object from which an end that is not the nearest is looked for [rad]."""
 
 
 @exclusive

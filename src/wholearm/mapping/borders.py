@@ -37,8 +37,8 @@ SAME_ANGLE, ROUNDING = 1e-7, 1e-11
 """Differences [rad] below which a closed finger that touches one of a border's contacts, and one
 that touches anything, is where the border has it: at the ends of a link angles lose digits."""
 ASIDE = 3e-8
-"""How far beside a pointed tip at a vertex the two contacts that meet there are looked up, in radii
-of gyration."""
+"""Distance beside a pointed tip at a vertex at which the two contacts that meet there are looked
+up, in radii of gyration."""
 LEVEL = 3e-11
 """Height within which vertices lie on the line of a link, in radii of gyration."""
 LONGEST = 0.06

@@ -32,7 +32,7 @@ SAMPLES = 100
 ARROWS = 24
 """Places across the map at which directions inside cells are checked."""
 BEYOND = np.radians(6.0)
-"""How far the window reaches beyond the flush angles next to the plan [rad]."""
+"""Reach of the window beyond the flush angles next to the plan [rad]."""
 CROSSED = -5
 """Cell of the places where the closed fingers would overlap."""
 SAME_PLACE = 3e-5

@@ -26,7 +26,7 @@ SHORTEST = 0.3
 AT_START = 1e-4
 """Length over `NEAR` below which the first part of a leg counts as rounding."""
 INSIDE = 0.2
-"""How far before the end of what can be reached a leg stops, over `NEAR`."""
+"""Distance of the end of a leg from the end of what can be reached, over `NEAR`."""
 PROBES = 9
 """Places of an excursion into a neighbouring cell at which its depth is measured."""
 

@@ -210,4 +210,4 @@ def _make_joint_limits(formation: Formation, _: float) -> list[MotionLimit]:
 
 
 MAKERS: list[Maker] = [_make_force_limits, _make_joint_limits]
-"""What makes the limits of a formation."""
+"""Functions that make the limits of a formation."""

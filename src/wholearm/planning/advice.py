@@ -31,9 +31,9 @@ ROWS = 201
 DIGITS = 3
 """Significant digits of what is advised."""
 _BEYOND = (0.0, 0.005, 0.015, 0.05, 0.15, 0.5)
-"""How far beyond the least change to try, relatively: plans keep limits between nodes too."""
+"""Relative distances beyond the least change to try: plans keep limits between nodes too."""
 _CLOSE = 0.02
-"""How much more than needed is good enough, relatively."""
+"""Relative excess over the least change that is good enough."""
 
 
 class Advice(NamedTuple):

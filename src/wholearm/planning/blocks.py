@@ -31,7 +31,7 @@ from .phase_plan import add_up
 from .stops import Plans
 
 PLAIN = -1
-"""In place of how often intervals are doubled: as many as at first, and no search for modes."""
+"""Number of doublings that stands for as many intervals as at first, and no search for modes."""
 FINEST = 64
 """Most intervals of a phase in the time domain that refining asks for."""
 AMPLE = 1.1
@@ -39,7 +39,7 @@ AMPLE = 1.1
 MOVED = 1e-9
 """Distance from which on a block starts somewhere else, in radii of gyration or radians."""
 SHORT = 5e-7
-"""How far below epsilon a margin may be by rounding, over the scene's force."""
+"""Largest shortfall of a margin below epsilon by rounding, over the scene's force."""
 
 
 @dataclass(frozen=True, eq=False)

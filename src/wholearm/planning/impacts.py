@@ -23,7 +23,7 @@ from .phase_plan import PhasePlan, add_up, combine
 from .stops import PlanPart, plan_stops
 
 PER_SPEED = " per m/s"
-"""What impulses and rates of an impact are for: one unit of speed before it."""
+"""Unit after impulses and rates of an impact: they are for one unit of speed before it."""
 
 
 @dataclass(frozen=True, eq=False)

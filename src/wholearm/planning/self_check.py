@@ -32,21 +32,21 @@ from ..verification.verify import choose_times, inspect
 from .blocks import PLAIN, BlockPlan, Planning, plan_alone, refine_block
 
 REFINEMENTS = 3
-"""How often the intervals of a block may be doubled."""
+"""Most doublings of the intervals of a block."""
 ROUGH = 2
-"""How often those in the time domain may be, before contact modes are left as they come: a plan
-that hangs on a contact that comes to rest need not hold, however fine it is."""
+"""Most doublings in the time domain, before contact modes are left as they come: a plan that hangs
+on a contact that comes to rest need not hold, however fine it is."""
 STRICT = 0.5
 """Share of what `verify` allows that a plan may use: `verify` looks at more instants."""
 RESIDUAL = 1e-8
-"""What the equations of motion may miss, relative to the scene's force or torque, length or speed:
-rounding leaves 1e-13 of them."""
+"""Largest residual of the equations of motion, relative to the scene's force or torque, length or
+speed: rounding leaves 1e-13."""
 ROWS = 8
 """Parts of a phase at whose ends replay and plan are compared."""
 PIECES = 40
 """Parts of a phase at whose ends normal forces are looked at."""
 _CLOSER = 4
-"""How many times as many parts are looked at, if a parabola through few instants dips too low."""
+"""Factor on the number of parts, if a parabola through few instants dips too low."""
 DENSE = 201
 """Rows per phase for the equations of motion, if the trajectory has not half as many."""
 

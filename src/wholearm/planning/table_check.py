@@ -19,9 +19,9 @@ from ..verification.verify import inspect
 from .self_check import PIECES, divide_pieces, pick_times
 
 FINER = 8.0
-"""How much less the rows of a table may miss when its replay does not hold."""
+"""Divisor of the error of the rows of a table when its replay does not hold."""
 ATTEMPTS = 3
-"""How many tables are tried."""
+"""Most tables that are tried."""
 
 
 class Table(NamedTuple):

@@ -17,7 +17,7 @@ from ..common.require import require_number
 from .torque import COLUMNS, TorqueProfile
 
 ERROR = 1e-5
-"""What the straight lines between rows may miss, relative to the largest torque."""
+"""Largest error of the straight lines between rows, relative to the largest torque."""
 STEP = 1e-6
 """Jump at a break from which on the rows keep it as a step, relative to the largest torque."""
 INTERPOLATIONS = ("linear", "hold")

@@ -15,7 +15,7 @@ from ..common.require import frozen, require_number, require_vector
 SIZES = (1e-4, 1e3)
 """Least and largest distance between the two corners of a polygon that are farthest apart [m]."""
 FAR = 1e3
-"""How far from the origin corners may be given, over that distance."""
+"""Largest distance of given corners from the origin, over that distance."""
 SLENDER = 1e-3
 """Least width of a polygon, over that distance."""
 SHORTEST_EDGE = 1e-4

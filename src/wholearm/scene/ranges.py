@@ -52,7 +52,7 @@ JOINT = Range(1e-8, 1e3)
 TORQUE = Range(1e-6, 1e3)
 """Torque limit, over what the weight makes at the tip."""
 STRENGTH = Range(1e-6, 1e6)
-"""What one finger can press with at its tip, over what the other can."""
+"""Ratio of the forces that one finger and the other can press with at their tips."""
 VISCOUS = Range(0.0, 200.0)
 """Viscous friction, over the torque limit or m g length at one radian in the scene's time."""
 DRY = Range(0.0, 1e3)

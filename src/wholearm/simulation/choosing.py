@@ -40,7 +40,7 @@ from .tolerances import STANDING, is_slower
 CLEAR = 1e-8
 """Least margin of a clear decision, relative to the scene's forces, torques or accelerations."""
 TRIES = 50
-"""How often in a row decisions may be made without any time passing."""
+"""Most decisions in a row without any time passing."""
 
 
 class Choice(NamedTuple):

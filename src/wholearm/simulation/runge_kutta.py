@@ -83,10 +83,10 @@ ERROR_5 = {
     8: -0.35032884874997366, 9: 0.3341791187130175, 10: 0.08192320648511571,
     11: -0.022355307863886294,
 }
-"""What the weights of order 8 differ by from those of order 5."""
+"""Differences of the weights of order 8 from those of order 5."""
 _THIRD = {0: 0.2440944881889764, 8: 0.7338466882816118, 11: 0.022058823529411766}
 ERROR_3 = {j: w - _THIRD.get(j, 0.0) for j, w in WEIGHTS.items()}
-"""What the weights of order 8 differ by from those of order 3."""
+"""Differences of the weights of order 8 from those of order 3."""
 WITHIN_ROWS: tuple[dict[int, float], ...] = (
     WEIGHTS,
     {

@@ -31,9 +31,10 @@ from .statics import balances, find_pulls
 from .tolerances import find_tolerances, measure_units
 
 _AHEAD = 1e-5
-"""How far ahead along the free direction signs and gaps are looked for, in units of the scene."""
+"""Distance ahead along the free direction at which signs and gaps are found, in units of the
+scene."""
 _CHECKS = 9
-"""At how many places of a piece that is not linear forces at rest are looked at."""
+"""Number of places of a piece that is not linear at which forces at rest are checked."""
 _CLEAR = 1e3
 """Acceleration halfway to the next change with which a motion starts, over that which is rounding:
 where changes are that close nothing is decided but by rounding."""

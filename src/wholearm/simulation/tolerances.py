@@ -16,13 +16,13 @@ from ..problem.definition import Until
 from ..scene.model import Scene
 
 ROUNDING_FORCE = 1e-9
-"""How far below zero a force, a torque or what friction has left counts as rounding."""
+"""Largest shortfall of a force, a torque or what friction has left that counts as rounding."""
 ROUNDING_SPEED = 2e-13
-"""How far below zero a speed counts as rounding."""
+"""Largest negative speed that counts as rounding."""
 ROUNDING_LIMIT = 3e-8
-"""How far below zero a limit counts as rounding: the contact just given up starts at zero."""
+"""Largest overlap that counts as rounding: the contact just given up starts at zero."""
 SHORT = 3e-5
-"""How far below zero a limit may start: a phase may end at rest this much short of the place where
+"""Largest overlap at the start of a phase: one may end at rest this much short of the place where
 the next one's formation begins."""
 REACHED = 3e-5
 """Distance to the end of a phase that counts as there, when at rest."""
@@ -32,12 +32,13 @@ STANDING = 1e-9
 """Speed that counts as none where friction decides: the integration's error may give it either
 sign."""
 SETTLING = 2e-5
-"""How long before a torque break a planned arrival or reversal may come by rounding."""
+"""Longest time before a torque break at which a planned arrival or reversal may come by
+rounding."""
 REST_WINDOW = 2e-3
-"""How long before a torque break a formation at rest is held, whatever the torques: too short for
-its contacts to part by more than what counts as touching."""
+"""Time before a torque break in which a formation at rest is held, whatever the torques: too short
+for its contacts to part by more than what counts as touching."""
 LONGEST_WINDOW = 2e-2
-"""How long before a torque break an arrival at a speed may come and still belong to it."""
+"""Longest time before a torque break at which an arrival at a speed still belongs to it."""
 FIRST_STEP = 2e-2
 """Length of the first step tried from rest."""
 SHORTEST_STEP = 1e-13

@@ -36,7 +36,7 @@ BODIES = (
     "finger 1",
     "finger 2",
 )
-"""What each of the five equations is of."""
+"""Names of the five equations."""
 
 
 class Balance(NamedTuple):

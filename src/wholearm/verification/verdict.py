@@ -21,11 +21,12 @@ from ..simulation.events import EventKind, OutcomeKind, Simulation
 from .margins import SHORTEST
 
 DEPARTURE = 1e-3
-"""How far a replay may be from its plan, relative to the scene's length, and in rad."""
+"""Largest distance of a replay from its plan, relative to the scene's length, and in rad."""
 REST_SPEED = 2e-2
 """Speed at the end of a phase that passes for rest, relative to the scene's speed."""
 STRAY = 2e-3
-"""How far below epsilon a normal force of a plan may fall, relative to epsilon: a replay strays."""
+"""Largest shortfall of a normal force of a plan below epsilon, relative to epsilon: a replay
+strays."""
 ROUNDING = 5e-7
 """The same by rounding, relative to the scene's force."""
 GOAL = 3e-4

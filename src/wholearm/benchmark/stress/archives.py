@@ -15,7 +15,7 @@ from .trees import change_tree, pick
 METAS = (
     "{" * 5000, "[" * 100_000, '{"problem": {}}', '{"rolling": [[]]}', "NaN", '{"epsilon": NaN}',
 )  # fmt: skip
-"""What takes the place of a trajectory's `meta`."""
+"""Texts that take the place of a trajectory's `meta`."""
 
 _DEFLATED = (zipfile.ZIP_DEFLATED,)
 

@@ -181,7 +181,7 @@ TWISTS: dict[str, Callable[[np.random.Generator, Table], Table]] = {
     "rough": _rough,
     "smooth": _smooth,
 }
-"""What is special about a scene."""
+"""Changes that make a scene special."""
 
 Phases = list[dict[str, Any]]
 Stops = list[tuple[float, float]]
@@ -259,4 +259,4 @@ def _rolled(
 
 
 ROUTES = (_at_rest, _at_rest, _struck, _joined, _split, _rolled)
-"""What is made of a list from the map."""
+"""Problems that are made of a list from the map."""

@@ -40,9 +40,9 @@ LOOSE = 0.01
 ENDS = 16
 """Most places of the end on either side of the nearest one."""
 STEP = 0.08
-"""How far apart the nearest of these are, over the radius of gyration."""
+"""Distance of the nearest of these, over the radius of gyration."""
 GROWTH = 1.12
-"""By how much more each is apart from the one before."""
+"""Ratio of each distance to the one before."""
 ENOUGH = 1e-3
 """Margin with which a curve is as good as wanted."""
 

@@ -58,12 +58,12 @@ DAMAGE = (
     "truncated", "flipped", "inserted", "cut out", "repeated", "empty", "folder", "noise", "utf-16",
     "latin-1", "bom", "crlf", "zeros", "reversed", "twice",
 )  # fmt: skip
-"""What is done to bytes whatever the format."""
+"""Kinds of damage to bytes whatever the format."""
 ROW_DAMAGE = (
     "cell", "cell", "cell", "cell", "header", "delete", "repeat", "thrice", "swap", "short", "long",
     "column", "semicolon", "quote", "scale", "scale", "few", "blank", "field",
 )  # fmt: skip
-"""What is done to rows of torques."""
+"""Kinds of damage to rows of torques."""
 
 
 class Mutant(NamedTuple):

@@ -54,7 +54,7 @@ KINDS = (
     "optimum that differs under noise",
     "check that failed",
 )
-"""What is counted; each has to be zero."""
+"""Kinds of findings that are counted; each count has to be zero."""
 
 
 class Answer(NamedTuple):

@@ -35,7 +35,7 @@ Bounds = list[tuple[float | None, float | None]]
 FASTEST = 1e3
 """Largest speed that is considered, over the scene's own."""
 TANGENTS = np.geomspace(1e-6, 1.0, 13)
-"""Where sqrt(b) is bounded by tangents, over the largest b."""
+"""Places of the tangents that bound sqrt(b), over the largest b."""
 
 
 class Forces(NamedTuple):

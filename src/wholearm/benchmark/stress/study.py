@@ -11,7 +11,7 @@ from typing import Any
 
 from ... import __version__
 from ...common.errors import InputError
-from ...common.files import write_whole
+from ...common.files import make_folder, write_text
 from .files import run_file
 from .journal import Journal
 from .plans import OBJECTIVES, run_scene
@@ -80,10 +80,7 @@ def run_stress(
     count : int
         How many findings there are.
     """
-    try:
-        os.makedirs(folder, exist_ok=True)
-    except OSError as error:
-        raise InputError(folder, "", f"cannot be made: {error.strerror}") from None
+    make_folder(folder)
     stem = os.path.join(folder, "bench_stress")
     stamp = {"study": "stress", "seed": options.seed, "version": __version__}
     journal = Journal(f"{stem}.jsonl", stamp, options.fresh, options.again)
@@ -97,7 +94,7 @@ def run_stress(
     noise = compare_values([record for record in records if "problem" in record])
     text, count = format_summary(records, noise, {**stamp, **stamp_machine(options.jobs)})
     path = f"{stem}.md"
-    write_whole(path, lambda stream: stream.write(text.encode()))
+    write_text(path, text)
     return text, path, count
 
 

@@ -14,7 +14,7 @@ STRANGE: tuple[Any, ...] = (
     [], [[]], [0], [1, 2, 3], ["v0-palm"], [[0, 0]], [["a", "b"]], [float("nan")], {}, {"x": 1},
     {"x": "y"}, {"a": {"b": {}}}, {"phi_deg": 1e9}, {"x": 0.0, "phi_deg": 1.0},
 )  # fmt: skip
-"""What takes the place of a value."""
+"""Values that take the place of others."""
 
 
 def pick(rng: np.random.Generator, options: Any) -> Any:

@@ -46,13 +46,13 @@ from .nlp import (
 from .terms import LimitShape
 
 _ROUGH = 4.0
-"""How much rougher a rolling contact may be made."""
+"""Largest factor on the friction of a rolling contact."""
 _TORQUE = 15.0
 """Unit of the torques' shortfalls, over the scene's torque: as bad as one of its force."""
 _FORCE = 5.0
 """Largest unit of force when a limit is relaxed, over the scene's."""
 FRICTION = "friction"
-"""What the keys of frictions begin with."""
+"""Beginning of the keys of frictions."""
 
 Replan = Callable[[Sequence[Curve], float], object]
 """Plans the phases along curves with a least normal force [N]; raises if there is no plan."""

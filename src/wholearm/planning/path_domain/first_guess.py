@@ -12,7 +12,7 @@ from .nlp import Units
 _SLOW = -12
 """Height of the slowest guess, as a power of two times that of a fall."""
 _QUICK = 30.0
-"""How much faster, squared, than the torque limits alone allow a guess may be."""
+"""Largest square of the speed of a guess, over that which the torque limits alone allow."""
 _FIRM = 40.0
 """Largest range of the squeeze that a guess is amid, over the scene's force or the least of it."""
 _LIGHT = 0.5

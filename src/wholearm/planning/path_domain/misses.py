@@ -18,7 +18,7 @@ Over the scene's force for contact forces, relative for torques, the square of s
 ROUNDS = 40
 """Most times that the NLP is solved for one phase."""
 OVER = 1.05
-"""How much more than the miss a limit is tightened."""
+"""Factor on the miss by which a limit is tightened."""
 
 
 class PathSolution(NamedTuple):

@@ -14,7 +14,7 @@ from .collocation import Scheme
 from .stage import Stage, StagePoints
 
 Z, V = slice(0, 5), slice(5, 10)
-"""What a node's unknowns are: z and z'. With a margin, that follows."""
+"""Slices of a node's unknowns: z and z'. With a margin, that follows."""
 STATE, MARGIN = 10, 10
 
 

@@ -14,8 +14,8 @@ MOST = 12
 PATIENCE = 48
 """Most iterations of one of them."""
 STRETCH = 1e-3
-"""What it costs all intervals to change their durations by as much as they are, over the cost: of
-many equal choices the nearest is made."""
+"""Price of changing the durations of all intervals by as much as they are, over the cost: of many
+equal choices the nearest is made."""
 WORTH = 1e-4
 """Least gain of a move over the cost; dropping what has shrunk to nothing may cost as much."""
 

@@ -52,7 +52,7 @@ _HURRY = 3e-4
 LONGEST = 120.0
 """Most processor time of one run of the solver [s]: iterations need not end by themselves."""
 NEAR, FAR = 1e-6, 1e-2
-"""How far from its bounds a start is kept: a solution, and a first guess."""
+"""Distance that a start keeps from its bounds: a solution, and a first guess."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,7 +38,7 @@ BUDGET = 300
 ATTEMPT = 100
 """Most iterations of the first run of the solver from a guess."""
 ROUNDING = 5e-7
-"""How far below epsilon a margin may be by rounding, over the weight of the object."""
+"""Largest shortfall of a margin below epsilon by rounding, over the weight of the object."""
 _EXACT = 3
 """Points of an interval beyond which collocation is so exact that intervals would stay as they are,
 too long for torques that are linear in each."""

@@ -14,15 +14,15 @@ from .mesh import bisect
 from .stage import Stage, StagePoints
 
 DEFECT = 2e-8
-"""What collocation may miss z and z' by at the end of an interval, in the scene's own units."""
+"""Largest error of z and z' by collocation at the end of an interval, in the scene's own units."""
 DEAR = 1e-5
-"""What limits that are raised in an interval may cost, over the cost, without halving it."""
+"""Largest price of limits that are raised in an interval, over the cost, without halving it."""
 AT_ONCE = 2
 """Most times that an interval is halved at once."""
 _CHEAPER = 3
 """Power of two by which a halving makes misses of limits cheaper."""
 _BROKEN = 1e-6
-"""How far below zero a limit is broken, over the radius of gyration."""
+"""Distance below zero from which on a limit is broken, over the radius of gyration."""
 
 
 def adopt(stages: Sequence[Stage], points: Sequence[StagePoints]) -> list[Stage]:

@@ -44,9 +44,9 @@ _PATIENCE = 80
 _ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 40}
 """Most iterations of one solve, if not 150."""
 _DEARER = 0.2
-"""How much dearer, relatively, a plan may get by tightening before it counts as lost."""
+"""Largest relative cost increase accepted from tightening."""
 _COARSE = 0.1
-"""How much dearer, relatively, it may get on finer intervals."""
+"""Largest relative cost increase accepted from finer intervals."""
 
 
 @dataclass
