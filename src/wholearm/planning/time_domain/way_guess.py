@@ -103,24 +103,25 @@ def list_ways(problem: Problem, phase: Phase, z: Array, most: int) -> list[Paced
         if forces is not None and np.isfinite(margin := forces.find_margin()):
             found.append(_Bent(goal, bends, heading, way, forces, margin))
 
+    def spread(heading: Array | None) -> None:
+        for goal in goals:
+            look(goal, (0.0, 0.0), heading)
+        for turn, scale in enumerate(SCALES):
+            own = sorted((b for b in found if b.heading is heading), key=lambda bent: bent.rank)
+            near = bool(own) and (turn < 2 or own[0].margin > CLOSE)
+            if not near or own[0].margin > SURE:
+                break
+            for bent in own[: BENT if turn < 2 else 1]:
+                for one, two in BENDS:
+                    bends = bent.bends[0] + scale * one, bent.bends[1] + scale * two
+                    look(bent.goal, bends, heading)
+
     goals = list_goals(phase, z, nearest.z[-1])
-    for goal in goals:
-        look(goal, (0.0, 0.0))
-    if all(bent.margin <= SURE for bent in found):
+    spread(None)
+    if all(bent.margin <= CLOSE for bent in found):
         # Contacts may keep motions from setting out straight.
         for heading in _list_headings(problem, phase, z)[:HEADINGS]:
-            for goal in goals:
-                look(goal, (0.0, 0.0), heading)
-    for turn, scale in enumerate(SCALES):
-        found.sort(key=lambda bent: bent.rank)
-        near = bool(found) and (turn < 2 or found[0].margin > CLOSE)
-        if not near or found[0].margin > SURE:
-            break
-        for bent in found[: BENT if turn < 2 else 1]:
-            for first, second in BENDS:
-                own, other = bent.bends
-                bends = own + scale * first, other + scale * second
-                look(bent.goal, bends, bent.heading)
+            spread(heading)
     found.sort(key=lambda bent: bent.rank)
     best: dict[tuple[float, ...], _Bent] = {}
     for bent in found:
