@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from plane import stack_rows
-from planned import SQUEEZES, DepartingMotion, change
+from planned import SQUEEZES, CosineMotion, DepartingMotion, change, choose_squeeze, fit
 from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
 from wholearm.common.arrays import Array
 from wholearm.contacts.elemental import parse_contact
@@ -175,6 +175,21 @@ def test_next_to_no_speed_is_a_stop() -> None:
     assert simulation.phase[-1] == 1 and simulation.find(EventKind.ARRIVAL)
     last, first = joints(simulation, 0)
     assert simulation.z_dot[last].any() and not simulation.z_dot[first].any()
+
+
+def test_a_step_of_the_torques_just_before_a_planned_stop_is_not_its_end() -> None:
+    """Hardly any way is left there, but it takes longer than what rounding makes of a time."""
+    problem = bumping(1e-5)[0]
+    curve, scales = trace_phases(problem)[0], problem.scene.scales
+    motion = CosineMotion(curve, 0.5, choose_squeeze(curve, 0.5, 0.2, 2.0))
+    before = 0.5 * (1 - 2 / np.pi * np.sqrt(1e-5 * scales.length / curve.length))
+    assert motion.law(np.array([before]))[0][0] > curve.length - 2e-5 * scales.length
+    torque = fit(motion, np.sort([*motion.turns, before]), 20, 7)
+    steps = torque.coefficients.copy()
+    steps[torque.breaks[:-1] >= before, :, 0] += 1e-7 * scales.torque
+    simulation = simulate(problem, TorqueProfile(torque.breaks, steps))
+    arrival = simulation.find(EventKind.ARRIVAL)[0]
+    assert arrival.time - before > 0.9 * (0.5 - before)
 
 
 def chords(torque: TorqueProfile, count: int) -> TorqueProfile:

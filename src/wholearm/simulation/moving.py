@@ -91,7 +91,8 @@ def _is_at_end(run: Replay, t: float) -> bool:
 
     By rounding a planned motion ends a little beyond the end of its phase, or has just turned back.
     It has to be at rest there, or to reach a contact softly; a coordinate is passed at any speed,
-    and an impact comes at any, with the step of the torques that goes with it, or as they end.
+    and an impact comes at any, with the step of the torques that goes with it, or as they end. A
+    motion that is about to stop instead may step its torques before it is there.
     """
     s = run.stepper
     if t != run.breaks[run.piece + 1] or not is_there(run):
@@ -99,7 +100,7 @@ def _is_at_end(run: Replay, t: float) -> bool:
     speed = abs(_measure_rate(run))
     if run.phase.end is End.SMOOTH:
         speed = speed if run.phase.until.contact else 0.0
-    elif run.phase.end is End.IMPACT:
+    elif run.phase.end is End.IMPACT and _strikes(run):
         coming = run.piece + 1
         speed = 0.0 if coming >= len(run.steps_at) or run.steps_at[coming] else speed
     elif s.formation.n_constraints < 4:
