@@ -42,5 +42,5 @@ def test_rates_are_those_of_the_formations_own_rows(grips: Grips) -> None:
         load = np.array([1.0, *tau])
         expected = response.acceleration @ load
         assert np.asarray(rates)[5:10, 0] == pytest.approx(expected, rel=1e-6)
-        held = (response.holds @ load / mode.force_limit_units).min()
+        held = (response.force_limits @ load / mode.force_limit_units).min()
         assert float(least) == pytest.approx(held, rel=1e-6)

@@ -76,7 +76,7 @@ class Polygon:
         edges = np.roll(corners, -1, axis=0) - corners
         # About a corner: far from the origin, areas would lose their digits.
         local = corners - corners[0]
-        cross = _cross(local, np.roll(local, -1, axis=0))
+        cross = cross_product(local, np.roll(local, -1, axis=0))
         area = cross.sum() / 2
         if area <= 0:
             raise InputError(
@@ -85,7 +85,7 @@ class Polygon:
                 f"the polygon is clockwise or flat (signed area {area:.3g} m^2); "
                 "list its corners anticlockwise",
             )
-        turns = _cross(np.roll(edges, 1, axis=0), edges)
+        turns = cross_product(np.roll(edges, 1, axis=0), edges)
         headings = np.arctan2(turns, np.sum(np.roll(edges, 1, axis=0) * edges, axis=1))
         reflex = np.flatnonzero(turns <= 1e-9 * area)
         if reflex.size:
@@ -104,7 +104,7 @@ class Polygon:
         mass = require_number(self.mass, "object.mass", positive=True)
         after = np.roll(vertices, -1, axis=0)
         squares = (vertices**2 + vertices * after + after**2).sum(axis=1)
-        uniform = mass * float(_cross(vertices, after) @ squares) / (12 * float(area))
+        uniform = mass * float(cross_product(vertices, after) @ squares) / (12 * float(area))
         inertia = uniform
         if self.inertia is not None:
             inertia = require_number(self.inertia, "object.inertia", positive=True)
@@ -165,7 +165,7 @@ def _check_shape(corners: Array, edges: Array, size: float) -> None:
             f"the edge from there has {lengths[shortest]:.3g} m; allowed are "
             f"{SHORTEST_EDGE * size:.3g} m and more, {SHORTEST_EDGE:g} of the polygon's size",
         )
-    away = _cross(edges[:, None], corners - corners[:, None]) / lengths[:, None]
+    away = cross_product(edges[:, None], corners - corners[:, None]) / lengths[:, None]
     width = float(away.max(axis=1).min())
     if width < SLENDER * size:
         raise InputError(
@@ -176,6 +176,6 @@ def _check_shape(corners: Array, edges: Array, size: float) -> None:
         )
 
 
-def _cross(a: Array, b: Array) -> Array:
+def cross_product(a: Array, b: Array) -> Array:
     """Plane cross product a_x b_y - a_y b_x along the last axis."""
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

@@ -229,8 +229,8 @@ class _Judge:
         gained = (now.rates @ self.load + then.rates @ self.later) / 2
         gained = signs * gained / (measure_rates(self.scene, count) / scales.time)
         fixed = find_fixed(mode, self.rows.A, self.rows.A_t)
-        holds = then.holds @ self.later
-        cones = holds[count:].reshape(2, -1).min(axis=0)
+        force_limits = then.force_limits @ self.later
+        cones = force_limits[count:].reshape(2, -1).min(axis=0)
         margins = [np.inf]
         for unit in self.still:
             row = unit.rows[0]
@@ -239,7 +239,9 @@ class _Judge:
                 margins.append(cones[mode.holders.index(unit.rows)] / force)
             elif abs(gained[row]) > CLEAR:
                 margins.append(gained[row])
-        return Choice(signs, fixed, float(min(margins)), float(holds[:count].min() / scales.force))
+        return Choice(
+            signs, fixed, float(min(margins)), float(force_limits[:count].min() / scales.force)
+        )
 
 
 def evaluate_rows(formation: Formation, z: Array, v: Array) -> Rows:

@@ -215,7 +215,7 @@ class Response(NamedTuple):
     acceleration : ndarray, shape (5, 3)
     rates : ndarray, shape (n_c + 2, 3)
         Accelerations of the contacts' sliding and of the joints.
-    holds : ndarray, shape (n_c + 2 K, 3), [N, N m]
+    force_limits : ndarray, shape (n_c + 2 K, 3), [N, N m]
         What has to be positive for everything to hold, H c + h.
     ratio : float
         Reduced inertia over that without friction; jammed at zero and below.
@@ -223,7 +223,7 @@ class Response(NamedTuple):
 
     acceleration: Array
     rates: Array
-    holds: Array
+    force_limits: Array
     ratio: float
 
 
@@ -264,9 +264,9 @@ def respond(mode: Mode, signs: Array, rows: Rows, v: Array) -> Response | None:
     rates = np.vstack([rows.A_t @ acceleration, acceleration[3:]])
     rates[:count, 0] += rows.A_t_dot_v
     H, h = mode.force_limit_rows
-    holds = H @ c
-    holds[:, 0] += h
-    return Response(acceleration, rates, holds, ratio)
+    force_limits = H @ c
+    force_limits[:, 0] += h
+    return Response(acceleration, rates, force_limits, ratio)
 
 
 def find_fixed(mode: Mode, A: Array, A_t: Array) -> NDArray[np.bool_]:

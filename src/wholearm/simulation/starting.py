@@ -53,8 +53,8 @@ class Way(Protocol):
     """One way in which a formation at rest could start to move."""
 
     @property
-    def holds(self) -> Array:
-        """What has to be positive for the contacts to hold, H c, is holds @ (1, tau_1, tau_2).
+    def force_limits(self) -> Array:
+        """Rows with H c = force_limits @ (1, tau_1, tau_2), positive where the contacts hold.
 
         Shape (n_c + 2 R, 3) [N]; the first n_c are the normal forces.
         """
@@ -92,7 +92,7 @@ class RestDirection:
         The friction that opposes it.
     acceleration : ndarray, shape (3,)
         Acceleration along `heading` is acceleration @ (1, tau_1, tau_2).
-    holds : ndarray, shape (n_c + 2 R, 3)
+    force_limits : ndarray, shape (n_c + 2 R, 3)
         Likewise what has to be positive for the contacts to hold, H c [N] (`contacts.cones`).
     ratio : float
         Reduced inertia over that without friction; jammed at zero and below.
@@ -104,7 +104,7 @@ class RestDirection:
     heading: Array
     directions: Directions
     acceleration: Array
-    holds: Array
+    force_limits: Array
     ratio: float
     closes: bool
     tolerances: Tolerances
@@ -113,8 +113,8 @@ class RestDirection:
     def margins(self) -> list[tuple[Array, float]]:
         """Rows r and offsets d with r @ (1, tau_1, tau_2) + d >= 0 while it moves this way."""
         rounding = self.tolerances
-        holds = [(row, rounding.force) for row in self.holds]
-        return [(self.acceleration, -rounding.drive), *holds]
+        force_limits = [(row, rounding.force) for row in self.force_limits]
+        return [(self.acceleration, -rounding.drive), *force_limits]
 
     def drive(self, tau: Array) -> float:
         """How strongly it accelerates this way, in the metric M5."""
@@ -126,7 +126,7 @@ class RestDirection:
 
     def moves(self, tau: Array) -> bool:
         """Whether the formation starts to move this way under torques `tau`, shape (2,)."""
-        keeps = float((self.holds @ [1.0, *tau]).min()) >= -self.tolerances.force
+        keeps = float((self.force_limits @ [1.0, *tau]).min()) >= -self.tolerances.force
         return self.ratio > 0 and keeps and self.slides(tau)
 
     def depart(self, x: float, tau: Array) -> Departure:
@@ -140,7 +140,7 @@ class Slack(NamedTuple):
     drive: float
     slips: Array
     grips: Array
-    holds: Array
+    force_limits: Array
     openings: Array
 
 
@@ -190,7 +190,7 @@ class ModeChoice:
         Diagonal of M5.
     acceleration : ndarray, shape (5, 3)
         z''.
-    holds : ndarray, shape (n_c + 2 R, 3), [N]
+    force_limits : ndarray, shape (n_c + 2 R, 3), [N]
         What has to be positive for the contacts to hold, H c (`contacts.cones`).
     slips : ndarray, shape (n_c + 2, 3)
         Accelerations of the contacts' sliding and of the joints, along `directions`.
@@ -207,7 +207,7 @@ class ModeChoice:
     directions: Directions
     mass: Array
     acceleration: Array
-    holds: Array
+    force_limits: Array
     slips: Array
     grips: Array
     openings: Array
@@ -221,7 +221,7 @@ class ModeChoice:
         kinds = (
             (self.slips, self.slack.slips),
             (self.openings, self.slack.openings),
-            (self.holds, self.slack.holds),
+            (self.force_limits, self.slack.force_limits),
             (self.grips, self.slack.grips),
         )
         pairs = (pair for kind in kinds for pair in zip(*kind, strict=True))
@@ -246,7 +246,9 @@ class ModeChoice:
 
     def moves(self, tau: Array) -> bool:
         """Whether it slides this way and every contact presses."""
-        return bool((self.holds @ [1.0, *tau] >= -self.slack.holds).all()) and self.slides(tau)
+        return bool(
+            (self.force_limits @ [1.0, *tau] >= -self.slack.force_limits).all()
+        ) and self.slides(tau)
 
     def depart(self, x: float, tau: Array) -> Departure:
         """Start this way at `x` of a piece, where the torques are `tau`."""
@@ -302,7 +304,7 @@ def _build_pattern(
     if response is None:
         return None
     declared = np.array([mode.declares(k) for k in range(len(mode.holders))] * 2, dtype=bool)
-    cones, cone_units = response.holds[count:], mode.force_limit_units[count:]
+    cones, cone_units = response.force_limits[count:], mode.force_limit_units[count:]
     tolerances, length = find_tolerances(formation.scene), formation.scene.scales.length
     slips = signs[:, None] * response.rates
     graze = _GRAZE * np.repeat([1.0, length], [count, 2]) @ slips
@@ -311,14 +313,14 @@ def _build_pattern(
         drive=tolerances.drive,
         slips=np.repeat([tolerances.still, tolerances.still_joint], [count, 2]),
         grips=ROUNDING_FORCE * cone_units[~declared],
-        holds=ROUNDING_FORCE * units,
+        force_limits=ROUNDING_FORCE * units,
         openings=np.full(len(touching.gradient), tolerances.closing),
     )
     return ModeChoice(
         directions=Directions(signs[:count], signs[count:]),
         mass=formation.scene.mass_diagonal,
         acceleration=response.acceleration,
-        holds=np.vstack([response.holds[:count], cones[declared]]),
+        force_limits=np.vstack([response.force_limits[:count], cones[declared]]),
         slips=slips,
         grips=cones[~declared],
         openings=touching.gradient @ response.acceleration + graze,

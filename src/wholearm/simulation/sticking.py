@@ -200,7 +200,7 @@ class Rest:
         pulls = find_pulls(self.formation.scene, self.touching, self.z, tau)
         if free or np.isinf(pulls).all():
             load = np.array([1.0, *tau])
-            weakest = min((way.holds @ load for way in free or self.ways), key=np.min)
+            weakest = min((way.force_limits @ load for way in free or self.ways), key=np.min)
             row, least, c_t = find_weakest(self.formation, weakest)
             return Collapse(high, self.formation.names[row], least, self._jams, c_t)
         name, least = self.touching[int(pulls.argmax())].name, -float(pulls.max())
@@ -281,7 +281,9 @@ def _build_way(
     assert answer is not None
     tolerances = find_tolerances(formation.scene)
     drive = heading * formation.scene.mass_diagonal @ answer.acceleration
-    return RestDirection(heading, directions, drive, answer.holds, answer.ratio, closes, tolerances)
+    return RestDirection(
+        heading, directions, drive, answer.force_limits, answer.ratio, closes, tolerances
+    )
 
 
 def _rates(formation: Formation, z: Array, step: float, heading: Array) -> Array:

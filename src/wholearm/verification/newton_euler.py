@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..scene.model import Scene
+from ..scene.polygon import cross_product
 
 if TYPE_CHECKING:
     from ..contacts.elemental import Contact
@@ -142,9 +143,9 @@ def balance(
         friction = np.where(slides, -bound * np.sign(v_t), np.clip(c_t, -bound, bound))
         force = c_n[:, None] * n + friction[:, None] * t
         left[:, :2] += force
-        left[:, 2] += _cross(arm, force)
+        left[:, 2] += cross_product(arm, force)
         if contact.finger is not None:
-            left[:, 3 + contact.finger] -= _cross(lever, force)
+            left[:, 3 + contact.finger] -= cross_product(lever, force)
         gaps[:, k], rates[:, k] = touch.gap, v_n
         against[:, k] = slides & (np.abs(friction - c_t) > 1e-6 * scales.force)
     for k, link in enumerate(scene.fingers):
@@ -200,8 +201,3 @@ def _rotate(angle: Array, vector: Array) -> Array:
 def _quarter(vectors: Array) -> Array:
     """Vectors, shape (n, 2), turned by a right angle to the left."""
     return np.stack([-vectors[:, 1], vectors[:, 0]], axis=1)
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Plane cross product of n pairs of vectors, shape (n,)."""
-    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])

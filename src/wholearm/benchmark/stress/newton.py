@@ -13,6 +13,7 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...scene.model import Scene
+from ...scene.polygon import cross_product
 
 
 class Touch(NamedTuple):
@@ -99,9 +100,11 @@ def _touch(
     for direction in (normal, tangent):
         row = np.zeros((len(z), 5))
         row[:, :2] = direction
-        row[:, 2] = cross(point - z[:, :2], direction)
+        row[:, 2] = cross_product(point - z[:, :2], direction)
         if finger is not None:
-            row[:, 3 + finger] = -cross(point - np.asarray(scene.fingers[finger].base), direction)
+            row[:, 3 + finger] = -cross_product(
+                point - np.asarray(scene.fingers[finger].base), direction
+            )
         rows.append(row)
     return Touch(gap, low, high, rows[0], rows[1], scene.friction.of(finger))
 
@@ -127,11 +130,6 @@ def balance(
     for touch, c_n, c_t in zip(touches, forces[0].T, forces[1].T, strict=True):
         rest -= c_n[:, None] * touch.normal + c_t[:, None] * touch.tangent
     return np.asarray(rest)
-
-
-def cross(a: Array, b: Array) -> Array:
-    """Plane cross product along the last axis."""
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
 def _dot(a: Array, b: Array) -> Array:
