@@ -20,14 +20,14 @@ def slide() -> Problem:
 
 def test_small_changes_leave_a_plan(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(changes, "TRIALS", 2)
-    monkeypatch.setattr(changes, "SPREADS", (0.05,))
+    monkeypatch.setattr(changes, "CHANGES", (0.05,))
     (row,) = measure_stress(slide())
     assert row.error == 0.0 and row.note == "2 of 2 planned and verified"
 
 
 def test_what_has_no_plan_is_counted_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(changes, "TRIALS", 1)
-    monkeypatch.setattr(changes, "SPREADS", (0.05,))
+    monkeypatch.setattr(changes, "CHANGES", (0.05,))
     (row,) = measure_stress(slide().with_(epsilon=50.0))
     assert row.error == 1.0 and row.note.startswith("0 of 1 planned and verified; time: phase ")
 

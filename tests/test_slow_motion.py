@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wholearm.benchmark.stress.slow_motion import fast_margin, inertia_ratio, slow_margin
-from wholearm.benchmark.stress.tracing import follow, spread
+from wholearm.benchmark.stress.tracing import follow, resample
 from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve
 from wholearm.mechanics.dynamics import Directions, reduced_inertia
@@ -23,7 +23,7 @@ def course(heptagon: Problem, curves: tuple[Curve, ...]) -> tuple[Phase, Course]
     phase = heptagon.phases[2]
     start = curves[2].evaluate(np.zeros(1)).z[0]
     (reached,) = (way for way in follow(heptagon.scene, phase, start) if way.reached)
-    return phase, spread(heptagon.scene, phase, reached, 12)
+    return phase, resample(heptagon.scene, phase, reached, 12)
 
 
 def _weaker(scene: Scene, share: float) -> Scene:

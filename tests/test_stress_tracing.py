@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from shipped import HEPTAGON
-from wholearm.benchmark.stress.tracing import follow, slides, spread
+from wholearm.benchmark.stress.tracing import follow, resample, slides
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import load
 from wholearm.geometry.tracing import trace_phases
@@ -41,7 +41,7 @@ def test_places_where_a_contact_turns_are_on_the_grid(
     phase, curve = heptagon.phases[2], curves[2]
     start = curve.evaluate(np.zeros(1)).z[0]
     (reached,) = (way for way in follow(heptagon.scene, phase, start) if way.reached)
-    s, z, z_s = spread(heptagon.scene, phase, reached, 20)
+    s, z, z_s = resample(heptagon.scene, phase, reached, 20)
     turns = [part.start for part in curve.segments[1:]]
     assert turns, "this phase is here for its reversal"
     for turn in turns:

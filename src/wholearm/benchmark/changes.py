@@ -15,7 +15,7 @@ from ..verification.verify import verify
 from .report import Row
 
 TRIALS = 12
-SPREADS = (0.01, 0.1, 0.2)
+CHANGES = (0.01, 0.1, 0.2)
 """Largest relative change of each number."""
 _FINGER = ("inertia", "viscous", "dry", "torque_limit")
 
@@ -26,12 +26,12 @@ def measure_stress(problem: Problem) -> list[Row]:
     Objectives take turns. The error is the share of trials without a plan that holds.
     """
     rows: list[Row] = []
-    for spread in SPREADS if problem.table else ():
+    for largest in CHANGES if problem.table else ():
         random = np.random.default_rng(0)
         started, failures = time.perf_counter(), []
         for trial in range(TRIALS):
             goal = ("time", "effort", "margin")[trial % 3]
-            changes = change_numbers(problem.table, spread, random)
+            changes = change_numbers(problem.table, largest, random)
             try:
                 other = problem.with_(changes)
                 report = verify(other, solve(other, goal))
@@ -40,7 +40,7 @@ def measure_stress(problem: Problem) -> list[Row]:
                 failures.append(f"{goal}: {error}")
         seconds = (time.perf_counter() - started) / TRIALS
         note = f"{TRIALS - len(failures)} of {TRIALS} planned and verified"
-        setting = f"up to {spread:.0%}"
+        setting = f"up to {largest:.0%}"
         share = len(failures) / TRIALS
         text = "; ".join([note, *failures[:1]])
         rows.append(Row("stress", "other masses and forces", setting, seconds, share, text))
@@ -48,9 +48,9 @@ def measure_stress(problem: Problem) -> list[Row]:
 
 
 def change_numbers(
-    table: Mapping[str, Any], spread: float, random: np.random.Generator
+    table: Mapping[str, Any], largest: float, random: np.random.Generator
 ) -> dict[str, Any]:
-    """Numbers of a problem file changed by up to `spread`, by their dotted keys."""
+    """Numbers of a problem file changed by up to `largest`, by their dotted keys."""
     keys = ["object.mass"]
     for number, finger in table["fingers"].items():
         keys += [f"fingers.{number}.{key}" for key in _FINGER if key in finger]
@@ -60,5 +60,5 @@ def change_numbers(
         place: Any = table
         for step in key.split("."):
             place = place[step]
-        changed[key] = place * (1 + spread * float(random.uniform(-1, 1)))
+        changed[key] = place * (1 + largest * float(random.uniform(-1, 1)))
     return changed

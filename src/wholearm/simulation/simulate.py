@@ -175,7 +175,7 @@ def _arrive(run: Replay, arrival: Arrival, following: Phase | None) -> Outcome |
     run.impact += before - run.stored
     # The torques of the phase that has ended go on until they step, or end.
     coming = min(run.coming_step, run.breaks[-1])
-    run.hold = coming if coming - run.t <= arrival.window else run.t
+    run.held_until = coming if coming - run.t <= arrival.window else run.t
     return None
 
 
@@ -208,7 +208,7 @@ def _rest(run: Replay) -> Departure | Arrival | Released | Switched | Outcome:
     while True:
         if run.t >= run.breaks[-1]:
             return run.run_out()
-        if run.t >= run.hold:
+        if run.t >= run.held_until:
             x = run.fraction(run.t)
             change = rest.wait(run.coefficients[run.piece], x)
             if isinstance(change, Departure) and change.x <= x:

@@ -16,7 +16,7 @@ from ...scene.model import Scene
 from .cell_curves import best_end, find_best, list_ends
 from .rest_motion import rest_margin
 from .slow_motion import fast_margin, inertia_ratio, slow_margin
-from .tracing import Trace, follow, spread, weights
+from .tracing import Trace, follow, resample, weights
 
 PLACES = 60
 """Places along a curve at which limits are looked at."""
@@ -126,7 +126,7 @@ def _reach(scene: Scene, phase: Phase, z: Array) -> Trace:
 
 def _judge_curve(problem: Problem, phase: Phase, trace: Trace) -> Verdict:
     scene, epsilon = problem.scene, problem.epsilon
-    s, z, z_s = spread(scene, phase, trace, PLACES)
+    s, z, z_s = resample(scene, phase, trace, PLACES)
     slow, place = slow_margin(scene, phase, epsilon, z, z_s)
     free = float(inertia_ratio(scene, phase, z, z_s).min())
     at = f"phase {phase.number}, place {place} of {len(z)}"

@@ -48,7 +48,7 @@ class Forces(NamedTuple):
     ----------
     equal, equal_to : ndarray, shape (n, 3, k) and (n, 3)
         Newton's and Euler's laws of the object.
-    hold, least : ndarray, shape (n, m, k) and (n, m)
+    rows, least : ndarray, shape (n, m, k) and (n, m)
         Limits.
     share : ndarray, shape (m,)
         What a margin of 1 takes from each limit.
@@ -56,7 +56,7 @@ class Forces(NamedTuple):
 
     equal: Array
     equal_to: Array
-    hold: Array
+    rows: Array
     least: Array
     share: Array
 
@@ -90,7 +90,7 @@ def fast_margin(
     Parameters
     ----------
     curve : (s, z, z_s)
-        As of `tracing.spread`.
+        As of `tracing.resample`.
     rests : (bool, bool)
         Whether the motion is at rest at the start and at the end of the curve.
     loose : float
@@ -108,7 +108,7 @@ def fast_margin(
     for left in (True, False):
         at = slice(0, count - 1) if left else slice(1, count)
         forces.append(_limits(scene, phase, epsilon, z[at], z_s[at], z_ss[at], signs, free))
-    width, slots = forces[0].hold.shape[2] - 3, np.arange(count - 1)
+    width, slots = forces[0].rows.shape[2] - 3, np.arange(count - 1)
     run = np.diff(s) / size
     # Unknowns: b at the nodes, then v at the nodes, then c at both ends of every interval, margin.
     first_c = 2 * count
@@ -118,7 +118,7 @@ def fast_margin(
         columns = first_c + (2 * slots + side)[:, None] * width + np.arange(width)
         _add_limits(equal, part.equal, part.equal_to, slots, slots + side, run, columns)
         first = upper.count
-        _add_limits(upper, -part.hold, -part.least, slots, slots + side, run, columns)
+        _add_limits(upper, -part.rows, -part.least, slots, slots + side, run, columns)
         row = np.arange(first, upper.count)
         upper.add(row, np.full(len(row), total - 1), np.repeat(part.share, len(slots)))
     top = _top(scene, z_s) / speed**2
@@ -273,15 +273,15 @@ def _push(touches: Sequence[Touch], rolling: Sequence[int], signs: Array, loose:
 
 def _solve_one(forces: Forces) -> float:
     """Margin of one place at rest."""
-    hold, equal = forces.hold[0, :, 3:], forces.equal[0, :, 3:]
-    cost = np.append(np.zeros(hold.shape[1]), -1.0)
+    rows, equal = forces.rows[0, :, 3:], forces.equal[0, :, 3:]
+    cost = np.append(np.zeros(rows.shape[1]), -1.0)
     answer = linprog(
         cost,
-        A_ub=np.column_stack([-hold, forces.share]),
+        A_ub=np.column_stack([-rows, forces.share]),
         b_ub=-forces.least[0],
         A_eq=np.column_stack([equal, np.zeros(3)]),
         b_eq=forces.equal_to[0],
-        bounds=[(None, None)] * hold.shape[1] + [(None, 1.0)],
+        bounds=[(None, None)] * rows.shape[1] + [(None, 1.0)],
         method="highs",
     )
     return float(-answer.fun) if answer.status == 0 else -np.inf

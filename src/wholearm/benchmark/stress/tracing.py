@@ -169,7 +169,7 @@ def _meets(scene: Scene, until: Until, z: Array) -> bool:
     return bool(min(touch.low[0], touch.high[0]) > -near)
 
 
-def spread(scene: Scene, phase: Phase, trace: Trace, count: int) -> tuple[Array, Array, Array]:
+def resample(scene: Scene, phase: Phase, trace: Trace, count: int) -> tuple[Array, Array, Array]:
     """The curve at even places, and also where a contact or a joint turns.
 
     Returns
