@@ -300,7 +300,8 @@ def _describe(block: BlockPlan, number: int, check: Check) -> str:
 def _collect_figures(planning: Planning, check: Check) -> ReplayFigures:
     """What a plan keeps of its replay."""
     assert isinstance(check.report, Report)
-    found = [(find_least_force(phase), phase.number) for phase in check.report.phases]
+    scene = planning.problem.scene
+    found = [(find_least_force(scene, phase), phase.number) for phase in check.report.phases]
     known = [(least, number) for least, number in found if least is not None]
     least, number = min(known, key=lambda pair: pair[0].least)
     return ReplayFigures(

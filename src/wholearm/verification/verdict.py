@@ -195,11 +195,12 @@ def describe_thin_margins(
     ]
 
 
-def find_least_force(phase: PhaseReport) -> ContactMargin | None:
+def find_least_force(scene: Scene, phase: PhaseReport) -> ContactMargin | None:
     """The contact with the least normal force in a phase; None if nothing moved.
 
     Contacts that are let go count until just before.
     """
+    shortest = SHORTEST * scene.scales.time
     released = phase.until.startswith("release of ") and phase.arrival is not None
     known = [
         margin
@@ -208,7 +209,7 @@ def find_least_force(phase: PhaseReport) -> ContactMargin | None:
         and not (
             released
             and margin.contact in phase.until
-            and abs(margin.time - (phase.arrival or 0.0)) <= SHORTEST
+            and abs(margin.time - (phase.arrival or 0.0)) <= shortest
         )
     ]
     return min(known, key=lambda margin: margin.least, default=None)
