@@ -224,9 +224,8 @@ def test_a_contact_that_is_let_go_is_not_the_least() -> None:
     late = replace(gone, least=-1.0, time=phase.arrival)
     early = replace(gone, least=-1.0, time=phase.arrival - 0.01)
     kept = [margin for margin in phase.contacts if margin is not gone]
-    assert find_least_force(problem.scene, replace(phase, contacts=(*kept, late))).least == min(
-        others
-    )  # type: ignore[union-attr]
+    found = find_least_force(problem.scene, replace(phase, contacts=(*kept, late)))
+    assert found is not None and found.least == min(others)
     assert find_least_force(problem.scene, replace(phase, contacts=(*kept, early))) is early
 
 
