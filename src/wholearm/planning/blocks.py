@@ -85,6 +85,11 @@ class BlockPlan:
         return max(len(plan.torque.coefficients) for plan in self.plans)
 
     @property
+    def has_searched(self) -> bool:
+        """Whether more than one sequence of contact modes was tried."""
+        return any(plan.sequences > 1 for plan in self.plans)
+
+    @property
     def is_finest(self) -> bool:
         """Whether it is planned in the time domain with all the intervals that it may have."""
         return self.chain is None and self.intervals >= FINEST

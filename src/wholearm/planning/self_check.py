@@ -188,7 +188,7 @@ def _improve(
     most = (REFINEMENTS if block.chain else ROUGH) if fails else 1
     if PLAIN != block.finer < most and not block.is_finest:
         refined = _refine(planning, index, report)
-    if refined is None and fails and not block.chain and block.finer != PLAIN:
+    if refined is None and fails and block.has_searched and block.finer != PLAIN:
         refined = _refine(planning, index, report, plain=True)
     return refined
 

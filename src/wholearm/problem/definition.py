@@ -150,7 +150,8 @@ class Problem:
         object.__setattr__(self, "checked", True)
 
     def __repr__(self) -> str:
-        return f"Problem({self.name!r}, {len(self.phases)} phases)"
+        count = len(self.phases)
+        return f"Problem({self.name!r}, {count} phase{'s' if count > 1 else ''})"
 
     def with_(self, changes: Mapping[str, Any] | None = None, /, **named: Any) -> Problem:
         """Return the problem with other values, checked like those of a file.

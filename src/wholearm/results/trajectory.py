@@ -95,7 +95,8 @@ class Trajectory:
     meta: Mapping[str, Any]
 
     def __repr__(self) -> str:
-        return f"Trajectory({len(self.motions)} phases, {self.duration:.6g} s)"
+        count = len(self.motions)
+        return f"Trajectory({count} phase{'s' if count > 1 else ''}, {self.duration:.6g} s)"
 
     @property
     def duration(self) -> float:
