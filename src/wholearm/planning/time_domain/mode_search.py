@@ -11,7 +11,7 @@ from .stage import Stage
 
 MOST = 12
 """Most sequences of modes to try from one start."""
-PATIENCE = 48
+PATIENCE = 60
 """Most iterations of one of them."""
 STRETCH = 1e-3
 """Price of changing the durations of all intervals by as much as they are, over the cost: of many
