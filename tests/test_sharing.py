@@ -21,7 +21,7 @@ import pytest
 import wholearm
 from shipped import FOLDER, LANDING, plan_of, problem_of
 from wholearm.common import sharing
-from wholearm.common.sharing import Keeper, exclusive, kept_property, retire_with
+from wholearm.common.sharing import Keeper, Store, exclusive, kept_property, retire_with
 from wholearm.simulation.simulate import simulate
 
 SQUARE = str(FOLDER / "square.toml")
@@ -314,3 +314,27 @@ def test_an_owner_that_is_kept_by_nothing_goes(tracked: type[Tracked]) -> None:
     reference = weakref.ref(owner)
     del owner
     assert reference() is None
+
+
+class Owner:
+    """What shares a value with others."""
+
+
+def test_a_value_lives_as_long_as_one_of_its_owners() -> None:
+    built: list[object] = []
+
+    def build(_: object) -> list[int]:
+        built.append(value := [len(built)])
+        return value
+
+    store = Store(build, lambda _: "same")
+    first, second = Owner(), Owner()
+    assert store(first) is store(second)
+    kept = store(second)
+    del first
+    gc.collect()
+    third = Owner()
+    assert store(third) is kept and len(built) == 1
+    del second, third
+    gc.collect()
+    assert store(Owner()) == [1]

@@ -96,6 +96,13 @@ def retire_with(owner: object, value: object) -> None:
     finalize(owner, _retired.append, value).atexit = False
 
 
+class _Share(Generic[_T]):
+    """A value that each of its owners holds."""
+
+    def __init__(self, value: _T) -> None:
+        self.value = value
+
+
 class Store(Generic[_T]):
     """Values made of CasADi objects that several owners share, for as long as one of them lives.
 
@@ -109,18 +116,18 @@ class Store(Generic[_T]):
 
     def __init__(self, build: Callable[[Any], _T], identify: Callable[[Any], Hashable]) -> None:
         self._build, self._identify = build, identify
-        self._values: WeakKeyDictionary[Any, _T] = WeakKeyDictionary()
-        self._firsts: WeakValueDictionary[Hashable, Any] = WeakValueDictionary()
+        self._shares: WeakKeyDictionary[Any, _Share[_T]] = WeakKeyDictionary()
+        self._known: WeakValueDictionary[Hashable, _Share[_T]] = WeakValueDictionary()
 
     @exclusive
     def __call__(self, owner: object) -> _T:
         """Return the value of `owner`."""
-        if owner not in self._values:
-            first = self._firsts.setdefault(self._identify(owner), owner)
-            value = self._values[first] if first in self._values else self._build(owner)
-            self._values[owner] = value
-            retire_with(owner, value)
-        return self._values[owner]
+        if owner not in self._shares:
+            key = self._identify(owner)
+            share = self._known.get(key) or _Share(self._build(owner))
+            self._known[key] = self._shares[owner] = share
+            retire_with(owner, share)
+        return self._shares[owner].value
 
 
 def _drop_locals(error: BaseException) -> None:

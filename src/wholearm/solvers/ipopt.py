@@ -122,8 +122,9 @@ class Solver:
         """
         result: dict[str, Expression] = self.function(**arguments)
         stats = self.function.stats()
-        cost = {"iterations": stats["iter_count"], "solve_time": stats["t_wall_total"]}
-        book(SolverStatistics(solves=1, **cost))
+        # A solver that was stopped does not always say what it has done.
+        cost = stats.get("iter_count", 0), stats.get("t_wall_total", 0.0)
+        book(SolverStatistics(solves=1, iterations=cost[0], solve_time=cost[1]))
         for runs in _RECORDS:
             runs.append(self._describe_run(stats))
         check()
