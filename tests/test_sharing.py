@@ -316,7 +316,7 @@ def test_an_owner_that_is_kept_by_nothing_goes(tracked: type[Tracked]) -> None:
     assert reference() is None
 
 
-class Owner:
+class Sharer:
     """What shares a value with others."""
 
 
@@ -328,13 +328,13 @@ def test_a_value_lives_as_long_as_one_of_its_owners() -> None:
         return value
 
     store = Store(build, lambda _: "same")
-    first, second = Owner(), Owner()
+    first, second = Sharer(), Sharer()
     assert store(first) is store(second)
     kept = store(second)
     del first
     gc.collect()
-    third = Owner()
+    third = Sharer()
     assert store(third) is kept and len(built) == 1
     del second, third
     gc.collect()
-    assert store(Owner()) == [1]
+    assert store(Sharer()) == [1]
