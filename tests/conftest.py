@@ -5,6 +5,7 @@ import signal
 
 import pytest
 
+import alone  # noqa: F401 -- before NumPy
 from once import STORE
 from shipped import HEPTAGON, plan_of, problem_of
 from wholearm.geometry.curve import Curve
