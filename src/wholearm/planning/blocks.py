@@ -1,8 +1,7 @@
 """Blocks of phases that are planned together, and how they are planned one after the other.
 
-Phases joined at rest are problems of their own; those joined smoothly or by impacts are one. Phases
-with one freedom are planned along their curves, unless they are joined to others with more, and
-anything else in the time domain.
+Phases joined smoothly or by impacts are one block. With one freedom they are planned along their
+curves, unless they are joined to others with more, and anything else in the time domain.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence
 from .path_domain.sequence_plan import plan_sequence
 from .phase_plan import add_up
-from .stops import Plans
+from .stops import Plans, end_of
 
 PLAIN = -1
 """Number of doublings that stands for as many intervals as at first, and no search for modes."""
@@ -76,8 +75,7 @@ class BlockPlan:
         """Where the block ends, shape (5,)."""
         if self.chain is not None:
             return self.chain.curves[-1].end
-        motion = self.plans[-1].motion
-        return np.asarray(motion.evaluate(np.array([motion.duration])).z[0])
+        return end_of(self.plans[-1])[0]
 
     @property
     def intervals(self) -> int:
@@ -170,14 +168,13 @@ def plan_blocks(
     InputError, InfeasibleError, JammingError, SolverError
         If there is no plan.
     """
-    count = len(split_blocks(problem))
-    none: list[float | None] = [None] * len(problem.phases)
+    finer, none = [0] * len(split_blocks(problem)), list[float | None]([None] * len(problem.phases))
     planning = Planning(problem, curves, options, (), none, none)
     if options.goal is Objective.MARGIN:
         first = replace(planning, options=_for_time(options), ahead=False)
-        least = plan_each(first, [0] * count, report).plans
+        least = plan_each(first, finer, report).plans
         planning = replace(planning, shares=share_duration(least, options.duration), least=least)
-    return _require_margin(plan_each(planning, [0] * count, report))
+    return _require_margin(plan_each(planning, finer, report))
 
 
 def plan_alone(planning: Planning, report: Callable[[str], None]) -> Planning | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
 
 from ..problem.definition import Phase
@@ -38,6 +39,25 @@ class PhasePlan(NamedTuple, Generic[M_co]):
     sequences: int = 0
     complete: bool = True
     attempt: str = ""
+
+
+@dataclass
+class Tried:
+    """What a search for contact modes has done.
+
+    Attributes
+    ----------
+    sequences : int
+        Of modes that were tried.
+    complete : bool
+        Whether none was left to try.
+    iterations : int
+        Of the solver.
+    """
+
+    sequences: int = 1
+    complete: bool = True
+    iterations: int = 0
 
 
 def add_up(phases: Sequence[Phase], allowed: Sequence[float | None]) -> float | None:

@@ -15,6 +15,7 @@ from ...common.shortfalls import Parameter
 from ...geometry.cost_to_go import CostToGo
 from ...problem.definition import Problem
 from ..options import Objective, PlanOptions
+from ..phase_plan import Tried
 from .between import Limits, check_between, find_misses, monitor_missed, raise_bounds
 from .collocation import Scheme, make_scheme
 from .layout import pack, unpack
@@ -47,25 +48,6 @@ _DEARER = 0.2
 """Largest relative cost increase accepted from tightening."""
 _COARSE = 0.1
 """Largest relative cost increase accepted from finer intervals."""
-
-
-@dataclass
-class Tried:
-    """What a search has done.
-
-    Attributes
-    ----------
-    sequences : int
-        Of modes that were tried.
-    complete : bool
-        Whether none was left to try.
-    iterations : int
-        Of the solver.
-    """
-
-    sequences: int = 1
-    complete: bool = True
-    iterations: int = 0
 
 
 class Price(NamedTuple):
