@@ -24,6 +24,7 @@ from ..solvers.statistics import Ledger, open_ledger
 from .blocks import Planning, plan_blocks
 from .impacts import assess_impacts
 from .options import PlanOptions
+from .path_domain import sequence_plan
 from .phase_plan import combine
 from .result import Plan, PlannedPhase, Status, Timings
 from .saved import write_meta
@@ -195,8 +196,6 @@ def _assess(planning: Planning, report: Callable[[str], None]) -> list[Transitio
             impacts = list_impacts(block.phases, block.plans)
             plan_part = plan_parts_of(planning.problem, block.phases)
         else:
-            from .path_domain import sequence_plan
-
             impacts = sequence_plan.list_impacts(block.chain, block.plans)
             plan_part = sequence_plan.plan_parts_of(block.chain, planning.problem.epsilon)
         given = block.phases, impacts, block.plans, plan_part
