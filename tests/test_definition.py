@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import wholearm
 from plane import finger_gap, place_corners
 from shipped import HEPTAGON
 from wholearm.common.errors import InputError
@@ -102,6 +103,17 @@ def test_optional_keys() -> None:
     assert str(problem.phases[0].until) == "x = 0.02 m"
 
 
+def test_a_problem_for_a_map_needs_no_phases() -> None:
+    problem = read_edited(drop("phases"))
+    assert problem.phases == () and repr(problem).endswith("0 phases)")
+    assert problem.with_(mass=0.3).phases == ()
+    with pytest.raises(InputError, match="phases: is missing; `wholearm map"):
+        wholearm.solve(problem)
+    torques = wholearm.TorqueProfile(np.array([0.0, 1.0]), np.zeros((1, 2, 1)))
+    with pytest.raises(InputError, match="phases: is missing"):
+        wholearm.simulate(problem, torques)
+
+
 def test_a_contact_slides_unless_it_is_said_to_roll() -> None:
     problem = read_edited(put("phases.3.contacts", ["v1-palm rolling", "v0-finger2", "v3-finger1"]))
     phase, before = problem.phases[3].formation, problem.phases[0].formation
@@ -135,7 +147,7 @@ ALLOWED_UNTIL = "allowed are a contact name"
         (put("start.phi", 0), "start.phi", "allowed are flush, x"),
         (put("phases.1.contact", []), "phases[2].contact", "did you mean 'contacts'"),
         (drop("epsilon"), "epsilon", "is missing"),
-        (drop("phases"), "phases", "is missing"),
+        (put("phases", 3), "phases", "3 is not a list of [[phases]]"),
         (drop("object.mass"), "object.mass", "is missing"),
         (drop("fingers.2"), "fingers.2", "is missing"),
         (drop("fingers.2.length"), "fingers.2.length", "is missing"),
@@ -174,8 +186,7 @@ ALLOWED_UNTIL = "allowed are a contact name"
         (put("start.x", "left"), "start.x", "'left'"),
         (put("start.x", 9.0), "start", "finger 1 is too short"),
         (put("fingers.2.base", [0.03, 0.02]), "fingers.2.base", "inside the object"),
-        (put("phases", []), "phases", "one or more"),
-        (put("phases", {}), "phases", "one or more"),
+        (put("phases", {}), "phases", "{} is not a list"),
         (put("phases.0", 3), "phases[1]", "not a table"),
         (put("phases.0.contacts", []), "phases[1].contacts", "contact names"),
         (put("phases.0.contacts", "v0-palm"), "phases[1].contacts", "contact names"),

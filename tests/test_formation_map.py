@@ -20,10 +20,10 @@ from wholearm.contacts.closing import close_finger, close_fingers, contact_table
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.mapping.borders import NOWHERE, Window, label_cells
-from wholearm.mapping.formation_map import CROSSED, Border, FormationMap, build_map
+from wholearm.mapping.formation_map import CROSSED, Border, FormationMap, build_map, choose_window
 from wholearm.mapping.route import list_formations
 from wholearm.problem.definition import Problem
-from wholearm.problem.read import build_problem
+from wholearm.problem.read import build_problem, read_problem
 from wholearm.scene.model import Scene
 
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
@@ -406,6 +406,19 @@ def test_command_lists_phases(capsys: pytest.CaptureFixture[str]) -> None:
     assert tomllib.loads(capsys.readouterr().out)["phases"] == TABLE["phases"][:3]
     assert main(["map", str(HEPTAGON), "--list", "-0.05,-1.98", "0.03,-1.98"]) == 0
     assert "x = 0.03" in capsys.readouterr().out
+
+
+def test_phases_are_listed_for_a_problem_without_any(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = HEPTAGON.read_text(encoding="utf-8")
+    path = tmp_path / "bare.toml"
+    path.write_text(text[: text.index("[[phases]]")], encoding="utf-8")
+    assert main(["map", str(path), "--list", "0.045,-1.98", "-.0637,-1.98"]) == 0
+    assert tomllib.loads(capsys.readouterr().out)["phases"] == TABLE["phases"][:3]
+    bare = read_problem(str(path))
+    low, high = choose_window(bare).phi
+    assert low < bare.start[2] < high and high - low < math.pi
 
 
 @pytest.mark.parametrize(

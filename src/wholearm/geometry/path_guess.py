@@ -42,11 +42,11 @@ def load(path: str) -> Problem:
         If the file is malformed, a formation does not touch, or an `until` is never reached.
     """
     problem = read_problem(path)
-    require_phases(problem)
+    check_phases(problem)
     return problem
 
 
-def require_phases(problem: Problem) -> None:
+def check_phases(problem: Problem) -> None:
     """Check that every phase of a problem can be carried out geometrically.
 
     Raises

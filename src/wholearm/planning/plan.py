@@ -16,6 +16,7 @@ from ..common.errors import InfeasibleError
 from ..common.sharing import exclusive
 from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phases
+from ..problem.check import require_phases
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory, assemble
@@ -95,6 +96,7 @@ def solve_with(
     problem: Problem, options: PlanOptions, progress: Callable[[str], None] | None = None
 ) -> Plan:
     """Plan with `options` given as one object; see `solve`."""
+    require_phases(problem)
     report = progress or (lambda _: None)
     with open_ledger() as ledger:
         started = time.perf_counter()

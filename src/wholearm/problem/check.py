@@ -6,6 +6,7 @@ Every message names the key that the value has in a file, says what was given an
 from __future__ import annotations
 
 import math
+from itertools import zip_longest
 
 from ..common.errors import InputError
 from ..common.require import require_number, require_vector
@@ -32,18 +33,29 @@ def check_problem(problem: Problem) -> None:
     check_ranges(problem.scene)
     check_epsilon(problem.scene, epsilon)
     check_place(problem.scene, "start.x", float(require_vector(problem.start, "start", 5)[0]))
-    if not problem.phases:
-        raise InputError("", "phases", "() is not a list of one or more [[phases]]")
     for index, phase in enumerate(problem.phases):
         if phase.index != index:
             text = f"has the index {phase.index}; phases count up from 0, which makes it {index}"
             raise InputError("", f"phases[{index + 1}]", text)
         _check_formation(phase.formation, f"phases[{index + 1}].contacts")
         _check_until(problem.scene, phase, f"phases[{index + 1}].until")
-    for phase, following in zip(problem.phases, [*problem.phases[1:], None], strict=True):
+    for phase, following in zip_longest(problem.phases, problem.phases[1:]):
         _check_end(phase, following)
     _check_fingers(problem)
     _check_first_formation(problem)
+
+
+def require_phases(problem: Problem) -> None:
+    """Check that there is something to plan or to replay: a problem for a map needs no phases.
+
+    Raises
+    ------
+    InputError
+        If the problem has no phases.
+    """
+    if not problem.phases:
+        text = "is missing; `wholearm map FILE --list X,PHI ...` lists [[phases]] along a route"
+        raise InputError(problem.source, "phases", text)
 
 
 def _check_formation(formation: Formation, key: str) -> None:
@@ -145,6 +157,8 @@ def _check_fingers(problem: Problem) -> None:
 
 def _check_first_formation(problem: Problem) -> None:
     """Check that what the first phase names touches; it may let go what else does."""
+    if not problem.phases:
+        return
     touching = find_touching(problem.scene, problem.start)
     first = problem.phases[0].formation.contacts
     if not set(first) <= set(touching):

@@ -108,6 +108,7 @@ class Problem:
     start : ndarray, shape (5,)
         Configuration z at the start, with the fingers closed; see `place_start`.
     phases : tuple of Phase
+        None of them for a map; planning and replays need one or more.
     source : str
         The file this was read from.
     table : mapping
@@ -151,7 +152,7 @@ class Problem:
 
     def __repr__(self) -> str:
         count = len(self.phases)
-        return f"Problem({self.name!r}, {count} phase{'s' if count > 1 else ''})"
+        return f"Problem({self.name!r}, {count} phase{'' if count == 1 else 's'})"
 
     def with_(self, changes: Mapping[str, Any] | None = None, /, **named: Any) -> Problem:
         """Return the problem with other values, checked like those of a file.

@@ -31,8 +31,8 @@ _T = TypeVar("_T")
 ROLLING = " rolling"
 """Follows the name of a contact that rolls in a phase's `contacts`."""
 
-_OPTIONAL = {"name", "gravity", "fingers_collide"}
-_TOP = _OPTIONAL | {"epsilon", "object", "fingers", "friction", "start", "phases"}
+_OPTIONAL = {"name", "gravity", "fingers_collide", "phases"}
+_TOP = _OPTIONAL | {"epsilon", "object", "fingers", "friction", "start"}
 _OBJECT = {"vertices", "mass", "inertia"}
 _DEFAULTS = {"radius": 0.0, "viscous": 0.0, "dry": 0.0}
 _FINGER = {
@@ -83,9 +83,9 @@ def _build_problem(table: Mapping[str, Any], source: str) -> Problem:
     scene = _read_scene(table)
     check_ranges(scene)
     start = _read_start(scene, _table(table, "start"))
-    given = table["phases"]
-    if not isinstance(given, list) or not given:
-        raise InputError("", "phases", f"{given!r} is not a list of one or more [[phases]]")
+    given = table.get("phases", [])
+    if not isinstance(given, list):
+        raise InputError("", "phases", f"{given!r} is not a list of [[phases]]")
     phases = tuple(_read_phase(scene, i, entry) for i, entry in enumerate(given))
     return Problem(
         table.get("name", "unnamed"), scene, table["epsilon"], start, phases, source, table

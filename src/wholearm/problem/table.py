@@ -141,8 +141,8 @@ def match_table(problem: Problem) -> Mapping[str, Any]:
     start = _match_start(table["start"], problem)
     if start is None:
         return {}
-    phases = [_match_phase(table["phases"], phase) for phase in problem.phases]
-    if not differing and start is table["start"] and phases == table["phases"]:
+    phases = [_match_phase(table.get("phases", []), phase) for phase in problem.phases]
+    if not differing and start is table["start"] and phases == table.get("phases", []):
         return table
     changed = copy.deepcopy({**table, "start": start, "phases": phases})
     for key, value in differing.items():

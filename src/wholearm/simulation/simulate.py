@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike
 from ..common.arrays import Array
 from ..common.errors import InputError, JammingError, SimulationError
 from ..common.sharing import exclusive
+from ..problem.check import require_phases
 from ..problem.definition import End, Phase, Problem
 from ..results.narrow import Torques, narrow
 from .events import EventKind, Outcome, OutcomeKind, Simulation, collect
@@ -82,6 +83,7 @@ def simulate(
         If a formation does not close at its start, or the step size underflows. Both errors say in
         which phase.
     """
+    require_phases(problem)
     profile, _ = narrow(torque)
     if not 1e-14 <= tolerance <= 1e-2:
         raise InputError("", "tolerance", f"{tolerance!r} is not between 1e-14 and 1e-2")

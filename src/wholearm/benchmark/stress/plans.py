@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...common.errors import InputError, SolverError, WholearmError
-from ...geometry.path_guess import require_phases
+from ...geometry.path_guess import check_phases
 from ...planning.plan import solve
 from ...problem.definition import Problem
 from ...problem.read import build_problem
@@ -112,7 +112,7 @@ def _load(table: dict[str, Any]) -> tuple[Problem | None, Exception | None]:
     problem = None
     try:
         problem = build_problem(table)
-        require_phases(problem)
+        check_phases(problem)
     except Exception as error:
         return problem, error
     return problem, None

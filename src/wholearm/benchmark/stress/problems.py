@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...common.errors import WholearmError
-from ...geometry.path_guess import require_phases
+from ...geometry.path_guess import check_phases
 from ...planning.plan import solve
 from ...problem.read import build_problem, read_problem
 from ...verification.verify import verify
@@ -50,7 +50,7 @@ def run_trial(task: tuple[str, str, str, int]) -> dict[str, Any]:
             problem = build_problem(add_noise(dict(given.table), rng), path)
         else:
             problem = given.with_(change_numbers(given.table, SPREAD, rng))
-        require_phases(problem)
+        check_phases(problem)
         plan = solve(problem, objective)
         value = plan.value
         report = verify(problem, plan)
