@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError, name_source
+from ..common.frozen import dataclass
 from ..common.sharing import exclusive
 from ..contacts.formation import Formation
 from ..contacts.limits import build_limits

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, NamedTuple
+from dataclasses import asdict, field, replace
+from typing import Any
 
+from ..common.frozen import NamedTuple, dataclass
 from .narrow import Moved
 from .trajectory import Trajectory
 

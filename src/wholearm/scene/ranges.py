@@ -7,11 +7,10 @@ for a mistake.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from ..common.errors import InputError
+from ..common.frozen import NamedTuple
 from .model import Finger, Scene
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
+
+from ..common.frozen import NamedTuple
 
 STATE = 14
 """Length of the integrated vector: z, z', then work, viscous, dry and contact losses."""

@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi as ca
 
 from ..common.arrays import Expression
+from ..common.frozen import NamedTuple
 from ..common.interrupts import check
 from .statistics import SolverStatistics, book
 

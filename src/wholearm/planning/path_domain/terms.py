@@ -17,12 +17,13 @@ column through all rows would make building the Jacobian quadratic in the number
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from ...common.arrays import Expression
+from ...common.frozen import NamedTuple
 from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ..columns import Columns, Symbols
 from ..options import Objective
