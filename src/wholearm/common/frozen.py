@@ -11,6 +11,7 @@ from collections import namedtuple
 from dataclasses import MISSING, Field, FrozenInstanceError
 from dataclasses import dataclass as _collect
 from inspect import Parameter, Signature
+from operator import attrgetter
 from reprlib import recursive_repr
 from typing import TYPE_CHECKING, Any
 
@@ -45,7 +46,10 @@ else:
                 if method.__name__ not in vars(cls):
                     setattr(cls, method.__name__, method)
             cls.__signature__ = _Signed()
-            return _collect(init=False, repr=False, eq=False)(cls)
+            cls = _collect(init=False, repr=False, eq=False)(cls)
+            fields = cls.__dataclass_fields__.values()
+            cls._compared = attrgetter(*(f.name for f in fields if f.compare))
+            return cls
 
         return make
 
@@ -85,30 +89,23 @@ def __delattr__(self: object, name: str) -> None:  # noqa: N807
 
 @recursive_repr()
 def __repr__(self: Any) -> str:  # noqa: N807
-    shown = [f"{f.name}={getattr(self, f.name)!r}" for f in _list_fields(self) if f.repr]
+    fields = self.__dataclass_fields__.values()
+    shown = [f"{f.name}={getattr(self, f.name)!r}" for f in fields if f.repr]
     return f"{type(self).__qualname__}({', '.join(shown)})"
 
 
-def __eq__(self: object, other: object) -> bool:  # noqa: N807
+def __eq__(self: Any, other: Any) -> bool:  # noqa: N807
     if type(self) is not type(other):
         return NotImplemented
-    return _list_compared(self) == _list_compared(other)
+    return bool(self._compared(self) == other._compared(other))
 
 
-def __hash__(self: object) -> int:  # noqa: N807
-    return hash(_list_compared(self))
+def __hash__(self: Any) -> int:  # noqa: N807
+    return hash(self._compared(self))
 
 
 _METHODS = [__init__, __setattr__, __delattr__, __repr__]
 _COMPARISONS = [__eq__, __hash__]
-
-
-def _list_fields(self: Any) -> list[Field[Any]]:
-    return list(self.__dataclass_fields__.values())
-
-
-def _list_compared(self: object) -> tuple[object, ...]:
-    return tuple(getattr(self, f.name) for f in _list_fields(self) if f.compare)
 
 
 class _Signed:
