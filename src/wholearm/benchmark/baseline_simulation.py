@@ -9,10 +9,9 @@ no reversals, no change of formation.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -83,7 +82,7 @@ def simulate_with_scipy(
     contacts, piece = problem.phases[phase_index].formation.contacts, 0
 
     def forces(t: float, state: Array) -> tuple[Array, Array]:
-        tau = _evaluate_piece(torque, piece, t)
+        tau = evaluate_piece(torque, piece, t)
         return solve_motion(problem.scene, contacts, state[:5], state[5:], tau, Xi, sigma)
 
     def derivative(t: float, state: Array) -> Array:
@@ -94,7 +93,7 @@ def simulate_with_scipy(
     parts, normal, lost = [], [], None
     state = np.concatenate([z0, z_dot0])
     for start, stop in pairwise([t_span[0], *inner.tolist(), t_span[1]]):
-        piece = _find_piece(torque, (start + stop) / 2)
+        piece = find_piece(torque, (start + stop) / 2)
         given = {"method": method, "rtol": rtol, "atol": atol, "events": events}
         parts.append(found := solve_ivp(derivative, (start, stop), state, **given))
         state = found.y[:, -1]
@@ -119,13 +118,13 @@ def _fall(forces: Callable[[float, Array], tuple[Array, Array]], index: int) -> 
     return event
 
 
-def _find_piece(torque: TorqueProfile, t: float) -> int:
+def find_piece(torque: TorqueProfile, t: float) -> int:
     """The piece of the torques that a time is in, or the nearest one."""
     piece = int(np.searchsorted(torque.breaks, t, side="right")) - 1
     return min(max(piece, 0), len(torque.coefficients) - 1)
 
 
-def _evaluate_piece(torque: TorqueProfile, piece: int, t: float) -> Array:
+def evaluate_piece(torque: TorqueProfile, piece: int, t: float) -> Array:
     """Torques of one piece at a time, shape (2,) [N m]."""
     start, stop = torque.breaks[piece], torque.breaks[piece + 1]
     x = (2 * t - start - stop) / (stop - start)
@@ -140,22 +139,24 @@ def solve_motion(
     tau: Array,
     Xi: Array,
     sigma: Array,
+    pull: float = 0.0,
 ) -> tuple[Array, Array]:
     """Accelerations z'', shape (5,), and c_n, shape (n_c,) [N], from one linear system.
 
     The unknowns are those of Eqs. (1) and (2) with the friction of Eq. (3) put in, together with
-    the contact conditions differentiated twice.
+    the contact conditions differentiated twice. With a `pull` p [1/s] gaps come back to zero as
+    Baumgarte has it, C'' + 2 p C' + p^2 C = 0. Extended precision is kept.
     """
     count = len(contacts)
-    matrix = np.zeros((5 + count, 5 + count))
-    right = np.zeros(5 + count)
+    matrix = np.zeros((5 + count, 5 + count), dtype=z.dtype)
+    right = np.zeros(5 + count, dtype=z.dtype)
     matrix[range(5), range(5)] = scene.mass_diagonal
     right[1] = -scene.polygon.mass * scene.gravity
     for i, finger in enumerate(scene.fingers):
         friction = finger.viscous * z_dot[3 + i] + finger.dry * sigma[i]
         right[3 + i] = tau[i] - friction
     for k, contact in enumerate(contacts):
-        point, normal, bend = _touch(scene, contact, z, z_dot)
+        point, normal, bend, gap = _touch(scene, contact, z, z_dot)
         tangent = np.array([normal[1], -normal[0]])
         coefficient = scene.friction.of(contact.finger)
         row = _lever(scene, contact, z, point, normal)
@@ -163,13 +164,42 @@ def solve_motion(
         matrix[:5, 5 + k] = -force
         matrix[5 + k, :5] = row
         right[5 + k] = -bend
-    solution = np.linalg.solve(matrix, right)
+        if pull:
+            right[5 + k] -= pull * (2 * row @ z_dot + pull * gap)
+    solution = solve_linear(matrix, right)
     return np.asarray(solution[:5]), np.asarray(solution[5:])
+
+
+def solve_linear(matrix: Array, right: Array) -> Array:
+    """Solve a linear system: by LAPACK, or by elimination what that has no precision for."""
+    if matrix.dtype == np.float64:
+        return np.asarray(np.linalg.solve(matrix, right))
+    table = np.column_stack([matrix, right])
+    for k in range(len(table)):
+        pivot = k + int(np.abs(table[k:, k]).argmax())
+        table[[k, pivot]] = table[[pivot, k]]
+        table[k] /= table[k, k]
+        factors = table[:, k].copy()
+        factors[k] = 0.0
+        table -= factors[:, None] * table[k]
+    return np.asarray(table[:, -1])
+
+
+def find_sliding(scene: Scene, contact: Contact, z: Array, z_dot: Array) -> Any:
+    """Sliding velocity of a contact [m/s]."""
+    point, normal, _, _ = _touch(scene, contact, z, z_dot)
+    tangent = np.array([normal[1], -normal[0]])
+    return _lever(scene, contact, z, point, tangent) @ z_dot
+
+
+def find_gaps(scene: Scene, contacts: tuple[Contact, ...], z: Array) -> Array:
+    """Gaps of contacts, shape (n_c,) [m]."""
+    return np.array([_touch(scene, contact, z, np.zeros(5))[3] for contact in contacts])
 
 
 def _lever(scene: Scene, contact: Contact, z: Array, point: Array, force: Array) -> Array:
     """Generalised force of a unit force on the object at `point` and its reaction on the finger."""
-    row = np.zeros(5)
+    row = np.zeros(5, dtype=z.dtype)
     arm = point - z[:2]
     row[:3] = force[0], force[1], arm[0] * force[1] - arm[1] * force[0]
     if contact.finger is not None:
@@ -178,19 +208,21 @@ def _lever(scene: Scene, contact: Contact, z: Array, point: Array, force: Array)
     return row
 
 
-def _touch(scene: Scene, contact: Contact, z: Array, z_dot: Array) -> tuple[Array, Array, float]:
-    """Contact point, normal into the object, and the gap's second derivative less A z''."""
-    c, s = math.cos(z[2]), math.sin(z[2])
+def _touch(
+    scene: Scene, contact: Contact, z: Array, z_dot: Array
+) -> tuple[Array, Array, float, float]:
+    """Contact point, normal into the object, the gap's second derivative less A z'', the gap."""
+    c, s = np.cos(z[2]), np.sin(z[2])
     turn = np.array([[c, -s], [s, c]])
     spin = z_dot[2]
     arm = turn @ scene.polygon.vertices[contact.index]
     vertex = z[:2] + arm
     velocity = z_dot[:2] + spin * np.array([-arm[1], arm[0]])
     if contact.finger is None:
-        return vertex, np.array([0.0, 1.0]), -(spin**2) * arm[1]
+        return vertex, np.array([0.0, 1.0]), -(spin**2) * arm[1], vertex[1]
     finger = scene.fingers[contact.finger]
     angle, rate = z[3 + contact.finger], z_dot[3 + contact.finger]
-    axis = np.array([math.cos(angle), math.sin(angle)])
+    axis = np.array([np.cos(angle), np.sin(angle)])
     across = np.array([-axis[1], axis[0]])
     if contact.surface == "finger":
         side = 1.0 if contact.finger == 0 else -1.0
@@ -198,7 +230,7 @@ def _touch(scene: Scene, contact: Contact, z: Array, z_dot: Array) -> tuple[Arra
         swing = -side * rate * axis
         reach = vertex - np.asarray(finger.base)
         bend = 2 * swing @ velocity - rate**2 * normal @ reach - spin**2 * normal @ arm
-        return vertex, normal, float(bend)
+        return vertex, normal, bend, normal @ reach - finger.radius
     if contact.feature != "e":
         raise ValueError(f"{contact.name}: the baseline knows no contacts with a tip's arc")
     following = scene.polygon.vertices[(contact.index + 1) % scene.polygon.n_vertices]
@@ -213,4 +245,5 @@ def _touch(scene: Scene, contact: Contact, z: Array, z_dot: Array) -> tuple[Arra
         - spin**2 * outward @ (tip - vertex)
         + outward @ (spin**2 * arm - rate**2 * finger.length * axis)
     )
-    return tip - finger.radius * outward, -outward, float(bend)
+    gap = outward @ (tip - vertex) - finger.radius
+    return tip - finger.radius * outward, -outward, bend, gap

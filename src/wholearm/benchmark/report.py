@@ -23,9 +23,6 @@ from ..figures.plots import save
 _LOOKS = {
     "phase time": ("#0072B2", "o"),
     "simulated end": ("#009E73", "D"),
-    "wholearm": ("#0072B2", "o"),
-    "SciPy DOP853": ("#D55E00", "s"),
-    "SciPy RK45": ("#CC79A7", "^"),
     "plain Opti": ("#D55E00", "s"),
 }
 
@@ -85,25 +82,20 @@ def format_csv(rows: Sequence[Row]) -> str:
 
 
 def draw_run_times(rows: Sequence[Row]) -> Figure:
-    """Run time against error on logarithmic axes: the planner's left, the simulator's right."""
+    """Run time of the planner against error on logarithmic axes."""
     with matplotlib.rc_context({"font.size": 10.0}):
-        figure = Figure(figsize=(10.0, 4.4), layout="constrained")
+        figure = Figure(figsize=(6.0, 4.4), layout="constrained")
         FigureCanvasAgg(figure)
-        planner, simulator = figure.subplots(1, 2)
-        _draw_study(planner, rows, "planner: phase time", "path NLP", "phase time")
-        _draw_study(planner, rows, "planner: simulated end", "path NLP", "simulated end")
-        _draw_baseline(planner, rows)
-        planner.set_title("Planning all phases, over the number of intervals")
-        planner.set_xlabel("error of the phase time [-], of the simulated end [m, rad]")
-        for method in ("wholearm", "SciPy DOP853", "SciPy RK45"):
-            _draw_study(simulator, rows, "simulator", method, method)
-        simulator.set_title("Simulating all phases, over the tolerance")
-        simulator.set_xlabel("largest error of z and z' [m, rad, m/s, rad/s]")
-        for axes in (planner, simulator):
-            axes.set_xscale("log")
-            axes.set_yscale("log")
-            axes.set_ylabel("run time [s]")
-            finish_axes(axes)
+        axes = figure.subplots()
+        _draw_study(axes, rows, "planner: phase time", "path NLP", "phase time")
+        _draw_study(axes, rows, "planner: simulated end", "path NLP", "simulated end")
+        _draw_baseline(axes, rows)
+        axes.set_title("Planning all phases, over the number of intervals")
+        axes.set_xlabel("error of the phase time [-], of the simulated end [m, rad]")
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_ylabel("run time [s]")
+        finish_axes(axes)
     return figure
 
 

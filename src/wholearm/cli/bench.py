@@ -6,10 +6,11 @@ import argparse
 import json
 import os
 from collections.abc import Sequence
+from typing import Any
 
 from .progress import clear_progress, show_progress
 
-STUDIES = ("problem", "stress", "guard", "skip", "growth")
+STUDIES = ("problem", "precision", "stress", "guard", "skip", "growth")
 """Words that can follow ``bench``; the word ``problem`` may be left out."""
 
 
@@ -31,6 +32,8 @@ def add_bench(bench: argparse.ArgumentParser) -> None:
     problem.add_argument("problem", help="problem file (TOML)")
     problem.add_argument("-o", "--output", default="results", help="folder for tables and figures")
     problem.set_defaults(run=_measure)
+
+    _add_precision(studies)
 
     text = "plan generated scenes and read damaged files, and count what must not happen"
     stress = studies.add_parser("stress", help=text, description=text)
@@ -67,8 +70,39 @@ def add_bench(bench: argparse.ArgumentParser) -> None:
     growth.set_defaults(run=_grow)
 
 
+def _add_precision(studies: Any) -> None:
+    """Give the parser the study of run time against error."""
+    text = "measure run time against error of planner and simulator, with peers beside them"
+    precision = studies.add_parser("precision", help=text, description=text)
+    precision.add_argument("--problems", default="problems", help="folder of problem files")
+    words = "measure this part only: simulation or planning"
+    precision.add_argument("--part", choices=("simulation", "planning"), help=words)
+    words = "measure these methods only, by the names that the table has"
+    precision.add_argument("--peers", nargs="+", default=[], metavar="NAME", help=words)
+    words = "processor time that one setting of a method may take on one phase [s] (60)"
+    precision.add_argument("--limit", type=float, default=60.0, help=words)
+    words = "measure again what the folder has runs of"
+    precision.add_argument("--fresh", action="store_true", help=words)
+    words = "folder for runs, table and figure"
+    precision.add_argument("-o", "--output", default="results", help=words)
+    precision.set_defaults(run=_compare)
+
+
+def _compare(options: argparse.Namespace) -> int:
+    from ..benchmark.precision.study import PARTS, StudyOptions, run_precision
+
+    chosen = StudyOptions(
+        options.problems,
+        (options.part,) if options.part else PARTS,
+        tuple(options.peers),
+        options.limit,
+        options.fresh,
+    )
+    return _say(run_precision(chosen, options.output, show_progress()))
+
+
 def _measure(options: argparse.Namespace) -> int:
-    from ..benchmark.precision import run_bench
+    from ..benchmark.problem import run_bench
     from ..geometry.path_guess import load
 
     return _say(run_bench(load(options.problem), options.output, progress=show_progress()))

@@ -7,7 +7,8 @@ import pytest
 
 from timed import landing
 from tipping import box
-from wholearm.benchmark.precision import keep_curves, run_bench
+from wholearm.benchmark.precision.instances import keep_curves
+from wholearm.benchmark.problem import run_bench
 from wholearm.common.errors import InputError
 from wholearm.problem.definition import End, Problem
 

@@ -1,8 +1,7 @@
-"""Run time against error: of the planner, of the simulator, and of plain baselines beside them."""
+"""Run times of one problem: of the planner, a plain baseline beside it, and all parts."""
 
 from __future__ import annotations
 
-import itertools
 import os
 import statistics
 import subprocess
@@ -24,30 +23,24 @@ from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phases
 from ..planning.options import Objective, PlanOptions
 from ..planning.path_domain.data import prepare
-from ..planning.path_domain.first_guess import guess
-from ..planning.path_domain.motion import PathMotion, make_grid
+from ..planning.path_domain.motion import make_grid
 from ..planning.path_domain.nlp import build_path_nlp
 from ..planning.path_domain.plan import plan_path
 from ..planning.path_domain.terms import LimitShape
 from ..planning.plan import solve
-from ..problem.definition import End, Problem
+from ..problem.definition import Problem
 from ..problem.read import read_problem
-from ..results.torque import TorqueProfile
-from ..simulation.events import Simulation
 from ..simulation.simulate import simulate
 from ..solvers.statistics import open_ledger
 from ..verification.verify import verify
 from .baseline_opti import plan_with_opti
-from .baseline_simulation import simulate_with_scipy
 from .changes import measure_stress
+from .precision.instances import keep_curves
 from .report import Row, write_results
 from .time_domain import measure_blocks, measure_order, measure_transcriptions
 
 INTERVALS = (10, 20, 40, 80, 160, 320, 640, 800)
 FINE = 1600
-TOLERANCES = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
-FINEST = 1e-13
-SCIPY_METHODS = ("DOP853", "RK45")
 BASELINE_INTERVALS = 40
 REPEATS = 3
 
@@ -97,18 +90,6 @@ def run_bench(
     return write_results(problem.name, rows, os.path.join(folder, f"bench_{stem}"))
 
 
-def keep_curves(problem: Problem) -> Problem | None:
-    """The first phases of a problem as far as each is a curve of four sliding contacts.
-
-    These are what the baselines know; None if already the first phase is not.
-    """
-    curves = trace_phases(problem)
-    rolling = [bool(phase.formation.rolling) for phase in problem.phases[: len(curves)]]
-    count = [*rolling, True].index(True)
-    kept = tuple(replace(phase, end=End.REST) for phase in problem.phases[:count])
-    return replace(problem, phases=kept) if kept else None
-
-
 def measure_planner(problem: Problem) -> list[Row]:
     """Planner over the number of intervals, building included.
 
@@ -154,113 +135,6 @@ def _plan_times(problem: Problem, curves: Sequence[Curve], intervals: int) -> Ar
         for phase, curve in zip(problem.phases, curves, strict=True)
     ]
     return np.array([plan.motion.duration for plan in plans])
-
-
-def measure_simulator(problem: Problem) -> list[Row]:
-    """Simulator over its tolerance, and SciPy's `solve_ivp` on plain NumPy callbacks.
-
-    Both replay all phases, with smooth torques in a few long pieces and with planned ones in many.
-    """
-    slow = [_cosine_motion(curve, problem.epsilon) for curve in trace_phases(problem)]
-    planned = [
-        plan_path(curve, problem.epsilon, PlanOptions(), phase.number).motion
-        for phase, curve in zip(problem.phases, trace_phases(problem), strict=True)
-    ]
-    smooth, few = _join_torques(slow, 14), TOLERANCES
-    rough, many = _join_torques(planned, 6), TOLERANCES[2::3]
-    return [
-        *_replay(problem, "simulator", slow, smooth, few),
-        *_replay(problem, "simulator, planned torques", planned, rough, many),
-    ]
-
-
-def _replay(
-    problem: Problem,
-    study: str,
-    motions: Sequence[PathMotion],
-    torque: TorqueProfile,
-    tolerances: Sequence[float],
-) -> list[Row]:
-    """Replay torques with both simulators, SciPy stretch by stretch from exact states.
-
-    The error is the largest of any z or z' shortly before the end of a stretch between reversals.
-    """
-    marks = _find_marks(motions)
-    checks = marks[:-1] + 0.95 * np.diff(marks)
-    times = np.sort(np.concatenate([marks, checks]))
-    exact = simulate(problem, torque, tolerance=FINEST, times=times)
-    wanted, starts = _states_at(exact, checks), _states_at(exact, marks[:-1])
-    stretches = [(i, part) for i, motion in enumerate(motions) for part in motion.curve.segments]
-    rows = []
-    for tolerance in tolerances:
-        median, run = _time_runs(
-            partial(simulate, problem, torque, tolerance=tolerance, times=checks)
-        )
-        error = float(np.abs(_states_at(run, checks) - wanted).max())
-        rows.append(Row(study, "wholearm", f"{tolerance:g}", median, error, f"{run.steps} steps"))
-    import scipy.integrate  # noqa: F401 -- so that no timing below includes it
-
-    for method, tolerance in itertools.product(SCIPY_METHODS, tolerances):
-        started = time.perf_counter()
-        error, calls = 0.0, 0
-        for k, (index, part) in enumerate(stretches):
-            plain = simulate_with_scipy(
-                problem,
-                index,
-                torque,
-                starts[k, :5],
-                starts[k, 5:],
-                part.Xi,
-                part.sigma,
-                (marks[k], checks[k]),
-                rtol=tolerance,
-                atol=tolerance,
-                method=method,
-            )
-            calls += plain.evaluations
-            end = np.append(plain.z[-1], plain.z_dot[-1])
-            error = max(error, float(np.abs(end - wanted[k]).max()))
-        elapsed = time.perf_counter() - started
-        note = f"{calls} evaluations"
-        rows.append(Row(study, f"SciPy {method}", f"{tolerance:g}", elapsed, error, note))
-    return rows
-
-
-def _cosine_motion(curve: Curve, epsilon: float) -> PathMotion:
-    """A slow smooth motion with its squeeze amid the range that limits allow."""
-    data = prepare(curve, epsilon, make_grid(curve, 3 + len(curve.segments)), 0)
-    profile, _ = guess(data)
-    slow = 0.3
-    calm = profile._replace(a=slow * profile.a, b=slow * profile.b)
-    return PathMotion(curve, data.grid, calm)
-
-
-def _join_torques(motions: Sequence[PathMotion], degree: int) -> TorqueProfile:
-    """Torques of motions one after the other, one piece for each interval."""
-    profiles = []
-    for motion in motions:
-        own = motion.times[np.append(motion.grid.steps > 0, True)]
-
-        def torque(t: Array, motion: PathMotion = motion) -> Array:
-            return motion.evaluate(t).tau
-
-        profiles.append(TorqueProfile.fit(own, torque, degree))
-    return TorqueProfile.chain(profiles)
-
-
-def _find_marks(motions: Sequence[PathMotion]) -> Array:
-    """When each stretch between reversals starts, and when the last one ends [s]."""
-    marks, start = [0.0], 0.0
-    for motion in motions:
-        last = np.flatnonzero(np.diff(motion.grid.segment, append=-1))
-        marks += (start + motion.times[last]).tolist()
-        start += motion.duration
-    return np.array(marks)
-
-
-def _states_at(simulation: Simulation, times: Array) -> Array:
-    """States (z, z') of a simulation at instants it was asked for, shape (n, 10)."""
-    return np.array([simulation.at(t) for t in times])
 
 
 def measure_baseline(problem: Problem) -> list[Row]:
@@ -340,7 +214,6 @@ def _run(command: Sequence[str]) -> None:
 
 ON_CURVES: tuple[Callable[[Problem], list[Row]], ...] = (
     measure_planner,
-    measure_simulator,
     measure_baseline,
     measure_order,
     measure_transcriptions,

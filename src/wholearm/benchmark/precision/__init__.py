@@ -1,0 +1,1 @@
+"""Run time against error, of planner and simulator and of public tools beside them."""

@@ -1,0 +1,163 @@
+"""``wholearm bench precision``: which runs are made, where they are kept, and what is missing."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from ...common.errors import InputError
+from ...common.files import make_folder, require_writable, together, write_text
+from ...figures.plots import save
+from ..stress.workers import Answer, run_tasks
+from .instances import Instance, find_files, list_instances
+from .report import draw_runs, format_report
+from .runs import LIMIT, Key, Run, format_runs, read_runs
+from .simulation import (
+    DRIFT,
+    FEW,
+    MANY,
+    SWING_TIME,
+    list_tasks,
+    make_course,
+    make_swing,
+    run_simulator,
+)
+from .simulators import SIMULATORS
+
+PARTS = ("simulation", "planning")
+SWING_FILE = "heptagon_four_contacts.toml"
+"""Problem file whose object swings."""
+KEPT_EVERY = 20
+"""Number of tasks after which runs are written to their file."""
+
+
+@dataclass(frozen=True)
+class StudyOptions:
+    """What is measured.
+
+    Attributes
+    ----------
+    folder : str
+        Of the problem files.
+    parts : tuple of str
+    methods : tuple of str
+        Those that are measured; empty for all.
+    limit : float, [s]
+        Processor time that one setting of a method may take on one phase.
+    fresh : bool
+        Whether to measure again what the file of runs has.
+    """
+
+    folder: str = "problems"
+    parts: tuple[str, ...] = PARTS
+    methods: tuple[str, ...] = ()
+    limit: float = LIMIT
+    fresh: bool = False
+
+
+def run_precision(
+    options: StudyOptions, output: str, progress: Callable[[str], None] | None = None
+) -> list[str]:
+    """Measure what the file of runs does not have yet; returns the files written.
+
+    Raises
+    ------
+    InputError
+        If there is no problem file, a method is not known, or files cannot be written.
+    """
+    make_folder(output)
+    paths = [os.path.join(output, f"bench_precision.{ending}") for ending in ("csv", "md", "png")]
+    for path in paths:
+        require_writable(path)
+    _require_known(options)
+    say = progress or (lambda _: None)
+    files = find_files(options.folder)
+    if not files:
+        raise InputError("", "--problems", f"{options.folder} has no problem files (*.toml)")
+    runs = read_runs(paths[0])
+    if options.fresh:
+        runs = [run for run in runs if not _is_chosen(options, run.study, run.method)]
+    done = {run.key for run in runs}
+    for count, answer in enumerate(_measure(options, files, done, say)):
+        runs += _read_answer(answer)
+        say(f"{answer.task.study}: {answer.task.method}, {answer.task.instance}")
+        if count % KEPT_EVERY == 0:
+            write_text(paths[0], format_runs(runs))
+    runs.sort(key=lambda run: (run.study, _place(run.method), run.instance))
+    with together():
+        write_text(paths[0], format_runs(runs))
+        write_text(paths[1], format_report(runs, options.limit))
+        save(draw_runs(runs), paths[2])
+    return paths
+
+
+def _place(method: str) -> int:
+    return list(SIMULATORS).index(method) if method in SIMULATORS else 0
+
+
+def _require_known(options: StudyOptions) -> None:
+    known = list(SIMULATORS)
+    for method in options.methods:
+        if method not in known:
+            allowed = "; ".join(known)
+            raise InputError("", "--peers", f"{method!r} given; allowed are {allowed}")
+
+
+def _is_chosen(options: StudyOptions, study: str, method: str) -> bool:
+    part = "simulation" if study in (FEW, MANY, DRIFT) else "planning"
+    return part in options.parts and (not options.methods or method in options.methods)
+
+
+def _measure(
+    options: StudyOptions,
+    files: tuple[str, ...],
+    done: set[Key],
+    say: Callable[[str], None],
+) -> Iterator[Answer]:
+    """Answers of all tasks that are chosen and not done."""
+    say("tracing phases")
+    instances = list_instances(files)
+    if "simulation" in options.parts:
+        yield from _simulate(options, instances, done, say)
+
+
+def _simulate(
+    options: StudyOptions,
+    instances: Sequence[Instance],
+    done: set[Key],
+    say: Callable[[str], None],
+) -> Iterator[Answer]:
+    """Simulators on all courses; references are found where something is left to do."""
+    makers: list[tuple[str, str, Callable[[], Any]]] = [
+        (study, instance.name, partial(make_course, instance, study))
+        for study in (FEW, MANY)
+        for instance in instances
+    ]
+    swing = os.path.join(options.folder, SWING_FILE)
+    if os.path.exists(swing):
+        makers.append((DRIFT, f"swing of {SWING_TIME:g} s", partial(make_swing, swing)))
+    for study, name, make in makers:
+        tasks = [
+            task
+            for task in list_tasks(study, name)
+            if _is_chosen(options, study, task.method) and task.key not in done
+        ]
+        if tasks:
+            say(f"reference of {name}, {study}")
+            course = make()
+            given = [task._replace(course=course) for task in tasks]
+            yield from run_tasks(run_simulator, given, 1, options.limit, lambda _: 0)
+
+
+def _read_answer(answer: Answer) -> list[Run]:
+    """Runs of a task, or one that failed."""
+    if answer.ended == "done":
+        return list(answer.result)
+    nothing = float("nan")
+    reason = {"late": "time limit", "died": "process ended"}.get(answer.ended, "")
+    reason = reason or str(answer.result).strip().splitlines()[-1]
+    key: Key = answer.task.key
+    return [Run(*key, 0, nothing, answer.seconds, nothing, nothing, nothing, reason)]

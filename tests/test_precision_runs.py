@@ -1,0 +1,56 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from wholearm.benchmark.precision.report import find_times
+from wholearm.benchmark.precision.runs import (
+    REPEATS,
+    SHIFT,
+    Run,
+    find_mean,
+    find_medians,
+    format_runs,
+    read_runs,
+    repeat,
+)
+
+FINE = Run("study", "phase 1", "a, b", "1e-6", 0, 0.5, 0.2, 1e-7)
+RUNS = [
+    FINE,
+    FINE._replace(repeat=1, build=0.1, solve=0.4, error=-3e-7),
+    FINE._replace(repeat=2, solve=0.3),
+    FINE._replace(setting="1e-3", solve=0.1, error=1e-4),
+    FINE._replace(instance="phase 2", solve=60.0, error=math.nan, outcome="time limit"),
+]
+
+
+def test_runs_are_read_as_they_were_written(tmp_path: Path) -> None:
+    path = tmp_path / "runs.csv"
+    assert read_runs(str(path)) == []
+    path.write_text(format_runs(RUNS))
+    assert list(map(str, read_runs(str(path)))) == list(map(str, RUNS))
+
+
+def test_medians_keep_the_worst_error() -> None:
+    median = find_medians(RUNS)["study", "phase 1", "a, b", "1e-6"]
+    assert (median.build, median.solve, median.errors) == (0.5, 0.3, (-3e-7,))
+    assert median.reaches(3e-7) and not median.reaches(2e-7)
+
+
+def test_the_soonest_setting_counts_and_failures_never_do() -> None:
+    medians = find_medians(RUNS)
+    assert find_times(medians, "study", "a, b", 1e-3) == [0.1, math.inf]
+    assert find_times(medians, "study", "a, b", 1e-6) == [0.3, math.inf]
+
+
+def test_means_are_geometric_but_for_their_shift() -> None:
+    assert find_mean([0.0, 3 * SHIFT]) == pytest.approx(SHIFT)
+    assert find_mean([1e6, 1e2]) == pytest.approx(1e4, rel=1e-3)
+
+
+def test_what_is_quick_is_run_several_times() -> None:
+    answers = [answer for _, _, answer in repeat(lambda: lambda: 7)]
+    assert answers == REPEATS * [7]
