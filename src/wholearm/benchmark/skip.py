@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..common.files import require_writable, write_text
-from ..common.frozen import dataclass
 from ..geometry.path_guess import load
 from ..geometry.tracing import trace_phases
 from ..planning.plan import solve

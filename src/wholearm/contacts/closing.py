@@ -9,13 +9,13 @@ Contacts are counted as in `contact_table`: those with the palm, with finger 1 a
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..common.errors import InputError
-from ..common.frozen import NamedTuple
 from ..scene.model import Finger, Scene
 from .elemental import Contact, candidate_contacts
 from .formation import Formation

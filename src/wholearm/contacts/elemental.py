@@ -23,14 +23,15 @@ and the same with t = (n_y, -n_x) for W_t and J_t. W_n^T = dC/dq and J_n = -dC/d
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from itertools import accumulate
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
 from ..common.errors import InputError
-from ..common.frozen import NamedTuple, dataclass
 from ..common.sharing import Store
 from ..scene.model import Scene
 

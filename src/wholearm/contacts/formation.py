@@ -18,14 +18,15 @@ theta_1,
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
 from ..common.batch import Batch
-from ..common.frozen import NamedTuple, dataclass
 from ..common.sharing import Keeper, Store, exclusive, kept_property
 from ..scene.model import Scene
 from .elemental import (

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-
-from ..common.frozen import NamedTuple
 
 SIZE = (10.0, 8.2)
 """Width and height of a figure [in]."""

@@ -7,11 +7,11 @@ however long the way is that it leaves to the phases after it.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.frozen import dataclass
 from ..mechanics.metric import metric_weights
 from ..problem.definition import Phase
 from .tracing import trace_phase

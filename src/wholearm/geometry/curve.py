@@ -10,13 +10,13 @@ rho being the object's radius of gyration, unless the curve has a speed ratio of
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.frozen import NamedTuple, dataclass
 from ..contacts.formation import Formation, Kinematics
 from ..mechanics.metric import metric_weights
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.frozen import dataclass
 from ..contacts.closing import close_fingers, lower
 from ..contacts.formation import Formation
 from ..mechanics.metric import metric_weights

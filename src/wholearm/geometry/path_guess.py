@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError, name_source
-from ..common.frozen import dataclass
 from ..common.sharing import exclusive
 from ..contacts.formation import Formation
 from ..contacts.limits import build_limits

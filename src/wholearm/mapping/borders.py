@@ -15,12 +15,12 @@ label changes are found by bisection. What is left are the pieces that are borde
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.frozen import dataclass
 from ..contacts.closing import (
     Closed,
     Flags,

@@ -7,12 +7,12 @@ contacts touch (two freedoms), on its borders four (one freedom), at crossings f
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError
-from ..common.frozen import dataclass
 from ..common.sharing import exclusive
 from ..contacts.closing import Flags, Numbers, close_fingers, contact_table, full_formation, lower
 from ..contacts.elemental import Contact

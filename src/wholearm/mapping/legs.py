@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError
-from ..common.frozen import NamedTuple
 from ..contacts.closing import Numbers, close_fingers, contact_table, describe_obstacle
 from ..contacts.elemental import Contact
 from ..contacts.formation import find_touching

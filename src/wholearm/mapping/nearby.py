@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.frozen import NamedTuple, dataclass
 from ..scene.model import Scene
 from .borders import Piece, Track, Window, flush_track, label_cells
 from .borders import palm_track as track_palm

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import overload
 
@@ -11,7 +11,6 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError
-from ..common.frozen import dataclass
 from ..common.sharing import exclusive
 from ..contacts.closing import close_finger, place_flush
 from ..contacts.elemental import Contact

@@ -23,11 +23,12 @@ det(P M5^-1 G^T) / det(P M5^-1 P^T), which is 1 without friction: `reduced_inert
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..common.frozen import NamedTuple
 from ..contacts.formation import Formation, Kinematics
 
 

@@ -16,13 +16,14 @@ so it is never gained.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import Enum
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.frozen import NamedTuple, dataclass
 from ..contacts.cones import force_limit_rows
 from ..contacts.formation import Formation
 from .dynamics import Directions, force_rows, reduced_inertia

@@ -14,13 +14,13 @@ advice go through a `LimitSet`, so that another maker is all that another limit 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
-from ..common.frozen import dataclass
 from ..common.shortfalls import Parameter
 from ..contacts.cones import force_limit_rows
 from ..contacts.formation import Formation

@@ -11,11 +11,10 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..common.arrays import Array
 from ..common.errors import InfeasibleError, InputError, JammingError, SolverError
-from ..common.frozen import NamedTuple
 from ..common.shortfalls import Change, Parameter, Place, Shortfall
 from ..contacts.formation import Formation
 from ..mechanics.limits import LimitSet

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InfeasibleError, name_source
-from ..common.frozen import dataclass
 from ..geometry.cost_to_go import CostToGo
 from ..geometry.curve import Curve
 from ..geometry.tracing import runs_on_curve, trace_phase

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..common.errors import InfeasibleError, SolverError
-from ..common.frozen import dataclass
 from ..mechanics.impact import Impact
 from ..problem.definition import Phase
 from ..results.trajectory import Motion

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import Enum
 
 from ..common.errors import InputError
-from ..common.frozen import dataclass
 from ..common.require import require_number
 
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from enum import Enum
 from functools import reduce
 from operator import add
-from typing import Any
+from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
-from ..common.frozen import NamedTuple, dataclass
 from ..problem.definition import Problem
 from ..results.modes import ModeSpan
 from ..results.replay_figures import ReplayFigures

@@ -8,6 +8,7 @@ at in few instants, since those are what it costs: the plan keeps its limits in 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +20,6 @@ from ..common.errors import (
     SimulationError,
     SolverError,
 )
-from ..common.frozen import NamedTuple
 from ..problem.definition import Problem
 from ..results.replay_figures import LeastForce, ReplayedPhase, ReplayFigures
 from ..results.report import Report

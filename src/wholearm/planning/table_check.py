@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import JammingError, ReplayError, SimulationError
 from ..common.files import write_text
-from ..common.frozen import NamedTuple
 from ..problem.definition import Problem
 from ..results.report import Report
 from ..results.torque_table import ERROR, format_rows, place_rows, read_rows, sample_rows

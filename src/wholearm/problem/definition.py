@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
 from ..common.arrays import Array
 from ..common.errors import InputError, name_source
-from ..common.frozen import dataclass
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..scene.model import Scene

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
-
-from ..common.frozen import NamedTuple
+from typing import Any, NamedTuple
 
 ROLLS = "rolls"
 """Mode of a contact that rolls; one that slides has the sign of its direction."""

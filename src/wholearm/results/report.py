@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, field, replace
-from typing import Any
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, NamedTuple
 
-from ..common.frozen import NamedTuple, dataclass
 from .narrow import Moved
 from .trajectory import Trajectory
 

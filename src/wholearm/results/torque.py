@@ -5,12 +5,12 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError
-from ..common.frozen import dataclass
 
 COLUMNS = ("t", "tau1", "tau2")
 MOST = 1e30

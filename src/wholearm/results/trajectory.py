@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.arrays import Array
 from ..common.files import require_ending, write_text
-from ..common.frozen import NamedTuple, dataclass
 from .torque import TorqueProfile
 
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
-
-from ..common.frozen import NamedTuple
+from typing import Any, NamedTuple
 
 
 class Transition(NamedTuple):

@@ -32,15 +32,15 @@ S. L. Yeap and J. C. Trinkle, "Dynamic Whole-Arm Dexterous Manipulation in the P
 from __future__ import annotations
 
 import math
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.arrays import Array
 from ..common.errors import InputError
-from ..common.frozen import NamedTuple, dataclass
 from ..common.require import require_number, require_vector
 from .polygon import Polygon
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import field
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.arrays import Array
 from ..common.errors import InputError
-from ..common.frozen import dataclass
 from ..common.require import frozen, require_number, require_vector
 
 SIZES = (1e-4, 1e3)

@@ -7,10 +7,11 @@ for a mistake.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ..common.errors import InputError
-from ..common.frozen import NamedTuple
 from .model import Finger, Scene
 
 

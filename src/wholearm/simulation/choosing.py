@@ -23,13 +23,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..common.errors import JammingError
-from ..common.frozen import NamedTuple
 from ..contacts.formation import Formation
 from ..scene.model import Scene
 from .events import EventKind

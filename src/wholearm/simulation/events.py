@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
-from ..common.frozen import dataclass
 from ..mechanics.dynamics import energy
 from ..problem.definition import Phase, Problem
 from ..results.torque import TorqueProfile

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from ..common.frozen import dataclass
 from ..problem.definition import End
 from .choosing import choose_mode, note_change
 from .events import EventKind, Outcome

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from ..common.frozen import NamedTuple
+from typing import Any, NamedTuple
 
 STATE = 14
 """Length of the integrated vector: z, z', then work, viscous, dry and contact losses."""

@@ -6,14 +6,14 @@ these: what tells them apart, geometry, enters by the constraint rows P, P' v an
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..common.frozen import NamedTuple, dataclass
 from ..scene.model import Scene
 from .layout import STATE, Inputs, lay_out
 from .modes import Grips, Mode

@@ -14,15 +14,15 @@ A contact that lies flush with one which its phase lets roll has no friction of 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array, Expression
-from ..common.frozen import NamedTuple, dataclass
 from ..contacts.formation import Formation
 from ..mechanics.dynamics import build_force_rows
 

@@ -10,14 +10,14 @@ closes further. Choices in which nothing is held are tried first.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import product
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
-from ..common.frozen import NamedTuple, dataclass
 from ..contacts.formation import Formation, Kinematics
 from ..mechanics.dynamics import Directions
 from .modes import Grips, Mode, Response, Rows, find_grips, list_units, respond

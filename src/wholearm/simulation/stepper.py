@@ -6,6 +6,7 @@ from, is one CasADi function of one packed vector, so that a step costs one call
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -14,7 +15,6 @@ import numpy as np
 
 from ..common.arrays import Array, Expression
 from ..common.batch import Batch
-from ..common.frozen import dataclass
 from ..contacts.elemental import GapLimit, build_features, build_gap
 from ..contacts.formation import Formation
 from ..problem.definition import Until

@@ -12,6 +12,7 @@ them the instant of starting is a root of a polynomial.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -19,7 +20,6 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..common.errors import SimulationError
-from ..common.frozen import dataclass
 from ..contacts.cones import find_weakest
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, Kinematics

@@ -7,11 +7,11 @@ torque, and so on: the same motion told in other units is simulated with the sam
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.frozen import NamedTuple
 from ..problem.definition import Until
 from ..scene.model import Scene
 

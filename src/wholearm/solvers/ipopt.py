@@ -5,12 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 
 from ..common.arrays import Expression
-from ..common.frozen import NamedTuple
 from ..common.interrupts import check
 from .statistics import SolverStatistics, book
 

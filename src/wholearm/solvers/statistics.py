@@ -9,9 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import fields
-
-from ..common.frozen import dataclass
+from dataclasses import dataclass, fields
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,12 @@ velocity is zero within a tolerance the friction may be anything inside its cone
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
-from ..common.frozen import NamedTuple
 from ..scene.model import Scene
 from ..scene.polygon import cross_product
 

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.frozen import dataclass
 from ..common.require import require_number
 from ..contacts.links import FINGERS_TOUCH
 from ..problem.definition import End, Problem

@@ -7,6 +7,7 @@ import json
 import math
 import tomllib
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -14,7 +15,6 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...common.errors import InputError
-from ...common.frozen import dataclass
 from ...contacts.closing import close_fingers
 from ...contacts.formation import Formation
 from ...mapping.route import Stretch, format_route, list_formations

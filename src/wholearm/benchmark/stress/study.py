@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from ... import __version__
 from ...common.errors import InputError
 from ...common.files import make_folder, write_text
-from ...common.frozen import dataclass
 from .files import run_file
 from .journal import Journal
 from .plans import OBJECTIVES, run_scene

@@ -7,14 +7,13 @@ there, so polynomials through the knots give them at all places where limits are
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
 from ...common.errors import JammingError, SolverError
-from ...common.frozen import NamedTuple
 from ...common.minima import find_minima
 from ...common.shortfalls import Parameter
 from ...geometry.curve import Curve, describe_pose

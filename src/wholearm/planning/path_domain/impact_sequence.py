@@ -11,10 +11,10 @@ same tangent.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from ...common.frozen import dataclass
 from ...geometry.curve import Curve
 from ...mechanics.impact import Impact, compute_impact
 from ...mechanics.metric import metric_weights

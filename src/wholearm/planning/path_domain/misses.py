@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from ...common.arrays import Array
-from ...common.frozen import NamedTuple
 from .data import PhaseData
 from .motion import PathMotion, Profile
 from .nlp import Tightening

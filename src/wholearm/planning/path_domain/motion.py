@@ -7,13 +7,14 @@ dynamics, hence the equations of motion hold at every instant.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ...common.frozen import NamedTuple, dataclass
 from ...geometry.curve import Curve
 from ...mechanics.dynamics import Directions, inverse, split_forces
 from ...results.trajectory import Samples

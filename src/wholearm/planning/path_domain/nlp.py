@@ -8,14 +8,14 @@ impacts join have an interval of length zero between them (`chain`).
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array, Expression
-from ...common.frozen import NamedTuple, dataclass
 from ...common.shortfalls import Parameter
 from ...mechanics.limits import LimitSet
 from ...solvers.ipopt import build_solver

@@ -9,13 +9,13 @@ misses more than `MISS`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from ...common.arrays import Array
 from ...common.errors import InfeasibleError, JammingError, SolverError, WholearmError
-from ...common.frozen import NamedTuple, dataclass
 from ...common.shortfalls import Parameter
 from ...geometry.curve import Curve
 from ..advice import describe_changes, find_changes, name_phases

@@ -17,13 +17,12 @@ column through all rows would make building the Jacobian quadratic in the number
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from ...common.arrays import Expression
-from ...common.frozen import NamedTuple
 from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ..columns import Columns, Symbols
 from ..options import Objective

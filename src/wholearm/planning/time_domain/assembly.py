@@ -9,13 +9,14 @@ Hessian a sum of them: expanding or differentiating the whole NLP is not needed.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array, Expression
-from ...common.frozen import NamedTuple, dataclass
 
 Indices = NDArray[np.int64]
 

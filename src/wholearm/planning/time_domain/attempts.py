@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 from ...common.arrays import Array
-from ...common.frozen import NamedTuple, dataclass
 from ...geometry.cost_to_go import CostToGo
 from ...problem.definition import Phase, Problem
 from .ending import keep_apart

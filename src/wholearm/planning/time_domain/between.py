@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.frozen import NamedTuple
 from ...common.minima import find_minima
 from ...mechanics.limits import PRESS, LimitSet, make_limits
 from ...results.trajectory import Samples

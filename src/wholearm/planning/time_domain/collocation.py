@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.frozen import NamedTuple
 
 
 class Scheme(NamedTuple):

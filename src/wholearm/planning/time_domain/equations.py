@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.frozen import dataclass
 from ...geometry.curve import tangent_basis
 from .assembly import Indices
 from .collocation import Scheme

@@ -7,13 +7,13 @@ that have the same equations, whatever their limits are.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache, wraps
 from typing import Any, TypeVar
 
 import casadi as ca
 
 from ...common.arrays import Expression
-from ...common.frozen import dataclass
 from ...contacts.elemental import Contact, build_features, build_gap
 from ...contacts.formation import Formation
 from ...mechanics.dynamics import build_force_rows

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.frozen import dataclass
 from ..columns import Columns
 from .assembly import Indices
 from .collocation import Scheme

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ...common.frozen import NamedTuple, dataclass
 from ...common.shortfalls import Parameter
 from ...mechanics.limits import PRESS, SPEED, LimitSet, make_limits
 from ..options import Objective

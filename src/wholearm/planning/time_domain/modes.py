@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
-from ...common.frozen import NamedTuple
 from ...contacts.elemental import Contact
 from ...contacts.formation import Formation
 from ...mechanics.dynamics import Directions, split_forces

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from ...common.arrays import Array
 from ...common.batch import Batch
-from ...common.frozen import dataclass
 from ...common.sharing import Store
 from ...contacts.elemental import Contact
 from ...contacts.formation import Formation

@@ -8,12 +8,12 @@ sliding that way. A stage that has shrunk to nothing is in the way of others.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ...common.frozen import NamedTuple
 from ...contacts.formation import Formation
 from .collocation import Scheme
 from .equations import least_rates

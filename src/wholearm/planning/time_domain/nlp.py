@@ -26,12 +26,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from ...common.arrays import Array, Expression
-from ...common.frozen import dataclass
 from ...geometry.curve import tangent_basis
 from ...solvers.ipopt import build_solver
 from ...solvers.statistics import SolverStatistics, book

@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.frozen import NamedTuple
 from ...geometry.cost_to_go import CostToGo
 from ...problem.definition import Phase, Problem
 from ..options import Objective, PlanOptions

@@ -14,10 +14,11 @@ acceleration against the way that things move.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.frozen import NamedTuple
 from ...contacts.formation import Formation
 from ...geometry.curve import tangent_basis
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ...common.frozen import NamedTuple
 from ...common.shortfalls import Parameter
 from ...geometry.cost_to_go import CostToGo
 from ...problem.definition import Problem

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.frozen import NamedTuple, dataclass
 from ...contacts.formation import Formation
 from ...mechanics.dynamics import Directions
 from ...problem.definition import Until

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.frozen import NamedTuple
 from ...contacts.formation import Formation
 from ...geometry.curve import tangent_basis
 from ...geometry.explore import close_contacts, is_inside

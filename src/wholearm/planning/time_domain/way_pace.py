@@ -15,11 +15,11 @@ is a linear programme over all intervals of the way. Contacts that roll keep wit
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from ...common.arrays import Array
-from ...common.frozen import NamedTuple
 from ...geometry.path_guess import PathGuess
 from ...mechanics.dynamics import force_rows
 from ...mechanics.metric import metric_weights
