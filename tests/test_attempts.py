@@ -9,7 +9,7 @@ from thrown import shove
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain import plan as time_plan
-from wholearm.planning.time_domain.attempts import FALLS, NEAREST, Attempt, Attempts
+from wholearm.planning.time_domain.attempts import FALLS, GRADUAL, NEAREST, Attempt, Attempts
 from wholearm.planning.time_domain.plan import plan_phases
 from wholearm.planning.time_domain.search import Search, Solution
 from wholearm.problem.definition import Problem
@@ -28,8 +28,13 @@ def test_a_single_phase_is_tried_along_ways_and_at_several_paces() -> None:
     names = [attempt.name for attempt in found]
     assert len(set(names)) < len(names) and found.count(attempts.first) == 1
     at = found.index(attempts.first)
-    assert all(name.startswith("a way with the margin ") for name in names[:at])
-    assert at <= len(attempts.ways)
+    # Modes are found before they are given, from the same guesses.
+    gradual = [attempt for attempt in found if attempt.gradual]
+    assert found[: len(gradual)] == gradual and gradual[0].stages is attempts.first.stages
+    plain = names[len(gradual) : at]
+    assert [attempt.name for attempt in gradual[1:]] == [f"{name}{GRADUAL}" for name in plain]
+    assert all(name.startswith("a way with the margin ") for name in plain)
+    assert len(plain) <= len(attempts.ways)
     # The same guess again on finer intervals counts as another, and the first one is not repeated.
     paces = [name for name in names[at + 1 :] if name.startswith(f"{NEAREST} at ")]
     assert len(paces) == len(names) - at - 1 == 2 * len(FALLS) - 1
@@ -43,7 +48,8 @@ def test_phases_in_motion_are_tried_ahead() -> None:
     attempts = list_attempts(problem, 2)
     assert attempts.ways == [] and not attempts.are_far
     names = [attempt.name for attempt in attempts]
-    assert names[0] == NEAREST and all(name.startswith("an end ahead at ") for name in names[1:])
+    assert names[:2] == [f"{NEAREST}{GRADUAL}", NEAREST]
+    assert all(name.startswith("an end ahead at ") for name in names[2:])
 
 
 def test_where_patience_is_not_asked_for_there_is_one_attempt() -> None:
@@ -62,8 +68,10 @@ def test_a_plan_names_the_attempt_that_led_to_it(monkeypatch: pytest.MonkeyPatch
 
     def lose_first(search: Search, attempt: Attempt) -> Solution:
         tried.append(attempt.name)
-        solution = run(search, attempt)
-        return solution._replace(success=False, status="lost") if len(tried) == 1 else solution
+        if len(tried) > 1 and not attempt.gradual:
+            return run(search, attempt)
+        nlp = search.build(attempt.stages)
+        return Solution(attempt.stages, 0.0, 0.0, "lost", False, nlp, {})
 
     monkeypatch.setattr(time_plan, "solve_attempt", lose_first)
     options = replace(OPTIONS, time_intervals=4)

@@ -22,6 +22,8 @@ from ..mechanics.metric import metric_weights
 
 REFINE = 3
 """Places per node of a panel at which limits and reversals are looked for."""
+_TIED = 1e-6
+"""Part of two rates, over both, below which they are proportional, and below which one is none."""
 
 
 class CurvePoint(NamedTuple):
@@ -220,6 +222,26 @@ def tangent_basis(formation: Formation, z: Array) -> Array:
     _, values, right = np.linalg.svd(P / np.sqrt(metric))
     rank = int((values > 1e-9 * values[0]).sum())
     return np.asarray((right[rank:] * np.sqrt(metric)).T / np.sqrt(metric[2]))
+
+
+def find_tied(formation: Formation, z: Array, row: int) -> tuple[int, ...]:
+    """Rows of (contacts, joints) that turn as one with a row at `z`: that row, then the others.
+
+    With two freedoms those are all whose rates are proportional to its own: of a flush edge, and of
+    a vertex in the corner of palm and link, which stands still with the link. With one freedom all
+    rates are; of these only a flush edge's change their sense together.
+    """
+    flush, N = formation.turn_with(row), tangent_basis(formation, z)
+    if N.shape[1] != 2:
+        return flush
+    A_t = formation.evaluate(z[None], np.zeros((1, 5))).A_t[0]
+    slips = A_t / formation.scene.scales.length
+    rates = np.vstack([slips, np.eye(5)[3:]]) @ (N / metric_weights(formation.scene)[:, None])
+    rates /= np.linalg.norm(rates, axis=1).max()
+    sizes = np.linalg.norm(rates, axis=1)
+    across = np.abs(rates[row, 0] * rates[:, 1] - rates[row, 1] * rates[:, 0])
+    tied = (across < _TIED * sizes * sizes[row]) & (sizes > _TIED) & (sizes[row] > _TIED)
+    return tuple(dict.fromkeys([row, *flush, *np.flatnonzero(tied).tolist()]))
 
 
 def refine(s: Array, stop: float) -> Array:

@@ -21,6 +21,8 @@ FIRST = 10
 """Most intervals of a phase to start with."""
 NEAREST = "the nearest end"
 """Name of the first guess."""
+GRADUAL = " with friction that sets in gradually"
+"""What is added to the name of a guess whose modes are found that way."""
 NEAR = -0.3
 """Margin of a way from which on a motion beside it may keep its limits."""
 WAYS = 3
@@ -38,11 +40,14 @@ class Attempt(NamedTuple):
     halvings : int
         How often its intervals are to be halved.
     stages : list of Stage
+    gradual : bool
+        Whether friction first sets in gradually, which shows its modes.
     """
 
     name: str
     halvings: int
     stages: list[Stage]
+    gradual: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,10 +92,19 @@ class Attempts:
         return bool(self.ways) and all(way.margin <= NEAR for way in self.ways)
 
     def __iter__(self) -> Iterator[Attempt]:
-        """Along ways, to the nearest end, and there or further ahead of other durations."""
+        """To the nearest end and along ways in modes that these lead to, and in their own.
+
+        After that there or further ahead of other durations.
+        """
+        if self.patient:
+            yield self.first._replace(name=f"{self.first.name}{GRADUAL}", gradual=True)
+        own = list[Attempt]()
         for way in [way for way in self.ways if way.margin > NEAR] or self.ways[:1]:
             name = f"a way with the margin {way.margin:.3g}"
-            yield Attempt(name, self._halvings, self._guess(self._halvings, FALLS[0], way=way))
+            guess = self._guess(self._halvings, FALLS[0], way=way)
+            own.append(Attempt(name, self._halvings, guess))
+            yield own[-1]._replace(name=f"{name}{GRADUAL}", gradual=True)
+        yield from own
         yield self.first
         onwards = len(self.phases) > 1
         for halvings in dict.fromkeys((self._halvings, 0)) if self.patient else ():

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...common.arrays import Array
-from ...geometry.curve import tangent_basis
+from ...geometry.curve import find_tied, tangent_basis
 from .assembly import Indices
 from .collocation import Scheme
 from .kernels import (
@@ -87,12 +87,22 @@ def add_stage(
         columns = kernel.x.join(z=layout.z[0], v=layout.v[0], a=layout.a[0])
         own = rows.nonlinear(scheme.degree, kernel.outputs, low=stage.opening, high=np.inf)
         rows.add_copies(kernel, columns, own)
-    goal = goal_kernel(formation, stage.until, stage.turns, stage.gained)
+    goal = goal_kernel(formation, stage.until, _list_free_turns(stage), stage.gained)
     if goal is not None:
         end = layout.nodes[-1]
         rows.add_copies(goal, goal.x.join(z=end[Z], v=end[V]), rows.nonlinear(goal.outputs))
     limits = add_limits(rows, stage, layout, scheme, target)
     return StageRows(states, points, senses, limits, monitor_rows)
+
+
+def _list_free_turns(stage: Stage) -> tuple[int, ...]:
+    """One of each that turn together: equations said twice spoil the solver's steps."""
+    end, told, found = stage.guess.nodes[-1, 0], set[int](), list[int]()
+    for row in stage.turns:
+        if row not in told:
+            found.append(row)
+            told.update(find_tied(stage.formation, end, row))
+    return tuple(found)
 
 
 def _collocate(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
@@ -142,7 +152,8 @@ def _balance(
     And the rows of the senses alone, shape (K, d, n_rubbing).
     """
     formation, shape = stage.formation, layout.z.shape[:2]
-    kernel, node = point_kernel(formation), layout.nodes[:-1, None]
+    gradual = stage.onset > 0
+    kernel, node = point_kernel(formation, gradual), layout.nodes[:-1, None]
     columns = kernel.x.join(
         z=layout.z,
         v=layout.v,
@@ -155,7 +166,8 @@ def _balance(
         Xi=stage.directions.Xi,
         sigma=stage.directions.sigma,
         place=scheme.points[:, None],
-        least=least_rates(stage, stage.guess.places(scheme.points))[..., None],
+        least=np.maximum(least_rates(stage, stage.guess.places(scheme.points)), 0.0)[..., None],
+        onset=np.full(1 * gradual, stage.onset),
     )
     still = find_still(stage, last) if scheme.ends else set()
     senses, low, high = (
@@ -164,7 +176,10 @@ def _balance(
         np.zeros(kernel.outputs),
     )
     high[senses] = np.inf
-    low[-1, -1, senses] = np.where([k in still for k in formation.rubbing_rows], -np.inf, 0.0)
+    if gradual:
+        low[..., senses] = -np.inf
+    free = [gradual or k in still for k in formation.rubbing_rows]
+    low[-1, -1, senses] = np.where(free, -np.inf, 0.0)
     own = rows.nonlinear(*shape, kernel.outputs, low=low, high=high)
     rows.add_copies(kernel, columns, own, parameters)
     return own, own[..., senses]
@@ -174,8 +189,11 @@ def least_rates(stage: Stage, places: Array) -> Array:
     """Least rate at `places`, shares of a stage's duration, in their shape.
 
     It is nothing where motion starts, stops or turns, and in a stage with one freedom: there all
-    moves together, and friction cannot hold one contact alone.
+    moves together, and friction cannot hold one contact alone. Where friction sets in gradually
+    any rate will do.
     """
+    if stage.onset:
+        return np.full(np.shape(places), -np.inf)
     free = stage.formation.n_constraints < 4
     return np.asarray(SLIDING * free * np.minimum(1.0, 8 * np.minimum(places, 1 - places)))
 

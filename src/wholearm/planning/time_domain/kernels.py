@@ -16,6 +16,7 @@ import casadi as ca
 from ...common.arrays import Expression
 from ...contacts.elemental import Contact, build_features, build_gap
 from ...contacts.formation import Formation
+from ...contacts.limits import build_limits
 from ...mechanics.dynamics import build_force_rows
 from ...problem.definition import Until
 from ..columns import Columns, Symbols
@@ -74,26 +75,30 @@ def _name(x: Symbols, p: Symbols, **y: Expression) -> NamedKernel:
 
 
 @share(32)
-def point_kernel(formation: Formation) -> NamedKernel:
+def point_kernel(formation: Formation, gradual: bool = False) -> NamedKernel:
     """Equations and inequalities at a collocation point.
 
     `tau` is that at the start and the end of the interval, `first` z at its start if a contact
     rolls, `place` the point's place in it and `least` the least rate. The contacts' constraints, in
     position, velocity and acceleration, and the five equations of motion are zero; the senses of
-    contacts that slide with friction must not be negative.
+    contacts that slide with friction must not be negative. Friction that sets in `gradual`ly, at
+    the rate `onset`, goes against the motion whichever way that is.
     """
     scene, n_c, rolls = formation.scene, formation.n_contacts, bool(formation.rolling)
     x = Columns(z=5, v=5, a=5, forces=formation.n_constraints, tau=4, first=5 * rolls)
     s = x.make_symbols()
-    p = Columns(Xi=n_c, sigma=2, place=1, least=1).make_symbols()
+    p = Columns(Xi=n_c, sigma=2, place=1, least=1, onset=1 * gradual).make_symbols()
     gaps, P, P_dot_v, A_t = formation.build_constraints(s.z, s.v)
+    Xi, sigma = p.Xi, p.sigma
+    if gradual:
+        Xi, sigma = ca.tanh(A_t @ s.v / p.onset), ca.tanh(s.v[3:] / p.onset)
     if rolls:
         gaps[n_c:] -= formation.roll_function(s.first, s.v)[0]
     applied = (
         ca.DM(scene.applied_force)
         + ca.vertcat(0, 0, 0, s.tau[:2] * (1 - p.place) + s.tau[2:] * p.place)
-        - ca.DM(scene.dry) * ca.vertcat(0, 0, 0, p.sigma)
-        + build_force_rows(formation, P, A_t, p.Xi).T @ s.forces
+        - ca.DM(scene.dry) * ca.vertcat(0, 0, 0, sigma)
+        + build_force_rows(formation, P, A_t, Xi).T @ s.forces
     )
     return _name(
         s,
@@ -165,13 +170,15 @@ def goal_kernel(
     z, v = x.z, x.v
     parts: list[Expression] = []
     if until is not None and until.contact is not None:
-        parts.append(build_gap(until.contact, scene))
+        # Where a contact changes its name its gap has no slope, but the end of its range has.
+        ranges = [limit for c in formation.contacts for limit in build_limits(c, scene)]
+        ends = [limit.value for limit in ranges if limit.gains(until.contact)]
+        parts.append(ends[0] if len(ends) == 1 else build_gap(until.contact, scene))
     elif until is not None and until.value is not None:
         parts.append((z[0] if until.coordinate == "x" else z[2]) - until.value)
     if turns:
         rates = ca.vertcat(formation.function(z, v)[2] @ v, v[3:])
-        # A flush edge has one rate, and equations said twice spoil the solver's steps.
-        parts += [rates[k] for k in {formation.turn_with(k): k for k in turns}.values()]
+        parts += [rates[k] for k in turns]
     if gained is not None:
         P = gained.build_constraints(z, v)[1]
         parts += [P[i, :] @ v for i in new_rows(formation, gained)]

@@ -40,8 +40,9 @@ class Mode(NamedTuple):
     signs: tuple[float, ...]
 
     def changed(self, rows: Sequence[int], sign: float) -> Mode:
-        """The mode with another direction of some rows."""
-        return Mode(tuple(sign if k in rows else s for k, s in enumerate(self.signs)))
+        """The mode with another direction of rows, that of the first one; others turn with it."""
+        turn = sign * self.signs[rows[0]]
+        return Mode(tuple((turn * s or sign) if k in rows else s for k, s in enumerate(self.signs)))
 
 
 def mode_of(stage: Stage) -> Mode:

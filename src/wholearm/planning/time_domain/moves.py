@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ...common.arrays import Array
 from ...contacts.formation import Formation
+from ...geometry.curve import find_tied
 from .collocation import Scheme
 from .equations import least_rates
 from .modes import drop, link, merge, mode_of, release_earlier, split
@@ -146,7 +147,8 @@ def _change(
 ) -> list[Stage] | None:
     """Pieces of a stage with another direction in a run, or None if that cannot be."""
     stage, formation = stages[index], stages[index].formation
-    rows = formation.turn_with(run.row)
+    middle = stage.guess.z[(run.begin + run.stop) // 2, 0]
+    rows = find_tied(formation, middle, run.row)
     if sign == 0:
         full = formation.n_constraints >= 4
         if run.row >= formation.n_contacts or len(rows) > 1 or full:

@@ -136,7 +136,8 @@ def _try_all(
     far, count, outcomes = attempts.are_far, 0, list[_Outcome]()
     for attempt in attempts:
         # What is far from any plan, or like what is short, is first asked what it is short of.
-        known = begun if far or count or attempt is attempts.first else None
+        plain = far or count or attempt is attempts.first
+        known = begun if plain and not attempt.gradual else None
         outcomes.append(_try(search, problem, attempt, known))
         count += bool(outcomes[-1].short)
         late = search.tried.iterations > stop
@@ -157,7 +158,7 @@ def _try(search: Search, problem: Problem, attempt: Attempt, known: Solution | N
         What solving leads to, if it is known.
     """
     solution = solve_attempt(search, attempt) if known is None else known
-    if solution.success:
+    if solution.success or attempt.gradual:
         return _Outcome(attempt.name, solution, [])
     # What coarse intervals are not short of, finer ones may be.
     lost = solution.is_lost
@@ -184,7 +185,15 @@ def _find_short(
 
 def solve_attempt(search: Search, attempt: Attempt) -> Solution:
     """Solve, find modes and intervals, halve these, and make limits hold in between."""
-    solution = search.solve(attempt.stages, most=ATTEMPT)
+    stages = attempt.stages
+    if attempt.gradual:
+        from .gradual import find_modes
+
+        found = find_modes(search, stages)
+        if not found.success:
+            return found
+        stages = found.stages
+    solution = search.solve(stages, most=ATTEMPT)
     if solution.success and solution.margin < -ROUNDING:
         # A way that presses too little may be far from one that presses enough.
         return solution._replace(success=False, status="the largest c_n is below epsilon")

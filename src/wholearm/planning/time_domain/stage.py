@@ -90,6 +90,9 @@ class Stage:
         Monitored limits that are as clear at the end: what comes next ends by closing them.
     adapts : float
         What it costs to change the duration of an interval; nothing if they keep their shares.
+    onset : float
+        Rate of contacts and joints, in the scene's unit, at which three quarters of their friction
+        has set in, against whatever way they move; nothing if friction has the given directions.
     """
 
     phase: int
@@ -107,6 +110,7 @@ class Stage:
     clearance: float = CLEARANCE
     apart: tuple[int, ...] = ()
     adapts: float = 0.0
+    onset: float = 0.0
 
     @property
     def intervals(self) -> int:

@@ -177,13 +177,12 @@ def _run(passed: Array) -> tuple[Array, Array, Array]:
 
 def _run_at(pace: Pace, passed: Array) -> tuple[Array, Array, Array]:
     """The same at a pace of its own."""
-    t = pace.t / pace.t[-1]
-    rates = np.gradient(pace.s, t)
-    rates[[0, -1]] = 0.0
-    place, rate, gain = (
-        np.interp(passed, t, table) for table in (pace.s, rates, np.gradient(rates, t))
-    )
-    return place, rate, gain
+    total = pace.t[-1]
+    own = np.clip(np.searchsorted(pace.t, passed * total) - 1, 0, len(pace.forces) - 1)
+    begin, since = pace.v[own], passed * total - pace.t[own]
+    gain = (np.diff(pace.v) / np.diff(pace.t))[own]
+    place = pace.s[own] + since * (begin + gain * since / 2)
+    return place, total * (begin + gain * since), total**2 * gain
 
 
 def _lack(outline: PathGuess, z: Array, v: Array, a: Array) -> tuple[Array, Array]:

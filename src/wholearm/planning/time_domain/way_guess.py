@@ -16,7 +16,7 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...contacts.formation import Formation
-from ...geometry.curve import tangent_basis
+from ...geometry.curve import find_tied, tangent_basis
 from ...geometry.explore import close_contacts, is_inside
 from ...geometry.path_guess import PathGuess, connect, guess_phase, list_ends
 from ...mechanics.dynamics import Directions
@@ -211,7 +211,7 @@ def split_way(outline: PathGuess) -> Way:
         own, part = signs[begin].copy(), np.concatenate([part, z[begin + 1 : stop]])
         turning = list[tuple[int, ...]]()
         if stop < len(signs):
-            turning = _order_turns(formation, own, signs[stop], rates[stop - 1 : stop + 1])
+            turning = _order_turns(formation, z[stop], own, signs[stop], rates[stop - 1 : stop + 1])
         # They turn within the steps before and after the cut.
         places = stop - 0.5 + (np.arange(len(turning)) + 1) / (len(turning) + 1)
         for rows, place in zip(turning, places, strict=True):
@@ -232,11 +232,11 @@ def _make_stretch(formation: Formation, z: Array, signs: Array, rows: Sequence[i
 
 
 def _order_turns(
-    formation: Formation, before: Array, after: Array, rates: Array
+    formation: Formation, z: Array, before: Array, after: Array, rates: Array
 ) -> list[tuple[int, ...]]:
     """Rows that turn between two stretches, those together that have to, the first ones first."""
     rows = np.flatnonzero(before != after).tolist()
-    groups = {tuple(i for i in formation.turn_with(k) if i in rows) for k in rows}
+    groups = {tuple(sorted(i for i in find_tied(formation, z, k) if i in rows)) for k in rows}
 
     def cross(group: tuple[int, ...]) -> float:
         first, last = rates[:, group[0]]

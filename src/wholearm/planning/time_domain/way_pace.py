@@ -42,12 +42,15 @@ class Pace(NamedTuple):
     t : ndarray, shape (n,), [s]
     s : ndarray, shape (n,)
         Share of the length.
+    v : ndarray, shape (n,), [1/s]
+        Its rate, which is linear in time in between.
     forces : ndarray, shape (n - 1, n_c + R)
         In between, over the weight of the object.
     """
 
     t: Array
     s: Array
+    v: Array
     forces: Array
 
 
@@ -122,7 +125,8 @@ class WayForces:
         steps = 2 * self.runs / np.maximum(v[1:] + v[:-1], np.sqrt(LEAST * self.square))
         length = np.append(0.0, np.cumsum(self.runs))
         forces = x[len(self.top) : -1].reshape(len(steps), -1)
-        return Pace(np.append(0.0, np.cumsum(steps)), length / length[-1], forces)
+        t = np.append(0.0, np.cumsum(steps))
+        return Pace(t, length / length[-1], v / length[-1], forces)
 
     def _maximise(self, gain: Array, least: float) -> Array | None:
         from scipy.optimize import linprog
