@@ -23,6 +23,7 @@ and the same with t = (n_y, -n_x) for W_t and J_t. W_n^T = dC/dq and J_n = -dC/d
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import NamedTuple
@@ -95,6 +96,8 @@ class LinkFeatures(NamedTuple):
         C-function of the tip with each edge, and how far along the edge the tip is.
     arc_gap, arc_run : expression, shape (1, n_v), [m]
         C-function of each vertex with the tip's arc, and how far beyond the tip's centre it is.
+    vertex_beyond, edge_beyond : expression, shape (1, n_v), [m]
+        How far each vertex is beyond the ends of the link, and the tip beyond those of each edge.
     """
 
     base: Expression
@@ -107,6 +110,8 @@ class LinkFeatures(NamedTuple):
     edge_run: Expression
     arc_gap: Expression
     arc_run: Expression
+    vertex_beyond: Expression
+    edge_beyond: Expression
 
 
 class Features(NamedTuple):
@@ -140,15 +145,11 @@ class Geometry(NamedTuple):
         The C-function.
     point, normal : expression, shape (2,), [m], [-]
         Where the contact is, and its normal into the object.
-    A, A_t : expression, shape (1, 5)
-        The contact's rows [W_n^T, -J_n] and [W_t^T, -J_t].
     """
 
     gap: Expression
     point: Expression
     normal: Expression
-    A: Expression
-    A_t: Expression
 
 
 class GapLimit(NamedTuple):
@@ -239,7 +240,8 @@ def _build_features(scene: Scene) -> Features:
     vertices = rotation @ ca.DM(body.T) + ca.repmat(z[:2], 1, len(body))
     along = rotation @ ca.DM((run / lengths[:, None]).T)
     normals = ca.vertcat(-along[1, :], along[0, :])
-    links = tuple(_build_link(scene, finger, z, vertices, along, normals) for finger in range(2))
+    hull = vertices, along, normals, ca.DM(lengths).T
+    links = tuple(_build_link(scene, finger, z, *hull) for finger in range(2))
     return Features(z, vertices, normals, lengths, (links[0], links[1]))
 
 
@@ -253,6 +255,7 @@ def _build_link(
     vertices: Expression,
     along: Expression,
     edge_normals: Expression,
+    edge_lengths: Expression,
 ) -> LinkFeatures:
     link = scene.fingers[finger]
     axis = ca.vertcat(ca.cos(z[3 + finger]), ca.sin(z[3 + finger]))
@@ -263,17 +266,20 @@ def _build_link(
     from_base = vertices - ca.repmat(base, 1, count)
     to_tip = ca.repmat(tip, 1, count) - vertices
     edge_gap = -ca.sum1(edge_normals * to_tip) - link.radius
+    vertex_run, edge_run = axis.T @ from_base, ca.sum1(along * to_tip)
     return LinkFeatures(
         base=base,
         tip=tip,
         normal=normal,
         vertex_gap=normal.T @ from_base - link.radius,
-        vertex_run=axis.T @ from_base,
+        vertex_run=vertex_run,
         other_gap=_find_largest_others(ca.horzsplit(edge_gap)),
         edge_gap=edge_gap,
-        edge_run=ca.sum1(along * to_tip),
+        edge_run=edge_run,
         arc_gap=ca.sqrt(ca.sum1(to_tip**2)) - link.radius,
         arc_run=-axis.T @ to_tip,
+        vertex_beyond=ca.fmax(-vertex_run, vertex_run - link.length),
+        edge_beyond=ca.fmax(-edge_run, edge_run - edge_lengths),
     )
 
 
@@ -313,26 +319,28 @@ def build_geometry(contact: Contact, scene: Scene) -> Geometry:
             point = link.tip + radius * normal
         else:
             normal = (point - link.tip) / (gap + radius)
-    tangent = ca.vertcat(normal[1], -normal[0])
-    return Geometry(
-        gap,
-        point,
-        normal,
-        _build_row(contact, scene, point, normal),
-        _build_row(contact, scene, point, tangent),
-    )
+    return Geometry(gap, point, normal)
 
 
-def _build_row(
-    contact: Contact, scene: Scene, point: Expression, direction: Expression
-) -> Expression:
-    arm = point - build_features(scene).z[:2]
-    moment = arm[0] * direction[1] - arm[1] * direction[0]
-    row = [direction[0], direction[1], moment, ca.SX(1, 1), ca.SX(1, 1)]
-    if contact.finger is not None:
-        lever = point - ca.DM(scene.fingers[contact.finger].base)
-        row[3 + contact.finger] = -ca.dot(direction, rotate_quarter(lever))
-    return ca.horzcat(*row)
+def build_rows(contacts: Sequence[Contact], scene: Scene) -> tuple[Expression, ...]:
+    """Return gaps, shape (n_c,) [m], and the rows A and A_t of contacts, shape (n_c, 5).
+
+    A = [W_n^T, -J_n] and A_t = [W_t^T, -J_t], all contacts at once.
+    """
+    parts = [build_geometry(contact, scene) for contact in contacts]
+    gaps = ca.vertcat(ca.SX(0, 1), *(part.gap for part in parts))
+    points = ca.horzcat(ca.SX(2, 0), *(part.point for part in parts)).T
+    normals = ca.horzcat(ca.SX(2, 0), *(part.normal for part in parts)).T
+    arms = points - ca.repmat(build_features(scene).z[:2].T, len(parts), 1)
+    rows = []
+    for along in (normals, ca.horzcat(normals[:, 1], -normals[:, 0])):
+        turns = [arms[:, 0] * along[:, 1] - arms[:, 1] * along[:, 0]]
+        for finger, link in enumerate(scene.fingers):
+            own = ca.sparsify(ca.DM([float(c.finger == finger) for c in contacts]))
+            levers = points - ca.repmat(ca.DM(link.base).T, len(parts), 1)
+            turns.append((levers[:, 1] * along[:, 0] - levers[:, 0] * along[:, 1]) * own)
+        rows.append(ca.horzcat(along, *turns))
+    return gaps, *rows
 
 
 def rotate_quarter(vector: Expression) -> Expression:

@@ -34,7 +34,7 @@ from .elemental import (
     GapLimit,
     build_features,
     build_gap,
-    build_geometry,
+    build_rows,
     candidate_contacts,
 )
 from .limits import build_clearance, list_limits
@@ -250,10 +250,7 @@ def describe(contacts: Sequence[Contact]) -> str:
 
 def _build_function(formation: Formation) -> Expression:
     z, v = build_features(formation.scene).z, ca.SX.sym("v", 5)
-    parts = [build_geometry(contact, formation.scene) for contact in formation.contacts]
-    gaps = ca.vertcat(*(part.gap for part in parts))
-    A = ca.vertcat(*(part.A for part in parts))
-    A_t = ca.vertcat(*(part.A_t for part in parts))
+    gaps, A, A_t = build_rows(formation.contacts, formation.scene)
     outputs = [gaps, A, A_t, ca.jtimes(A @ v, z, v)]
     return ca.Function("formation", [z, v], [ca.densify(part) for part in outputs])
 
@@ -263,8 +260,7 @@ def _build_roll_function(formation: Formation) -> Expression:
     z, v = build_features(scene).z, ca.SX.sym("v", 5)
     rolling = [formation.contacts[row] for row in formation.rolling_rows]
     slip = ca.vertcat(ca.SX(0, 1), *(build_slip(c, scene) for c in rolling))
-    rows = [build_geometry(c, scene).A_t for c in rolling]
-    A_t = ca.vertcat(ca.SX(0, 5), *rows)
+    _, _, A_t = build_rows(rolling, scene)
     bend = ca.jtimes(A_t @ v, z, v)
     return ca.Function("roll", [z, v], [ca.densify(slip), ca.densify(bend)])
 

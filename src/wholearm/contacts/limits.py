@@ -117,10 +117,15 @@ def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
     """
     gap = own = build_gap(contact, scene)
     text = f"{contact.corner} touches {contact.part}"
-    if contact.feature == "e" and contact.finger is not None and not touching:
-        others = build_features(scene).links[contact.finger].other_gap
-        gap = ca.fmax(gap, others[contact.index] - own)
-    if contact.finger is not None and not (touching and contact.surface == "finger"):
+    if contact.finger is None or (touching and contact.surface == "finger"):
+        return GapLimit(gap, text, contact)
+    link = build_features(scene).links[contact.finger]
+    if contact.surface == "finger":
+        gap = ca.fmax(gap, link.vertex_beyond[contact.index])
+    elif contact.feature == "e":
+        gap = ca.fmax(gap, link.edge_beyond[contact.index])
+        gap = gap if touching else ca.fmax(gap, link.other_gap[contact.index] - own)
+    else:
         for limit in build_limits(contact, scene):
             gap = ca.fmax(gap, -limit.value)
     return GapLimit(gap, text, contact)

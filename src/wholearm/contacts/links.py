@@ -27,6 +27,10 @@ _ROUNDING = 1e-30
 
 def build_finger_gap(scene: Scene) -> Expression:
     """Return the gap between the two links [m], an expression of the features' symbol z."""
+    return _GAPS(scene)
+
+
+def _build_gap(scene: Scene) -> Expression:
     links = build_features(scene).links
     radii = sum(link.radius for link in scene.fingers)
     lengths = [link.length for link in scene.fingers]
@@ -56,6 +60,7 @@ def _build_gap_function(scene: Scene) -> Expression:
     return ca.Function("finger_gap", [build_features(scene).z], [build_finger_gap(scene)])
 
 
+_GAPS = Store(_build_gap, lambda scene: scene.shape)
 _GAP_FUNCTIONS = Store(_build_gap_function, lambda scene: scene.shape)
 
 

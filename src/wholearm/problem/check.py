@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from itertools import zip_longest
 
+import numpy as np
+
 from ..common.errors import InputError
 from ..common.require import require_number, require_vector
 from ..common.sharing import exclusive
@@ -159,8 +161,13 @@ def _check_first_formation(problem: Problem) -> None:
     """Check that what the first phase names touches; it may let go what else does."""
     if not problem.phases:
         return
+    formation, z = problem.phases[0].formation, problem.start[None]
+    missed = max(np.abs(formation.evaluate(z, z).C).max(), -formation.evaluate_limits(z).min())
+    if missed < problem.scene.touching:
+        return
+    # Only what a message may need looks at every other contact.
     touching = find_touching(problem.scene, problem.start)
-    first = problem.phases[0].formation.contacts
+    first = formation.contacts
     if not set(first) <= set(touching):
         raise InputError(
             "",
