@@ -16,7 +16,12 @@ from .stepper import Stepper
 
 
 def keep_wanted(run: Replay, stop: float) -> None:
-    """Set aside the instants that are wanted within the step just made, which ends at `stop`."""
+    """Set aside the instants that are wanted within the step just made, which ends at `stop`.
+
+    Its start is recorded already.
+    """
+    while run.wanted[run.next_wanted] <= run.t:
+        run.next_wanted += 1
     if run.wanted[run.next_wanted] >= stop:
         return
     section = run.sections[-1]

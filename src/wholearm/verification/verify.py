@@ -46,8 +46,10 @@ from .verdict import (
 
 _ENDS = (EventKind.ARRIVAL, EventKind.RELEASE)
 _CHANGES = {EventKind.STICK: "sticks", EventKind.SLIP: "slips", EventKind.REVERSAL: "reverses"}
-SAMPLES = 2000
+SAMPLES = 400
 """About how many instants normal forces are looked at, besides the simulation's own steps."""
+ROWS = 20
+"""About how many rows of each phase of a trajectory its replay is compared with."""
 MANY = 150
 """Instants of a phase from which on it costs less to evaluate them within steps than to end steps
 there: what evaluates them is compiled for each formation."""
@@ -163,11 +165,15 @@ def _list_reduced(problem: Problem, simulation: Simulation) -> tuple[ReducedStat
 
 
 def choose_times(torque: TorqueProfile, plan: Trajectory | None) -> Array:
-    """Instants inside every piece of the torques, at least one, and the rows of the plan."""
+    """Instants inside every piece of the torques, at least one, and rows of the plan."""
     count = max(1, SAMPLES // len(torque.coefficients))
     share = np.arange(1, count + 1) / (count + 1)
     inside = torque.breaks[:-1, None] + np.diff(torque.breaks)[:, None] * share
-    return np.append(inside.ravel(), [] if plan is None else plan.t)
+    rows = (
+        [] if plan is None else [np.flatnonzero(plan.phase == k) for k in range(len(plan.motions))]
+    )
+    thin = [own[np.linspace(0, len(own) - 1, ROWS + 1).astype(int)] for own in rows]
+    return np.concatenate([inside.ravel(), *(plan.t[own] for own in thin)])
 
 
 def _report_phase(
