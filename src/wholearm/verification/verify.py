@@ -169,11 +169,12 @@ def choose_times(torque: TorqueProfile, plan: Trajectory | None) -> Array:
     count = max(1, SAMPLES // len(torque.coefficients))
     share = np.arange(1, count + 1) / (count + 1)
     inside = torque.breaks[:-1, None] + np.diff(torque.breaks)[:, None] * share
-    rows = (
-        [] if plan is None else [np.flatnonzero(plan.phase == k) for k in range(len(plan.motions))]
-    )
-    thin = [own[np.linspace(0, len(own) - 1, ROWS + 1).astype(int)] for own in rows]
-    return np.concatenate([inside.ravel(), *(plan.t[own] for own in thin)])
+    times = [inside.ravel()]
+    if plan is not None:
+        owned = (np.flatnonzero(plan.phase == index) for index in range(len(plan.motions)))
+        picked = (own[np.linspace(0, len(own) - 1, ROWS + 1).astype(int)] for own in owned)
+        times += [plan.t[rows] for rows in picked]
+    return np.concatenate(times)
 
 
 def _report_phase(
