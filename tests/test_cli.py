@@ -417,6 +417,10 @@ def test_output_that_is_a_device(capsys: pytest.CaptureFixture[str]) -> None:
         (["solve", str(HEPTAGON), "--objective", "fun"], "objective: 'fun' given; allowed are"),
         (["solve", str(HEPTAGON), "--duration", "1"], "duration: is for the objective margin"),
         (["solve", str(HEPTAGON), "--time-weight", "nan"], "time_weight: nan is not a positive"),
+        (
+            ["solve", str(HEPTAGON), "--certify", "--objective", "margin"],
+            "is for the objective time",
+        ),
         (["plot", "a.npz"], "-o/--output"),
         (["verify", str(HEPTAGON), "a.npz", "--tolerance", "0"], "--tolerance: 0.0 is not a pos"),
     ],

@@ -64,6 +64,7 @@ def test_the_grid_in_the_time_domain_is_kept(transcription: str, degree: int) ->
         ("transcription", "path"),
         ("transcription", ""),
         ("transcription", None),
+        ("certify", 1),
     ],
 )
 def test_bad_options_are_named(key: str, given: Any) -> None:
@@ -78,3 +79,9 @@ def test_bad_options_are_named(key: str, given: Any) -> None:
 def test_only_the_margin_has_a_duration(objective: str) -> None:
     with pytest.raises(InputError, match="duration: is for the objective margin only"):
         PlanOptions(objective=objective, duration=1.0)
+
+
+@pytest.mark.parametrize("objective", ["effort", "margin"])
+def test_only_the_least_time_has_a_bound(objective: str) -> None:
+    with pytest.raises(InputError, match="certify: is for the objective time only"):
+        PlanOptions(objective=objective, certify=True)

@@ -15,13 +15,13 @@ from scipy.optimize import linprog
 
 from plane import with_speed_limit
 from shipped import HEPTAGON, IMPACTS, problem_of
-from topp import PhasePlane
 from toys import Toy, constant
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, JammingError, SolverError
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import inverse
+from wholearm.planning.lower_bound.lower_bound import bound_least_time
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain import plan as path_plan
 from wholearm.planning.path_domain.impact_sequence import ImpactSequence, make_sequence
@@ -88,23 +88,15 @@ def test_least_time_is_within_its_tolerance_of_a_finer_plan(
     assert coarse.value == coarse.motion.duration
 
 
-@pytest.mark.parametrize("phase", [0, 2, 4])
-def test_least_time_agrees_with_the_phase_plane(curves: tuple[Curve, ...], phase: int) -> None:
-    coarse, fine = (PhasePlane(curves[phase], EPSILON, n).least_time() for n in (150, 300))
-    # Its own error is of first order; extrapolation leaves some 1e-5.
-    assert plan(curves[phase], "time", 320).value == pytest.approx(2 * fine - coarse, rel=2e-4)
-    assert plan(curves[phase], "time", 80).value == pytest.approx(2 * fine - coarse, rel=7e-4)
-
-
 def test_a_phase_that_only_a_quick_motion_carries(curves: tuple[Curve, ...]) -> None:
     """Slow motions cannot press v1 on the palm so hard in phase 3."""
     epsilon = 0.8
     slow = with_speed_limit(curves[2], (0.3, 0.3))
     with pytest.raises(InfeasibleError):
         plan_path(slow, epsilon, PlanOptions(intervals=20), 3)
-    coarse, fine = (PhasePlane(curves[2], epsilon, n).least_time() for n in (150, 300))
+    bound = bound_least_time([curves[2]], epsilon)
     chosen = plan_path(curves[2], epsilon, PlanOptions(intervals=160), 3)
-    assert chosen.value == pytest.approx(2 * fine - coarse, rel=2e-4)
+    assert bound is not None and 0 <= chosen.value / bound.value - 1 < 2e-4
 
 
 # Phases that are run through one after the other.
@@ -151,17 +143,6 @@ def test_a_chain_is_one_problem(chain: ImpactSequence) -> None:
     for one, other in pairwise(motions):
         end, start = one.evaluate(np.array([one.duration])), other.evaluate(np.zeros(1))
         np.testing.assert_allclose(start.z, end.z, rtol=0, atol=1e-12)
-
-
-def test_least_time_of_a_chain_agrees_with_the_phase_plane(chain: ImpactSequence) -> None:
-    coarse, fine = (
-        PhasePlane(chain.continuous_curves, EPSILON, n).least_time() for n in (100, 200)
-    )
-    planned = sum(plan.value for plan in plan_joined(chain, "time", 320))
-    assert planned == pytest.approx(2 * fine - coarse, rel=2e-4)
-    assert sum(plan.value for plan in plan_joined(chain, "time", 80)) == pytest.approx(
-        planned, rel=5e-4
-    )
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)

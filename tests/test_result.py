@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from shipped import HEPTAGON, IMPACTS, problem_of
+from wholearm.cli.summary import summarise
 from wholearm.common.errors import InputError
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
@@ -23,7 +24,7 @@ NOT_IN_0_1_0 = (
     "rolling", "modes", "sequences", "complete", "attempts", "transcription", "duration",
     "time_intervals", "degree", "scheme", "opening", "clearance", "samples", "mode_search",
     "build_times",
-    "solve_times", "transitions", "replay",
+    "solve_times", "transitions", "replay", "certify", "certificate",
 )  # fmt: skip
 
 
@@ -43,7 +44,13 @@ def made() -> Plan:
 def within() -> Plan:
     """A plan in the time domain."""
     whole = two_phases()
-    return solve(replace(whole, phases=whole.phases[:1]), transcription="time", time_intervals=8)
+    first = replace(whole, phases=whole.phases[:1])
+    return solve(first, transcription="time", time_intervals=8, certify=True)
+
+
+@pytest.fixture(scope="module")
+def certified() -> Plan:
+    return solve(two_phases(), intervals=20, samples=5, replay=False, certify=True)
 
 
 def change_meta(plan: Plan, path: Path, changed: dict[str, Any], gone: tuple[str, ...] = ()) -> str:
@@ -52,14 +59,23 @@ def change_meta(plan: Plan, path: Path, changed: dict[str, Any], gone: tuple[str
     return str(path)
 
 
-@pytest.mark.parametrize("which", ["made", "within"])
+@pytest.mark.parametrize("which", ["made", "within", "certified"])
 def test_a_plan_comes_back_from_its_file(
     which: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
     plan: Plan = request.getfixturevalue(which)
     plan.save(tmp_path / "a.npz")
     loaded = load_plan(tmp_path / "a.npz")
-    for name in ("options", "status", "value", "phases", "transitions", "timings", "versions"):
+    for name in (
+        "options",
+        "status",
+        "value",
+        "phases",
+        "transitions",
+        "timings",
+        "versions",
+        "certificate",
+    ):
         assert getattr(loaded, name) == getattr(plan, name), name
     assert loaded.replay == plan.replay
     assert loaded.meta == plan.meta == write_meta(loaded)
@@ -98,6 +114,33 @@ def test_a_file_of_0_1_0_loads(made: Plan, tmp_path: Path) -> None:
     assert loaded.statistics.solves == made.statistics.solves
 
 
+def test_a_certificate_has_every_phase_and_all_together(certified: Plan) -> None:
+    certificate = certified.certificate
+    assert certificate is not None and certificate.total is not None
+    assert [part.phases for part in certificate.parts] == [(1,), (2,)]
+    for part, phase in zip(certificate.parts, certified.phases, strict=True):
+        assert part.bound is not None and part.error is not None and part.gap is not None
+        assert part.duration == phase.duration >= part.bound and part.error < 1e-7 * part.bound
+        # Twenty intervals are coarse.
+        assert 0 <= part.gap < 1e-2
+    total = certificate.total
+    assert total.phases == (1, 2) and total.duration == pytest.approx(certified.duration)
+    assert total.bound == pytest.approx(sum(part.bound or 0 for part in certificate.parts))
+    assert certified.meta["certificate"]["total"]["gap"] == total.gap
+    text = summarise(certified, "a.npz")
+    rows = [line.split() for line in text.splitlines() if "e-" in line]
+    assert [row[0] for row in rows] == ["1", "2", "all"]
+    assert float(rows[2][2]) == pytest.approx(total.bound, abs=1e-8)
+
+
+def test_what_is_planned_over_time_is_not_certified(within: Plan) -> None:
+    certificate = within.certificate
+    assert certificate is not None and certificate.total is None
+    (part,) = certificate.parts
+    assert part.bound is None and part.gap is None and part.phases == (1,)
+    assert "  not certified: planned over time" in summarise(within, "a.npz")
+
+
 @pytest.mark.parametrize(
     ("changed", "gone", "text"),
     [
@@ -107,6 +150,7 @@ def test_a_file_of_0_1_0_loads(made: Plan, tmp_path: Path) -> None:
         ({"iterations": ["a", "b"]}, (), "does not describe a plan"),
         ({"transitions": [3]}, (), "does not describe a plan"),
         ({"replay": {}}, (), "does not describe a plan"),
+        ({"certificate": {"parts": [3]}}, (), "does not describe a plan"),
         ({"timings": {"plan": "long"}}, (), "does not describe a plan"),
         ({}, ("value",), "does not describe a plan"),
         ({}, ("problem",), "does not hold its problem's tables"),

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve, Segment
 from wholearm.mechanics.dynamics import Directions, PathForces
+from wholearm.planning.lower_bound import rows
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain import data as path_data
 from wholearm.planning.path_domain.motion import PathMotion
@@ -75,8 +76,9 @@ class Toy:
 
     @contextmanager
     def in_place(self) -> Iterator[None]:
-        """Let the planner see this toy's forces."""
+        """Let the planner and the lower bound see this toy's forces."""
         with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(rows, "inverse", self._inverse)
             patch.setattr(path_data, "inverse", self._inverse)
             patch.setattr(path_data, "reduced_inertia", lambda *_: np.ones(1))
             yield

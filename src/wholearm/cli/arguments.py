@@ -39,6 +39,8 @@ def add_solve(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-mode-search", dest="mode_search", action="store_false", help=text)
     text = "return the plan without replaying it"
     parser.add_argument("--no-replay", dest="replay", action="store_false", help=text)
+    text = "bound the least time along curves from below, and print the gap"
+    parser.add_argument("--certify", action="store_true", help=text)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
 

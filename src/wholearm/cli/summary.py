@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ..planning.result import Plan
+    from ..results.certificate import Certificate
     from ..results.replay_figures import ReplayFigures
 
 
@@ -35,6 +36,7 @@ def summarise(plan: Plan, output: str, table: Mapping[str, Any] | None = None) -
     lines += _list_modes(plan)
     lines += _list_transitions(plan)
     lines += [_describe_replay(plan.replay)]
+    lines += [] if plan.certificate is None else _list_bounds(plan.certificate)
     lines += _list_table(table) if table is not None else []
     value = f"{plan.status.value}: {plan.options.goal.value} = {plan.value:.6f} {plan.unit}"
     return "\n".join([*lines, f"{value}, {plan.duration:.6f} s in all; wrote {output}"])
@@ -52,6 +54,25 @@ def _describe_replay(replay: ReplayFigures | None) -> str:
         f"{max((end.angle for end in ends), default=0.0):.1e} rad at the ends of phases"
     )
     return text + (f", with up to {2**finer} times the intervals" if finer > 0 else "")
+
+
+def _list_bounds(certificate: Certificate) -> list[str]:
+    """Table of lower bounds of the durations, and of all that have one together."""
+    header = (
+        f"{'phases':>8}  {'planned [s]':>12}  {'at least [s]':>12}  {'error [s]':>9}  {'gap':>8}"
+    )
+    lines, total = ["", f"{header}  lower bounds of the least time"], certificate.total
+    for part in (*certificate.parts, *([total] if total is not None else [])):
+        ends = dict.fromkeys((part.phases[0], part.phases[-1]))
+        row = f"{'all' if part is total else '-'.join(map(str, ends)):>8}  {part.duration:>12.8f}"
+        if part.bound is None:
+            lines.append(f"{row}  not certified: {part.reason}")
+            continue
+        lines.append(f"{row}  {part.bound:>12.8f}  {part.error:>9.1e}  {part.gap:>8.1e}")
+    missing = [part for part in certificate.parts if part.bound is None]
+    if total is not None and missing:
+        lines[-1] += "  of those with a bound"
+    return [*lines, ""]
 
 
 def _list_table(table: Mapping[str, Any]) -> list[str]:

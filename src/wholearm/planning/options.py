@@ -58,6 +58,7 @@ class PlanOptions:
     scheme: str = "radau"
     replay: bool = True
     mode_search: bool = True
+    certify: bool = False
 
     def __post_init__(self) -> None:
         given = self.objective
@@ -78,7 +79,7 @@ class PlanOptions:
         if self.transcription not in ("auto", "time"):
             given = self.transcription
             raise InputError("", "transcription", f"{given!r} given; allowed are auto and time")
-        for key in ("replay", "mode_search"):
+        for key in ("replay", "mode_search", "certify"):
             if not isinstance(value := getattr(self, key), bool):
                 raise InputError("", key, f"{value!r} given; allowed are true and false")
         for key in ("opening", "clearance"):
@@ -91,6 +92,9 @@ class PlanOptions:
             object.__setattr__(self, "duration", duration)
             if self.objective is not Objective.MARGIN:
                 raise InputError("", "duration", "is for the objective margin only")
+
+        if self.certify and self.objective in (Objective.EFFORT, Objective.MARGIN):
+            raise InputError("", "certify", "is for the objective time only")
 
     @property
     def goal(self) -> Objective:

@@ -73,6 +73,8 @@ def solve(
         Whether contact modes are changed, in the time domain, for as long as that betters a plan.
     replay : bool, default True
         Whether to replay the plan, to refine what does not hold and to return only what does.
+    certify : bool, default False
+        Whether to bound the least time along curves from below, for `time`.
 
     Returns
     -------
@@ -113,6 +115,12 @@ def solve_with(
         replayed = time.perf_counter()
         transitions = _assess(planning, report)
         assessed = time.perf_counter()
+        certificate = None
+        if options.certify:
+            from .certify import certify
+
+            report("bounding the least time from below")
+            certificate = certify(planning)
     phases = _list_phases(planning, ledger)
     plan = Plan(
         problem,
@@ -137,6 +145,7 @@ def solve_with(
             "numpy": np.__version__,
             "python": ".".join(map(str, sys.version_info[:3])),
         },
+        certificate,
     )
     return replace(plan, trajectory=replace(trajectory, meta=write_meta(plan)))
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from numpy.typing import ArrayLike
 
 from ..problem.definition import Problem
+from ..results.certificate import Certificate
 from ..results.modes import ModeSpan
 from ..results.replay_figures import ReplayFigures
 from ..results.trajectory import Samples, Trajectory
@@ -117,6 +118,8 @@ class Plan:
     timings : Timings
     versions : mapping of str
         Of this package and those that it plans with.
+    certificate : Certificate or None
+        Lower bounds of the durations, if they were asked for.
     """
 
     problem: Problem
@@ -129,6 +132,7 @@ class Plan:
     replay: ReplayFigures | None
     timings: Timings
     versions: Mapping[str, str]
+    certificate: Certificate | None = None
 
     def __repr__(self) -> str:
         value = f"{self.options.goal.value} = {self.value:.6g} {self.unit}"

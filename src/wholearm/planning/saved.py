@@ -8,6 +8,7 @@ from typing import Any
 from ..common.errors import InputError
 from ..problem.definition import Problem
 from ..problem.read import read_own_problem
+from ..results.certificate import Certificate
 from ..results.modes import ModeSpan
 from ..results.replay_figures import ReplayFigures
 from ..results.trajectory import Trajectory
@@ -19,7 +20,7 @@ from .result import Plan, PlannedPhase, Status, Timings
 
 _OPTIONS = (
     "intervals", "transcription", "time_weight", "duration", "time_intervals", "degree", "scheme",
-    "opening", "clearance", "samples", "mode_search",
+    "opening", "clearance", "samples", "mode_search", "certify",
 )  # fmt: skip
 """Options that stand in `meta` by themselves; `objective` and `replay` do in other ways."""
 
@@ -50,6 +51,7 @@ def write_meta(plan: Plan) -> dict[str, Any]:
         "problem": plan.problem.table,
         "transitions": [transition.to_dict() for transition in plan.transitions],
         "replay": None if plan.replay is None else plan.replay.to_dict(),
+        "certificate": None if plan.certificate is None else plan.certificate.to_dict(),
         "timings": plan.timings._asdict(),
     }
 
@@ -114,6 +116,7 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
         for k in range(count)
     )
     replay, timings = meta.get("replay"), meta.get("timings", {})
+    certificate = meta.get("certificate")
     return Plan(
         problem,
         options,
@@ -125,4 +128,5 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
         None if replay is None else ReplayFigures.of(replay),
         Timings(*(float(timings.get(name, 0.0)) for name in Timings._fields)),
         dict(meta.get("versions", {})),
+        None if certificate is None else Certificate.of(certificate),
     )

@@ -1,0 +1,140 @@
+"""A lower bound of the least time from rest to rest along curves, with an estimate of its error.
+
+A sweep finds about the fastest motion, the costate of that motion gives the bound, and the grid is
+refined where the bound loses most. How near the motion is to the fastest one matters to second
+order only, and never to whether the bound is one. What has an error is the quadrature.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ...common.arrays import Array
+from ...geometry.curve import Curve
+from .costate import find_costate
+from .dual import evaluate, find_least
+from .rows import Rows
+from .sweep import NoMotionError, Sweep, find_fastest
+from .way import Grid, Way
+
+_TOLERANCE = 3e-8
+"""What the bound may lose, and its error, relative to the time."""
+_INTERVALS = (100, 400)
+"""Of the first grid; the second number is tried where no motion is found on the first."""
+_ROUNDS = 8
+_MOST = 1500
+"""Most intervals."""
+_SAFETY = 2.0
+"""Factor on the difference of two rules of quadrature; where limits take turns both err alike."""
+_SPEEDS = 4
+"""Sweeps until viscous friction is linearised about the right speed."""
+
+_RULES = tuple(np.polynomial.legendre.leggauss(count) for count in (2, 3))
+_PLACES = np.concatenate([[0.0, 0.5, 1.0], *((1 + nodes) / 2 for nodes, _ in _RULES)])
+"""Left end, middle, right end and the nodes of both rules in an interval."""
+
+
+class LowerBound(NamedTuple):
+    """A lower bound of the least time.
+
+    Attributes
+    ----------
+    value : float, [s]
+        The bound, less the estimate of its error.
+    error : float, [s]
+        That estimate: of the quadrature, by rules of two orders.
+    """
+
+    value: float
+    error: float
+
+
+class _Round(NamedTuple):
+    """The bound on a grid, what each interval may lose, (N,) [s], and the motion it is from."""
+
+    bound: LowerBound
+    losses: Array
+    motion: Sweep
+
+
+def bound_least_time(curves: Sequence[Curve], epsilon: float) -> LowerBound | None:
+    """Bound the time of motions along curves from below; None where no motion is found.
+
+    Parameters
+    ----------
+    curves : sequence of Curve
+        With such speed ratios that the speed is the same on both sides of where two of them meet.
+    epsilon : float, [N]
+        Least normal force.
+    """
+    way = Way(curves, epsilon)
+    for intervals in _INTERVALS:
+        try:
+            return _refine(way, way.make_grid(intervals))
+        except NoMotionError:
+            continue
+    return None
+
+
+def _refine(way: Way, grid: Grid) -> LowerBound:
+    """The bound on grids that are refined where they lose most."""
+    found = _bound(way, grid, None)
+    for _ in range(_ROUNDS):
+        share = found.losses / (_TOLERANCE * max(found.bound.value, np.finfo(float).tiny))
+        # What switches or kinks lose falls with the square or the third power of the interval.
+        parts = np.clip(np.ceil(np.cbrt(share * len(share))), 1, 8)
+        finer = grid.split(parts.astype(np.int64))
+        if share.sum() < 1 or len(finer.owners) > _MOST:
+            break
+        middles = (finer.angles[1:] + finer.angles[:-1]) / 2
+        near = np.interp(way.place(middles), way.place(grid.angles), found.motion.b)
+        grid, found = finer, _bound(way, finer, near)
+    return found.bound
+
+
+def _bound(way: Way, grid: Grid, near: Array | None) -> _Round:
+    """The bound on a grid; `near` is what b in its intervals is about."""
+    h = np.diff(grid.angles)[:, None]
+    angles = grid.angles[:-1, None] + _PLACES * h
+    rows = way.evaluate(angles, grid.owners)
+    left, middle, right = (rows.pick((slice(None), k)) for k in range(3))
+    s = way.place(grid.angles)
+    part = (way.place(angles) - s[:-1, None]) / np.diff(s)[:, None]
+    cap = np.append(left.cap, np.inf)
+    cap[1:] = np.minimum(cap[1:], right.cap)
+    for _ in range(_SPEEDS if near is None else 1):
+        motion = find_fastest(middle, np.diff(s), part[:, 1], cap, near)
+        b = motion.b[:-1, None] + part * np.diff(motion.b)[:, None]
+        near = b[:, 1]
+    costate = find_costate(way, grid, left, right, motion)
+    shape = len(h), len(_PLACES) - 3
+    p, slope = (part.ravel() for part in costate.interpolate(way, grid, _PLACES[3:]))
+    inner = rows.pick((slice(None), slice(3, None)))
+    inner = Rows(*(part.reshape(shape[0] * shape[1], *part.shape[2:]) for part in inner))
+    least = find_least(inner, p, slope)
+    excess = evaluate(inner, p, slope, b[:, 3:].ravel()) - least
+    stretch = way.length / 2 * np.sin(angles[:, 3:])
+    least, excess = least.reshape(shape) * stretch, excess.reshape(shape) * stretch
+    # Along a limit of the speed nothing is lost, however b is interpolated.
+    at_cap = motion.b == cap
+    excess[at_cap[:-1] & at_cap[1:]] = 0.0
+    coarse, fine = (
+        h[:, 0] / 2 * (least[:, own] @ weights)
+        for own, (_, weights) in zip((slice(2), slice(2, None)), _RULES, strict=True)
+    )
+    error = np.abs(fine - coarse)
+    losses = error + np.abs(h[:, 0] / 2 * (excess[:, 2:] @ _RULES[1][1]))
+    jumps = np.minimum(costate.jumps(grid), 0.0)
+    taken = np.zeros(len(jumps))
+    at = np.flatnonzero(jumps)
+    taken[at] = np.minimum(right.pick(at).highest(), left.pick(at + 1).highest())
+    lost = np.abs(jumps * (taken - motion.b[1:-1]))
+    losses[:-1] += lost
+    losses[1:] += lost
+    total = float(fine.sum() + jumps @ taken)
+    estimate = _SAFETY * float(error.sum())
+    value = total - estimate if np.isfinite(total) else 0.0
+    return _Round(LowerBound(value, estimate), losses, motion)

@@ -1,0 +1,117 @@
+"""Limits along curves in which the squeeze is eliminated.
+
+At a place of a curve every limit is affine in a = s'', b = s'^2, v = s' and the squeeze. Two of
+them whose squeezes have opposite signs, added so that these cancel, leave a limit without it; all
+such pairs together say which (a, b) some squeeze allows.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.arrays import Array
+from ...geometry.curve import Curve
+from ...mechanics.dynamics import Directions, inverse
+from ...mechanics.limits import SPEED, make_limits
+
+GIVE = 2.5e-7
+"""By how much limits give way, over what is much for each: a plan may miss as much of them."""
+
+
+class Rows(NamedTuple):
+    """Limits a_i a + b_i b + v_i v + one_i >= 0 and b <= cap at places of a curve.
+
+    Arrays of shape (..., m), and (...) for `cap` [m^2/s^2], which is infinite without speed limits.
+    """
+
+    a: Array
+    b: Array
+    v: Array
+    one: Array
+    cap: Array
+
+    def pick(self, index: Any) -> Rows:
+        """Return the places that `index` selects."""
+        return Rows(*(part[index] for part in self))
+
+    def rest(self, b: Array) -> Array:
+        """What the rows are but for their part in a, shape (..., m), at each b."""
+        b = b[..., None]
+        return np.asarray(self.b * b + self.v * np.sqrt(b) + self.one)
+
+    def extreme(self, b: Array, largest: bool) -> tuple[Array, Array, NDArray[np.int64]]:
+        """The largest or least a at n places, its slope da/db, and the row that sets it."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            bounds = -self.rest(b) / self.a
+            if largest:
+                row = np.where(self.a < 0, bounds, np.inf).argmin(axis=1)
+            else:
+                row = np.where(self.a > 0, bounds, -np.inf).argmax(axis=1)
+            k = np.arange(len(b))
+            slope = -(self.b[k, row] + self.v[k, row] / (2 * np.sqrt(b))) / self.a[k, row]
+        return bounds[k, row], slope, row
+
+    def highest(self) -> Array:
+        """An upper bound of b at n places from the limits there, shape (n,)."""
+        up, down = np.maximum(self.a, 0)[:, :, None], np.maximum(-self.a, 0)[:, None, :]
+
+        def cross(part: Array) -> Array:
+            return np.asarray(down * part[:, :, None] + up * part[:, None, :])
+
+        b, v, one = cross(self.b), cross(self.v), cross(self.one)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            root = (v + np.sqrt(np.maximum(v**2 - 4 * b * one, 0))) / (-2 * b)
+        bounded = (up > 0) & (down > 0) & (b < 0)
+        largest = np.where(bounded, np.maximum(root, 0), np.inf).min(axis=(1, 2))
+        return np.asarray(np.minimum(largest**2, self.cap))
+
+
+def evaluate_rows(curve: Curve, epsilon: float, s: Array, segment: NDArray[np.int64]) -> Rows:
+    """Limits at n places of a curve, each taken as part of a segment; see `GIVE`.
+
+    Parameters
+    ----------
+    curve : Curve
+    epsilon : float, [N]
+    s : ndarray, shape (n,)
+    segment : ndarray of int, shape (n,)
+    """
+    point = curve.evaluate(s)
+    signs = ([getattr(part, name) for part in curve.segments] for name in ("Xi", "sigma"))
+    directions = Directions(*(np.array(sign)[segment] for sign in signs))
+    forces = inverse(curve.formation, *point[:3], directions, point.kinematics)
+    every = make_limits(curve.formation, epsilon)
+    limits = every.without(SPEED)
+    of_c, of_tau, _ = (part.T for part in limits.columns)
+    rows, sides, bounds = limits.sides
+    scale = sides / limits.scales[rows]
+
+    def measure(of_forces: Array, of_torques: Array) -> Array:
+        return np.asarray((of_forces @ of_c + of_torques @ of_tau)[:, rows] * scale)
+
+    squeeze = measure(forces.Cl, forces.Tl)
+    i, j = np.triu_indices(len(rows), 1)
+    opposite = squeeze[:, i] * squeeze[:, j] <= 0
+    one, other = (np.where(opposite, np.abs(squeeze[:, k]), 0) for k in (j, i))
+    # A pair that leaves nothing is 0 >= -1.
+    size = np.where(one + other > 0, one + other, 1)
+
+    def combine(of_limits: Array) -> Array:
+        return np.asarray((one * of_limits[:, i] + other * of_limits[:, j]) / size)
+
+    constant = measure(forces.C0, forces.T0) - bounds * scale + GIVE
+    cap = np.full(len(s), np.inf)
+    for limit in every.only(SPEED).limits:
+        rates = np.abs(point.z_s[:, 3:] @ limit.rows[0, -2:])
+        with np.errstate(divide="ignore"):
+            cap = np.minimum(cap, (limit.high[0] / rates) ** 2 * (1 + GIVE))
+    return Rows(
+        combine(measure(forces.Ca, forces.Ta)),
+        combine(measure(forces.Cb, forces.Tb)),
+        combine(measure(0 * forces.C0, forces.Tv)),
+        np.where(one + other > 0, combine(constant), 1.0),
+        cap,
+    )

@@ -1,0 +1,97 @@
+"""The fastest motion along curves, by a sweep back and one forth over the plane of s and b = s'^2.
+
+The larger of two motions that keep the limits keeps them too, so the fastest one is the largest
+everywhere. Backwards: from which b can rest at the end still be reached? Forwards: as fast as
+limits and that allow. In an interval a is constant and the limits are kept at one place.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.arrays import Array
+from .rows import Rows
+
+
+class Mode(IntEnum):
+    """What sets a in an interval."""
+
+    PUSH = 0
+    """The largest a."""
+    SWITCH = 1
+    """First the largest, then the least a."""
+    BRAKE = 2
+    """The least a."""
+    HELD = 3
+    """A limit of b."""
+
+
+class Sweep(NamedTuple):
+    """The fastest motion on a grid: b at its nodes, (N + 1,), and modes of its intervals, (N,)."""
+
+    b: Array
+    modes: NDArray[np.int64]
+
+
+class NoMotionError(ValueError):
+    """No motion keeps the limits on this grid."""
+
+
+def find_fastest(rows: Rows, steps: Array, part: Array, cap: Array, near: Array | None) -> Sweep:
+    """Sweep over a grid, from rest to rest.
+
+    Parameters
+    ----------
+    rows : Rows
+        At a place of each interval.
+    steps, part : ndarray, shape (N,)
+        Lengths of the intervals, and which part of each is before its place.
+    cap : ndarray, shape (N + 1,)
+        Largest b at the nodes.
+    near : ndarray, shape (N,), optional
+        What b at the places is about: there the speed is linearised; without it, left out.
+    """
+    of_b, one = rows.b, rows.one
+    if near is not None:
+        speed = np.sqrt(near)[:, None]
+        of_b, one = of_b + rows.v / (2 * speed), one + rows.v * speed / 2
+    of_a = rows.a / (2 * steps)[:, None]
+    before = (1 - part)[:, None] * of_b - of_a
+    after = part[:, None] * of_b + of_a
+    # From one node's b, bounds of the other's: slopes and values at zero.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        brakes, pushes = (after >= 0) & (before < 0), after < 0
+        brake = np.where(brakes, after / -before, 0), np.where(brakes, one / -before, np.inf)
+        push = np.where(pushes, before / -after, 0), np.where(pushes, one / -after, np.inf)
+    count = len(steps)
+    largest, braked = np.zeros(count + 1), np.zeros(count, dtype=bool)
+    for k in range(count - 1, -1, -1):
+        following = largest[k + 1]
+        b = (brake[0][k] * following + brake[1][k]).min()
+        braked[k] = b < cap[k] and (push[0][k] * b + push[1][k]).min() >= following
+        if not braked[k]:
+            b = min(_find_corner(before[k], after[k], one[k], following), cap[k])
+        largest[k] = b
+    b, reaches = np.zeros(count + 1), np.zeros(count + 1, dtype=bool)
+    for k in range(count):
+        pushed = (push[0][k] * b[k] + push[1][k]).min()
+        reaches[k + 1] = pushed >= largest[k + 1]
+        b[k + 1] = min(pushed, largest[k + 1])
+    if largest[0] < 0 or not (b[1:-1] > 0).all():
+        raise NoMotionError
+    found = [~reaches[1:], ~reaches[:-1], braked]
+    return Sweep(b, np.select(found, [Mode.PUSH, Mode.SWITCH, Mode.BRAKE], Mode.HELD))
+
+
+def _find_corner(before: Array, after: Array, one: Array, following: float) -> float:
+    """Largest b from which rows before b + after b' + one >= 0 leave a b' from 0 to `following`."""
+    before, after = np.append(before, [0, 0]), np.append(after, [1, -1])
+    one = np.append(one, [0, following])
+    up, down = np.maximum(after, 0)[:, None], np.maximum(-after, 0)
+    slope, value = down * before[:, None] + up * before, down * one[:, None] + up * one
+    bounded = (up > 0) & (down > 0) & (slope < 0)
+    return float((value[bounded] / -slope[bounded]).min(initial=np.inf))

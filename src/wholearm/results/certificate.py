@@ -1,0 +1,75 @@
+"""Lower bounds of the durations of a plan, and how near it comes to them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+
+class TimeBound(NamedTuple):
+    """A lower bound of the time of phases that are planned together.
+
+    Attributes
+    ----------
+    phases : tuple of int
+        Their numbers.
+    duration : float, [s]
+        What the plan takes for them.
+    bound : float or None, [s]
+        No motion along their curves takes less; None where nothing is known.
+    error : float or None, [s]
+        Estimate of the bound's own error, which it is lowered by.
+    reason : str
+        Why there is no bound, or empty.
+    """
+
+    phases: tuple[int, ...]
+    duration: float
+    bound: float | None
+    error: float | None
+    reason: str = ""
+
+    @property
+    def gap(self) -> float | None:
+        """How much longer than the bound the plan takes at most, relative to the bound."""
+        return None if self.bound is None else self.duration / self.bound - 1
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {**self._asdict(), "phases": list(self.phases), "gap": self.gap}
+
+
+class Certificate(NamedTuple):
+    """Lower bounds of the durations of all phases of a plan."""
+
+    parts: tuple[TimeBound, ...]
+
+    @property
+    def total(self) -> TimeBound | None:
+        """The bound of all phases that have one, together; None without any."""
+        known = [part for part in self.parts if part.bound is not None]
+        if not known:
+            return None
+        return TimeBound(
+            tuple(phase for part in known for phase in part.phases),
+            sum(part.duration for part in known),
+            sum(part.bound or 0.0 for part in known),
+            sum(part.error or 0.0 for part in known),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        total = self.total
+        return {
+            "parts": [part.to_dict() for part in self.parts],
+            "total": None if total is None else total.to_dict(),
+        }
+
+    @staticmethod
+    def of(given: Mapping[str, Any]) -> Certificate:
+        """The certificate that `to_dict` has written."""
+        names = TimeBound._fields
+        rows = [{name: part[name] for name in names} for part in given["parts"]]
+        return Certificate(
+            tuple(TimeBound(**row | {"phases": tuple(row["phases"])}) for row in rows)
+        )

@@ -1,0 +1,178 @@
+from __future__ import annotations
+
+import ast
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.optimize import brentq
+
+from shipped import HEPTAGON, IMPACTS, problem_of
+from toys import Toy, constant, inertia
+from wholearm.geometry.curve import Curve
+from wholearm.geometry.tracing import trace_phases
+from wholearm.mechanics.dynamics import Directions, inverse
+from wholearm.mechanics.limits import make_limits
+from wholearm.planning.lower_bound.dual import find_least
+from wholearm.planning.lower_bound.lower_bound import LowerBound, bound_least_time
+from wholearm.planning.lower_bound.rows import GIVE, evaluate_rows
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.path_domain.impact_sequence import make_sequence
+from wholearm.planning.path_domain.misses import MISS
+from wholearm.planning.path_domain.plan import plan_path
+from wholearm.planning.path_domain.sequence_plan import plan_sequence
+
+LIMIT, EPSILON = 2.0, 0.05
+
+
+def bound(toy: Toy) -> LowerBound:
+    with toy.in_place():
+        found = bound_least_time([toy.curve], toy.epsilon)
+    assert found is not None
+    return found
+
+
+def viscous(drag: float) -> float:
+    """Time of a way of 1 m with v' = F - B v, then v' = -F - B v."""
+
+    def rise(t: float) -> float:
+        return LIMIT / drag * (t + math.expm1(-drag * t) / drag)
+
+    def fall(t: float) -> float:
+        return LIMIT / drag * (math.expm1(drag * t) / drag - t)
+
+    def brake(t: float) -> float:
+        return math.log(1 - math.expm1(-drag * t)) / drag
+
+    start = brentq(lambda t: rise(t) + fall(brake(t)) - 1, 1e-3, 20)
+    return float(start + brake(start))
+
+
+def growing() -> float:
+    """(1 + s) |a| <= F: b is 2 F log(1 + s) from the start, 2 F log(2 / (1 + s)) to the end."""
+    switch = math.sqrt(2) - 1
+
+    def slow(u: float, b: float) -> float:
+        return 2 * u / math.sqrt(2 * LIMIT * b)
+
+    first = quad(lambda u: slow(u, math.log1p(u * u)), 0, math.sqrt(switch))[0]
+    last = quad(lambda u: slow(u, -math.log1p(-u * u / 2)), 0, math.sqrt(1 - switch))[0]
+    return float(first + last)
+
+
+STEP = math.sqrt(0.75 * LIMIT), math.sqrt(0.5 * LIMIT)
+CLOSED = [
+    (Toy(constant(1.0)), math.sqrt(2.0)),
+    (Toy(constant(1.0), length=0.03), 2 * math.sqrt(0.03 / LIMIT)),
+    (Toy(constant(1.0, 1.0)), 2 / math.sqrt(LIMIT - EPSILON)),
+    (Toy(constant(1.0), speed_limit=(0.3, np.inf)), 1 / 0.3 + 0.3 / LIMIT),
+    (Toy(constant(1.0), speed_limit=(1.2, np.inf)), 1 / 1.2 + 1.2 / LIMIT),
+    (Toy(constant(1.0), speed_limit=(1.6, np.inf)), math.sqrt(2.0)),
+    (Toy(inertia(lambda s, later: 1.0 + s)), growing()),
+    (
+        Toy(inertia(lambda s, later: np.where(later, 2.0, 1.0)), breaks=(0.5,)),
+        (2 * STEP[0] - STEP[1]) / LIMIT + STEP[1] / (LIMIT / 2),
+    ),
+    (Toy(constant(1.0, 0.0, 0.1)), viscous(0.1)),
+    (Toy(constant(1.0, 0.0, 0.5)), viscous(0.5)),
+    (Toy(constant(1.0, 0.0, 3.0)), viscous(3.0)),
+]
+
+
+@pytest.mark.parametrize("case", range(len(CLOSED)))
+def test_closed_forms_are_bounded_closely(case: int) -> None:
+    toy, exact = CLOSED[case]
+    found = bound(toy)
+    assert exact * (1 - 1e-6) < found.value <= exact
+    assert 0 <= found.error < 1e-7 * exact
+
+
+def test_two_halves_are_one_whole() -> None:
+    half = Toy(constant(1.0, 0.5, 0.2))
+    with half.in_place():
+        joined = bound_least_time((half.curve, half.curve), half.epsilon)
+    assert joined is not None
+    assert joined.value == pytest.approx(bound(Toy(half.law, length=2.0)).value, rel=1e-7)
+
+
+def test_no_motion_has_no_bound() -> None:
+    # The squeeze alone, 0.05 N at a lever of 50 m, takes more torque than there is.
+    toy = Toy(constant(1.0, 50.0))
+    with toy.in_place():
+        assert bound_least_time([toy.curve], toy.epsilon) is None
+
+
+@pytest.mark.parametrize("phase", [0, 2])
+def test_any_costate_gives_a_lower_bound(curves: tuple[Curve, ...], phase: int) -> None:
+    """Whatever p and p' are, no motion within the limits has less than H in the integrand."""
+    curve, rng = curves[phase], np.random.default_rng(phase)
+    count = 4000
+    s = rng.uniform(0, curve.length, count)
+    segment = np.searchsorted([part.stop for part in curve.segments[:-1]], s)
+    point = curve.evaluate(s)
+    signs = (np.array([getattr(p, name) for p in curve.segments]) for name in ("Xi", "sigma"))
+    directions = Directions(*(sign[segment] for sign in signs))
+    forces = inverse(curve.formation, *point[:3], directions)
+    a, b = rng.uniform(-20, 20, count), 4 * rng.uniform(0, 1, count) ** 3
+    squeeze = rng.uniform(-10, 10, count)
+    rates = point.z_s[:, 3:] * np.sqrt(b)[:, None]
+    y = np.hstack([forces.c(a, b, squeeze), forces.tau(a, b, squeeze), rates])
+    limits = make_limits(curve.formation, EPSILON)
+    kept = (limits.find_slack(y @ limits.rows.T) >= 0).all(axis=1)
+    assert kept.sum() > 100
+    rows = evaluate_rows(curve, EPSILON, s, segment)
+    p = rng.normal(0, 0.05, count) * (rng.uniform(0, 1, count) > 0.1)
+    slope = rng.normal(0, 2, count)
+    value = 1 / np.sqrt(b) - slope * b - 2 * p * a
+    least = find_least(rows, p, slope)
+    assert (value - least)[kept].min() >= -1e-9
+
+
+@pytest.mark.parametrize("phase", [0, 2, 4])
+def test_plans_come_near_the_bound(curves: tuple[Curve, ...], phase: int) -> None:
+    found = bound_least_time([curves[phase]], EPSILON)
+    assert found is not None and found.error < 3e-8 * found.value
+    for intervals, gap in ((80, 7e-4), (320, 1e-4)):
+        plan = plan_path(curves[phase], EPSILON, PlanOptions(intervals=intervals), 1)
+        assert 0 <= plan.value / found.value - 1 < gap
+
+
+def test_plans_of_a_chain_come_near_the_bound() -> None:
+    problem = problem_of(IMPACTS)
+    chain = make_sequence(problem.phases, trace_phases(problem)).split()[0]
+    found = bound_least_time(chain.continuous_curves, EPSILON)
+    assert found is not None
+    plans = plan_sequence(chain, EPSILON, PlanOptions(intervals=80))
+    assert 0 <= sum(plan.value for plan in plans) / found.value - 1 < 5e-4
+
+
+def test_limits_give_way_by_what_a_plan_may_miss() -> None:
+    assert GIVE >= MISS
+
+
+def test_a_faster_hand_has_a_lower_bound() -> None:
+    problem = problem_of(HEPTAGON)
+    values = []
+    for limit in (1.8, 2.0, 2.5):
+        curve = trace_phases(problem.with_(torque_limit=limit))[1]
+        found = bound_least_time([curve], EPSILON)
+        assert found is not None
+        values.append(found.value)
+    assert (np.diff(values) < -1e-3).all()
+
+
+def test_the_bound_shares_nothing_with_the_nlp() -> None:
+    folder = Path(__file__).parents[1] / "src/wholearm/planning/lower_bound"
+    files = list(folder.glob("*.py"))
+    assert len(files) > 3
+    for path in files:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom):
+                first = (node.module or "").split(".")[0]
+                own = ("common", "geometry", "mechanics")
+                assert node.level < 2 or first in own
+                assert node.level or first not in ("casadi", "wholearm")
+            elif isinstance(node, ast.Import):
+                assert [alias.name for alias in node.names] == ["numpy"]
