@@ -10,8 +10,7 @@ from thrown import shove
 from timed import flip
 from wholearm.benchmark import time_domain
 from wholearm.benchmark.report import Row, format_markdown
-from wholearm.benchmark.time_domain import measure_blocks, measure_order, measure_transcriptions
-from wholearm.planning.plan import solve
+from wholearm.benchmark.time_domain import measure_blocks, measure_order
 
 ORDERS = {("radau", 3): 5, ("legendre", 3): 6}
 
@@ -43,24 +42,6 @@ def test_replays_that_end_early_have_no_error(monkeypatch: pytest.MonkeyPatch) -
     assert [row.note for row in rows] == [
         "the replay ends early", "", "order 3.32 observed, 3 in theory"
     ]  # fmt: skip
-
-
-def test_least_times_are_compared_with_those_along_the_curve(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(time_domain, "TIME_INTERVALS", (4, 8))
-    rows = measure_transcriptions(flip())
-    assert [(row.method, row.setting) for row in rows] == [
-        ("phase 1", f"{count} intervals") for count in (4, 8)
-    ]
-    errors = [row.error or np.nan for row in rows]
-    # Torques that are linear in longer intervals are slower, and the more of them the less.
-    assert errors[0] > errors[1] > 0
-    expected = solve(flip(), intervals=320).duration
-    plan = solve(flip(), transcription="time", time_intervals=4)
-    assert plan.duration / expected - 1 == pytest.approx(errors[0], abs=1e-9)
-    iterations, solves = plan.meta["iterations"][0], plan.meta["solves"][0]
-    assert rows[0].note == f"{iterations} iterations in {solves} solves"
 
 
 def test_whole_plans_are_measured_where_phases_need_the_time_domain() -> None:

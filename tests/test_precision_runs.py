@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from wholearm.benchmark.precision.report import find_times
+from wholearm.benchmark.precision.report import Comparison, find_times
 from wholearm.benchmark.precision.runs import (
     REPEATS,
     SHIFT,
@@ -34,6 +34,12 @@ def test_runs_are_read_as_they_were_written(tmp_path: Path) -> None:
     assert list(map(str, read_runs(str(path)))) == list(map(str, RUNS))
 
 
+def test_some_errors_count_or_all() -> None:
+    plan = FINE._replace(error=1e-4, end=1e-2, violation=0.0)
+    (median,) = find_medians([plan]).values()
+    assert median.reaches(1e-3, 1) and not median.reaches(1e-3) and median.reaches(1e-2)
+
+
 def test_medians_keep_the_worst_error() -> None:
     median = find_medians(RUNS)["study", "phase 1", "a, b", "1e-6"]
     assert (median.build, median.solve, median.errors) == (0.5, 0.3, (-3e-7,))
@@ -42,8 +48,11 @@ def test_medians_keep_the_worst_error() -> None:
 
 def test_the_soonest_setting_counts_and_failures_never_do() -> None:
     medians = find_medians(RUNS)
-    assert find_times(medians, "study", "a, b", 1e-3) == [0.1, math.inf]
-    assert find_times(medians, "study", "a, b", 1e-6) == [0.3, math.inf]
+    own = Comparison("study", "title", "a, b", (1e-3, 1e-6), False, None)
+    assert find_times(medians, "a, b", own, 1e-3) == [0.1, math.inf]
+    assert find_times(medians, "a, b", own, 1e-6) == [0.3, math.inf]
+    built = own._replace(building=True)
+    assert find_times(medians, "a, b", built, 1e-6) == [0.8, math.inf]
 
 
 def test_means_are_geometric_but_for_their_shift() -> None:

@@ -1,4 +1,4 @@
-"""Run times of one problem: of the planner, a plain baseline beside it, and all parts."""
+"""What planning one problem takes: orders of collocation, whole plans, changed numbers, parts."""
 
 from __future__ import annotations
 
@@ -9,39 +9,26 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import partial
 from typing import Any
 
-import numpy as np
-
-from ..common.arrays import Array
 from ..common.errors import WholearmError
 from ..common.files import make_folder
 from ..common.sharing import exclusive
-from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phases
 from ..planning.options import Objective, PlanOptions
 from ..planning.path_domain.data import prepare
 from ..planning.path_domain.motion import make_grid
 from ..planning.path_domain.nlp import build_path_nlp
-from ..planning.path_domain.plan import plan_path
 from ..planning.path_domain.terms import LimitShape
 from ..planning.plan import solve
 from ..problem.definition import Problem
 from ..problem.read import read_problem
 from ..simulation.simulate import simulate
-from ..solvers.statistics import open_ledger
-from ..verification.verify import verify
-from .baseline_opti import plan_with_opti
 from .changes import measure_stress
 from .precision.instances import keep_curves
 from .report import Row, write_results
-from .time_domain import measure_blocks, measure_order, measure_transcriptions
+from .time_domain import measure_blocks, measure_order
 
-INTERVALS = (10, 20, 40, 80, 160, 320, 640, 800)
-FINE = 1600
-BASELINE_INTERVALS = 40
 REPEATS = 3
 
 
@@ -49,7 +36,7 @@ REPEATS = 3
 def run_bench(
     problem: Problem, folder: str, progress: Callable[[str], None] | None = None
 ) -> list[str]:
-    """Measure everything and write a table (Markdown, CSV) and a figure (PNG).
+    """Measure everything and write tables as Markdown and CSV.
 
     Parameters
     ----------
@@ -73,7 +60,7 @@ def run_bench(
     report = progress or (lambda _: None)
     curves = keep_curves(problem)
     studies: list[tuple[Callable[[Problem], list[Row]], Problem | None]] = [
-        *((study, curves) for study in ON_CURVES),
+        (measure_order, curves),
         (measure_blocks, problem),
         (measure_stress, problem),
         (measure_parts, problem),
@@ -90,33 +77,6 @@ def run_bench(
     return write_results(problem.name, rows, os.path.join(folder, f"bench_{stem}"))
 
 
-def measure_planner(problem: Problem) -> list[Row]:
-    """Planner over the number of intervals, building included.
-
-    The error of the phase time is the largest relative one against a fine solution; that of the
-    simulated end is the largest difference of any z between plan and simulation at a phase's end.
-    """
-    curves = trace_phases(problem)
-    fine = _plan_times(problem, curves, FINE)
-    rows = []
-    for intervals in INTERVALS:
-        plan_all = partial(_plan_times, problem, curves, intervals)
-        median, times = _time_runs(plan_all, build_path_nlp.cache_clear)
-        trajectory = solve(problem, intervals=intervals).trajectory
-        ends = trajectory.phase_starts[1:]
-        simulation = simulate(problem, trajectory.torque, tolerance=1e-11, times=ends)
-        missed = 0.0
-        for index, end in enumerate(ends):
-            start = ends[index - 1] if index else 0.0
-            planned = trajectory.motions[index].evaluate(np.array([end - start]))
-            nearest = np.flatnonzero(simulation.phase == index)[-1]
-            missed = max(missed, float(np.abs(planned.z[0] - simulation.z[nearest]).max()))
-        error = float(np.abs(times / fine - 1).max())
-        rows.append(Row("planner: phase time", "path NLP", str(intervals), median, error))
-        rows.append(Row("planner: simulated end", "path NLP", str(intervals), median, missed))
-    return rows
-
-
 def _time_runs(run: Callable[[], Any], before: Callable[[], object] = int) -> tuple[float, Any]:
     """Median of the seconds of some runs, and what the last one gave."""
     seconds, result = [], None
@@ -126,50 +86,6 @@ def _time_runs(run: Callable[[], Any], before: Callable[[], object] = int) -> tu
         result = run()
         seconds.append(time.perf_counter() - started)
     return statistics.median(seconds), result
-
-
-def _plan_times(problem: Problem, curves: Sequence[Curve], intervals: int) -> Array:
-    options = PlanOptions(intervals=intervals)
-    plans = [
-        plan_path(curve, problem.epsilon, options, phase.number)
-        for phase, curve in zip(problem.phases, curves, strict=True)
-    ]
-    return np.array([plan.motion.duration for plan in plans])
-
-
-def measure_baseline(problem: Problem) -> list[Row]:
-    """Plain time-domain transcription of the same phases, and ours beside it.
-
-    The error is that of the phase time against a fine solution; a negative one is a time that
-    limits do not allow. The note has the least c_n of an open-loop replay of the phase.
-    """
-    options, fine = PlanOptions(), PlanOptions(intervals=FINE)
-    rows, ours, theirs = list[Row](), 0.0, 0.0
-    build_path_nlp.cache_clear()
-    for phase, curve in zip(problem.phases, trace_phases(problem), strict=True):
-        started = time.perf_counter()
-        with open_ledger() as ledger:
-            plan = plan_path(curve, problem.epsilon, options, phase.number)
-        elapsed = time.perf_counter() - started
-        plain = plan_with_opti(curve, problem.epsilon, BASELINE_INTERVALS)
-        took = plain.build_time + plain.solve_time
-        least = plan_path(curve, problem.epsilon, fine, phase.number).motion.duration
-        number = f"phase {phase.number}"
-        alone = replace(problem, start=curve.start, phases=(replace(phase, index=0),))
-        for method, seconds, duration, torque, iterations in (
-            ("path NLP", elapsed, plan.motion.duration, plan.torque, ledger.of(0).iterations),
-            ("plain Opti", took, plain.duration, plain.torque, plain.iterations),
-        ):
-            margins = verify(alone, torque).phases[0].contacts
-            weakest = min(contact.least for contact in margins)
-            note = f"T = {duration:.6f} s, {iterations} iterations, least c_n {weakest:.4f} N"
-            rows.append(Row("least time", method, number, seconds, duration / least - 1, note))
-        ours, theirs = ours + elapsed, theirs + took
-    note = f"{ours / theirs:.4f} of plain Opti"
-    rows.append(Row("least time", "path NLP", "all phases", ours, None, note))
-    note = f"{theirs / ours:.0f} x path NLP"
-    rows.append(Row("least time", "plain Opti", "all phases", theirs, None, note))
-    return rows
 
 
 def measure_parts(problem: Problem) -> list[Row]:
@@ -210,12 +126,3 @@ def measure_parts(problem: Problem) -> list[Row]:
 
 def _run(command: Sequence[str]) -> None:
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-
-
-ON_CURVES: tuple[Callable[[Problem], list[Row]], ...] = (
-    measure_planner,
-    measure_baseline,
-    measure_order,
-    measure_transcriptions,
-)
-"""Studies of phases that are curves of four sliding contacts."""

@@ -1,4 +1,4 @@
-"""The time domain: order of convergence, agreement with the path domain, and cost of its blocks."""
+"""The time domain: order of convergence, and cost of its blocks."""
 
 from __future__ import annotations
 
@@ -10,23 +10,19 @@ import numpy as np
 from ..common.arrays import Array
 from ..geometry.tracing import runs_on_curve, trace_phases
 from ..planning.options import Objective, PlanOptions
-from ..planning.path_domain.plan import plan_path
 from ..planning.plan import solve
 from ..planning.time_domain.collocation import make_scheme
 from ..planning.time_domain.motion import TimeMotion, make_motions
 from ..planning.time_domain.own_units import to_si
-from ..planning.time_domain.plan import plan_phases
 from ..planning.time_domain.search import Search
 from ..planning.time_domain.staging import guess_stages
 from ..problem.definition import Phase, Problem
 from ..simulation.simulate import simulate
-from ..solvers.statistics import open_ledger
 from .report import Row
 
 SCHEMES = (("radau", 2), ("radau", 3), ("radau", 4), ("legendre", 2), ("legendre", 3))
 """Schemes whose order is measured."""
 ORDER_INTERVALS = (4, 8, 16, 32)
-TIME_INTERVALS = (8, 16, 32, 64)
 _FALLS = 2.0
 
 
@@ -81,33 +77,6 @@ def find_end_error(problem: Problem, name: str, degree: int, intervals: int) -> 
     if simulation.t[-1] < torque.breaks[-1] - 1e-3 * torque.duration:
         return math.nan
     return float(np.abs(simulation.z[-1] - found[-1].guess.nodes[-1, 0]).max())
-
-
-def measure_transcriptions(problem: Problem) -> list[Row]:
-    """Least time of every one-freedom phase in the time domain against that along its curve."""
-    rows = []
-    z = problem.start
-    for phase, curve in zip(problem.phases, trace_phases(problem), strict=False):
-        least = plan_path(curve, problem.epsilon, PlanOptions(intervals=320), phase.number)
-        for intervals in TIME_INTERVALS:
-            options = PlanOptions(time_intervals=intervals, transcription="time")
-            started = time.perf_counter()
-            with open_ledger() as ledger:
-                plan = plan_phases(problem, (phase,), z, options)[0]
-            cost = ledger.of(0)
-            seconds = time.perf_counter() - started
-            rows.append(
-                Row(
-                    "time domain: least time against the path domain",
-                    f"phase {phase.number}",
-                    f"{intervals} intervals",
-                    seconds,
-                    plan.value / least.value - 1,
-                    f"{cost.iterations} iterations in {cost.solves} solves",
-                )
-            )
-        z = curve.end
-    return rows
 
 
 def measure_blocks(problem: Problem) -> list[Row]:

@@ -46,11 +46,15 @@ def keep_curves(problem: Problem) -> Problem | None:
 
 
 @lru_cache(maxsize=4)
-def list_instances(paths: tuple[str, ...]) -> tuple[Instance, ...]:
-    """Every phase of problem files that is such a curve; those that files share once."""
+def list_instances(paths: tuple[str, ...], drag: bool = True) -> tuple[Instance, ...]:
+    """Every phase of problem files that is such a curve; those that files share once.
+
+    Without `drag` joints have no viscous friction.
+    """
     found: dict[object, Instance] = {}
     for path in paths:
-        problem = keep_curves(read_problem(path))
+        read = read_problem(path)
+        problem = keep_curves(read if drag else read.with_(viscous=0.0))
         for instance in isolate(problem, Path(path).stem) if problem else ():
             found.setdefault(_identify(instance), instance)
     return tuple(found.values())

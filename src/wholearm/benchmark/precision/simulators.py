@@ -14,9 +14,10 @@ import casadi as ca
 import numpy as np
 
 from ...common.arrays import Array, Expression
-from ...mechanics.dynamics import build_force_rows, build_forward
+from ...mechanics.dynamics import build_forward
 from ...simulation.simulate import simulate
 from ..baseline_simulation import evaluate_piece, solve_motion
+from .plant import build_plant
 from .reference import Course, Span
 
 PULL = 20.0
@@ -104,14 +105,14 @@ def call_numpy(course: Course, pull: float = 0.0) -> Callable[[Span], tuple[Rate
 
 def call_casadi(course: Course) -> Callable[[Span], tuple[Rates, Rates]]:
     """CasADi functions of the same equations and their Jacobian, with buffers that stay."""
-    t, y, p, ode = _write_rates(course)
+    t, y, p, ode, _ = write_rates(course)
     plain = ca.Function("rates", [t, y, p], [ode])
     bent = ca.Function("jacobian", [t, y, p], [ca.densify(ca.jacobian(ode, y))])
     given = _Buffered(plain), _Buffered(bent)
 
     def choose(span: Span) -> tuple[Rates, Rates]:
         for function in given:
-            function.p[:] = _pack(course, span)
+            function.p[:] = pack_span(course, span)
         return given[0], given[1]
 
     return choose
@@ -135,8 +136,8 @@ class _Buffered:
         return self.out[:, 0].copy() if self.column else self.out.copy()
 
 
-def _write_rates(course: Course) -> tuple[Any, ...]:
-    """The right-hand side as expressions of t, y and the parameters of `_pack`."""
+def write_rates(course: Course) -> tuple[Any, ...]:
+    """The right-hand side and contact forces, as expressions of t, y and `pack_span`'s numbers."""
     formation = course.problem.phases[0].formation
     n_c, terms = formation.n_contacts, course.torque.coefficients.shape[2]
     t, y = ca.SX.sym("t"), ca.SX.sym("y", 10)
@@ -144,7 +145,7 @@ def _write_rates(course: Course) -> tuple[Any, ...]:
     flat, piece = ca.SX.sym("flat", 2 * terms), ca.SX.sym("piece", 2)
     p = ca.vertcat(Xi, sigma, flat, piece)
     found = build_forward(formation)(y[:5], y[5:], _write_torque(t, flat, piece), Xi, sigma)
-    return t, y, p, ca.vertcat(y[5:], found[0])
+    return t, y, p, ca.vertcat(y[5:], found[0]), found[1]
 
 
 def _write_torque(t: Expression, flat: Expression, piece: Expression) -> Expression:
@@ -154,7 +155,7 @@ def _write_torque(t: Expression, flat: Expression, piece: Expression) -> Express
     return ca.vertcat(*(ca.polyval(coefficients[k, ::-1].T, x) for k in range(2)))
 
 
-def _pack(course: Course, span: Span) -> Array:
+def pack_span(course: Course, span: Span) -> Array:
     """Parameters of the right-hand side on a stretch."""
     coefficients = course.torque.coefficients[span.piece]
     ends = course.torque.breaks[span.piece : span.piece + 2]
@@ -166,7 +167,7 @@ def build_sundials(course: Course, tolerance: float, name: str, **options: Any) 
 
     All stretches are one call, by `mapaccum`.
     """
-    t, y, p, ode = _write_rates(course)
+    t, y, p, ode, _ = write_rates(course)
     ends, x = ca.SX.sym("ends", 2), ca.SX.sym("x")
     half, now = (ends[1] - ends[0]) / 2, (ends[0] + ends[1] + x * (ends[1] - ends[0])) / 2
     system = {"x": y, "t": x, "p": ca.vertcat(p, ends)}
@@ -180,7 +181,7 @@ def build_sundials(course: Course, tolerance: float, name: str, **options: Any) 
     step = ca.integrator("step", name, system, -1.0, 1.0, given)
     count = len(course.spans)
     chain = step.mapaccum(count)
-    columns = [[*_pack(course, span), span.start, span.stop] for span in course.spans]
+    columns = [[*pack_span(course, span), span.start, span.stop] for span in course.spans]
     parameters = ca.DM(np.array(columns).T)
     start = ca.DM(np.append(course.problem.start, np.zeros(5)))
     guess = {"z0": ca.DM.ones(system["z"].shape[0], count)} if "z" in system else {}
@@ -192,21 +193,12 @@ def build_sundials(course: Course, tolerance: float, name: str, **options: Any) 
     return run
 
 
-def _write_dae(
-    course: Course, y: Expression, p: Expression, t: Expression, c_n: Expression
-) -> tuple[Expression, Expression]:
+def _write_dae(course: Course, y: Expression, p: Expression, t: Expression, c_n: Expression) -> Any:
     """Accelerations, and what A z'' + A' z' misses, with the contact forces as unknowns."""
     formation = course.problem.phases[0].formation
-    scene, n_c = formation.scene, formation.n_contacts
-    terms = course.torque.coefficients.shape[2]
-    Xi, sigma, flat, piece = ca.vertsplit(p, [0, n_c, n_c + 2, n_c + 2 + 2 * terms, p.shape[0]])
-    tau = _write_torque(t, flat, piece)
-    _, P, P_dot_v, A_t = formation.build_constraints(y[:5], y[5:])
-    friction = ca.DM(scene.viscous) * y[5:] + ca.DM(scene.dry) * ca.vertcat(0, 0, 0, sigma)
-    applied = ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau) - friction
-    G = build_force_rows(formation, P, A_t, Xi)
-    acceleration = (applied + G.T @ c_n) / ca.DM(scene.mass_diagonal)
-    return acceleration, P @ acceleration + P_dot_v
+    sizes = np.cumsum([0, formation.n_contacts, 2, 2 * course.torque.coefficients.shape[2], 2])
+    Xi, sigma, flat, piece = ca.vertsplit(p, sizes.tolist())
+    return build_plant(formation)(y[:5], y[5:], _write_torque(t, flat, piece), c_n, Xi, sigma)
 
 
 def _scipy(method: str, callback: Callable[..., Any]) -> Callable[[Course, float], Runner]:

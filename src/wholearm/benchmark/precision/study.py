@@ -12,8 +12,18 @@ from ...common.errors import InputError
 from ...common.files import make_folder, require_writable, together, write_text
 from ...figures.plots import save
 from ..stress.workers import Answer, run_tasks
+from .figure import draw_runs
 from .instances import Instance, find_files, list_instances
-from .report import draw_runs, format_report
+from .planning import (
+    IMPLICIT,
+    LEAST_TIME,
+    NO_DRAG,
+    PLANNERS,
+    find_least_time,
+    list_plan_tasks,
+    run_planner,
+)
+from .report import format_report
 from .runs import LIMIT, Key, Run, format_runs, read_runs
 from .simulation import (
     DRIFT,
@@ -26,6 +36,9 @@ from .simulation import (
     run_simulator,
 )
 from .simulators import SIMULATORS
+
+METHODS = [*SIMULATORS, *PLANNERS]
+"""Names of all methods, in the order of the tables."""
 
 PARTS = ("simulation", "planning")
 SWING_FILE = "heptagon_four_contacts.toml"
@@ -79,14 +92,14 @@ def run_precision(
         raise InputError("", "--problems", f"{options.folder} has no problem files (*.toml)")
     runs = read_runs(paths[0])
     if options.fresh:
-        runs = [run for run in runs if not _is_chosen(options, run.study, run.method)]
+        runs = [run for run in runs if not _is_chosen(options, run.method)]
     done = {run.key for run in runs}
     for count, answer in enumerate(_measure(options, files, done, say)):
         runs += _read_answer(answer)
         say(f"{answer.task.study}: {answer.task.method}, {answer.task.instance}")
         if count % KEPT_EVERY == 0:
             write_text(paths[0], format_runs(runs))
-    runs.sort(key=lambda run: (run.study, _place(run.method), run.instance))
+    runs.sort(key=lambda run: (run.study, METHODS.index(run.method), run.instance))
     with together():
         write_text(paths[0], format_runs(runs))
         write_text(paths[1], format_report(runs, options.limit))
@@ -94,20 +107,15 @@ def run_precision(
     return paths
 
 
-def _place(method: str) -> int:
-    return list(SIMULATORS).index(method) if method in SIMULATORS else 0
-
-
 def _require_known(options: StudyOptions) -> None:
-    known = list(SIMULATORS)
     for method in options.methods:
-        if method not in known:
-            allowed = "; ".join(known)
+        if method not in METHODS:
+            allowed = "; ".join(METHODS)
             raise InputError("", "--peers", f"{method!r} given; allowed are {allowed}")
 
 
-def _is_chosen(options: StudyOptions, study: str, method: str) -> bool:
-    part = "simulation" if study in (FEW, MANY, DRIFT) else "planning"
+def _is_chosen(options: StudyOptions, method: str) -> bool:
+    part = "simulation" if method in SIMULATORS else "planning"
     return part in options.parts and (not options.methods or method in options.methods)
 
 
@@ -122,6 +130,10 @@ def _measure(
     instances = list_instances(files)
     if "simulation" in options.parts:
         yield from _simulate(options, instances, done, say)
+    if "planning" in options.parts:
+        for study in (LEAST_TIME, NO_DRAG, IMPLICIT):
+            given = list_instances(files, study != NO_DRAG)
+            yield from _plan(options, study, given, files, done, say)
 
 
 def _simulate(
@@ -143,13 +155,38 @@ def _simulate(
         tasks = [
             task
             for task in list_tasks(study, name)
-            if _is_chosen(options, study, task.method) and task.key not in done
+            if _is_chosen(options, task.method) and task.key not in done
         ]
         if tasks:
             say(f"reference of {name}, {study}")
             course = make()
             given = [task._replace(course=course) for task in tasks]
             yield from run_tasks(run_simulator, given, 1, options.limit, lambda _: 0)
+
+
+def _plan(
+    options: StudyOptions,
+    study: str,
+    instances: Sequence[Instance],
+    files: tuple[str, ...],
+    done: set[Key],
+    say: Callable[[str], None],
+) -> Iterator[Answer]:
+    """Planners on all phases; least times are found where something is left to do."""
+    given = []
+    for instance in instances:
+        tasks = [
+            task
+            for task in list_plan_tasks(study, instance, files)
+            if _is_chosen(options, task.method) and task.key not in done
+        ]
+        if tasks:
+            say(f"least time of {instance.name}, {study}")
+            least = find_least_time(instance)
+            given += [task._replace(least=least) for task in tasks]
+    # One process for each method: what it imports is imported once.
+    given.sort(key=lambda task: METHODS.index(task.method))
+    yield from run_tasks(run_planner, given, 1, options.limit, lambda task: task.method)
 
 
 def _read_answer(answer: Answer) -> list[Run]:

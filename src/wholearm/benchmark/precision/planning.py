@@ -1,0 +1,221 @@
+"""Planners that are compared: both domains of ours, plain transcriptions and public tools."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from functools import partial
+from importlib.util import find_spec
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...planning.options import Objective, PlanOptions
+from ...planning.path_domain.data import prepare
+from ...planning.path_domain.motion import make_grid
+from ...planning.path_domain.nlp import build_path_nlp
+from ...planning.path_domain.plan import plan_path
+from ...planning.path_domain.terms import LimitShape
+from ...planning.phase_plan import PhasePlan
+from ...planning.time_domain.plan import plan_phases
+from .check import check_plan
+from .implicit import STARTS, build_implicit
+from .instances import Instance, list_instances, pick
+from .opti import build_opti
+from .plant import OPTIMUM, PeerPlan, list_stretches
+from .rockit_peer import build_rockit
+from .runs import Key, Run, repeat
+from .toppra_peer import build_toppra
+from .yapss_peer import build_yapss
+
+LEAST_TIME, NO_DRAG = "least time", "least time without viscous friction"
+IMPLICIT = "least time, contacts not given"
+"""Studies: all phases, the same without viscous friction, and one phase from random starts."""
+FINE = 1600
+"""Intervals along curves of the plans whose duration is the reference."""
+NEAR = 1e-7
+"""Distance over the duration in which a step of the torques is that of a reversal."""
+IMPLICIT_PHASE = "heptagon_four_contacts 4"
+"""Phase of the random starts."""
+
+
+class Planner(NamedTuple):
+    """A planner.
+
+    Attributes
+    ----------
+    settings : str
+        What it is told besides the number of intervals.
+    build : callable
+        Takes an instance and a setting; gives what solves it.
+    choices : tuple of str
+        Settings that are measured.
+    module : str
+        What has to be installed, if anything.
+    studies : tuple of str
+    """
+
+    settings: str
+    build: Callable[[Instance, str], Callable[[], PeerPlan]]
+    choices: tuple[str, ...]
+    module: str = ""
+    studies: tuple[str, ...] = (LEAST_TIME,)
+
+
+class PlanTask(NamedTuple):
+    """One setting of one planner on one phase.
+
+    Attributes
+    ----------
+    study, instance, method, setting : str
+    files : tuple of str
+        Problem files that the instance is from.
+    least : float, [s]
+        Least time under refinement.
+    """
+
+    study: str
+    instance: str
+    method: str
+    setting: str
+    files: tuple[str, ...]
+    least: float = math.nan
+
+    @property
+    def key(self) -> Key:
+        """Of its runs."""
+        return self[:4]
+
+
+def run_planner(task: PlanTask) -> list[Run]:
+    """Run one task as often as its time allows, and check every plan."""
+    instance = pick(list_instances(task.files, task.study != NO_DRAG), task.instance)
+    build = partial(PLANNERS[task.method].build, instance, task.setting)
+    runs = []
+    with warnings.catch_warnings():
+        # Other people's libraries warn of their own affairs.
+        warnings.simplefilter("ignore")
+        if module := PLANNERS[task.method].module:
+            # No timing is to include the import.
+            __import__(module)
+        for index, (built, took, plan) in enumerate(repeat(build)):
+            end, violation, outcome = check_plan(instance, plan)
+            error = plan.duration / task.least - 1 if plan.status == OPTIMUM else math.nan
+            runs.append(Run(*task.key, index, built, took, error, end, violation, outcome))
+    return runs
+
+
+def find_least_time(instance: Instance) -> float:
+    """Duration of a fine plan along the curve [s]."""
+    options = PlanOptions(intervals=FINE)
+    return plan_path(instance.curve, instance.problem.epsilon, options, 1).motion.duration
+
+
+def list_plan_tasks(study: str, instance: Instance, files: tuple[str, ...]) -> list[PlanTask]:
+    """Every installed planner and setting on a phase."""
+    return [
+        PlanTask(study, instance.name, method, setting, files)
+        for method, planner in PLANNERS.items()
+        if study in planner.studies and is_installed(method)
+        if study != IMPLICIT or instance.name == IMPLICIT_PHASE
+        for setting in planner.choices
+    ]
+
+
+def is_installed(method: str) -> bool:
+    """Whether a planner has what it needs."""
+    module = PLANNERS[method].module
+    return not module or find_spec(module) is not None
+
+
+def _build_on_curve(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
+    """Ours along the curve; its NLP is built anew."""
+    curve, epsilon = instance.curve, instance.problem.epsilon
+    options = PlanOptions(intervals=int(setting))
+    build_path_nlp.cache_clear()
+    limits = prepare(curve, epsilon, make_grid(curve, 20), 1).limits
+    build_path_nlp(LimitShape.of(limits), options.intervals, Objective.TIME)
+    return lambda: _convert(instance, plan_path(curve, epsilon, options, 1))
+
+
+def _build_over_time(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
+    """Ours over time; a setting is the number of intervals, and the degree."""
+    intervals, degree = map(int, setting.split(" x "))
+    options = PlanOptions(time_intervals=intervals, degree=degree, transcription="time")
+    problem = instance.problem
+
+    def run() -> PeerPlan:
+        (plan,) = plan_phases(problem, problem.phases, problem.start, options)
+        return _convert(instance, plan)
+
+    return run
+
+
+def _convert(instance: Instance, plan: PhasePlan[Any]) -> PeerPlan:
+    """Our plan as those of peers are given: reversals are where the way passes their places."""
+    motion, marks = plan.motion, []
+    for stretch in list_stretches(instance.curve)[:-1]:
+        low, high = 0.0, motion.duration
+        for _ in range(60):
+            middle = (low + high) / 2
+            place = motion.evaluate(np.array([middle])).z[0, stretch.progress]
+            first = instance.curve.start[stretch.progress]
+            before = (place - stretch.target) * (first - stretch.target) > 0
+            low, high = (middle, high) if before else (low, middle)
+        breaks = plan.torque.breaks
+        nearest = float(breaks[np.abs(breaks - high).argmin()])
+        marks.append(nearest if abs(nearest - high) < NEAR * motion.duration else high)
+    return PeerPlan(OPTIMUM, motion.duration, plan.torque, tuple(marks))
+
+
+_CURVE = ("10", "20", "40", "80", "160", "320", "640")
+_TIME = ("8 x 3", "16 x 3", "32 x 3", "16 x 2", "16 x 4")
+_NODES = ("20", "40", "80")
+PLANNERS = {
+    "wholearm, curve": Planner(
+        "limits tightened between nodes included",
+        _build_on_curve,
+        _CURVE,
+        studies=(LEAST_TIME, NO_DRAG),
+    ),
+    "wholearm, time": Planner(
+        "Radau, intervals x degree; linear torques, refinement included", _build_over_time, _TIME
+    ),
+    "Opti": Planner("trapezoidal rule; Ipopt as it comes, straight line", build_opti, _NODES),
+    "Opti, expanded": Planner("the same with `expand`", partial(build_opti, expand=True), _NODES),
+    "Opti, tuned": Planner(
+        "`expand`, adaptive barrier, first guess a slow motion that keeps the limits",
+        partial(build_opti, expand=True, tuned=True),
+        _NODES,
+    ),
+    "rockit": Planner(
+        "Radau of degree 3, linear torques, algebraic contact forces; `expand`, adaptive barrier, "
+        "the slow motion",
+        build_rockit,
+        ("10", "20"),
+        "rockit",
+    ),
+    "yapss": Planner(
+        "two Legendre-Gauss points a segment, automatic second derivatives; adaptive barrier, the "
+        "slow motion",
+        build_yapss,
+        ("20", "40", "80", "160"),
+        "yapss",
+    ),
+    "toppra": Planner(
+        "Seidel, limits at both ends of intervals, squeeze eliminated after Fourier and Motzkin",
+        build_toppra,
+        ("50", "100", "200", "400", "800", "1600", "3200"),
+        "toppra",
+        (NO_DRAG,),
+    ),
+    "contact-implicit": Planner(
+        "16 implicit Euler steps, products below 1, 0.1, ... 1e-4 in the scene's units, `expand`, "
+        f"adaptive barrier; {STARTS} random starts on {IMPLICIT_PHASE}",
+        build_implicit,
+        tuple(map(str, range(STARTS))),
+        studies=(IMPLICIT,),
+    ),
+}
+"""Planners by name."""

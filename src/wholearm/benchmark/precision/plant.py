@@ -1,0 +1,124 @@
+"""What peers are given of a phase: its equations of motion, and a slow motion to start from."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from ...common.arrays import Array, Expression
+from ...contacts.formation import Formation
+from ...geometry.curve import Curve, Segment
+from ...mechanics.dynamics import build_force_rows
+from ...planning.path_domain.data import prepare
+from ...planning.path_domain.first_guess import guess
+from ...planning.path_domain.motion import PathMotion, make_grid
+from ...results.torque import TorqueProfile
+from ...results.trajectory import Samples
+from .instances import Instance
+
+OPTIMUM = "Solve_Succeeded"
+"""Ipopt's status of a solution."""
+
+
+class PeerPlan(NamedTuple):
+    """What a planner has found for one phase.
+
+    Attributes
+    ----------
+    status : str
+        `OPTIMUM`, or why there is no plan.
+    duration : float, [s]
+    torque : TorqueProfile
+    marks : tuple of float, [s]
+        When directions reverse.
+    """
+
+    status: str
+    duration: float
+    torque: TorqueProfile
+    marks: tuple[float, ...]
+
+
+NO_PLAN = PeerPlan("", 1.0, TorqueProfile(np.array([0.0, 1.0]), np.zeros((1, 2, 1))), ())
+"""What there is where nothing was found."""
+
+
+class Stretch(NamedTuple):
+    """A stretch of a phase without a reversal, as peers plan it.
+
+    Attributes
+    ----------
+    part : Segment
+    share : float
+        Of the curve's length.
+    target : float
+        Coordinate `progress` at its end.
+    progress : int
+        Coordinate of the object that runs along the phase: x, or phi where it turns.
+    """
+
+    part: Segment
+    share: float
+    target: float
+    progress: int
+
+
+def build_plant(formation: Formation) -> Expression:
+    """CasADi function (z, z', tau, c_n, Xi, sigma) -> (z'', A z'' + A' z')."""
+    scene, n_c = formation.scene, formation.n_contacts
+    z, v, c_n = ca.SX.sym("z", 5), ca.SX.sym("v", 5), ca.SX.sym("c_n", n_c)
+    tau, Xi, sigma = ca.SX.sym("tau", 2), ca.SX.sym("Xi", n_c), ca.SX.sym("sigma", 2)
+    _, P, P_dot_v, A_t = formation.build_constraints(z, v)
+    friction = ca.DM(scene.viscous) * v + ca.DM(scene.dry) * ca.vertcat(0, 0, 0, sigma)
+    applied = ca.DM(scene.applied_force) + ca.vertcat(0, 0, 0, tau) - friction
+    G = build_force_rows(formation, P, A_t, Xi)
+    acceleration = (applied + G.T @ c_n) / ca.DM(scene.mass_diagonal)
+    missed = P @ acceleration + P_dot_v
+    return ca.Function("plant", [z, v, tau, c_n, Xi, sigma], [acceleration, missed])
+
+
+def list_stretches(curve: Curve) -> list[Stretch]:
+    """The stretches of a phase."""
+    ends = curve.evaluate(np.array([0.0, *(part.stop for part in curve.segments)])).z
+    progress = 2 if abs(ends[-1] - ends[0])[2] > 1e-6 else 0
+    return [
+        Stretch(part, (part.stop - part.start) / curve.length, float(end[progress]), progress)
+        for part, end in zip(curve.segments, ends[1:], strict=True)
+    ]
+
+
+def sample_slow_motion(instance: Instance, counts: list[int]) -> list[tuple[Array, Samples]]:
+    """Times from its start and samples of each stretch of a slow motion, at so many instants.
+
+    It keeps all limits, with its squeeze amid the range that they allow.
+    """
+    curve = instance.curve
+    data = prepare(curve, instance.problem.epsilon, make_grid(curve, 20 + len(curve.segments)), 0)
+    motion = PathMotion(curve, data.grid, guess(data)[0])
+    last = np.flatnonzero(np.diff(motion.grid.segment, append=-1))
+    marks = np.append(0.0, motion.times[last])
+    found = []
+    for start, stop, count in zip(marks, marks[1:], counts, strict=False):
+        # Ends of a stretch are looked at from within it.
+        t = np.linspace(start, stop, count)
+        inside = np.clip(t, start + 1e-9 * (stop - start), stop - 1e-9 * (stop - start))
+        found.append((t - start, motion.evaluate(inside)))
+    return found
+
+
+def count_intervals(stretches: list[Stretch], intervals: int, least: int = 4) -> list[int]:
+    """About so many intervals, shared among the stretches of a phase."""
+    return [max(least, round(intervals * stretch.share)) for stretch in stretches]
+
+
+def join_pieces(status: str, durations: list[float], torques: list[Array]) -> PeerPlan:
+    """The plan with torques that are linear between even nodes of each stretch, (n, 2) each."""
+    marks = np.append(0.0, np.cumsum(durations))
+    if not np.isfinite(marks).all() or min(durations) <= 0:
+        return NO_PLAN._replace(status=status)
+    spans = zip(marks, marks[1:], torques, strict=False)
+    times = np.concatenate([np.linspace(start, stop, len(tau)) for start, stop, tau in spans])
+    torque = TorqueProfile.join_rows(times, np.concatenate(torques))
+    return PeerPlan(status, float(marks[-1]), torque, tuple(marks[1:-1]))

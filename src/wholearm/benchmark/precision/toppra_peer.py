@@ -1,0 +1,151 @@
+"""A peer: toppra, reachability analysis along a path, for phases without viscous friction.
+
+Limits of contact forces and torques are linear in s'', s'^2 and the squeeze. The squeeze is
+eliminated after Fourier and Motzkin: each pair of rows with squeezes of opposite signs is one row
+in s'' and s'^2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.arrays import Array
+from ...mechanics.dynamics import PathForces, inverse
+from ...mechanics.limits import make_limits
+from ...planning.path_domain.motion import directions_of
+from ...results.torque import TorqueProfile
+from .instances import Instance
+from .plant import NO_PLAN, OPTIMUM, PeerPlan
+
+APART = 1e-7
+"""Distance of grid points from a reversal between them, over the curve's length."""
+TORQUE_NODES = 5
+"""Instants in an interval that its torque's polynomial goes through."""
+
+
+class _Rows:
+    """Limits at places of a curve, as constant + a s'' + b s'^2 + q squeeze >= 0."""
+
+    def __init__(self, instance: Instance, s: Array, owner: NDArray[np.int64]) -> None:
+        curve = instance.curve
+        self.forces = inverse(curve.formation, *curve.evaluate(s)[:3], directions_of(curve, owner))
+        limits = make_limits(curve.formation, instance.problem.epsilon)
+        rows, signs, bounds = limits.sides
+        of_c, of_tau, _ = (part[rows].T * signs for part in limits.columns)
+
+        def collect(c: Array, tau: Array) -> Array:
+            return np.asarray(c @ of_c + tau @ of_tau)
+
+        forces = self.forces
+        self.constant = collect(forces.C0, forces.T0) - signs * bounds
+        self.a, self.b = collect(forces.Ca, forces.Ta), collect(forces.Cb, forces.Tb)
+        self.q = collect(forces.Cl, forces.Tl)
+
+    def eliminate(self) -> tuple[Array, Array, Array]:
+        """Rows in s'' and s'^2 alone: a, b and constant, shape (n, pairs) each."""
+        one, other = np.triu_indices(self.q.shape[1], 1)
+        first, second = self.q[:, one], self.q[:, other]
+        opposite = first * second < 0
+        weigh = np.where(opposite, np.abs(second), 0.0), np.where(opposite, np.abs(first), 0.0)
+        size = np.maximum(weigh[0] + weigh[1], 1e-300)
+
+        def combine(rows: Array) -> Array:
+            return np.asarray((weigh[0] * rows[:, one] + weigh[1] * rows[:, other]) / size)
+
+        kept = opposite.any(axis=0)
+        # A row that is none at some places holds there whatever the motion.
+        constant = np.where(opposite, combine(self.constant), 1.0)
+        return combine(self.a)[:, kept], combine(self.b)[:, kept], constant[:, kept]
+
+    def middle(self, a: Array, b: Array) -> Array:
+        """Squeeze amid the range that limits leave, shape (n,) [N]."""
+        rest = self.constant + self.a * a[:, None] + self.b * b[:, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            bound = -rest / self.q
+        low = np.where(self.q > 0, bound, -np.inf).max(axis=1)
+        high = np.where(self.q < 0, bound, np.inf).min(axis=1)
+        return np.asarray((low + high) / 2)
+
+
+def build_toppra(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
+    """Limits on a grid that is fine towards the ends, kept at both ends of every interval."""
+    import toppra
+    from toppra.constraint import DiscretizationType, LinearConstraint
+    from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
+
+    toppra.setup_logging("ERROR")
+    length = instance.curve.length
+    grid = length * (1 - np.cos(np.linspace(0.0, np.pi, int(setting) + 1))) / 2
+    for part in instance.curve.segments[:-1]:
+        near = np.abs(grid - part.stop) > 4 * APART * length
+        grid = np.append(grid[near], part.stop + APART * length * np.array([-1.0, 1.0]))
+        grid.sort()
+    stops = [part.stop for part in instance.curve.segments[:-1]]
+    a, b, constant = _Rows(instance, grid, np.searchsorted(stops, grid)).eliminate()
+    below, zero = -np.eye(a.shape[1]), np.zeros(a.shape[1])
+
+    class Limits(LinearConstraint):  # type: ignore[misc]
+        """Limits with the squeeze eliminated."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.identical = True
+            self.set_discretization_type(DiscretizationType.Interpolation)
+
+        def compute_constraint_params(self, *_: Any) -> Any:
+            given = (a, b, constant, below, zero, None, None, grid)
+            return canlinear_colloc_to_interpolate(*given, identical=True)
+
+    path = toppra.SplineInterpolator(grid, grid[:, None])
+    planner = toppra.algorithm.TOPPRA(
+        [Limits()],
+        path,
+        gridpoints=grid,
+        solver_wrapper="seidel",
+        parametrizer="ParametrizeConstAccel",
+    )
+
+    def run() -> PeerPlan:
+        _, speeds, _ = planner.compute_parameterization(0.0, 0.0)
+        if speeds is None or not np.isfinite(speeds).all():
+            return NO_PLAN._replace(status="no feasible parametrisation")
+        return _make_plan(instance, grid, np.asarray(speeds))
+
+    return run
+
+
+def _make_plan(instance: Instance, grid: Array, speeds: Array) -> PeerPlan:
+    """Torques by inverse dynamics, with the squeeze linear between grid points.
+
+    The two points beside a reversal become one, with a step of the torques.
+    """
+    stops = np.array([part.stop for part in instance.curve.segments[:-1]])
+    for stop in stops:
+        k = int(np.searchsorted(grid, stop)) - 1
+        speed = (speeds[k] + speeds[k + 1]) / 2
+        grid, speeds = (
+            np.concatenate([part[:k], [middle], part[k + 2 :]])
+            for part, middle in ((grid, stop), (speeds, speed))
+        )
+    steps, b = np.diff(grid), speeds**2
+    a = np.diff(b) / (2 * steps)
+    times = np.append(0.0, np.cumsum(2 * steps / (speeds[1:] + speeds[:-1])))
+    owner = np.searchsorted(stops, (grid[1:] + grid[:-1]) / 2)
+    ends = [_Rows(instance, grid[p], owner).middle(a, b[p]) for p in (slice(-1), slice(1, None))]
+
+    def torque(t: Array) -> Array:
+        k = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(a) - 1)
+        local = t - times[k]
+        run = np.clip(local * (speeds[k] + a[k] * local / 2), 0.0, steps[k])
+        part = run / steps[k]
+        squeeze = ends[0][k] * (1 - part) + ends[1][k] * part
+        forces: PathForces = _Rows(instance, grid[k] + run, owner[k]).forces
+        return forces.tau(a[k], (speeds[k] + a[k] * local) ** 2, squeeze)
+
+    profile = TorqueProfile.fit(times, torque, TORQUE_NODES - 1)
+    marks = times[np.searchsorted(grid, stops)]
+    return PeerPlan(OPTIMUM, float(times[-1]), profile, tuple(marks))
