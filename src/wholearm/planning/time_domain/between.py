@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...common.arrays import Array
 from ...common.minima import find_minima
@@ -62,8 +63,18 @@ class Limits(NamedTuple):
     @property
     def worst(self) -> float:
         """The largest, over what is allowed."""
+        return float(self._over.max(initial=0.0))
+
+    def list_missed(self) -> NDArray[np.bool_]:
+        """Which intervals miss more than is allowed, shape (K,)."""
+        return np.asarray(self._over > 1.0)
+
+    @property
+    def _over(self) -> Array:
+        """The largest of each interval, over what is allowed, shape (K,)."""
         allowed = (MISS, GRAZE, FALTER * SLIDING)
-        return max(float(t.max(initial=0.0)) / a for t, a in zip(self, allowed, strict=True))
+        parts = (t.max(axis=1, initial=0.0) / a for t, a in zip(self, allowed, strict=True))
+        return np.asarray(np.max(list(parts), axis=0))
 
 
 class CheckPlaces(NamedTuple):

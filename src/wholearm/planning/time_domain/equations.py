@@ -96,13 +96,18 @@ def add_stage(
 
 
 def _list_free_turns(stage: Stage) -> tuple[int, ...]:
-    """One of each that turn together: equations said twice spoil the solver's steps."""
-    end, told, found = stage.guess.nodes[-1, 0], set[int](), list[int]()
+    """One of each that turn together: equations said twice spoil the solver's steps.
+
+    With two freedoms two of them stop all.
+    """
+    formation, end = stage.formation, stage.guess.nodes[-1, 0]
+    told, found = set[int](), list[int]()
     for row in stage.turns:
         if row not in told:
             found.append(row)
-            told.update(find_tied(stage.formation, end, row))
-    return tuple(found)
+            told.update(find_tied(formation, end, row))
+    freedoms = 5 - formation.n_constraints
+    return tuple(found[:freedoms] if freedoms > 1 else found)
 
 
 def _collocate(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:

@@ -110,7 +110,22 @@ def _find_turns(stage: Stage, scheme: Scheme, rates: Array) -> tuple[Array, list
             turns[-1] = last._replace(rows=(*last.rows, row))
         else:
             turns.append(_Turn(place, (row,)))
-    return signs, turns
+    return signs, _join_stops(turns, near, rates.shape[1] - stage.formation.n_rolling)
+
+
+def _join_stops(turns: list[_Turn], near: float, count: int) -> list[_Turn]:
+    """The turns, those as one where all `count` rows turn `near` each other: there motion stops."""
+    joined = list[_Turn]()
+    while turns:
+        own = [turn for turn in turns if turn.place < turns[0].place + near]
+        rows = tuple(row for turn in own for row in turn.rows)
+        if len(rows) == len(set(rows)) == count:
+            joined.append(_Turn(own[len(own) // 2].place, rows))
+            turns = turns[len(own) :]
+        else:
+            joined.append(turns[0])
+            turns = turns[1:]
+    return joined
 
 
 def _spread(places: Sequence[float]) -> list[float]:

@@ -11,6 +11,8 @@ from .stage import Stage
 
 MOST = 12
 """Most sequences of modes to try from one start."""
+LOST = 4
+"""Sequences that led to nothing since the last gain after which no more are tried."""
 PATIENCE = 60
 """Most iterations of one of them."""
 STRETCH = 1e-3
@@ -23,8 +25,8 @@ WORTH = 1e-4
 def improve(search: Search, solution: Solution) -> Solution:
     """Change the modes of a solution for as long as that makes it better."""
     known = {sign_sequence(solution.stages)}
-    waiting, tried = list_neighbours(search, solution), 1
-    while waiting and tried < MOST:
+    waiting, tried, lost = list_neighbours(search, solution), 1, 0
+    while waiting and tried < MOST and lost < LOST:
         moved = waiting.pop(0)
         signs = sign_sequence(moved)
         # A stage that has shrunk to nothing may have gained by the intervals beside it alone.
@@ -35,11 +37,12 @@ def improve(search: Search, solution: Solution) -> Solution:
         other = search.solve(moved, most=PATIENCE)
         search.tried.sequences += 1
         if not other.success:
+            lost += 1
             continue
         gain = solution.cost - other.cost
         least = WORTH if len(moved) >= len(solution.stages) else -WORTH
         if gain > least * abs(solution.cost):
-            solution, waiting = other, list_neighbours(search, other)
+            solution, waiting, lost = other, list_neighbours(search, other), 0
         elif _rolls(moved) > _rolls(solution.stages):
             # No better by itself, but it tells which way its contacts would slide.
             waiting = [*list_neighbours(search, other, leaning=True), *waiting]

@@ -35,7 +35,7 @@ CONVINCING = 2
 """Motions that miss limits least, from different guesses, after which there seems to be no plan."""
 BUDGET = 300
 """Iterations of the solver after which no further guess is begun: of one block."""
-ATTEMPT = 100
+ATTEMPT = 80
 """Most iterations of the first run of the solver from a guess."""
 ROUNDING = 5e-7
 """Largest shortfall of a margin below epsilon by rounding, over the weight of the object."""
@@ -133,8 +133,9 @@ def _try_all(
         What the first attempt has led to.
     """
     stop = search.tried.iterations + BUDGET
-    far, count, outcomes = attempts.are_far, 0, list[_Outcome]()
+    far, count, outcomes = False, 0, list[_Outcome]()
     for attempt in attempts:
+        far = far or not attempt.gradual and attempts.are_far
         # What is far from any plan, or like what is short, is first asked what it is short of.
         plain = far or count or attempt is attempts.first
         known = begun if plain and not attempt.gradual else None

@@ -316,6 +316,8 @@ class Search:
                     solution = finer
                     limits = [Limits.none(stage) for stage in solution.stages]
                     continue
+                # What finer intervals do not lead to now they will not lead to later.
+                refined = REFINEMENTS
             if any(stage.adapts for stage in solution.stages):
                 solution = self.solve(settle(solution.stages), solution)
                 if not solution.success:
@@ -328,6 +330,9 @@ class Search:
                 solution.nlp, solution.stages, limits, solution.multipliers, solution.margin
             )
             if not tighter.success:
+                tighter = self._halve_missed(solution, misses)
+                limits = [Limits.none(stage) for stage in tighter.stages]
+            if not tighter.success:
                 return tighter
             if tighter.cost - solution.cost > _DEARER * abs(solution.cost):
                 status = "a plan that keeps limits between points is much dearer"
@@ -335,3 +340,8 @@ class Search:
             solution = tighter
         status = f"limits are still missed {worst:.2g} times what is allowed between points"
         return solution._replace(status=status, success=False)
+
+    def _halve_missed(self, solution: Solution, misses: Sequence[Limits]) -> Solution:
+        """Go on from a plan with twice the intervals where it misses limits, which then is less."""
+        times = [miss.list_missed().astype(np.int64) for miss in misses]
+        return self.solve(bisect_intervals(solution.stages, self.scheme, times), solution)
