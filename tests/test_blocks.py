@@ -44,7 +44,7 @@ def test_no_phase_has_to_press_much_more_than_those_before_it(
     curves, options = trace_phases(problem), PlanOptions("margin", intervals=20)
     known = blocks.plan_blocks(problem, curves, options, lambda _: None).plans
 
-    def plan_with_impacts(*of: Any) -> Any:
+    def plan_with_impacts(*of: Any, **_: Any) -> Any:
         plan = known[of[1][0].index]
         if of[3].goal is Objective.MARGIN:
             given.append((of[6], plan.value))

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 
@@ -11,13 +12,15 @@ from wholearm.common.arrays import Array
 from wholearm.geometry.curve import find_tied, tangent_basis
 from wholearm.geometry.explore import close_contacts
 from wholearm.geometry.path_guess import list_ends
-from wholearm.mechanics.metric import metric_weights
-from wholearm.planning.options import PlanOptions
+from wholearm.mechanics.metric import measure_speed, metric_weights
+from wholearm.planning.options import Objective, PlanOptions
+from wholearm.planning.stops import end_of
 from wholearm.planning.time_domain.attempts import Attempts
 from wholearm.planning.time_domain.gradual import find_modes, split_by_senses
 from wholearm.planning.time_domain.kernels import goal_kernel
 from wholearm.planning.time_domain.modes import merge, mode_of
 from wholearm.planning.time_domain.motion import make_motions
+from wholearm.planning.time_domain.plan import plan_phases
 from wholearm.planning.time_domain.search import Search, Solution
 from wholearm.problem.definition import Phase, Problem
 from wholearm.problem.read import build_problem, read_problem
@@ -102,3 +105,19 @@ def test_an_end_where_a_contact_changes_its_name_has_a_slope() -> None:
     assert np.abs(kernel.function(x, []).full()).max() < 1e-9 * problem.scene.scales.length
     slope = np.abs(kernel.jacobian(x, []).full()).max()
     assert slope > 0.1 * problem.scene.scales.length
+
+
+def test_the_largest_margin_may_end_where_the_least_time_does() -> None:
+    problem, phase, z = corner()
+    options = PlanOptions(time_intervals=4)
+    (quick,) = plan_phases(problem, [phase], z, options)
+    duration = 2 * quick.motion.duration
+    options = replace(options, objective=Objective.MARGIN)
+    given = (problem, [phase], z, options, duration)
+    (free,) = plan_phases(*given, fastest=[quick])
+    (plan,) = plan_phases(*given, fastest=[quick], pinned=True)
+    ends = [end_of(own)[0] for own in (quick, plan, free)]
+    assert measure_speed(problem.scene, ends[1] - ends[0]) < 1e-6 * problem.scene.scales.length
+    assert measure_speed(problem.scene, ends[2] - ends[0]) > 0.1 * problem.scene.scales.length
+    assert problem.epsilon < plan.value < free.value * (1 + 1e-6)
+    assert max(own.motion.duration for own in (plan, free)) < duration * (1 + 1e-6)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InfeasibleError, name_source
+from ..common.errors import InfeasibleError, InputError, SolverError, name_source
 from ..geometry.cost_to_go import CostToGo
 from ..geometry.curve import Curve
 from ..geometry.tracing import runs_on_curve, trace_phase
@@ -37,6 +37,8 @@ AMPLE = 1.1
 """Ratio to the least normal force of other phases from which on more decides nothing."""
 MOVED = 1e-9
 """Distance from which on a block starts somewhere else, in radii of gyration or radians."""
+APART = 1e-6
+"""The same, from which on its plans of least duration are others."""
 SHORT = 5e-7
 """Largest shortfall of a margin below epsilon by rounding, over the scene's force."""
 
@@ -109,6 +111,8 @@ class Planning:
         least duration, and as used, where a block turned out to start from somewhere else.
     least : list of PhasePlan
         Those plans of least duration; empty for other objectives.
+    pinned : bool
+        Whether blocks end where those plans do.
     ahead : bool
         Whether blocks end with regard to what follows them. Plans that durations are shared out
         by do not, as blocks for the objective `margin` cannot.
@@ -121,6 +125,7 @@ class Planning:
     shares: list[float | None]
     allowed: list[float | None]
     least: Plans = field(default_factory=list)
+    pinned: bool = False
     ahead: bool = True
 
     @property
@@ -174,6 +179,11 @@ def plan_blocks(
         first = replace(planning, options=_for_time(options), ahead=False)
         least = plan_each(first, finer, report).plans
         planning = replace(planning, shares=share_duration(least, options.duration), least=least)
+        try:
+            return _require_margin(plan_each(planning, finer, report))
+        except (InfeasibleError, InputError, SolverError):
+            # From where blocks of the largest margin end the next ones need not go on.
+            planning = replace(planning, pinned=True)
     return _require_margin(plan_each(planning, finer, report))
 
 
@@ -239,7 +249,9 @@ def plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str], 
             own = _refine(options, known, finer[index])
             to_go = _look_ahead(planning, phases, own) if planning.ahead else None
             with name_source(problem.source):
-                made = _plan_block(planning, phases, z, own, allowed, to_go, find_ample(blocks))
+                quick = fastest or [least[phase.index] for phase in phases if least]
+                ample = find_ample(blocks)
+                made = _plan_block(planning, phases, z, own, allowed, to_go, ample, quick)
             known = BlockPlan(phases, z, *wanted, fastest, *made)
         blocks.append(known)
         z = known.end
@@ -271,6 +283,7 @@ def _plan_block(
     allowed: Sequence[float | None] | None,
     to_go: CostToGo | None = None,
     ample: float = math.inf,
+    fastest: Plans | None = None,
 ) -> tuple[Plans, ImpactSequence | None]:
     """Plan a block from `z`, along its curves or in the time domain; also its curves."""
     plans: Plans = []
@@ -281,7 +294,9 @@ def _plan_block(
 
         with charge(block[0].number):
             duration = add_up(block, allowed)
-            plans += plan_with_impacts(problem, block, z, options, duration, to_go, ample)
+            given = (problem, block, z, options, duration, to_go, ample, fastest)
+            pinned = planning.pinned or _leads_on(problem, block, options)
+            plans += plan_with_impacts(*given, pinned=pinned)
         return plans, None
     curves = []
     for phase in block:
@@ -293,6 +308,16 @@ def _plan_block(
         with charge(part.phases[0].number):
             plans += plan_sequence(part, problem.epsilon, options, add_up(part.phases, allowed))
     return plans, chain
+
+
+def _leads_on(problem: Problem, block: Sequence[Phase], options: PlanOptions) -> bool:
+    """Whether what follows a block in the time domain is planned there, too.
+
+    Where it can begin is then known of the plans of least duration alone.
+    """
+    following = problem.phases[block[-1].index + 1 :]
+    own = next((part for part in split_blocks(problem) if part[0] in following), None)
+    return own is not None and not runs_along_curves(own, options)
 
 
 def _look_ahead(
@@ -347,4 +372,4 @@ def _distance(scene: Scene, one: Array, other: Array) -> float:
 
 def _starts_off(scene: Scene, motion: Motion, z: Array) -> bool:
     """Whether a motion starts somewhere else than at `z`."""
-    return _distance(scene, motion.evaluate(np.zeros(1)).z[0], z) > MOVED
+    return _distance(scene, motion.evaluate(np.zeros(1)).z[0], z) > APART

@@ -31,6 +31,8 @@ class PhasePlan(NamedTuple, Generic[M_co]):
         Whether the search for contact modes has tried all that promised to be better.
     attempt : str
         Name of the guess that led to it; none along curves.
+    stages : sequence
+        The stages that it was solved on, in the scene's own units; none along curves.
     """
 
     motion: M_co
@@ -39,6 +41,7 @@ class PhasePlan(NamedTuple, Generic[M_co]):
     sequences: int = 0
     complete: bool = True
     attempt: str = ""
+    stages: Sequence[object] = ()
 
 
 @dataclass

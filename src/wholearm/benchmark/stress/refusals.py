@@ -95,12 +95,16 @@ def judge(
 
 
 def _find_start(problem: Problem, number: int, objective: str) -> Array | None:
-    """Where the plan of the phases before one ends at rest; None if there is none."""
+    """Where the plan of the phases before one ends at rest; None if there is none.
+
+    For the largest margin, phases go on from where plans of least time end.
+    """
     before = problem.phases[: number - 1]
     if not before or before[-1].end is not End.REST:
         return None
     try:
-        plan = solve(replace(problem, phases=before), objective, replay=False)
+        goal = "time" if objective == "margin" else objective
+        plan = solve(replace(problem, phases=before), goal, replay=False)
     except WholearmError:
         return None
     motion = plan.trajectory.motions[-1]

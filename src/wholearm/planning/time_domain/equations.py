@@ -87,7 +87,12 @@ def add_stage(
         columns = kernel.x.join(z=layout.z[0], v=layout.v[0], a=layout.a[0])
         own = rows.nonlinear(scheme.degree, kernel.outputs, low=stage.opening, high=np.inf)
         rows.add_copies(kernel, columns, own)
-    goal = goal_kernel(formation, stage.until, _list_free_turns(stage), stage.gained)
+    until = stage.until
+    if stage.stop is not None:
+        until, N = None, tangent_basis(formation, stage.stop)
+        there = rows.linear(N.shape[1], low=N.T @ stage.stop, high=N.T @ stage.stop)
+        rows.add_entries(there[:, None], layout.nodes[-1, Z], N.T)
+    goal = goal_kernel(formation, until, _list_free_turns(stage), stage.gained)
     if goal is not None:
         end = layout.nodes[-1]
         rows.add_copies(goal, goal.x.join(z=end[Z], v=end[V]), rows.nonlinear(goal.outputs))

@@ -37,6 +37,8 @@ def plan_with_impacts(
     duration: float | None,
     to_go: CostToGo | None = None,
     ample: float = math.inf,
+    fastest: Plans | None = None,
+    pinned: bool = False,
 ) -> Plans:
     """Plan a block with the impacts that are possible, or else with stops.
 
@@ -51,7 +53,9 @@ def plan_with_impacts(
     to_go : CostToGo, optional
         What follows a block without impacts.
     ample : float, [N]
-        As of `plan_phases`.
+    fastest : list of PhasePlan, optional
+    pinned : bool
+        As of `plan_phases`; a block with impacts makes its own.
 
     Raises
     ------
@@ -60,7 +64,19 @@ def plan_with_impacts(
     """
     ends = _find_impacts(block)
     if not ends:
-        return [*plan_phases(problem, block, z, options, duration, to_go=to_go, ample=ample)]
+        known = fastest or ()
+        own = plan_phases(
+            problem,
+            block,
+            z,
+            options,
+            duration,
+            to_go=to_go,
+            ample=ample,
+            fastest=known,
+            pinned=pinned,
+        )
+        return [*own]
     explained = plan_parts_of(problem, block, ample, explained=True)
     # A duration that is too short for stops need not be so without them.
     probe = (

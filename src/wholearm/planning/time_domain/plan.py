@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,11 +21,14 @@ import numpy as np
 from ...common.arrays import Array
 from ...geometry.cost_to_go import CostToGo
 from ...problem.definition import Phase, Problem
+from ...results.trajectory import Motion
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
 from .attempts import NEAREST, Attempt, Attempts
 from .ending import choose_end
+from .mesh import resample
 from .mode_search import adapt, improve
+from .modes import LEAST_INTERVALS
 from .motion import TimeMotion, make_motions
 from .own_units import to_si, unit_of
 from .refinement import bisect_intervals, settle
@@ -53,6 +57,8 @@ def plan_phases(
     *,
     to_go: CostToGo | None = None,
     ample: float = math.inf,
+    fastest: Sequence[PhasePlan[Motion]] = (),
+    pinned: bool = False,
     explained: bool = True,
     patient: bool = True,
 ) -> list[PhasePlan[TimeMotion]]:
@@ -70,6 +76,11 @@ def plan_phases(
         What follows, where the phases leave open where they end.
     ample : float, [N]
         Least normal force from which on more decides nothing, as other phases keep less anyway.
+    fastest : sequence of PhasePlan
+        Plans of least time of these phases from `z`, for the objective `margin`: where no guess
+        leads to more, it starts from them or is them.
+    pinned : bool
+        Whether it ends where they do.
     explained : bool
         Whether to look for a change that would make a plan possible, where there is none.
     patient : bool
@@ -84,9 +95,17 @@ def plan_phases(
     """
     search = Search.of(problem, options, duration, to_go, ample)
     attempts = Attempts(problem, phases, z, search, to_go, patient)
+    known = [stage for plan in fastest for stage in plan.stages if isinstance(stage, Stage)]
+    if known and search.goal is Objective.MARGIN:
+        usual = fastest[0].attempt == attempts.first.name
+        slowed = _slow_down(search, known, attempts.first, usual, pinned)
+        if slowed is not None:
+            return _summarise(problem, search, phases, slowed, fastest[0].attempt)
     begun = solve_attempt(search, attempts.first)
     if search.goal is Objective.MARGIN and not begun.success:
-        begun = _solve_from_fastest(search, attempts.first) or begun
+        quick = solve_attempt(search.aiming(Objective.TIME), attempts.first)
+        if quick.success:
+            begun = _slow_down(search, quick.stages, attempts.first, False, pinned) or begun
     if begun.success:
         return _summarise(problem, search, phases, begun, attempts.first.name)
     from .explain import explain, refuse
@@ -135,7 +154,7 @@ def _try_all(
     stop = search.tried.iterations + BUDGET
     far, count, outcomes = False, 0, list[_Outcome]()
     for attempt in attempts:
-        far = far or not attempt.gradual and attempts.are_far
+        far = far or (not attempt.gradual and attempts.are_far)
         # What is far from any plan, or like what is short, is first asked what it is short of.
         plain = far or count or attempt is attempts.first
         known = begun if plain and not attempt.gradual else None
@@ -209,18 +228,37 @@ def solve_attempt(search: Search, attempt: Attempt) -> Solution:
     return search.enforce_between(solution) if solution.success else solution
 
 
-def _solve_from_fastest(search: Search, attempt: Attempt) -> Solution | None:
-    """Solve for the largest margin from the motion of least time, or take that one.
+def _slow_down(
+    search: Search, fastest: list[Stage], attempt: Attempt, usual: bool, pinned: bool
+) -> Solution | None:
+    """Solve for the largest margin from the stages of least time, `pinned` to where these end.
 
-    It keeps epsilon within any duration that is no shorter, and is a plan if nothing better is
-    found. None if it takes longer.
+    Before that from the `usual` guess, if that has led to them.
+
+    Those keep epsilon within any duration that is no shorter, and are a plan if nothing better is
+    found. None if they take longer.
     """
-    fastest = solve_attempt(search.aiming(Objective.TIME), attempt)
-    lasts = sum(stage.guess.duration for stage in fastest.stages)
-    if not fastest.success or search.duration is None or lasts > search.duration:
+    lasts, most = sum(stage.guess.duration for stage in fastest), search.duration
+    if most is None or lasts > most:
         return None
-    better = solve_attempt(search, Attempt(attempt.name, 0, settle(fastest.stages)))
-    return better if better.success else fastest._replace(margin=0.0)
+    whole, first = len({stage.phase for stage in fastest}), attempt.stages
+    count = sum(stage.intervals for stage in first) / whole
+    coarse = list[Stage]()
+    for stage in settle(fastest):
+        shares = [own.guess.duration for own in fastest if own.phase == stage.phase]
+        own = max(LEAST_INTERVALS, round(count * stage.guess.duration / sum(shares)))
+        breaks = np.linspace(0.0, 1.0, own + 1)
+        coarse.append(replace(stage, guess=resample(stage.guess, search.scheme, breaks)))
+    end = coarse[-1].guess.nodes[-1, 0]
+    # What has led to the least time is tried first.
+    tries = ((first, False), (coarse, False)) if usual else ((coarse, False), (first, True))
+    for stages, gradual in tries:
+        given = [*stages[:-1], replace(stages[-1], stop=end if pinned else None)]
+        solution = solve_attempt(search, attempt._replace(stages=given, gradual=gradual))
+        if solution.success:
+            return solution
+    nlp = search.build(fastest)
+    return Solution(fastest, 0.0, 0.0, solution.status, True, nlp, {})
 
 
 def _halve(search: Search, stages: list[Stage]) -> list[Stage]:
@@ -247,6 +285,7 @@ def _summarise(
             Objective.EFFORT: weight * motion.duration + torque.integrate_squares(),
             Objective.MARGIN: problem.epsilon + unit * margin,
         }[search.goal]
-        plans.append(PhasePlan(motion, torque, value, attempt=attempt))
+        own = [stage for stage in solution.stages if stage.phase == phase.index]
+        plans.append(PhasePlan(motion, torque, value, attempt=attempt, stages=own))
     plans[0] = plans[0]._replace(sequences=tried.sequences, complete=tried.complete)
     return plans

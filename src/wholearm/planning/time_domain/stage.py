@@ -90,6 +90,8 @@ class Stage:
         Monitored limits that are as clear at the end: what comes next ends by closing them.
     adapts : float
         What it costs to change the duration of an interval; nothing if they keep their shares.
+    stop : ndarray or None, shape (5,)
+        Where the last stage ends, if that is given: with two freedoms its end leaves one open.
     onset : float
         Rate of contacts and joints, in the scene's unit, at which three quarters of their friction
         has set in, against whatever way they move; nothing if friction has the given directions.
@@ -110,6 +112,7 @@ class Stage:
     clearance: float = CLEARANCE
     apart: tuple[int, ...] = ()
     adapts: float = 0.0
+    stop: Array | None = None
     onset: float = 0.0
 
     @property
