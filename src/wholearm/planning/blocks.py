@@ -16,9 +16,9 @@ from ..common.arrays import Array
 from ..common.errors import InfeasibleError, InputError, SolverError, name_source
 from ..geometry.cost_to_go import CostToGo
 from ..geometry.curve import Curve
-from ..geometry.tracing import runs_on_curve, trace_phase
+from ..geometry.tracing import trace_phase
 from ..mechanics.metric import measure_speed
-from ..problem.definition import End, Phase, Problem
+from ..problem.definition import Phase, Problem
 from ..results.trajectory import Motion
 from ..scene.model import Scene
 from ..solvers.statistics import charge
@@ -27,6 +27,7 @@ from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence
 from .path_domain.sequence_plan import plan_sequence
 from .phase_plan import add_up
+from .splitting import leads_on, runs_along_curves, split_blocks
 from .stops import Plans, end_of
 
 PLAIN = -1
@@ -139,18 +140,6 @@ class Planning:
         return next(k for k, end in enumerate(ends) if number <= end)
 
 
-def split_blocks(problem: Problem) -> list[tuple[Phase, ...]]:
-    """Phases that have to be planned together: those joined smoothly or by impacts."""
-    blocks: list[tuple[Phase, ...]] = []
-    block: tuple[Phase, ...] = ()
-    for phase in problem.phases:
-        block = (*block, phase)
-        if phase.end is End.REST:
-            blocks.append(block)
-            block = ()
-    return blocks
-
-
 def plan_blocks(
     problem: Problem,
     curves: tuple[Curve, ...],
@@ -207,20 +196,6 @@ def refine_block(
     finer = [block.finer for block in planning.blocks]
     finer[index] = PLAIN if plain else finer[index] + 1
     return _require_margin(plan_each(planning, finer, report))
-
-
-def runs_along_curves(block: Sequence[Phase], options: PlanOptions) -> bool:
-    """Whether phases are planned along their curves: a single one, or several that slide."""
-    if options.transcription != "auto":
-        return False
-    if len(block) == 1:
-        return runs_on_curve(block[0])
-    return all(
-        phase.formation.n_constraints == 4
-        and not phase.formation.rolling
-        and not phase.until.is_release
-        for phase in block
-    )
 
 
 def plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str], None]) -> Planning:
@@ -295,7 +270,7 @@ def _plan_block(
         with charge(block[0].number):
             duration = add_up(block, allowed)
             given = (problem, block, z, options, duration, to_go, ample, fastest)
-            pinned = planning.pinned or _leads_on(problem, block, options)
+            pinned = planning.pinned or leads_on(problem, block, options)
             plans += plan_with_impacts(*given, pinned=pinned)
         return plans, None
     curves = []
@@ -308,16 +283,6 @@ def _plan_block(
         with charge(part.phases[0].number):
             plans += plan_sequence(part, problem.epsilon, options, add_up(part.phases, allowed))
     return plans, chain
-
-
-def _leads_on(problem: Problem, block: Sequence[Phase], options: PlanOptions) -> bool:
-    """Whether what follows a block in the time domain is planned there, too.
-
-    Where it can begin is then known of the plans of least duration alone.
-    """
-    following = problem.phases[block[-1].index + 1 :]
-    own = next((part for part in split_blocks(problem) if part[0] in following), None)
-    return own is not None and not runs_along_curves(own, options)
 
 
 def _look_ahead(
