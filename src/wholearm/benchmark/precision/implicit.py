@@ -24,7 +24,7 @@ STEPS = 16
 """Steps of a phase."""
 RELAXED = (1.0, 1e-1, 1e-2, 1e-3, 1e-4)
 """Largest products, in the scene's units, from first to last."""
-ITERATIONS = 300
+ITERATIONS = 100
 """Largest number of iterations for each of them."""
 STARTS = 50
 

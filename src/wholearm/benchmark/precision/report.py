@@ -70,16 +70,17 @@ def format_report(runs: Sequence[Run], limit: float = LIMIT) -> str:
     lines = ["# Run time against error, with peers", "", stamp(), ""]
     lines += [f"{_name_processor()}; {'; '.join(_list_versions())}.", ""]
     lines += [
-        f"Medians of up to {REPEATS} runs (one where it takes over {BUDGET:g} s). Means are "
+        f"Times are medians of processor time over up to {REPEATS} runs (one where that takes over "
+        f"{BUDGET:g} s), in one thread. Means are "
         f"geometric ones, shifted by {1e3 * SHIFT:g} ms, over the phases of all problems, each "
         "with the setting that reaches the error soonest; what does not reach it counts with the "
-        f"time limit, {limit:g} s of processor time.",
+        f"time limit, {limit:g} s.",
         "",
         "Errors of states are relative to the scene's length and time. A plan counts as solved if "
         "its torques, replayed open loop by other equations than its own, keep every contact and "
         "end within 1e-2 of the end. Its three errors are those of the phase time, against the "
-        "least time under refinement, of the replayed end state, and the worst violation between "
-        "nodes, over the object's weight or the torque limit.",
+        "lower bound of `solve --certify`, of the replayed end state, and the worst violation "
+        "between nodes, over the object's weight or the torque limit.",
         "",
     ]
     for comparison in COMPARISONS:

@@ -94,7 +94,7 @@ def run_precision(
     if options.fresh:
         runs = [run for run in runs if not _is_chosen(options, run.method)]
     done = {run.key for run in runs}
-    for count, answer in enumerate(_measure(options, files, done, say)):
+    for count, answer in enumerate(_measure(options, files, done, say), start=1):
         runs += _read_answer(answer)
         say(f"{answer.task.study}: {answer.task.method}, {answer.task.instance}")
         if count % KEPT_EVERY == 0:
