@@ -45,7 +45,8 @@ def find_first(run: Replay, start: Array, h: float, among: range | None = None) 
             return float(s.outputs[place]) + offset
 
         near = 1e-2 * run.tolerances.shortest_step
-        h = _find_root(value, h, float(before[k]), float(after[k]), near)
+        flat = 1e-3 * float(s.slack[k])
+        h = _find_root(value, h, float(before[k]), float(after[k]), near, flat)
         done.append(k)
         if h != s.inputs[s.at.h]:
             run.step_to(h)
@@ -59,11 +60,17 @@ def find_first(run: Replay, start: Array, h: float, among: range | None = None) 
 
 
 def _find_root(
-    function: Callable[[float], float], high: float, f_low: float, f_high: float, near: float
+    function: Callable[[float], float],
+    high: float,
+    f_low: float,
+    f_high: float,
+    near: float,
+    flat: float,
 ) -> float:
-    """Root in [0, high] of a function that falls from f_low >= 0 to f_high < 0, to `near`.
+    """Root in [0, high] of a function that falls from f_low >= 0 to f_high < 0.
 
-    The Illinois variant of regula falsi, which converges fast on the smooth functions here.
+    Regula falsi as of Anderson and Bjorck, which converges like secants on the smooth functions
+    here, until it moves by `near` at most or the function is within `flat` of zero.
     """
     if f_low <= 0:
         return 0.0
@@ -73,12 +80,12 @@ def _find_root(
         if not low < middle < high and not high < middle < low:
             break
         f_middle = function(middle)
-        if f_middle == 0.0:
+        if abs(f_middle) <= flat:
             return middle
         if f_middle * f_high < 0:
             low, f_low = high, f_high
         else:
-            f_low /= 2
+            f_low *= 1 - f_middle / f_high if abs(f_middle) < abs(f_high) else 0.5
         close = abs(middle - high) <= near
         high, f_high = middle, f_middle
         if close:

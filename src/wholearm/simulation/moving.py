@@ -28,6 +28,9 @@ from .runge_kutta import ORDER
 from .tolerances import REACHED, SHORTEST_STEP, SLOW, measure_units
 from .within import keep_wanted
 
+_GROWTH = 40.0
+"""Largest growth of a step: at order 8 an error of 1e-13 of the tolerance allows it."""
+
 
 def move(run: Replay) -> Ending:
     """Integrate until the motion rests, arrives, releases its contacts or fails."""
@@ -75,7 +78,7 @@ def _try_step(run: Replay, target: float) -> tuple[float, bool]:
         brief = h <= run.tolerances.settling / 10
         sudden = outputs[to.dip] < -1e-6 and outputs[to.worst] >= 0 and not brief
         if error <= 1 and not sudden:
-            grown = h * (5.0 if error < 1e-6 else min(5.0, 0.9 * error ** (-1 / ORDER)))
+            grown = h * min(_GROWTH, 0.9 * max(error, 1e-300) ** (-1 / ORDER))
             run.h = grown if h == run.h else max(run.h, grown)
             run.steps += 1
             return h, whole

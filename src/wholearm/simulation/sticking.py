@@ -257,8 +257,9 @@ def find_rest(formation: Formation, z: Array) -> Rest:
         # What is stationary here has the direction that it takes up just after.
         ahead = [_rates(formation, z, step, sign * heading) for sign in (1, -1)]
         signs = np.where(still, np.where(np.abs(ahead) > 1e-12 * scale, np.sign(ahead), 0.0), signs)
+    mode = Mode(formation)
     ways = tuple(
-        _build_way(formation, side * heading, Directions(s[:-2], s[-2:]), kinematics, close)
+        _build_way(mode, side * heading, Directions(s[:-2], s[-2:]), kinematics, close)
         for side, s, close in zip((1.0, -1.0), signs, closes, strict=True)
     )
     return Rest(formation, z, ways, formation.contacts + _gained(formation, near), near)
@@ -271,16 +272,17 @@ def _gained(formation: Formation, near: NDArray[np.bool_]) -> tuple[Contact, ...
 
 
 def _build_way(
-    formation: Formation,
+    mode: Mode,
     heading: Array,
     directions: Directions,
     kinematics: Kinematics,
     closes: bool,
 ) -> RestDirection:
-    answer = respond_at_rest(Mode(formation), np.concatenate(directions), kinematics)
+    answer = respond_at_rest(mode, np.concatenate(directions), kinematics)
     assert answer is not None
-    tolerances = find_tolerances(formation.scene)
-    drive = heading * formation.scene.mass_diagonal @ answer.acceleration
+    scene = mode.formation.scene
+    tolerances = find_tolerances(scene)
+    drive = heading * scene.mass_diagonal @ answer.acceleration
     return RestDirection(
         heading, directions, drive, answer.force_limits, answer.ratio, closes, tolerances
     )
