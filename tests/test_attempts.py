@@ -30,11 +30,14 @@ def test_a_single_phase_is_tried_along_ways_and_at_several_paces() -> None:
     at = found.index(attempts.first)
     # Modes are found before they are given, from the same guesses.
     gradual = [attempt for attempt in found if attempt.gradual]
-    assert found[: len(gradual)] == gradual and gradual[0].stages is attempts.first.stages
-    plain = names[len(gradual) : at]
-    assert [attempt.name for attempt in gradual[1:]] == [f"{name}{GRADUAL}" for name in plain]
+    assert gradual[0].stages is attempts.first.stages and found[0] == gradual[0]
+    plain = [name for name, attempt in zip(names, found, strict=True) if not attempt.gradual]
+    plain = plain[: plain.index(NEAREST)]
     assert all(name.startswith("a way with the margin ") for name in plain)
     assert len(plain) <= len(attempts.ways)
+    sure = [way.margin for way in attempts.ways if way.margin > 0]
+    assert [attempt.gradual for attempt in found[1 : 1 + len(sure)]] == [False] * len(sure)
+    assert {attempt.name for attempt in gradual[1:]} <= {f"{name}{GRADUAL}" for name in plain}
     # The same guess again on finer intervals counts as another, and the first one is not repeated.
     paces = [name for name in names[at + 1 :] if name.startswith(f"{NEAREST} at ")]
     assert len(paces) == len(names) - at - 1 == 2 * len(FALLS) - 1

@@ -16,6 +16,7 @@ from wholearm.mechanics.metric import measure_speed, metric_weights
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.stops import end_of
 from wholearm.planning.time_domain.attempts import Attempts
+from wholearm.planning.time_domain.equations import least_rates, least_senses
 from wholearm.planning.time_domain.gradual import find_modes, split_by_senses
 from wholearm.planning.time_domain.kernels import goal_kernel
 from wholearm.planning.time_domain.modes import merge, mode_of
@@ -109,7 +110,7 @@ def test_an_end_where_a_contact_changes_its_name_has_a_slope() -> None:
 
 def test_the_largest_margin_may_end_where_the_least_time_does() -> None:
     problem, phase, z = corner()
-    options = PlanOptions(time_intervals=4)
+    options = PlanOptions(time_intervals=6)
     (quick,) = plan_phases(problem, [phase], z, options)
     duration = 2 * quick.motion.duration
     options = replace(options, objective=Objective.MARGIN)
@@ -121,3 +122,13 @@ def test_the_largest_margin_may_end_where_the_least_time_does() -> None:
     assert measure_speed(problem.scene, ends[2] - ends[0]) > 0.1 * problem.scene.scales.length
     assert problem.epsilon < plan.value < free.value * (1 + 1e-6)
     assert max(own.motion.duration for own in (plan, free)) < duration * (1 + 1e-6)
+
+
+def test_the_second_contact_of_a_vertex_need_not_move() -> None:
+    """Its rate has a zero where the link stands across, however fast the vertex moves."""
+    _, found = begun()
+    places = np.linspace(0.1, 0.9, 9)
+    least = least_senses(found.stages[0], places)
+    assert least.shape == (9, 5) and (least[:, 1] == 0.0).all()
+    assert (least[:, [0, 2, 3, 4]] == least_rates(found.stages[0], places)[:, None]).all()
+    assert least[:, 0].min() > 0.0

@@ -100,7 +100,13 @@ def test_points_have_newton_and_euler_and_closed_contacts(formation: Formation) 
         Xi, sigma = rng.choice([-1.0, 1.0], n_c), rng.choice([-1.0, 1.0], 2)
         first, least = (z + 0.02 * rng.normal(size=5) if formation.rolling else z[:0]), 0.3
         x = [z, v, a, forces, tau, first]
-        y = call(point_kernel(formation), x, Xi, sigma, np.array([place, least]))
+        y = call(
+            point_kernel(formation),
+            x,
+            Xi,
+            sigma,
+            np.array([place, *[least] * formation.n_contacts]),
+        )
         gaps, rates, bends, balance, senses = np.split(y, np.cumsum([n_p, n_p, n_p, 5]))
         np.testing.assert_allclose(gaps[:n_c], measure_gaps(formation, z), atol=1e-15)
         expected = constraints(formation, z, v, a)

@@ -92,19 +92,27 @@ class Attempts:
         return bool(self.ways) and all(way.margin <= NEAR for way in self.ways)
 
     def __iter__(self) -> Iterator[Attempt]:
-        """To the nearest end and along ways in modes that these lead to, and in their own.
+        """To the nearest end in modes that this leads to, and along ways that keep limits.
 
-        After that there or further ahead of other durations.
+        Then along ways in modes that these lead to, along others in their own, to the nearest end,
+        and there or further ahead of other durations.
         """
         if self.patient:
             yield self.first._replace(name=f"{self.first.name}{GRADUAL}", gradual=True)
-        own = list[Attempt]()
-        for way in [way for way in self.ways if way.margin > NEAR] or self.ways[:1]:
-            name = f"a way with the margin {way.margin:.3g}"
-            guess = self._guess(self._halvings, FALLS[0], way=way)
-            own.append(Attempt(name, self._halvings, guess))
-            yield own[-1]._replace(name=f"{name}{GRADUAL}", gradual=True)
-        yield from own
+        near = [way for way in self.ways if way.margin > NEAR] or self.ways[:1]
+        guesses = [
+            Attempt(
+                f"a way with the margin {way.margin:.3g}",
+                self._halvings,
+                self._guess(self._halvings, FALLS[0], way=way),
+            )
+            for way in near
+        ]
+        sure = sum(way.margin > 0 for way in near)
+        yield from guesses[:sure]
+        for guess in [] if self.are_far else guesses:
+            yield guess._replace(name=f"{guess.name}{GRADUAL}", gradual=True)
+        yield from guesses[sure:]
         yield self.first
         onwards = len(self.phases) > 1
         for halvings in dict.fromkeys((self._halvings, 0)) if self.patient else ():

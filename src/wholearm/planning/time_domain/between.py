@@ -13,7 +13,7 @@ from ...common.arrays import Array
 from ...common.minima import find_minima
 from ...mechanics.limits import PRESS, LimitSet, make_limits
 from ...results.trajectory import Samples
-from .equations import SLIDING, least_rates
+from .equations import SLIDING, least_senses
 from .limits import bound_by_limits
 from .motion import StageMotion
 from .nlp import TimeNLP
@@ -118,7 +118,7 @@ def find_misses(stage: Stage, check: CheckPlaces, epsilon: float, margin: float 
     tables = (
         _find_slack(stage, limits, samples, margin),
         values - clear,
-        _measure_senses(stage, samples) - 0.5 * least_rates(stage, check.places)[:, None],
+        _measure_senses(stage, samples) - 0.5 * least_senses(stage, check.places),
     )
     shape = (stage.intervals, CHECKS)
     slack = (find_minima(table.reshape(*shape, table.shape[1])) for table in tables)

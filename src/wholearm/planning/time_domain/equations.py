@@ -172,11 +172,12 @@ def _balance(
         tau=layout.tau[:, None],
         first=node[..., Z] if formation.rolling else node[..., :0],
     )
+    least = least_senses(stage, stage.guess.places(scheme.points))[..., : formation.n_contacts]
     parameters = kernel.p.join(
         Xi=stage.directions.Xi,
         sigma=stage.directions.sigma,
         place=scheme.points[:, None],
-        least=np.maximum(least_rates(stage, stage.guess.places(scheme.points)), 0.0)[..., None],
+        least=np.maximum(least, 0.0),
         onset=np.full(1 * gradual, stage.onset),
     )
     still = find_still(stage, last) if scheme.ends else set()
@@ -186,10 +187,8 @@ def _balance(
         np.zeros(kernel.outputs),
     )
     high[senses] = np.inf
-    if gradual:
-        low[..., senses] = -np.inf
-    free = [gradual or k in still for k in formation.rubbing_rows]
-    low[-1, -1, senses] = np.where(free, -np.inf, 0.0)
+    low[..., senses] = -np.inf if gradual else 0.0
+    low[-1, -1, senses][[k in still for k in formation.rubbing_rows]] = -np.inf
     own = rows.nonlinear(*shape, kernel.outputs, low=low, high=high)
     rows.add_copies(kernel, columns, own, parameters)
     return own, own[..., senses]
@@ -206,6 +205,17 @@ def least_rates(stage: Stage, places: Array) -> Array:
         return np.full(np.shape(places), -np.inf)
     free = stage.formation.n_constraints < 4
     return np.asarray(SLIDING * free * np.minimum(1.0, 8 * np.minimum(places, 1 - places)))
+
+
+def least_senses(stage: Stage, places: Array) -> Array:
+    """Least rates of (contacts, joints) at `places`, in their shape and one more axis.
+
+    Of two contacts of one vertex one is enough: the rate of the other may have a zero of its own.
+    """
+    contacts, least = stage.formation.contacts, least_rates(stage, places)[..., None]
+    vertices = [contact.index if contact.feature == "v" else None for contact in contacts]
+    again = [own is not None and own in vertices[:k] for k, own in enumerate(vertices)]
+    return np.where([*again, False, False], np.minimum(least, 0.0), least)
 
 
 def find_still(stage: Stage, last: bool) -> set[int]:

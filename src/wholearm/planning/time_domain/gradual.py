@@ -25,9 +25,9 @@ from .stage import Stage
 
 ONSETS = (0.1, 0.03)
 """Rates at which friction sets in, one after the other, in the scene's unit."""
-PATIENCE = 80
+PATIENCE = 60
 """Most iterations of the solver for each of them."""
-SLOW = 1e-3
+SLOW = 1e-5
 """Rate over the largest one at the same instant below which its sign says nothing."""
 STILL = 1e-4
 """Largest rate at an instant, over that of all, below which none of them says anything."""

@@ -79,15 +79,15 @@ def point_kernel(formation: Formation, gradual: bool = False) -> NamedKernel:
     """Equations and inequalities at a collocation point.
 
     `tau` is that at the start and the end of the interval, `first` z at its start if a contact
-    rolls, `place` the point's place in it and `least` the least rate. The contacts' constraints, in
-    position, velocity and acceleration, and the five equations of motion are zero; the senses of
+    rolls, `place` the point's place in it and `least` the least rates. The contacts' constraints,
+    in position, velocity and acceleration, and the five equations of motion are zero; the senses of
     contacts that slide with friction must not be negative. Friction that sets in `gradual`ly, at
     the rate `onset`, goes against the motion whichever way that is.
     """
     scene, n_c, rolls = formation.scene, formation.n_contacts, bool(formation.rolling)
     x = Columns(z=5, v=5, a=5, forces=formation.n_constraints, tau=4, first=5 * rolls)
     s = x.make_symbols()
-    p = Columns(Xi=n_c, sigma=2, place=1, least=1, onset=1 * gradual).make_symbols()
+    p = Columns(Xi=n_c, sigma=2, place=1, least=n_c, onset=1 * gradual).make_symbols()
     gaps, P, P_dot_v, A_t = formation.build_constraints(s.z, s.v)
     Xi, sigma = p.Xi, p.sigma
     if gradual:

@@ -11,7 +11,7 @@ from .stage import Stage
 
 MOST = 12
 """Most sequences of modes to try from one start."""
-LOST = 4
+LOST = 3
 """Sequences that led to nothing since the last gain after which no more are tried."""
 PATIENCE = 60
 """Most iterations of one of them."""

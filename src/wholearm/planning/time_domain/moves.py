@@ -17,7 +17,7 @@ from ...common.arrays import Array
 from ...contacts.formation import Formation
 from ...geometry.curve import find_tied
 from .collocation import Scheme
-from .equations import least_rates
+from .equations import least_senses
 from .modes import drop, link, merge, mode_of, release_earlier, split
 from .stage import Stage
 
@@ -176,7 +176,8 @@ def _find_held(stage: Stage, scheme: Scheme) -> list[Run]:
     z, v = part.z.reshape(-1, 5), part.v.reshape(-1, 5)
     senses = stage.measure_senses(z, v)
     fast = np.abs(v[:, 2:]).max()
-    least = 1.01 * least_rates(stage, stage.guess.places(scheme.points)).reshape(-1, 1)
+    least = least_senses(stage, stage.guess.places(scheme.points))
+    least = 1.01 * least.reshape(-1, least.shape[-1])
     touches = senses < least + _STALLED * fast
     touches &= (np.abs(senses).max(axis=1) > 1e-3 * fast)[:, None]
     shape = (stage.intervals, scheme.degree, -1)

@@ -38,7 +38,7 @@ from ...solvers.statistics import SolverStatistics, book
 from ..options import Objective
 from .assembly import Assembled, assemble_nlp
 from .collocation import Scheme
-from .equations import StageRows, add_stage, find_still, join_stages, least_rates
+from .equations import StageRows, add_stage, find_still, join_stages, least_senses
 from .kernels import effort_kernel, stretch_kernel
 from .layout import MARGIN, STATE, StageLayout, V, Z, lay_out
 from .limits import Target, bound_by_limits
@@ -172,9 +172,9 @@ def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tup
         low[layout.short] = 0.0
         low[layout.h] = SHORTEST
         still = find_still(stage, stage is stages[-1]) if scheme.ends else set()
-        rate = least_rates(stage, stage.guess.places(scheme.points))
+        rates = least_senses(stage, stage.guess.places(scheme.points))
         for joint, sigma in enumerate(stage.directions.sigma):
-            own, one_way = layout.v[..., 3 + joint], rate.copy()
+            own, one_way = layout.v[..., 3 + joint], rates[..., joint - 2].copy()
             if stage.formation.n_contacts + joint in still:
                 one_way[-1, -1] = -np.inf
             if sigma > 0:

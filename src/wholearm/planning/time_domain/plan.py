@@ -37,7 +37,7 @@ from .stage import Stage
 
 CONVINCING = 2
 """Motions that miss limits least, from different guesses, after which there seems to be no plan."""
-BUDGET = 300
+BUDGET = 400
 """Iterations of the solver after which no further guess is begun: of one block."""
 ATTEMPT = 80
 """Most iterations of the first run of the solver from a guess."""
@@ -222,8 +222,11 @@ def solve_attempt(search: Search, attempt: Attempt) -> Solution:
     plain = not search.options.mode_search or search.has_ample(solution)
     better = solution if plain else improve(search, solution)
     search, solution = choose_end(search, adapt(search, better))
+    wanted = 2**attempt.halvings * sum(stage.intervals for stage in attempt.stages)
     for _ in range(max(attempt.halvings, search.scheme.degree > _EXACT)):
-        if solution.success:
+        # Modes that were found may have asked for more intervals than the guess has.
+        most = sum(stage.intervals for stage in solution.stages)
+        if solution.success and (most < wanted or search.scheme.degree > _EXACT):
             solution = search.solve(_halve(search, solution.stages), solution)
     return search.enforce_between(solution) if solution.success else solution
 
