@@ -49,10 +49,10 @@ def test_medians_keep_the_worst_error() -> None:
 def test_the_soonest_setting_counts_and_failures_never_do() -> None:
     medians = find_medians(RUNS)
     own = Comparison("study", "title", "a, b", (1e-3, 1e-6), False, None)
-    assert find_times(medians, "a, b", own, 1e-3) == [0.1, math.inf]
-    assert find_times(medians, "a, b", own, 1e-6) == [0.3, math.inf]
+    assert find_times(medians, "a, b", own, 1e-3) == {"phase 1": 0.1, "phase 2": math.inf}
+    assert find_times(medians, "a, b", own, 1e-6) == {"phase 1": 0.3, "phase 2": math.inf}
     built = own._replace(building=True)
-    assert find_times(medians, "a, b", built, 1e-6) == [0.8, math.inf]
+    assert find_times(medians, "a, b", built, 1e-6) == {"phase 1": 0.8, "phase 2": math.inf}
 
 
 def test_means_are_geometric_but_for_their_shift() -> None:

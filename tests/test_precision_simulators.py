@@ -26,7 +26,9 @@ FLIPS = str(PROBLEMS / "heptagon_four_contacts.toml")
 def course() -> Course:
     """The heptagon's first phase, with a reversal on its way."""
     (first, *_) = list_instances((FLIPS,))
-    return make_course(first, FEW)
+    found = make_course(first, FEW)
+    assert found is not None
+    return found
 
 
 def test_files_share_phases() -> None:
@@ -52,6 +54,11 @@ def test_every_simulator_converges_to_the_reference(method: str) -> None:
         for tolerance in (1e-5, 1e-9)
     ]
     assert errors[1] < 2e-7 and errors[1] < 0.3 * errors[0] + 1e-12
+
+
+def test_phases_that_allow_no_slow_motion_have_no_course() -> None:
+    rough = list_instances((str(PROBLEMS / "heptagon_impact.toml"),))
+    assert [make_course(instance, FEW) is None for instance in rough[3:4]] == [True]
 
 
 def test_gaps_and_energy_are_kept_in_a_swing_without_friction() -> None:

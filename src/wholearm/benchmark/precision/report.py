@@ -13,7 +13,19 @@ import numpy as np
 
 from ..report import stamp
 from .planning import IMPLICIT, LEAST_TIME, NO_DRAG, PLANNERS
-from .runs import BUDGET, LIMIT, REPEATS, SHIFT, SOLVED, Key, Median, Run, find_mean, find_medians
+from .runs import (
+    BUDGET,
+    LIMIT,
+    REPEATS,
+    SHIFT,
+    SHORT,
+    SOLVED,
+    Key,
+    Median,
+    Run,
+    find_mean,
+    find_medians,
+)
 from .simulation import DRIFT, FEW, MANY
 from .simulators import SIMULATORS
 
@@ -70,11 +82,14 @@ def format_report(runs: Sequence[Run], limit: float = LIMIT) -> str:
     lines = ["# Run time against error, with peers", "", stamp(), ""]
     lines += [f"{_name_processor()}; {'; '.join(_list_versions())}.", ""]
     lines += [
-        f"Times are medians of processor time over up to {REPEATS} runs (one where that takes over "
-        f"{BUDGET:g} s), in one thread. Means are "
+        f"Times are medians over up to {REPEATS} runs (one where that takes over {BUDGET:g} s) in "
+        f"one thread, of processor time, or by the wall clock below {SHORT:g} s. Means are "
         f"geometric ones, shifted by {1e3 * SHIFT:g} ms, over the phases of all problems, each "
         "with the setting that reaches the error soonest; what does not reach it counts with the "
         f"time limit, {limit:g} s.",
+        "",
+        "Phases whose slow motion would lose a contact have no few pieces of torque, and where a "
+        "method was not run on a phase, ours does not count there either.",
         "",
         "Errors of states are relative to the scene's length and time. A plan counts as solved if "
         "its torques, replayed open loop by other equations than its own, keep every contact and "
@@ -94,15 +109,18 @@ def format_report(runs: Sequence[Run], limit: float = LIMIT) -> str:
     return "\n".join([*lines, ""])
 
 
-def find_times(medians: Medians, method: str, own: Comparison, target: float) -> list[float]:
-    """Times in which a method reaches an error on each phase of a study, or infinity [s]."""
-    names = dict.fromkeys(key[1] for key in medians if key[0] == own.study)
-    found = dict.fromkeys(names, math.inf)
+def find_times(medians: Medians, method: str, own: Comparison, target: float) -> dict[str, float]:
+    """Times in which a method reaches an error on each phase that it has runs on [s].
+
+    Infinite where it does not.
+    """
+    found: dict[str, float] = {}
     for (study, name, which, _), median in medians.items():
-        if (study, which) == (own.study, method) and median.reaches(target, own.errors):
+        if (study, which) == (own.study, method):
             took = median.solve + own.building * median.build
-            found[name] = min(found[name], took)
-    return list(found.values())
+            reached = took if median.reaches(target, own.errors) else math.inf
+            found[name] = min(found.get(name, math.inf), reached)
+    return found
 
 
 def list_methods(medians: Medians, study: str) -> list[str]:
@@ -123,10 +141,14 @@ def _format_targets(medians: Medians, own: Comparison, limit: float) -> list[str
         cells = [method]
         for target in own.targets:
             times, ours = (find_times(medians, m, own, target) for m in (method, own.ours))
-            reached = sum(map(math.isfinite, times))
-            mean, least = (find_mean([min(t, limit) for t in part]) for part in (times, ours))
+            names = times.keys() & ours.keys()
+            reached = sum(math.isfinite(times[name]) for name in names)
+            mean, least = (
+                find_mean([min(part[name], limit) for name in names] or [math.nan])
+                for part in (times, ours)
+            )
             shown = (f"{mean:.4f}", f"{mean / least:.2g}") if reached else ("-", "-")
-            cells += [shown[0], f"{reached} of {len(times)}", shown[1]]
+            cells += [shown[0], f"{reached} of {len(names)}", shown[1]]
         lines.append(f"| {' | '.join(cells)} |")
     return [*lines, ""]
 

@@ -11,14 +11,16 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple, TypeVar
 
-REPEATS = 3
+REPEATS = 5
 """Largest number of runs that a median is of."""
-BUDGET = 0.5
+BUDGET = 0.3
 """Time after which a run is not repeated any more [s]."""
 LIMIT = 60.0
 """Processor time that one setting of a method may take on one phase [s]."""
 SHIFT = 0.01
 """Shift of the geometric means [s]."""
+SHORT = 0.05
+"""Time below which the wall clock counts, and processor time from there on [s]."""
 SOLVED = "solved"
 
 Key = tuple[str, str, str, str]
@@ -36,7 +38,7 @@ class Run(NamedTuple):
     repeat : int
         Which of the runs of this setting, from 0.
     build, solve : float, [s]
-        Processor time to build, and to simulate or solve.
+        Time to build, and to simulate or solve.
     error : float
         Of the state, relative to the scene, or of the phase time, relative.
     end : float
@@ -79,19 +81,26 @@ class Median(NamedTuple):
 
 
 def repeat(build: Callable[[], Callable[[], _Answer]]) -> Iterator[tuple[float, float, _Answer]]:
-    """Build and run until there is enough for a median: times of both, and what came of it.
-
-    Processor time counts, which other work on the machine hardly changes.
-    """
+    """Build and run until there is enough for a median: times of both, and what came of it."""
     began = time.process_time()
     for _ in range(REPEATS):
-        started = time.process_time()
-        run = build()
-        built = time.process_time()
-        answer = run()
-        yield built - started, time.process_time() - built, answer
+        built, run = _time(build)
+        took, answer = _time(run)
+        yield built, took, answer
         if time.process_time() - began > BUDGET:
             break
+
+
+def _time(work: Callable[[], _Answer]) -> tuple[float, _Answer]:
+    """How long something takes [s], and its answer.
+
+    Processor time, which other work on the machine hardly changes, unless that is too short for
+    its clock.
+    """
+    wall, processor = time.perf_counter(), time.process_time()
+    answer = work()
+    wall, processor = time.perf_counter() - wall, time.process_time() - processor
+    return (wall if wall < SHORT else processor), answer
 
 
 def find_medians(runs: Sequence[Run]) -> dict[Key, Median]:

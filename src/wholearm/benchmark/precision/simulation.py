@@ -28,7 +28,7 @@ from .simulators import SIMULATORS
 FEW, MANY, DRIFT = "simulation, few pieces", "simulation, many pieces", "simulation, 100 s"
 """Studies: torques in a few long pieces, planned torques in eighty, and a long swing."""
 TOLERANCES = {
-    FEW: tuple(10.0**-k for k in range(4, 13)),
+    FEW: tuple(10.0**-k for k in (4, *range(6, 14))),
     MANY: (1e-6, 1e-9, 1e-12),
     DRIFT: (1e-6, 1e-9, 1e-12),
 }
@@ -37,6 +37,8 @@ DEGREES = {FEW: 14, MANY: 6}
 """Degrees of the torques' polynomials."""
 SLOW = 0.3
 """Square of the speed of the motion with few pieces, over that of a first guess of a plan."""
+LOOKS = 201
+"""Instants at which contact forces of a motion are looked at."""
 STOP = 0.95
 """Share of the last stretch between reversals that is run: just before a stop all is ill-posed."""
 SWING = {"x": 0.03, "friction": 0.0, "viscous": 0.0, "dry": 0.0}
@@ -92,13 +94,19 @@ def _measure_swing(course: Course, state: Array) -> tuple[float, float]:
     return gap, abs(float(rise)) / scene.scales.torque
 
 
-def make_course(instance: Instance, study: str) -> Course:
-    """The course of a phase, until just before it comes to rest."""
+def make_course(instance: Instance, study: str) -> Course | None:
+    """The course of a phase, until just before it comes to rest.
+
+    None if the slow motion would lose a contact.
+    """
     problem, curve = instance.problem, instance.curve
     if study == FEW:
         motion = make_slow_motion(curve, problem.epsilon)
     else:
         motion = plan_path(curve, problem.epsilon, PlanOptions(), 1).motion
+    looks = np.linspace(0.0, motion.duration, LOOKS)
+    if motion.evaluate(looks).c_n.min() <= 0:
+        return None
     last = np.flatnonzero(np.diff(motion.grid.segment, append=-1))
     marks = np.append(0.0, motion.times[last])
     stop = marks[-2] + STOP * (marks[-1] - marks[-2])

@@ -150,7 +150,7 @@ def _simulate(
     ]
     swing = os.path.join(options.folder, SWING_FILE)
     if os.path.exists(swing):
-        makers.append((DRIFT, f"swing of {SWING_TIME:g} s", partial(make_swing, swing)))
+        makers.insert(0, (DRIFT, f"swing of {SWING_TIME:g} s", partial(make_swing, swing)))
     for study, name, make in makers:
         tasks = [
             task
@@ -160,6 +160,8 @@ def _simulate(
         if tasks:
             say(f"reference of {name}, {study}")
             course = make()
+            if course is None:
+                continue
             given = [task._replace(course=course) for task in tasks]
             yield from run_tasks(run_simulator, given, 1, options.limit, lambda _: 0)
 
