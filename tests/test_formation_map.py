@@ -134,6 +134,26 @@ def test_closing_many_agrees_with_closing_one(radius: float) -> None:
     assert contact_table(scene)[first_contact(scene, 1)].name == "v0-finger2"
 
 
+@pytest.mark.parametrize("radius", [0.02, 0.005, 0.0])
+def test_closing_on_many_vertices_finds_the_first_of_them(radius: float) -> None:
+    """Only neighbours of one vertex are looked at; some links end at an edge or a vertex."""
+    rng, angles = np.random.default_rng(2), np.linspace(0, math.tau, 40, endpoint=False)
+    seen = set()
+    for flatness, length in ((1.0, 0.18), (0.3, 0.06), (0.15, 0.1)):
+        points = 0.05 * np.column_stack([np.cos(angles), flatness * np.sin(angles)])
+        scene = make_scene(points, base=0.06, depth=-0.012, length=length, radius=radius)
+        x, phi = rng.uniform(-0.12, 0.12, 100), rng.uniform(-4.0, 4.0, 100)
+        closed = close_fingers(scene, x, phi)
+        for row, finger in np.argwhere(closed.obstacle == 0):
+            z = closed.z[row]
+            alone = close_alone(scene, z[:3], finger)
+            assert z[3 + finger] == pytest.approx(alone, abs=1e-11)
+            contact = contact_table(scene)[closed.touched[row, finger]]
+            assert abs(gaps(scene, [contact], z[None])[0, 0]) < 1e-9
+            seen.add((contact.feature, contact.surface))
+    assert seen >= {("v", "finger"), ("e", "tip")}
+
+
 def test_configurations_of_cells_touch_without_overlap(every: FormationMap) -> None:
     scene = every.problem.scene
     rng = np.random.default_rng(2)
@@ -389,6 +409,19 @@ def test_a_route_into_touching_fingers_says_so() -> None:
         list_formations(problem, (0.02, -0.02), (-0.03, 0.03))
     free = hexagon((0.19, 0.19), -0.085, solid=False)
     assert len(list_formations(free, (0.065, 0.0), (-0.05, 0.0))) == 4
+
+
+@pytest.mark.parametrize("count", [6, 24, 120])
+def test_the_window_ends_before_the_next_edge_but_one(count: int) -> None:
+    angles = np.linspace(0, math.tau, count, endpoint=False)
+    corners = 0.05 * np.column_stack([np.cos(angles), np.sin(angles)])
+    start = {"flush": 0, "x": 0.0}
+    problem = build_problem({**TABLE, "object": {**TABLE["object"], "vertices": corners.tolist()},
+                             "start": start, "fingers_collide": False, "phases": []})  # fmt: skip
+    window = choose_window(problem)
+    assert len(window.flush_angles(problem.scene)) == 3
+    low, high = window.phi
+    assert 2 * math.tau / count < high - low < 2 * math.tau / count + np.radians(12.1)
 
 
 def test_map_needs_a_sound_grid_and_some_reach(heptagon: Problem) -> None:

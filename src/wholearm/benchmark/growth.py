@@ -39,8 +39,6 @@ WORK = {
     "vertices": ("reading", "map"),
 }
 """Kinds of work that are measured for each."""
-LARGEST = {"map": 50}
-"""Sizes from which on some work would take minutes."""
 RADIUS = 0.05
 """Radius of the regular polygons [m]."""
 TURNS = (0.04, 0.045)
@@ -108,7 +106,6 @@ def list_work() -> list[tuple[str, str, int]]:
         for grows, sizes in SIZES.items()
         for work in WORK[grows]
         for size in sizes
-        if size <= LARGEST.get(work, size)
     ]
 
 

@@ -8,6 +8,7 @@ Contacts are counted as in `contact_table`: those with the palm, with finger 1 a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ from ..common.arrays import Array
 from ..common.errors import InputError
 from ..scene.model import Finger, Scene
 from .elemental import Contact, candidate_contacts
-from .formation import Formation
+from .formation import Formation, Kinematics
 from .links import FINGERS_TOUCH, evaluate_finger_gap
 
 Numbers = NDArray[np.int64]
@@ -28,6 +29,12 @@ TOO_SHORT, JOINT_COVERED, FINGERS_CROSS = 1, 2, 3
 """Reasons why a finger cannot close: it reaches no part of the object; its joint is in the object
 or right above it, so that the link overlaps the object before it closes; the other finger is closed
 in its way."""
+
+
+AROUND = 5
+"""Neighbouring vertices that are looked at where a finger closes."""
+LEVEL = 1e-12
+"""How far below a joint the object is still level with it, over the link's length."""
 
 
 class Closed(NamedTuple):
@@ -56,33 +63,43 @@ def contact_table(scene: Scene) -> tuple[Contact, ...]:
 
 
 @lru_cache(maxsize=8)
-def full_formation(scene: Scene) -> Formation:
-    """All contacts of `contact_table`, to evaluate the rows of many formations in one go."""
-    return Formation(scene, contact_table(scene))
+def _single_contacts(scene: Scene) -> dict[int, Formation]:
+    """Formations of one contact each, as they are made, by their index into `contact_table`."""
+    return {}
+
+
+def evaluate_contacts(scene: Scene, label: Sequence[int], z: Array) -> Kinematics:
+    """Rows of some contacts of `contact_table` at n configurations, with A' v for z as velocity.
+
+    Many formations have few contacts in common, but each contact is in many of them.
+    """
+    single, parts = _single_contacts(scene), []
+    for index in label:
+        if index not in single:
+            single[index] = Formation(scene, (contact_table(scene)[index],))
+        parts.append(single[index].evaluate(z, z))
+    return Kinematics(*(np.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
 
 
 def first_contact(scene: Scene, finger: int) -> int:
     """Index into `contact_table` of a finger's first contact."""
-    count = scene.polygon.n_vertices
-    return count if finger == 0 else count + len(candidate_contacts(scene, 0))
+    # Sides and edges of finger 1, and the arc of its tip where that is rounded.
+    kinds = 0 if finger == 0 else 3 if scene.fingers[0].radius > 0 else 2
+    return (1 + kinds) * scene.polygon.n_vertices
 
 
-def place_corners(scene: Scene, x: Array, y: Array, phi: Array) -> Array:
-    """World positions of the vertices at n poses, shape (n, n_v, 2) [m]."""
+def place_corners(scene: Scene, x: Array, y: Array, phi: Array, vertices: Numbers) -> Array:
+    """World positions of some vertices, shape (m,) or (n, m), at n poses, (n, m, 2) [m]."""
     c, s = np.cos(phi)[:, None], np.sin(phi)[:, None]
-    body = scene.polygon.vertices
-    return np.stack(
-        [
-            x[:, None] + c * body[:, 0] - s * body[:, 1],
-            y[:, None] + s * body[:, 0] + c * body[:, 1],
-        ],
-        axis=2,
-    )
+    body = scene.polygon.vertices[vertices]
+    across, up = body[..., 0], body[..., 1]
+    return np.stack([x[:, None] + c * across - s * up, y[:, None] + s * across + c * up], axis=2)
 
 
 def lower(scene: Scene, phi: Array) -> tuple[Array, Numbers]:
     """Height [m] of the centroid at which the object touches the palm, and the vertex that does."""
     body = scene.polygon.vertices
+    # Products of matrices would depend, in the last bit, on how many poses there are.
     heights = np.sin(phi)[:, None] * body[:, 0] + np.cos(phi)[:, None] * body[:, 1]
     vertex = heights.argmin(axis=1)
     return -heights.min(axis=1), vertex
@@ -91,12 +108,11 @@ def lower(scene: Scene, phi: Array) -> tuple[Array, Numbers]:
 def close_fingers(scene: Scene, x: Array, phi: Array) -> Closed:
     """Lower the object and close both fingers at n poses, `x` [m] and `phi` [rad] of shape (n,)."""
     y, _ = lower(scene, phi)
-    corners = place_corners(scene, x, y, phi)
     z = np.column_stack([x, y, phi, np.empty((len(x), 2))])
     touched = np.empty((len(x), 2), dtype=np.int64)
     obstacle = np.zeros((len(x), 2), dtype=np.int64)
-    for finger, link in enumerate(scene.fingers):
-        angle, feature, obstacle[:, finger] = _close_finger(link, finger, corners)
+    for finger in range(2):
+        angle, feature, obstacle[:, finger] = _close_finger(scene, finger, x, y, phi)
         closed = obstacle[:, finger] == 0
         z[:, 3 + finger] = np.where(closed, angle, np.nan)
         touched[:, finger] = np.where(closed, first_contact(scene, finger) + feature, -1)
@@ -133,8 +149,7 @@ def close_finger(scene: Scene, q: Array, finger: int) -> float:
         If the finger reaches no part of the object, or its joint is in the object or too near.
     """
     link = scene.fingers[finger]
-    corners = place_corners(scene, *np.asarray(q)[:3, None])
-    angle, _, (obstacle,) = _close_finger(link, finger, corners)
+    angle, _, (obstacle,) = _close_finger(scene, finger, *np.asarray(q)[:3, None])
     if obstacle == JOINT_COVERED:
         where = "is inside the object or nearer to it than the link's radius, or right above it"
         raise InputError(
@@ -145,18 +160,108 @@ def close_finger(scene: Scene, q: Array, finger: int) -> float:
     return float(angle[0])
 
 
-def _close_finger(link: Finger, finger: int, corners: Array) -> tuple[Array, Numbers, Numbers]:
+def _close_finger(
+    scene: Scene, finger: int, x: Array, y: Array, phi: Array
+) -> tuple[Array, Numbers, Numbers]:
     """Angle and first feature (side, edge, arc in the order of candidates) of a closing finger.
 
-    And 0, or why it cannot close; `corners` as of `place_corners`.
+    And 0, or why it cannot close, for n poses of the object.
     """
-    corners = corners - np.asarray(link.base)
+    link, count = scene.fingers[finger], scene.polygon.n_vertices
+    angle, feature = np.empty(len(x)), np.empty(len(x), dtype=np.int64)
+    obstacle = np.zeros(len(x), dtype=np.int64)
+    first, clear = find_nearby(scene, finger, x, y, phi)
+    for mine, size in ((clear, min(AROUND, count)), (~clear, count)):
+        if not mine.any():
+            continue
+        vertices = (first[mine, None] + np.arange(size + 1)) % count
+        corners = place_corners(scene, x[mine], y[mine], phi[mine], vertices)
+        corners -= np.asarray(link.base)
+        least, found = _touch(link, finger, corners)
+        reached = found >= 0
+        kind, place = np.divmod(found, size)
+        own = kind * count + vertices[np.arange(len(place)), place]
+        feature[mine], angle[mine] = np.where(reached, own, -1), least
+        covered = np.zeros(len(least), dtype=bool)
+        if size == count:
+            around = corners[:, :-1]
+            covered = (_distance(around) <= link.radius) | _hangs_into(link, around)
+        obstacle[mine] = np.where(covered, JOINT_COVERED, np.where(reached, 0, TOO_SHORT))
+    return angle, feature, obstacle
+
+
+def find_nearby(scene: Scene, finger: int, x: Array, y: Array, phi: Array) -> tuple[Numbers, Flags]:
+    """Where on the object a closing finger may touch it first, for n poses.
+
+    The edges on whose outer side the joint is are a chain. A link that is long enough touches the
+    vertex at the end of the chain that it comes to first. A shorter one touches with its tip:
+    distances from the joint fall along the chain up to the nearest place and rise from there, so
+    it is where they first fall to its length.
+
+    Returns
+    -------
+    first : ndarray of int, shape (n,)
+        First of `AROUND` neighbouring vertices, one of which it is or is next to.
+    clear : ndarray of bool, shape (n,)
+        Whether this holds: the joint is outside of the object and not above any of it.
+    """
+    link, polygon = scene.fingers[finger], scene.polygon
+    body, count, radius = polygon.vertices, polygon.n_vertices, link.radius
+    run = np.roll(body, -1, axis=0) - body
+    size = np.hypot(run[:, 0], run[:, 1])
+    along = run / size[:, None]
+    outward = np.column_stack([along[:, 1], -along[:, 0]])
+    c, s = np.cos(phi), np.sin(phi)
+    across, up = np.asarray(link.base)
+    dx, dy = across - x, up - y
+    joint = np.column_stack([c * dx + s * dy, c * dy - s * dx])
+    height = joint @ outward.T - (outward * body).sum(axis=1)
+    seen = height > radius
+    lowest = (np.column_stack([s, c]) @ body.T).min(axis=1) - dy
+    clear = seen.any(axis=1) & (lowest > -LEVEL * link.length) & (link.length > radius)
+    # Finger 1 comes to the end of the chain, finger 2 to its start.
+    onwards = -1 if finger == 0 else 1
+    last = (seen & ~np.roll(seen, onwards, axis=1)).argmax(axis=1)
+    vertex = (last + (finger == 0)) % count
+    away = np.hypot(*(joint - body[vertex]).T)
+    far = np.flatnonzero(clear & (away**2 - radius**2 > link.length**2))
+    if len(far):
+        away = np.hypot(*(joint[far, None] - body).transpose(2, 0, 1))
+        place = joint[far] @ along.T - (along * body).sum(axis=1)
+        height, least = height[far], away - radius
+        # From the ends of an edge, moved out by the radius, and from the edge between them.
+        start = away**2 + radius**2 - 2 * radius * height
+        stop = np.roll(away, -1, axis=1) ** 2 + radius**2 - 2 * radius * height
+        within = np.minimum(start, stop) <= link.length**2
+        within |= (place > 0) & (place < size) & (height - radius <= link.length)
+        corner = (place <= 0) & np.roll(place >= size, 1, axis=1)
+        corner &= least <= link.length
+        within = seen[far] & (within | corner | np.roll(corner, -1, axis=1))
+        vertex[far] = (within & ~np.roll(within, onwards, axis=1)).argmax(axis=1) + (finger == 0)
+    return (vertex - AROUND // 2) % count, clear
+
+
+def _touch(link: Finger, finger: int, corners: Array) -> tuple[Array, Numbers]:
+    """Angle at which a closing finger first touches a chain of corners, and with which feature.
+
+    Parameters
+    ----------
+    corners : ndarray, shape (n, m + 1, 2)
+        From the joint; the last one is the end of the last edge only.
+
+    Returns
+    -------
+    angle : ndarray, shape (n,)
+    feature : ndarray of int, shape (n,)
+        Of m sides, m edges and m arcs; -1 where it reaches none.
+    """
+    following, corners = corners[:, 1:], corners[:, :-1]
     sign = 1.0 if finger == 0 else -1.0
     outside = -np.pi / 2 if finger == 0 else np.pi + np.pi / 2
     length, radius = link.length, link.radius
     distance = np.hypot(corners[..., 0], corners[..., 1])
     bearing = np.arctan2(corners[..., 1], corners[..., 0])
-    along = np.roll(corners, -1, axis=1) - corners
+    along = following - corners
     size = np.hypot(along[..., 0], along[..., 1])
     along /= size[..., None]
     outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
@@ -186,9 +291,7 @@ def _close_finger(link: Finger, finger: int, corners: Array) -> tuple[Array, Num
     least = swept[np.arange(len(swept)), feature]
     reached = np.isfinite(least)
     angle = outside + sign * np.where(reached, least, 0.0)
-    covered = (_distance(corners) <= link.radius) | _hangs_into(link, corners)
-    obstacle = np.where(covered, JOINT_COVERED, np.where(reached, 0, TOO_SHORT))
-    return angle, np.where(reached, feature, -1), obstacle
+    return angle, np.where(reached, feature, -1)
 
 
 def _hangs_into(link: Finger, corners: Array) -> Flags:

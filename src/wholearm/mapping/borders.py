@@ -171,23 +171,23 @@ def flush_track(scene: Scene, finger: int, edge: int, vertex: int, places: Array
     first = first_contact(scene, finger)
 
     def pose(phi: Array) -> tuple[Array, Array]:
-        corners, m = _corners_at(scene, phi, vertex), _outward(scene, edge, phi)
+        (corner,), m = _corners_at(scene, phi, vertex, edge), _outward(scene, edge, phi)
         with np.errstate(divide="ignore", invalid="ignore"):
-            across = (link.radius - m[:, 1] * (base[1] - corners[:, edge, 1])) / m[:, 0]
-        return base[0] - corners[:, edge, 0] - across, phi
+            across = (link.radius - m[:, 1] * (base[1] - corner[:, 1])) / m[:, 0]
+        return base[0] - corner[:, 0] - across, phi
 
     def label(x: Array, phi: Array) -> Numbers:
-        corners, m = _corners_at(scene, phi, vertex), _outward(scene, edge, phi)
-        corners[..., 0] += x[:, None]
+        corners, m = _corners_at(scene, phi, vertex, near, far), _outward(scene, edge, phi)
+        corners[..., 0] += x
         sign = 1.0 if finger == 0 else -1.0
         axis = sign * np.column_stack([-m[:, 1], m[:, 0]])
-        runs = ((corners - base) * axis[:, None]).sum(axis=2)
+        near_run, far_run = ((corners - base) * axis).sum(axis=2)
         closed = close_fingers(scene, x, phi)
         labels = label_closed(closed, vertex)
-        within = (runs[:, near] > 0) & (runs[:, near] <= link.length)
+        within = (near_run > 0) & (near_run <= link.length)
         # The edge lies on the link up to its far vertex or up to the tip.
         on_tip = first + count + edge
-        reaches = runs[:, far] <= link.length
+        reaches = far_run <= link.length
         second = np.where(reaches, first + far, on_tip)
         pair = np.column_stack([np.full(len(x), first + near), second])
         pair[reaches] = [first + edge, first + after]
@@ -228,8 +228,10 @@ def _circle_track(
     distance = np.hypot(link.length, link.radius) if edge is None else link.length
 
     def centre(phi: Array) -> Array:
-        corners = _corners_at(scene, phi, vertex)[:, index]
-        return corners if edge is None else corners + link.radius * _outward(scene, edge, phi)
+        (corner,) = _corners_at(scene, phi, vertex, index)
+        if edge is None:
+            return np.asarray(corner)
+        return np.asarray(corner + link.radius * _outward(scene, edge, phi))
 
     def pose(phi: Array) -> tuple[Array, Array]:
         place = centre(phi)
@@ -246,11 +248,11 @@ def _circle_track(
         if edge is None:
             angle = angle - sign * np.arctan2(link.radius, link.length)
             inwards = sign * np.column_stack([-np.sin(angle), np.cos(angle)])
-            corners = _corners_at(scene, phi, vertex)
-            supported = (
-                ((corners - corners[:, [index]]) * inwards[:, None]).sum(axis=2)
-                > -LEVEL * scene.scales.length
-            ).all(axis=1)
+            # All vertices are on one side of a line through a vertex if its neighbours are.
+            neighbours = (index - 1) % count, (index + 1) % count
+            own, *others = _corners_at(scene, phi, vertex, index, *neighbours)
+            away = [((other - own) * inwards).sum(axis=1) for other in others]
+            supported = np.minimum(*away) > -LEVEL * scene.scales.length
             pair = np.broadcast_to([side, arc], (len(x), 2))
         else:
             axis = np.column_stack([np.cos(angle), np.sin(angle)])
@@ -274,11 +276,11 @@ def _circle_track(
     return Track(pose, label, places, LONGEST * scene.scales.length)
 
 
-def _corners_at(scene: Scene, phi: Array, vertex: int) -> Array:
-    """Vertices with `vertex` on the palm and the centroid at x = 0, shape (n, n_v, 2) [m]."""
+def _corners_at(scene: Scene, phi: Array, vertex: int, *wanted: int) -> Array:
+    """Wanted vertices with `vertex` on the palm and the centroid at x = 0, shape (m, n, 2) [m]."""
     body = scene.polygon.vertices[vertex]
     y = -(np.sin(phi) * body[0] + np.cos(phi) * body[1])
-    return place_corners(scene, np.zeros_like(phi), y, phi)
+    return place_corners(scene, 0 * phi, y, phi, np.array(wanted)).transpose(1, 0, 2)
 
 
 def _outward(scene: Scene, edge: int, phi: Array) -> Array:

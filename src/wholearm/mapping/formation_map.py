@@ -14,7 +14,14 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import InputError
 from ..common.sharing import exclusive
-from ..contacts.closing import Flags, Numbers, close_fingers, contact_table, full_formation, lower
+from ..contacts.closing import (
+    Flags,
+    Numbers,
+    close_fingers,
+    contact_table,
+    evaluate_contacts,
+    lower,
+)
 from ..contacts.elemental import Contact
 from ..problem.definition import Problem
 from ..scene.model import Scene
@@ -33,6 +40,8 @@ ARROWS = 24
 """Places across the map at which directions inside cells are checked."""
 BEYOND = np.radians(6.0)
 """Reach of the window beyond the flush angles next to the plan [rad]."""
+BESIDE = 0.25
+"""The same over half the distance of these angles, at most."""
 CROSSED = -5
 """Cell of the places where the closed fingers would overlap."""
 SAME_PLACE = 3e-5
@@ -233,9 +242,10 @@ def _cover_phases(problem: Problem) -> tuple[float, float]:
     around = Window((0.0, 0.0), (low - 2 * np.pi, high + 2 * np.pi)).flush_angles(problem.scene)
     flush = np.array([angle for angle, _ in around])
     # What is flush at an end of the plan is not yet the next edge.
-    low = float(flush[flush < low - 1e-6].max()) - BEYOND
-    high = float(flush[flush > high + 1e-6].min()) + BEYOND
-    return low, high
+    before, after = float(flush[flush < low - 1e-6].max()), float(flush[flush > high + 1e-6].min())
+    # The next edge but one is not of interest, however many there are.
+    beyond = min(BEYOND, BESIDE * (after - before) / 2)
+    return before - beyond, after + beyond
 
 
 def _label_grid(scene: Scene, x: Array, phi: Array) -> tuple[Numbers, Numbers]:
@@ -276,7 +286,8 @@ def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]
     ends = [(border, k) for border in borders for k in (0, -1)]
     points = np.array([border.points[k] for border, k in ends]).reshape(-1, 2)
     size = SAME_PLACE * np.array([scene.scales.length, 1.0])
-    full = full_formation(scene)
+    table = contact_table(scene)
+    place = {contact: k for k, contact in enumerate(table)}
     crossings, free = [], np.ones(len(points), dtype=bool)
     for k in range(len(points)):
         if not free[k]:
@@ -291,12 +302,9 @@ def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]
         z = border.z[end]
         # Borders also end where a finger's first touch jumps from one side of its joint to the
         # other; what they touch there is not touched at once.
-        gaps = np.abs(full.evaluate(z[None], z[None]).C[0])
-        contacts = tuple(
-            contact
-            for contact, gap in zip(full.contacts, gaps, strict=True)
-            if contact in met and gap < scene.touching
-        )
+        label = sorted(place[contact] for contact in met)
+        gaps = np.abs(evaluate_contacts(scene, label, z[None]).C[0])
+        contacts = tuple(table[k] for k in np.array(label)[gaps < scene.touching])
         if len(contacts) >= 5:
             edges = tuple(dict.fromkeys(b.flush for b in meeting if b.flush is not None))
             crossings.append(Crossing(points[k], z, contacts, edges))

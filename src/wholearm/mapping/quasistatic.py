@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..common.arrays import Array
-from ..contacts.closing import Flags, Numbers, full_formation
+from ..contacts.closing import Flags, Numbers, contact_table, evaluate_contacts
 from ..contacts.formation import Formation, Kinematics
 from ..mechanics.dynamics import Directions, force_rows, inverse, reduced_inertia
 from ..mechanics.metric import metric_weights
@@ -129,8 +129,7 @@ def _directions(kinematics: Kinematics, z_s: Array) -> Directions:
 
 
 def _pick(scene: Scene, label: Numbers, z: Array) -> tuple[Formation, Kinematics]:
-    """A formation and its rows at configurations `z`, from those of all contacts."""
-    full = full_formation(scene)
-    every = full.evaluate(z, z)
-    formation = Formation(scene, tuple(full.contacts[k] for k in label))
-    return formation, Kinematics(*(array[:, label] for array in every))
+    """A formation and its rows at configurations `z`, from those of its contacts."""
+    chosen = label.tolist()
+    formation = Formation(scene, tuple(contact_table(scene)[k] for k in chosen))
+    return formation, evaluate_contacts(scene, chosen, z)
