@@ -30,7 +30,7 @@ def test_rates_are_those_of_the_formations_own_rows(grips: Grips) -> None:
         packed[at.Xi], packed[at.sigma] = signs[:-2], signs[-2:]
         packed[at.piece], packed[at.torque] = (0.0, 2.0), [tau[0], 0.0, tau[1], 0.0]
         _, P, bend, A_t = mode.build_constraints(state[:5], state[5:10])
-        rates, least = shared[0].stage(state, 0.7, packed, P, bend, A_t)
+        rates, least = shared[0].stage(state[:10], 0.7, packed, P, bend, A_t)
         v = state[5:10]
         known = formation.evaluate(state[None, :5], v[None])
         turn = 1e-7 * v

@@ -29,18 +29,20 @@ def test_error_weights_cancel(weights: dict[int, float]) -> None:
 
 
 def test_order_on_a_known_solution() -> None:
-    y, t, h = ca.SX.sym("y", 2), ca.SX.sym("t"), ca.SX.sym("h")
+    """Two unknowns that move, and the integral of the rate of half the square of the first."""
+    y, t, h = ca.SX.sym("y", 3), ca.SX.sym("t"), ca.SX.sym("h")
 
     def rate(state: ca.SX, time: ca.SX) -> ca.SX:
-        return ca.vertcat(state[1], -state[0] * (1 + 0 * time)) * ca.cos(time)
+        assert state.shape == (2, 1)
+        return ca.vertcat(state[1], -state[0], state[0] * state[1]) * ca.cos(time)
 
-    step = ca.Function("step", [y, t, h], [runge_kutta.build_step(rate, y, t, h)[0]])
+    step = ca.Function("step", [y, t, h], [runge_kutta.build_step(rate, y, t, h, 2)[0]])
     errors = []
     for count in (8, 16):
-        state = np.array([0.0, 1.0])
+        state = np.array([0.0, 1.0, 0.0])
         for k in range(count):
             state = step(state, 3 * k / count, 3 / count).full()[:, 0]
-        exact = np.sin(np.sin(3.0)), np.cos(np.sin(3.0))
+        exact = np.sin(np.sin(3.0)), np.cos(np.sin(3.0)), np.sin(np.sin(3.0)) ** 2 / 2
         errors.append(np.abs(state - exact).max())
     assert np.log2(errors[0] / errors[1]) > 7.5
 
@@ -53,7 +55,7 @@ def test_rows_within_a_step_sum_to_nodes() -> None:
 def test_order_within_a_step_of_a_known_solution() -> None:
     """The error within one step of y' = y cos t falls with its length to the eighth power."""
     y, t, h = ca.SX.sym("y", 1), ca.SX.sym("t"), ca.SX.sym("h")
-    terms = runge_kutta.build_extension(lambda state, time: state * ca.cos(time), y, t, h)
+    terms = runge_kutta.build_extension(lambda state, time: state * ca.cos(time), y, t, h, 1)
     extend = ca.Function("extend", [y, t, h], [terms])
     x, errors = np.linspace(0.0, 1.0, 21), []
     for length in (1.0, 0.5):
@@ -67,7 +69,7 @@ def test_order_within_a_step_of_a_known_solution() -> None:
 
 def test_error_estimate_bounds_the_error() -> None:
     y, t, h = ca.SX.sym("y", 1), ca.SX.sym("t"), ca.SX.sym("h")
-    end, fifth, third = runge_kutta.build_step(lambda s, _: -s, y, t, h)
+    end, fifth, third = runge_kutta.build_step(lambda s, _: -s, y, t, h, 1)
     tolerance = 1e-6
     error = runge_kutta.build_error(fifth, third, y, 1.0, tolerance)
     step = ca.Function("step", [y, t, h], [end, error])

@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 STATE = 14
 """Length of the integrated vector: z, z', then work, viscous, dry and contact losses."""
+MOVING = 10
+"""Length of what the motion depends on: z, z'."""
 
 
 class Inputs(NamedTuple):

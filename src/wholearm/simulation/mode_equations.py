@@ -15,7 +15,7 @@ import numpy as np
 
 from ..common.arrays import Array, Expression
 from ..scene.model import Scene
-from .layout import STATE, Inputs, lay_out
+from .layout import MOVING, STATE, Inputs, lay_out
 from .modes import Grips, Mode
 from .runge_kutta import build_error
 from .tolerances import ROUNDING_FORCE, find_tolerances, measure_units
@@ -55,7 +55,8 @@ class Mechanics(NamedTuple):
     at : Inputs
         Layout of the packed inputs.
     stage : callable
-        (state, time, packed, rows) -> its rates, and the least that holds it in units of the scene.
+        (z and z', time, packed, rows) -> rates of the state, and the least that holds it in units
+        of the scene.
     report : callable
         (state, time, packed, rows) -> outputs up to the ratio, events before and after the limits,
         and the least of these events with their slacks.
@@ -118,15 +119,15 @@ class _Model:
                 np.full(2, tolerances.turning),
             ]
         )
-        inputs = [self.y, self.t, self.packed, *self.rows]
+        inputs = [self.t, self.packed, *self.rows]
         rates, c, v_t, tau, K, P = self._move()
         held = self._hold(c)
         least = ca.mmin(held / self.mode.force_limit_units)
         report = self._report(rates, c, v_t, tau, K, P, held, slack, stall)
         return Mechanics(
             self.at,
-            ca.Function("stage", inputs, [rates, least]),
-            ca.Function("report", inputs, report),
+            ca.Function("stage", [self.y[:MOVING], *inputs], [rates, least]),
+            ca.Function("report", [self.y, *inputs], report),
             self._build_correction(),
             self._build_error(),
             slack,
@@ -199,8 +200,8 @@ class _Model:
         return ca.Function("correct", [P, r], [ca.densify(lift @ ca.solve(P @ lift, r))])
 
     def _build_error(self) -> Expression:
-        fifth, third = ca.SX.sym("fifth", STATE), ca.SX.sym("third", STATE)
+        fifth, third = ca.SX.sym("fifth", MOVING), ca.SX.sym("third", MOVING)
         units = ca.DM(measure_units(self.mode.formation.scene))
-        start, tolerance = self.packed[self.at.y][:10], self.packed[self.at.tolerance]
-        error = build_error(fifth[:10], third[:10], start, units, tolerance)
+        start, tolerance = self.packed[self.at.y][:MOVING], self.packed[self.at.tolerance]
+        error = build_error(fifth, third, start, units, tolerance)
         return ca.Function("error", [fifth, third, self.packed], [error])

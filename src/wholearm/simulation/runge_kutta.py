@@ -143,33 +143,38 @@ def build_step(
     y: Expression,
     t: Expression,
     h: Expression,
+    moving: int,
 ) -> tuple[Expression, Expression, Expression]:
-    """One step of y' = rate(y, t), with its two error estimates.
+    """One step of y' = rate(y[:moving], t), with its two error estimates.
 
     Parameters
     ----------
     rate : callable
-        Right-hand side on expressions.
+        Right-hand side on expressions, shape (n,).
     y : expression, shape (n,)
     t, h : scalar expression, [s]
         Start and length of the step.
+    moving : int
+        The others are integrals along the motion of so many, which stages need not have.
 
     Returns
     -------
-    end, fifth, third : expression, shape (n,)
+    end, fifth, third : expression, shape (n,), (moving,) and (moving,)
         The state at t + h, and the errors of the embedded formulas of order 5 and 3.
     """
-    stages, last = _build_combinations(y.shape[0])
+    stages, last = _build_combinations(y.shape[0], moving)
     rates: list[Expression] = []
     for combine, row in zip(stages, ROWS, strict=True):
-        place = combine(y, t, h, *(rates[j] for j in row)) if row else (y, t)
+        place = combine(y, t, h, *(rates[j] for j in row)) if row else (y[:moving], t)
         rates.append(rate(*place))
     end, fifth, third = last(y, t, h, *rates)
     return end, fifth, third
 
 
 @lru_cache(maxsize=8)
-def _build_combinations(n: int, within: bool = False) -> tuple[list[Expression], Expression]:
+def _build_combinations(
+    n: int, moving: int, within: bool = False
+) -> tuple[list[Expression], Expression]:
     """CasADi functions of y, t, h and rates of stages, for states of length n.
 
     Those of the stages return where and when each one's rate is taken, from the rates that it
@@ -180,20 +185,20 @@ def _build_combinations(n: int, within: bool = False) -> tuple[list[Expression],
     y, t, h = ca.SX.sym("y", n), ca.SX.sym("t"), ca.SX.sym("h")
     rates = [ca.SX.sym(f"rate_{j}", n) for j in range(len(table))]
 
-    def combine(weights: dict[int, float]) -> Expression:
-        used = ca.horzcat(ca.SX(n, 0), *(rates[stage] for stage in weights))
+    def combine(weights: dict[int, float], count: int = n) -> Expression:
+        used = ca.horzcat(ca.SX(count, 0), *(rates[stage][:count] for stage in weights))
         return h * (used @ ca.DM(list(weights.values())))
 
-    stages = [
-        ca.Function("stage", [y, t, h, *(rates[j] for j in row)], [y + combine(row), t + node * h])
-        for node, row in zip(nodes, table, strict=False)
-    ]
+    stages = []
+    for node, row in zip(nodes, table, strict=False):
+        place = [y[:moving] + combine(row, moving), t + node * h]
+        stages.append(ca.Function("stage", [y, t, h, *(rates[j] for j in row)], place))
     if within:
         whole, first, last = combine(WEIGHTS), h * rates[0], h * rates[len(ROWS)]
         terms = [whole, first - whole, 2 * whole - (first + last), *map(combine, WITHIN)]
         ends = [ca.horzcat(*terms)]
     else:
-        ends = [y + combine(WEIGHTS), combine(ERROR_5), combine(ERROR_3)]
+        ends = [y + combine(WEIGHTS), combine(ERROR_5, moving), combine(ERROR_3, moving)]
     return stages, ca.Function("last", [y, t, h, *rates], ends)
 
 
@@ -202,18 +207,19 @@ def build_extension(
     y: Expression,
     t: Expression,
     h: Expression,
+    moving: int,
 ) -> Expression:
     """Terms of the continuous extension of a step, shape (n, 7), for `interpolate`.
 
     Parameters
     ----------
-    rate, y, t, h
+    rate, y, t, h, moving
         As of `build_step`.
     """
-    stages, last = _build_combinations(y.shape[0], within=True)
+    stages, last = _build_combinations(y.shape[0], moving, within=True)
     rates: list[Expression] = []
     for combine, row in zip(stages, (*ROWS, *WITHIN_ROWS), strict=True):
-        place = combine(y, t, h, *(rates[j] for j in row)) if row else (y, t)
+        place = combine(y, t, h, *(rates[j] for j in row)) if row else (y[:moving], t)
         rates.append(rate(*place))
     return last(y, t, h, *rates)
 

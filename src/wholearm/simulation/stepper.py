@@ -18,7 +18,7 @@ from ..common.batch import Batch
 from ..contacts.elemental import GapLimit, build_features, build_gap
 from ..contacts.formation import Formation
 from ..problem.definition import Until
-from .layout import STATE, EventRows, Inputs, Outputs, lay_out
+from .layout import MOVING, STATE, EventRows, Inputs, Outputs, lay_out
 from .mode_equations import Mechanics, share_mechanics
 from .modes import FREE, Grips, Mode
 from .runge_kutta import build_extension, build_step
@@ -54,7 +54,7 @@ class Compiled:
         """Terms of the continuous extensions of steps, shape (STATE, 7): of their packed inputs."""
         own = self.equations
         y, t, h = (own.packed[place] for place in (self.at.y, self.at.t, self.at.h))
-        terms = build_extension(own.rate, y, t, h)
+        terms = build_extension(own.rate, y, t, h, MOVING)
         return Batch(ca.Function("extend", [own.packed], [ca.densify(terms)]))
 
     @cached_property
@@ -187,7 +187,7 @@ def _compile(
     to = Outputs(*lay_out(STATE, 5, n_c, n_c, 2, 5, None, None, None, None, None, rows.size))
     slack = np.concatenate([mechanics.slack, np.full(limits, own.short), [0.0, mechanics.stall]])
     y, t, h = packed[at.y], packed[at.t], packed[at.h]
-    end, fifth, third = build_step(own.rate, y, t, h)
+    end, fifth, third = build_step(own.rate, y, t, h, MOVING)
     error = mechanics.error(fifth, third, packed)
     dip = ca.mmin(ca.vertcat(*own.forces))
     step = ca.Function("step", [packed], [own.report(own.project(end), t + h, error, dip)])
@@ -197,7 +197,7 @@ def _compile(
 
 def _build_stage(mode: Mode, mechanics: Mechanics) -> Expression:
     """CasADi function (state, time, packed) -> (its rates, the least that holds it)."""
-    state, time = ca.SX.sym("state", STATE), ca.SX.sym("time")
+    state, time = ca.SX.sym("state", MOVING), ca.SX.sym("time")
     packed = ca.SX.sym("packed", mechanics.at.size)
     _, *rows = mode.build_constraints(state[:5], state[5:10])
     return ca.Function("stage", [state, time, packed], mechanics.stage(state, time, packed, *rows))
