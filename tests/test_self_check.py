@@ -64,7 +64,7 @@ def test_a_phase_that_hardly_stops_is_found_by_where_the_next_one_ends() -> None
     assert isinstance(check.report, Report)
     first, *others = check.report.phases
     speed, least = 1e-3, Allowance(departure=1.0, rest_speed=1.0)
-    report = replace(check.report, phases=(replace(first, end_speed=speed), *others))
+    report = replace(check.report, phases=(first._replace(end_speed=speed), *others))
     left = check._replace(report=report)
     duration_row = np.array([1.0, 2.0 * least.departure * problem.scene.scales.length / speed])
     assert left.find_culprit(problem.scene.scales, least, duration_row) == 1
@@ -221,12 +221,12 @@ def test_a_contact_that_is_let_go_is_not_the_least() -> None:
     assert found is not None and phase.arrival is not None
     if abs(gone.time - phase.arrival) < 1e-6 * problem.scene.scales.time:
         assert found.least == min(others)
-    late = replace(gone, least=-1.0, time=phase.arrival)
-    early = replace(gone, least=-1.0, time=phase.arrival - 0.01)
+    late = gone._replace(least=-1.0, time=phase.arrival)
+    early = gone._replace(least=-1.0, time=phase.arrival - 0.01)
     kept = [margin for margin in phase.contacts if margin is not gone]
-    found = find_least_force(problem.scene, replace(phase, contacts=(*kept, late)))
+    found = find_least_force(problem.scene, phase._replace(contacts=(*kept, late)))
     assert found is not None and found.least == min(others)
-    assert find_least_force(problem.scene, replace(phase, contacts=(*kept, early))) is early
+    assert find_least_force(problem.scene, phase._replace(contacts=(*kept, early))) is early
 
 
 def test_without_a_replay() -> None:

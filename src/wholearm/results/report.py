@@ -10,8 +10,7 @@ from .narrow import Moved
 from .trajectory import Trajectory
 
 
-@dataclass(frozen=True)
-class ContactMargin:
+class ContactMargin(NamedTuple):
     """The least normal force of one contact in one phase.
 
     Attributes
@@ -31,16 +30,14 @@ class ContactMargin:
     margin: float
 
 
-@dataclass(frozen=True)
-class LeastImpulse:
+class LeastImpulse(NamedTuple):
     """The contact of the next phase with the least impulse in an impact, and that impulse [N s]."""
 
     contact: str
     impulse: float
 
 
-@dataclass(frozen=True)
-class SlipMargin:
+class SlipMargin(NamedTuple):
     """The least margin to slipping of one rolling contact in one phase.
 
     Attributes
@@ -57,8 +54,7 @@ class SlipMargin:
     time: float
 
 
-@dataclass(frozen=True)
-class FingerGap:
+class FingerGap(NamedTuple):
     """The least gap between the two links.
 
     Attributes
@@ -73,8 +69,7 @@ class FingerGap:
     time: float
 
 
-@dataclass(frozen=True)
-class Deviation:
+class Deviation(NamedTuple):
     """Largest difference between planned and simulated state.
 
     Attributes
@@ -92,8 +87,7 @@ class Deviation:
     time: float
 
 
-@dataclass(frozen=True)
-class PhaseReport:
+class PhaseReport(NamedTuple):
     """One phase of the replay.
 
     Attributes
@@ -135,8 +129,7 @@ class PhaseReport:
     deviation: Deviation | None
 
 
-@dataclass(frozen=True)
-class ModeChange:
+class ModeChange(NamedTuple):
     """A contact or joint that goes on in another mode while the rest moves.
 
     Attributes
@@ -155,8 +148,7 @@ class ModeChange:
     kind: str
 
 
-@dataclass(frozen=True)
-class ReducedState:
+class ReducedState(NamedTuple):
     """Phi_1 theta_1'' + Phi_2 theta_1' + Phi_3 = 0, the paper's Eqs. (10)-(16), at one instant.
 
     Attributes
@@ -196,8 +188,7 @@ class Failure(NamedTuple):
     text: str
 
 
-@dataclass(frozen=True)
-class EnergyBalance:
+class EnergyBalance(NamedTuple):
     """Energies of the whole replay [J]: work = kinetic + potential + losses + residual.
 
     Attributes
@@ -316,6 +307,8 @@ class Report:
 
 def _plain(value: Any) -> Any:
     """`value` with None for NaN and infinity and plain containers."""
+    if hasattr(value, "_asdict"):
+        value = value._asdict()
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

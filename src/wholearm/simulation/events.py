@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,8 +48,7 @@ class EventKind(Enum):
     """The torques end before the goal."""
 
 
-@dataclass(frozen=True)
-class Event:
+class Event(NamedTuple):
     """Something that happens at an instant.
 
     Attributes
@@ -88,8 +88,7 @@ class OutcomeKind(Enum):
     GOAL_MISSED = "goal missed"
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """How a simulation ended, with one sentence that says it."""
 
     kind: OutcomeKind

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,8 +17,7 @@ from .stepper import Stepper
 from .tolerances import REACHED, SLOW, is_slower
 
 
-@dataclass(frozen=True)
-class Arrival:
+class Arrival(NamedTuple):
     """The end of a phase is reached.
 
     Attributes
@@ -36,8 +35,7 @@ class Arrival:
     strikes: bool = False
 
 
-@dataclass(frozen=True)
-class Released:
+class Released(NamedTuple):
     """The contacts that the next phase does not have are let go.
 
     Attributes
@@ -49,8 +47,7 @@ class Released:
     c_n: float
 
 
-@dataclass(frozen=True)
-class Switched:
+class Switched(NamedTuple):
     """A contact comes to rest, or slips, as the next phase has it.
 
     Attributes

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +41,7 @@ _CLEAR = 1e3
 where changes are that close nothing is decided but by rounding."""
 
 
-@dataclass(frozen=True)
-class Collapse:
+class Collapse(NamedTuple):
     """No forces balance any more at `x` of a piece, and no way holds every contact.
 
     Attributes
