@@ -12,16 +12,14 @@ from wholearm.common.arrays import Array
 from wholearm.geometry.curve import find_tied, tangent_basis
 from wholearm.geometry.explore import close_contacts
 from wholearm.geometry.path_guess import list_ends
-from wholearm.mechanics.metric import measure_speed, metric_weights
+from wholearm.mechanics.metric import metric_weights
 from wholearm.planning.options import Objective, PlanOptions
-from wholearm.planning.stops import end_of
 from wholearm.planning.time_domain.attempts import Attempts
 from wholearm.planning.time_domain.equations import least_rates, least_senses
 from wholearm.planning.time_domain.gradual import find_modes, split_by_senses
 from wholearm.planning.time_domain.kernels import goal_kernel
 from wholearm.planning.time_domain.modes import merge, mode_of
 from wholearm.planning.time_domain.motion import make_motions
-from wholearm.planning.time_domain.plan import plan_phases
 from wholearm.planning.time_domain.search import Search, Solution
 from wholearm.problem.definition import Phase, Problem
 from wholearm.problem.read import build_problem, read_problem
@@ -108,20 +106,20 @@ def test_an_end_where_a_contact_changes_its_name_has_a_slope() -> None:
     assert slope > 0.1 * problem.scene.scales.length
 
 
-def test_the_largest_margin_may_end_where_the_least_time_does() -> None:
-    problem, phase, z = corner()
-    options = PlanOptions(time_intervals=6)
-    (quick,) = plan_phases(problem, [phase], z, options)
-    duration = 2 * quick.motion.duration
-    options = replace(options, objective=Objective.MARGIN)
-    given = (problem, [phase], z, options, duration)
-    (free,) = plan_phases(*given, fastest=[quick])
-    (plan,) = plan_phases(*given, fastest=[quick], pinned=True)
-    ends = [end_of(own)[0] for own in (quick, plan, free)]
-    assert measure_speed(problem.scene, ends[1] - ends[0]) < 1e-6 * problem.scene.scales.length
-    assert measure_speed(problem.scene, ends[2] - ends[0]) > 0.1 * problem.scene.scales.length
-    assert problem.epsilon < plan.value < free.value * (1 + 1e-6)
-    assert max(own.motion.duration for own in (plan, free)) < duration * (1 + 1e-6)
+def test_where_the_last_stage_stops_may_be_given() -> None:
+    """The largest margin ends elsewhere, but for that."""
+    search, found = begun()
+    quick = search.solve(found.stages)
+    times = 2 * sum(stage.guess.duration for stage in quick.stages)
+    slow = replace(search, goal=Objective.MARGIN, duration=times)
+    free = slow.solve(quick.stages)
+    last = replace(quick.stages[-1], stop=quick.end)
+    pinned = slow.solve([*quick.stages[:-1], last])
+    assert quick.success and free.success and pinned.success
+    assert np.abs(pinned.end - quick.end).max() < 1e-7 < 0.01 < np.abs(free.end - quick.end).max()
+    assert 0.0 < pinned.margin < free.margin + 1e-6
+    spent = [sum(own.guess.duration for own in found.stages) for found in (free, pinned)]
+    assert max(spent) < times * (1 + 1e-6)
 
 
 def test_the_second_contact_of_a_vertex_need_not_move() -> None:
