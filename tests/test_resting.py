@@ -3,13 +3,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from shipped import FOLDER
 from timed import landing, plan_landing
 from wholearm.common.errors import InfeasibleError
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.time_domain.own_units import in_own_units, scale_state
 from wholearm.planning.time_domain.plan import plan_phases
-from wholearm.planning.time_domain.resting import find_block, list_headings, list_ways
+from wholearm.planning.time_domain.resting import (
+    find_block,
+    list_headings,
+    list_ways,
+    pushes_one_way,
+)
+from wholearm.problem.read import build_problem, read_problem
 
 COARSE = PlanOptions(time_intervals=4)
 
@@ -79,3 +86,21 @@ def test_an_end_at_which_nothing_comes_to_rest_is_refused() -> None:
     formation = in_own_units(problem).phases[0].formation
     blocked = find_block(formation, z, 50.0, ends=True)
     assert blocked is not None and blocked.contact in formation.names and blocked.short > 1.0
+
+
+def test_one_contact_pushes_one_way_unless_the_centroid_passes_above_it() -> None:
+    """About the vertex that touches it is weight alone that turns, whatever friction does."""
+    table = dict(read_problem(str(FOLDER / "square.toml")).table)
+    phase = {"contacts": ["v0-palm"], "until": {"phi_deg": 5.0}}
+    problem = build_problem({**table, "phases": [phase]})
+    vertex = problem.scene.polygon.vertices[0]
+    upright = -np.pi / 2 - np.arctan2(vertex[1], vertex[0])
+    for turns, one_way in (([0.1, 0.11], True), ([0.1, 0.0], False), ([0.1, -0.1], False)):
+        z = np.repeat(problem.start[None], len(turns), axis=0)
+        z[:, 2] = upright + np.array(turns)
+        for friction in (0.1, 1.0):
+            formation = problem.with_(friction=friction).phases[0].formation
+            assert pushes_one_way(formation, z) == one_way
+    with pytest.raises(InfeasibleError, match="v0-palm can only push the object one way"):
+        plan_phases(problem, problem.phases, problem.start, COARSE, explained=False)
+    assert not pushes_one_way(landing().phases[0].formation, landing().start[None])

@@ -74,6 +74,7 @@ def refuse(
         blocked = find_block(last.formation, last.guess.nodes[-1, 0], epsilon, ends=True)
         say = "at its end, {}, no motion comes to rest in any contact mode"
     if blocked is None:
+        _refuse_pushed(problem, phases[0], stages if alone else ())
         return
     where = describe_pose(to_si(stage, problem).guess.nodes[node, 0])
     text = f"phase {phase.number} is infeasible: {say.format(where)}"
@@ -97,6 +98,22 @@ def refuse(
         return _unit_of(parameter, problem.scene.scales) * value if value else None
 
     raise _advise(problem, phase, text, find_value, replan, shortfalls)
+
+
+def _refuse_pushed(problem: Problem, phase: Phase, stages: Sequence[Stage]) -> None:
+    """Raise an error if what touches pushes the object one way, all along the guess to its end."""
+    from .resting import pushes_one_way
+
+    if not stages or stages[0].formation.n_constraints > 2:
+        return
+    z = np.concatenate([stage.guess.z.reshape(-1, 5) for stage in stages])
+    if pushes_one_way(stages[0].formation, z):
+        names = " ".join(stages[0].formation.names)
+        where = describe_pose(to_si(stages[-1], problem).guess.nodes[-1, 0])
+        raise InfeasibleError(
+            f"phase {phase.number} is infeasible: {names} can only push the object one way, with "
+            f"whatever friction, so that it does not come to rest at its end, {where}"
+        )
 
 
 def explain(

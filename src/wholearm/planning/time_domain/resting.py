@@ -26,6 +26,8 @@ MOVES = 1e-5
 """Least sum of accelerations, over the scene's own, that counts as a motion."""
 BEGINS = 0.3
 """Sum of accelerations with which a motion sets out, over the scene's own."""
+PUSHES = 1e-3
+"""Part of contact forces along one direction, of all, that surely sets the object in motion."""
 _SAME = 1e-9
 """Difference of two forces, over the scene's own, below which they are those of one motion."""
 _STILL = 1e-9
@@ -97,6 +99,26 @@ def find_change(
     if not values:
         return None
     return max(values) if finger is None else min(values)
+
+
+def pushes_one_way(formation: Formation, z: Array) -> bool:
+    """Whether contacts push the object one way at all of `z`, shape (n, 5): it stays in motion.
+
+    That is so if a direction w has w^T f > 0 for all forces f on the edges of all friction cones,
+    and w^T g >= 0: then w^T M q' only grows.
+    """
+    from scipy.optimize import linprog
+
+    kinematics, mu = formation.evaluate(z, np.zeros_like(z)), formation.friction[:, None]
+    edges = [kinematics.A + side * mu * kinematics.A_t for side in (-1.0, 1.0)]
+    forces = np.concatenate(edges, axis=1)[..., :3].reshape(-1, 3)
+    rows = np.column_stack([-forces, np.ones(len(forces))])
+    gravity = np.append(-formation.scene.applied_force[:3], 0.0)
+    bounds = [(-1.0, 1.0)] * 3 + [(0.0, 1.0)]
+    answer = linprog(
+        [0, 0, 0, -1], np.vstack([rows, gravity]), np.zeros(len(rows) + 1), bounds=bounds
+    )
+    return bool(answer.status == 0 and answer.x[-1] > PUSHES)
 
 
 def list_headings(formation: Formation, z: Array, epsilon: float) -> list[Array]:
