@@ -20,12 +20,13 @@ from wholearm.planning.time_domain.gradual import find_modes, split_by_senses
 from wholearm.planning.time_domain.kernels import goal_kernel
 from wholearm.planning.time_domain.modes import merge, mode_of
 from wholearm.planning.time_domain.motion import make_motions
+from wholearm.planning.time_domain.nlp import bound_unknowns
 from wholearm.planning.time_domain.search import Search, Solution
 from wholearm.problem.definition import Phase, Problem
 from wholearm.problem.read import build_problem, read_problem
 
 
-def with_phase(name: str, contacts: str, until: str) -> tuple[Problem, Phase]:
+def with_phase(name: str, contacts: str, until: object) -> tuple[Problem, Phase]:
     """A shipped problem with another last phase."""
     table = dict(read_problem(str(FOLDER / f"{name}.toml")).table)
     phases = [table["phases"][0], {"contacts": contacts.split(), "until": until}]
@@ -130,3 +131,20 @@ def test_the_second_contact_of_a_vertex_need_not_move() -> None:
     assert least.shape == (9, 5) and (least[:, 1] == 0.0).all()
     assert (least[:, [0, 2, 3, 4]] == least_rates(found.stages[0], places)[:, None]).all()
     assert least[:, 0].min() > 0.0
+
+
+def test_what_ends_a_phase_is_not_reached_before() -> None:
+    """A motion that first passes its end would be over there."""
+    problem, phase = with_phase("triangle", "v1-palm v1-finger1 v0-finger2", {"phi_deg": -12.0})
+    search = Search.of(problem, PlanOptions())
+    (stage,) = Attempts(problem, [phase], corner()[2], search, None, True).first.stages
+    row, value, side = 2, np.radians(-12.0), -1.0
+    assert stage.ahead is not None
+    assert np.array(stage.ahead) == pytest.approx([row, value, side])
+    nlp = search.build([stage])
+    (low, high), layout = bound_unknowns(nlp, [stage], search.scheme), nlp.layouts[0]
+    least = low[layout.z[..., row]].ravel()
+    assert (np.diff(least[:-1]) <= 0).all() and (least[:-1] > value).all()
+    assert np.isinf(least[-1]) and np.isinf(high[layout.z[..., row]]).all()
+    # Other phases end by contacts alone.
+    assert all(own.ahead is None for own in begun()[1].stages)

@@ -49,6 +49,9 @@ SHORTEST = 1e-6
 """Least duration of an interval, in the scene's unit: next to nothing, and not nothing."""
 _HURRY = 3e-4
 """Weight of time against shortfalls: keeps a motion that is short of something brisk."""
+CLEAR = 1e-3
+"""Distance that a coordinate keeps in the scene's unit from the value that ends a phase; towards
+the end it is less, as where things come to rest."""
 LONGEST = 120.0
 """Most processor time of one run of the solver [s]: iterations need not end by themselves."""
 NEAR, FAR = 1e-6, 1e-2
@@ -182,6 +185,22 @@ def bound_unknowns(nlp: TimeNLP, stages: Sequence[Stage], scheme: Scheme) -> tup
             else:
                 high[own] = -one_way
         bound_by_limits(nlp.rows_of[k].limits, layout, (low, high))
+        _stay_short(stage, layout, scheme, (low, high))
         if coming is not None and stage.ends_in_impact:
             low[layout.impulses[: coming.formation.n_contacts]] = 0.0
     return low, high
+
+
+def _stay_short(
+    stage: Stage, layout: StageLayout, scheme: Scheme, bounds: tuple[Array, Array]
+) -> None:
+    """Keep a coordinate, in place, from the value with which the phase would end too early."""
+    if stage.ahead is None:
+        return
+    row, value, side = stage.ahead
+    left = 1.0 - stage.guess.places(scheme.points) * (stage.until is not None)
+    most = value - side * CLEAR * np.minimum(1.0, (2 * left) ** 2)
+    # Where the phase ends an equation says so.
+    if stage.until is not None and scheme.ends:
+        most[-1, -1] = side * np.inf
+    bounds[int(side > 0)][layout.z[..., row]] = most

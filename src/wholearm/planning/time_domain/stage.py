@@ -90,6 +90,9 @@ class Stage:
         Monitored limits that are as clear at the end: what comes next ends by closing them.
     adapts : float
         What it costs to change the duration of an interval; nothing if they keep their shares.
+    ahead : (int, float, float) or None
+        Row of z, the value that it has where the phase ends, and from which side it comes there:
+        reached before, that would be the end.
     stop : ndarray or None, shape (5,)
         Where the last stage ends, if that is given: with two freedoms its end leaves one open.
     onset : float
@@ -112,6 +115,7 @@ class Stage:
     clearance: float = CLEARANCE
     apart: tuple[int, ...] = ()
     adapts: float = 0.0
+    ahead: tuple[int, float, float] | None = None
     stop: Array | None = None
     onset: float = 0.0
 

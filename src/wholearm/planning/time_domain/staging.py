@@ -78,9 +78,21 @@ def guess_stages(
                 monitored=tuple(sorted({*_choose_monitored(phase, outline), *released})),
                 released=released,
                 opens=opens,
+                ahead=_look_ahead(phase, parts),
             )
         )
     return link(stages)
+
+
+def _look_ahead(
+    phase: Phase, parts: Sequence[tuple[Phase, PathGuess, bool]]
+) -> tuple[int, float, float] | None:
+    """The coordinate with whose value a phase ends, if that is its end."""
+    if phase.until.value is None:
+        return None
+    row, value = 0 if phase.until.coordinate == "x" else 2, phase.until.value
+    start = next(outline.z[0, row] for own, outline, _ in parts if own is phase)
+    return row, value, 1.0 if value > start else -1.0
 
 
 def _list_parts(
