@@ -18,7 +18,7 @@ from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.simulate import simulate
-from wholearm.verification.verify import verify
+from wholearm.verification.verify import choose_times, verify
 
 
 def brake_less(starts: Array, c: Array) -> Array:
@@ -42,6 +42,22 @@ def test_a_good_plan_passes() -> None:
             # The interpolated torques are good to about 1e-11.
             assert deviation.position < 1e-9 and deviation.angle < 1e-9
     assert report.energy.relative < 1e-9
+
+
+def test_every_piece_of_the_torques_and_both_ends_of_phases_are_looked_at() -> None:
+    _, trajectory = plan()
+    times = np.sort(choose_times(trajectory.torque, trajectory))
+    for start, stop in pairwise(trajectory.torque.breaks):
+        assert ((times > start) & (times < stop)).any()
+    assert np.isin(trajectory.phase_starts[:-1], times).all()
+    assert np.isin(trajectory.t[-1], times)
+
+
+def test_the_start_is_recorded_once_though_it_is_looked_at() -> None:
+    problem, trajectory = plan()
+    bare = simulate(problem, trajectory.torque)
+    looked = simulate(problem, trajectory.torque, times=[0.0])
+    assert np.array_equal(looked.t, bare.t)
 
 
 def test_least_forces_are_those_of_inverse_dynamics() -> None:
