@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from .rows import Rows
+from .rows import Extreme, Rows
 from .sweep import Mode, Sweep
 from .way import Grid, Way
 
@@ -57,15 +57,13 @@ class Costate(NamedTuple):
 def find_costate(way: Way, grid: Grid, left: Rows, right: Rows, found: Sweep) -> Costate:
     """The costate of a motion, from the limits at the left and right ends of intervals."""
     b, modes = found.b, found.modes.copy()
-    with np.errstate(divide="ignore", invalid="ignore"):
-        sides = [
-            [rows.extreme(own, largest) for largest in (True, False)]
-            for rows, own in ((left, b[:-1]), (right, b[1:]))
-        ]
+    pushes, brakes = (
+        (left.extreme(b[:-1], largest), right.extreme(b[1:], largest)) for largest in (True, False)
+    )
     y = np.zeros((len(modes), 2))
     for k in np.flatnonzero(modes == Mode.SWITCH).tolist():
-        pushed, braked = sides[0][0][0][k], sides[1][1][0][k]
-        turn = _find_turn(left, right, int(sides[1][1][2][k]), k)
+        pushed, braked = float(pushes[0].a[k]), float(brakes[1].a[k])
+        turn = _find_turn(left, right, int(brakes[1].row[k]), k)
         if turn is not None:
             low, high = min(k, turn[0]), max(k, turn[0])
             modes[low : high + 1] = Mode.PUSH
@@ -73,8 +71,9 @@ def find_costate(way: Way, grid: Grid, left: Rows, right: Rows, found: Sweep) ->
             modes[turn[0]] = Mode.SWITCH
         index = k if turn is None else turn[0]
         y[index] = _switch(way, grid, left, right, b, (pushed, braked), index, turn)
-    rates, forces = _linearise(way, grid, b, modes, sides)
-    _integrate(way, grid, modes, rates, forces, (sides[0][0][0][0], sides[1][1][0][-1]), y)
+    rates, forces = _linearise(way, grid, b, modes, pushes, brakes)
+    ends = float(pushes[0].a[0]), float(brakes[1].a[-1])
+    _integrate(way, grid, modes, rates, forces, ends, y)
     slopes = np.where((modes == Mode.HELD)[:, None], 0.0, forces + rates * y)
     # At rest only the value is known.
     secant = np.diff(y, axis=1)[:, 0] / np.diff(grid.angles)
@@ -118,19 +117,20 @@ def _switch(
     return np.asarray(rate * np.array([x, x - h]) * np.sin(grid.angles[k : k + 2]))
 
 
-_Sides = list[list[tuple[Array, Array, NDArray[np.int64]]]]
-
-
 def _linearise(
-    way: Way, grid: Grid, b: Array, modes: NDArray[np.int64], sides: _Sides
+    way: Way,
+    grid: Grid,
+    b: Array,
+    modes: NDArray[np.int64],
+    pushes: tuple[Extreme, Extreme],
+    brakes: tuple[Extreme, Extreme],
 ) -> tuple[Array, Array]:
     """Rates and forces of dy/dangle = force + rate y at both ends of the intervals, (N, 2) each."""
-    pushes = np.column_stack([modes <= Mode.SWITCH, modes == Mode.PUSH])
-    brakes = np.column_stack([modes == Mode.BRAKE, (modes == Mode.BRAKE) | (modes == Mode.SWITCH)])
-    slope = np.zeros(pushes.shape)
-    for end, of_end in enumerate(sides):
-        for used, (_, of_b, _) in zip((pushes[:, end], brakes[:, end]), of_end, strict=True):
-            slope[used, end] = of_b[used]
+    slope, switches = np.zeros((len(modes), 2)), modes == Mode.SWITCH
+    for mode, extremes, switched in ((Mode.PUSH, pushes, 0), (Mode.BRAKE, brakes, 1)):
+        for end in range(2):
+            used = (modes == mode) | (switches if end == switched else False)
+            slope[used, end] = extremes[end].slope[used]
     angles = np.column_stack([grid.angles[:-1], grid.angles[1:]])
     speed = np.sqrt(np.column_stack([b[:-1], b[1:]]))
     inner = speed > 0

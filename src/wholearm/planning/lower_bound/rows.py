@@ -21,6 +21,14 @@ GIVE = 2.5e-7
 """By how much limits give way, over what is much for each: a plan may miss as much of them."""
 
 
+class Extreme(NamedTuple):
+    """The largest or the least a at n places, its slope da/db, and the row that sets it."""
+
+    a: Array
+    slope: Array
+    row: NDArray[np.int64]
+
+
 class Rows(NamedTuple):
     """Limits a_i a + b_i b + v_i v + one_i >= 0 and b <= cap at places of a curve.
 
@@ -42,8 +50,8 @@ class Rows(NamedTuple):
         b = b[..., None]
         return np.asarray(self.b * b + self.v * np.sqrt(b) + self.one)
 
-    def extreme(self, b: Array, largest: bool) -> tuple[Array, Array, NDArray[np.int64]]:
-        """The largest or least a at n places, its slope da/db, and the row that sets it."""
+    def extreme(self, b: Array, largest: bool) -> Extreme:
+        """The largest or least a at n places for some b, shape (n,)."""
         with np.errstate(divide="ignore", invalid="ignore"):
             bounds = -self.rest(b) / self.a
             if largest:
@@ -52,7 +60,7 @@ class Rows(NamedTuple):
                 row = np.where(self.a > 0, bounds, -np.inf).argmax(axis=1)
             k = np.arange(len(b))
             slope = -(self.b[k, row] + self.v[k, row] / (2 * np.sqrt(b))) / self.a[k, row]
-        return bounds[k, row], slope, row
+        return Extreme(bounds[k, row], slope, row)
 
     def highest(self) -> Array:
         """An upper bound of b at n places from the limits there, shape (n,)."""
