@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import casadi as ca
+import numpy as np
 
 from ..common.arrays import Expression
 from ..common.interrupts import check
@@ -120,7 +121,9 @@ class Solver:
         KeyboardInterrupt
             If a signal stopped the solver.
         """
-        result: dict[str, Expression] = self.function(**arguments)
+        # CasADi takes lists in three times as fast as arrays.
+        given = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in arguments.items()}
+        result: dict[str, Expression] = self.function(**given)
         stats = self.function.stats()
         # A solver that was stopped does not always say what it has done.
         cost = stats.get("iter_count", 0), stats.get("t_wall_total", 0.0)
