@@ -102,10 +102,13 @@ def test_solve_writes_the_plan(folder: Path, capsys: pytest.CaptureFixture[str])
     np.testing.assert_allclose(shown, plan.meta["phase_durations"], atol=5e-7)
     assert min(float(line.split()[2]) for line in lines[1:6]) == pytest.approx(0.05, abs=1e-5)
     assert max(float(line.split()[3]) for line in lines[1:6]) <= 2.0
-    assert lines[6].startswith("replayed: least c_n 0.0500")
+    assert lines[6].startswith("replayed: least c_n 0.0")
+    # A parabola through three instants may dip a little below what the plan keeps.
+    assert float(lines[6].split()[3]) > 0.0499
     assert lines[7].startswith("wrote a.csv: ") and " rows; its replay holds: phi = " in lines[7]
     took = f"{plan.duration:.6f} s"
-    assert lines[8] == f"solved: time = {took}, {took} in all; wrote a.npz"
+    error = f"{max(plan.meta['error'], 1e-9):.0e}"
+    assert lines[8] == f"solved: time = {took} (to {error}), {took} in all; wrote a.npz"
     assert main(["verify", str(HEPTAGON), "a.csv"]) == 0
     assert len(plan.t) == 5 * 21
     assert Path("a.csv").read_text().startswith("t,tau1,tau2\n0.0,")

@@ -66,13 +66,14 @@ def test_axes_are_logarithmic_with_names_and_units() -> None:
 
 def test_work_is_as_large_as_is_asked() -> None:
     table = dict(read_problem(str(HEPTAGON)).table)
-    for size in (10, 20):
+    # Five nodes for each element of four intervals.
+    for size, nodes in ((12, 15), (20, 25)):
         with record_runs() as runs:
             run_work(table, "intervals", "least time", size)
-        assert runs[0].unknowns == 3 * (size + 1) - 2
+        assert runs[0].unknowns == 3 * nodes - 2
     with record_runs() as runs:
         run_work(table, "intervals", "margin", 20)
-    assert max(run.unknowns for run in runs) > 3 * 21 - 2
+    assert max(run.unknowns for run in runs) > 3 * 25 - 2
     for size in (5, 6):
         run_work(table, "vertices", "reading", size)
 

@@ -19,7 +19,7 @@ from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.data import prepare
 from wholearm.planning.path_domain.explain import change_curve
 from wholearm.planning.path_domain.impact_sequence import make_sequence
-from wholearm.planning.path_domain.motion import make_grid
+from wholearm.planning.path_domain.mesh import Mesh
 from wholearm.planning.path_domain.plan import plan_curves, plan_path
 from wholearm.planning.path_domain.sequence_plan import plan_sequence
 from wholearm.planning.plan import solve
@@ -136,7 +136,7 @@ def relax_by_linear_program(curve: Curve, epsilon: float, name: str) -> float | 
 
     Then everything is linear in a, b and the squeeze at the nodes.
     """
-    data = prepare(curve, epsilon, make_grid(curve, INTERVALS), 1)
+    data = prepare(curve, epsilon, Mesh().make_grid(curve, INTERVALS // 4), 1)
     nodes, n_c = len(data.grid.s), 4
     forces, steps = data.nodes.forces, data.grid.steps
     assert not forces.Tv.any()

@@ -1,29 +1,30 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from scipy.integrate import quad, solve_ivp
+from scipy.integrate import quad
 
 from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve, Segment
-from wholearm.planning.path_domain.motion import (
-    Grid,
-    PathMotion,
+from wholearm.planning.path_domain.elements import (
+    DEGREE,
+    FROM_REST,
+    INSIDE,
+    TO_REST,
+    Elements,
     Profile,
-    arctanh_ratio,
-    cosh_ratio,
-    make_grid,
-    redistribute_nodes,
-    sinh_ratio,
+    find_basis,
+    lay_out,
 )
+from wholearm.planning.path_domain.mesh import Mesh
+from wholearm.planning.path_domain.motion import PathMotion
 
-SEEDS = range(6)
+SEEDS = range(4)
 
 
 def stub_curve(length: float, breaks: list[float]) -> Curve:
@@ -42,74 +43,72 @@ def random_motion(seed: int) -> PathMotion:
     rng = np.random.default_rng(seed)
     length, break_at = rng.uniform(0.02, 0.5), rng.uniform(0.2, 0.8)
     curve = stub_curve(length, [break_at * length])
-    grid = make_grid(curve, 24)
+    grid = Mesh().make_grid(curve, 6)
     x = grid.s / length
     waves = rng.uniform(-0.4, 0.4, 2)
     a = (1 - 2 * x) * (1 + waves[0] * np.sin(5 * x)) + 0.3 * waves[1] * grid.segment
-    a = rng.uniform(0.5, 20.0) * (a - np.dot(grid.steps, a[1:] + a[:-1]) / (2 * length))
-    b = np.concatenate([[0.0], np.cumsum(grid.steps * (a[1:] + a[:-1]))])
+    a = rng.uniform(0.5, 20.0) * (a - grid.integrate(a)[-1] / (2 * length))
+    b = grid.integrate(a)
     b[-1] = 0.0
     assert (b[1:-1] > 0).all()
     return PathMotion(curve, grid, Profile(a, b, rng.uniform(0, 1, len(a))))
 
 
+def acceleration(motion: PathMotion, element: int, s: Array) -> Array:
+    """S'' at places of an element, by an interpolation of its own."""
+    grid = motion.grid
+    start, stop = grid.edges[element]
+    share = np.clip((s - start) / (stop - start), 0.0, 1.0)
+    kind = int(grid.kinds[element])
+    y = {INSIDE: share, FROM_REST: np.sqrt(share), TO_REST: np.sqrt(1 - share)}[kind]
+    nodes = find_basis().y[kind]
+    own = motion.profile.a[element * (DEGREE + 1) : (element + 1) * (DEGREE + 1)]
+    return np.polyval(np.polyfit(nodes, own, DEGREE), y)
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_motion_integrates_its_acceleration(seed: int) -> None:
+    """S'' is that of the elements, s' its integral over time, and s that of s'."""
     motion = random_motion(seed)
-    grid, (a, _, _) = motion.grid, motion.profile
-    state = np.zeros(2)
-    for k in np.flatnonzero(grid.steps > 0):
-        slope = (a[k + 1] - a[k]) / grid.steps[k]
-
-        def rate(t: float, y: Array, k: int = int(k), slope: float = slope) -> list[float]:
-            return [y[1], a[k] + slope * (y[0] - grid.s[k])]
-
-        span = (motion.times[k], motion.times[k + 1])
-        inner = np.linspace(*span, 7)
-        result = solve_ivp(rate, span, state, t_eval=inner, method="DOP853", rtol=1e-13, atol=1e-16)
-        s, _, here = motion.locate(inner[1:-1])
-        # Each interval adds the integrator's 1e-13 relative.
-        length = motion.curve.length
-        np.testing.assert_allclose(s, result.y[0, 1:-1], rtol=0, atol=1e-12 * length)
-        speed = np.sqrt(motion.profile.b.max())
-        np.testing.assert_allclose(np.sqrt(here.b), result.y[1, 1:-1], rtol=0, atol=1e-11 * speed)
-        state = result.y[:, -1]
-    np.testing.assert_allclose(state, [motion.curve.length, 0.0], rtol=0, atol=1e-10)
+    length, nodes, weights = motion.curve.length, *np.polynomial.legendre.leggauss(20)
+    speed, place = 0.0, 0.0
+    for k in motion.grid.nonempty.tolist():
+        start, stop = motion.times[k], motion.times[k + 1]
+        t = start + (1 + nodes) / 2 * (stop - start)
+        s, _, here = motion.locate(t)
+        expected = acceleration(motion, k // (DEGREE + 1), s)
+        scale = np.abs(motion.profile.a).max()
+        np.testing.assert_allclose(here.a, expected, rtol=0, atol=1e-9 * scale)
+        place += (stop - start) / 2 * float(weights @ np.sqrt(here.b))
+        speed += (stop - start) / 2 * float(weights @ here.a)
+        assert place == pytest.approx(motion.grid.s[k + 1], abs=1e-10 * length)
+        top = math.sqrt(motion.profile.b.max())
+        assert speed == pytest.approx(math.sqrt(motion.profile.b[k + 1]), abs=1e-9 * top)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_duration_is_the_integral_of_slowness(seed: int) -> None:
+def test_b_between_nodes_is_the_integral_of_a(seed: int) -> None:
     motion = random_motion(seed)
-    grid, (a, b, _) = motion.grid, motion.profile
-    total = 0.0
-    for k in np.flatnonzero(grid.steps > 0):
-        h = grid.steps[k]
-
-        def slowness(run: float, k: int = int(k), h: float = h) -> float:
-            rise = (a[k + 1] - a[k]) / h
-            return 1 / math.sqrt(b[k] + run * (2 * a[k] + rise * run))
-
-        def from_end(run: float, k: int = int(k), h: float = h) -> float:
-            rise = (a[k + 1] - a[k]) / h
-            return 1 / math.sqrt(run * (-2 * a[k + 1] + rise * run))
-
-        # At rest the integrand is singular; run = u^2 removes that.
-        if b[k] == 0:
-            part = quad(lambda u: 2 * u * slowness(u * u), 0, math.sqrt(h), epsabs=0)[0]
-        elif b[k + 1] == 0:
-            part = quad(lambda u: 2 * u * from_end(u * u), 0, math.sqrt(h), epsabs=0)[0]
-        else:
-            part = quad(slowness, 0, h, epsabs=0)[0]
-        total += part
-        assert motion.times[k + 1] - motion.times[k] == pytest.approx(part, rel=1e-10)
-    assert motion.duration == pytest.approx(total, rel=1e-11)
+    grid, fractions = motion.grid, np.linspace(0.0, 1.0, 5)
+    b = Elements(grid, motion.profile).at(fractions).b.reshape(-1, 5)
+    for row, k in zip(b, grid.nonempty.tolist(), strict=True):
+        start, step = grid.s[k], grid.steps[k]
+        for fraction, value in zip(fractions[1:], row[1:], strict=True):
+            rise = quad(
+                lambda u, k=k, s=start, h=step * fraction: (
+                    2 * h * float(acceleration(motion, k // (DEGREE + 1), np.array(s + h * u)))
+                ),
+                0,
+                1,
+            )[0]
+            assert value - row[0] == pytest.approx(rise, abs=1e-7 * motion.profile.b.max())
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_profile_holds_the_derivatives_of_s(seed: int) -> None:
     motion = random_motion(seed)
     rng = np.random.default_rng(100 + seed)
-    k = rng.choice(np.flatnonzero(motion.grid.steps > 0), 40)
+    k = rng.choice(motion.grid.nonempty, 40)
     start, stop = motion.times[k], motion.times[k + 1]
     t = start + rng.uniform(0.2, 0.8, 40) * (stop - start)
     # Inside an interval s is smooth; the step trades 1e-16 / h^2 against h^2.
@@ -146,8 +145,8 @@ def test_rest_at_both_ends_and_beyond(seed: int) -> None:
 
 def test_interval_of_length_zero_takes_no_time_and_jumps() -> None:
     motion = random_motion(0)
-    (gap,) = np.flatnonzero(motion.grid.steps == 0)
-    assert motion.times[gap] == motion.times[gap + 1]
+    (gap,) = np.flatnonzero(np.diff(motion.grid.segment))
+    assert motion.grid.steps[gap] == 0.0 and motion.times[gap] == motion.times[gap + 1]
     instant = 1e-9 * motion.duration
     _, segment, here = motion.locate(motion.times[gap] + np.array([-instant, instant]))
     assert segment.tolist() == [0, 1]
@@ -156,96 +155,45 @@ def test_interval_of_length_zero_takes_no_time_and_jumps() -> None:
     np.testing.assert_allclose(here.squeeze, motion.profile.squeeze[[gap, gap + 1]], rtol=1e-5)
 
 
-def test_a_run_out_of_near_rest() -> None:
-    """Speed grows almost exponentially where a starts near zero; the time is known then."""
-    tiny, slope = 1e-9, 4.0
-    grid = Grid(np.array([0.0, 1.0]), np.zeros(2, dtype=np.int64))
-    a = np.array([tiny, tiny + slope])
-    motion = PathMotion(stub_curve(1.0, []), grid, Profile(a, np.array([0.0, a.sum()]), a))
-    # s'' = tiny + slope s from rest: s = tiny / slope (cosh(sqrt(slope) t) - 1).
-    exact = math.acosh(1 + slope / tiny) / math.sqrt(slope)
-    # artanh near 1 loses half the digits of the distance to 1.
-    assert motion.duration == pytest.approx(exact, rel=1e-6)
+def test_a_stall_is_seen() -> None:
+    """The speed all but vanishes in the middle of an element, though not at its nodes."""
+    edges = np.array([[0.0, 0.4], [0.4, 0.6], [0.6, 1.0]])
+    grid = lay_out(edges, np.zeros(3, dtype=np.int64), (True, True))
+    dip = np.where((grid.s >= 0.4) & (grid.s <= 0.6), 0.9, 0.0)
+    y = np.clip((grid.s - 0.4) / 0.2, 0.0, 1.0)
+    b = np.where(dip > 0, (y - 0.3) ** 2 + 1e-12, grid.s * (1 - grid.s))
+    a = np.where(dip > 0, (y - 0.3) / 0.2, 0.5 - grid.s)
+    smooth = np.where(dip > 0, 0.24, b)
+    stalled, moving = (
+        PathMotion(stub_curve(1.0, []), grid, Profile(own_a, own_b, own_a))
+        for own_a, own_b in ((a, b), (np.where(dip > 0, 0.0, a), smooth))
+    )
+    assert stalled.stalls and not moving.stalls
 
 
-SERIES: dict[Any, Callable[[int], float]] = {
-    sinh_ratio: lambda n: 1 / math.factorial(2 * n + 1),
-    cosh_ratio: lambda n: 1 / math.factorial(2 * n + 2),
-    arctanh_ratio: lambda n: 1 / (2 * n + 1),
-}
-
-
-@pytest.mark.parametrize("ratio", SERIES)
-def test_ratios_match_their_series(ratio: Any) -> None:
-    sizes = np.concatenate([[0.0], np.geomspace(1e-16, 0.4, 60), [1e-4, 1e-6]])
-    x = np.concatenate([sizes, -sizes])
-    expected = [math.fsum(SERIES[ratio](n) * v**n for n in range(60)) for v in x.tolist()]
-    np.testing.assert_allclose(ratio(x), expected, rtol=4e-15)
-
-
-def test_ratios_away_from_zero() -> None:
-    root = np.linspace(0.7, 6.0, 50)
-    np.testing.assert_allclose(sinh_ratio(root**2), np.sinh(root) / root, rtol=1e-14)
-    np.testing.assert_allclose(sinh_ratio(-(root**2)), np.sin(root) / root, atol=1e-15)
-    np.testing.assert_allclose(cosh_ratio(root**2), (np.cosh(root) - 1) / root**2, rtol=1e-14)
-    np.testing.assert_allclose(cosh_ratio(-(root**2)), (1 - np.cos(root)) / root**2, atol=1e-15)
-    np.testing.assert_allclose(arctanh_ratio(-(root**2)), np.arctan(root) / root, rtol=1e-14)
-    part = np.linspace(0.7, 0.9999, 50)
-    np.testing.assert_allclose(np.tanh(part * arctanh_ratio(part**2)), part, rtol=1e-13)
-
-
-@pytest.mark.parametrize("intervals", [10, 11, 37, 80, 801])
+@pytest.mark.parametrize("elements", [6, 7, 37])
 @pytest.mark.parametrize("breaks", [[], [0.4], [0.01, 0.02], [0.3, 0.300001, 0.9], [1 - 1e-6]])
-def test_grid_has_its_intervals_and_breaks(intervals: int, breaks: list[float]) -> None:
+def test_grid_has_its_elements_and_breaks(elements: int, breaks: list[float]) -> None:
     length = 0.037
     curve = stub_curve(length, [length * part for part in breaks])
-    grid = make_grid(curve, intervals)
-    assert len(grid.s) == len(grid.segment) == intervals + 1
+    switches = length * np.array([0.123, 0.777])
+    grid = Mesh(switches).make_grid(curve, elements)
+    assert len(grid.s) == len(grid.segment) == elements * (DEGREE + 1)
     assert grid.s[0] == 0.0 and grid.s[-1] == length
     assert (np.diff(grid.s) >= 0).all() and (np.diff(grid.segment) >= 0).all()
-    # Of length zero are exactly the intervals between segments, at exactly their ends.
-    np.testing.assert_array_equal(np.diff(grid.s) == 0, np.diff(grid.segment) == 1)
-    ends = [segment.stop for segment in curve.segments]
+    # Of length zero are exactly the intervals between elements.
+    gaps = np.flatnonzero(np.diff(grid.s) == 0)
+    np.testing.assert_array_equal(gaps, DEGREE + (DEGREE + 1) * np.arange(elements - 1))
+    assert set(switches) <= set(grid.edges[:, 0])
     for index, segment in enumerate(curve.segments):
         mine = grid.s[grid.segment == index]
-        assert len(mine) >= 2 and mine[0] == segment.start and mine[-1] == ends[index]
+        assert len(mine) >= 2 and mine[0] == segment.start and mine[-1] == segment.stop
+    assert grid.kinds.tolist() == [FROM_REST, *[INSIDE] * (elements - 2), TO_REST]
 
 
-def test_grid_is_fine_towards_the_ends() -> None:
-    steps = make_grid(stub_curve(1.0, []), 80).steps
+def test_grid_is_fine_towards_the_ends_or_where_it_is_asked_to_be() -> None:
+    grid = Mesh().make_grid(stub_curve(1.0, []), 20)
     # Even in the angle of s = (1 - cos) / 2.
-    expected = (np.cos(np.pi * np.arange(80) / 80) - np.cos(np.pi * np.arange(1, 81) / 80)) / 2
-    np.testing.assert_allclose(steps, expected, rtol=1e-12)
-
-
-def test_nodes_are_drawn_to_where_misses_are() -> None:
-    curve = stub_curve(1.0, [0.4])
-    grid = make_grid(curve, 60)
-    nonempty = np.flatnonzero(grid.steps > 0)
-    misses = np.zeros(len(nonempty))
-    middle = (grid.s[nonempty] + grid.s[nonempty + 1]) / 2
-    bad = np.abs(middle - 0.7) < 0.05
-    misses[bad] = 9.0
-    drawn = redistribute_nodes(grid, nonempty, misses)
-    np.testing.assert_array_equal(drawn.segment, grid.segment)
-    for segment in (0, 1):
-        mine = grid.segment == segment
-        assert drawn.s[mine][0] == grid.s[mine][0] and drawn.s[mine][-1] == grid.s[mine][-1]
-        assert (np.diff(drawn.s[mine]) > 0).all()
-    # A miss of 9 asks for three parts of such intervals; the other segment stays as it is.
-    first = grid.segment == 0
-    np.testing.assert_allclose(drawn.s[first], grid.s[first], rtol=0, atol=1e-15)
-    within = [int((np.abs(s - 0.7) < 0.05).sum()) for s in (grid.s, drawn.s)]
-    assert 1.5 * within[0] < within[1] <= 3 * within[0]
-
-
-def test_drawing_together_is_capped_and_leaves_even_misses_alone() -> None:
-    grid = make_grid(stub_curve(1.0, []), 40)
-    nonempty = np.arange(40)
-    even = redistribute_nodes(grid, nonempty, np.full(40, 7.0))
-    np.testing.assert_allclose(even.s, grid.s, rtol=0, atol=1e-15)
-    spike, beyond = np.zeros(40), np.zeros(40)
-    spike[20], beyond[20] = 16.0, 1e9
-    np.testing.assert_array_equal(
-        redistribute_nodes(grid, nonempty, spike).s, redistribute_nodes(grid, nonempty, beyond).s
-    )
+    np.testing.assert_allclose(grid.edges[:, 0], (1 - np.cos(np.pi * np.arange(20) / 20)) / 2)
+    weighted = Mesh(np.array([0.5]), np.array([1.0, 3.0])).make_grid(stub_curve(1.0, []), 20)
+    assert (weighted.edges[:, 1] <= 0.5).sum() == 5

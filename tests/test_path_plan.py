@@ -23,7 +23,7 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import inverse
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
 from wholearm.planning.options import Objective, PlanOptions
-from wholearm.planning.path_domain import plan as path_plan
+from wholearm.planning.path_domain import rounds
 from wholearm.planning.path_domain.impact_sequence import ImpactSequence, make_sequence
 from wholearm.planning.path_domain.motion import PathMotion, directions_of
 from wholearm.planning.path_domain.nlp import PathNLP, build_path_nlp
@@ -186,7 +186,11 @@ def test_fastest_motion_is_at_a_limit(curves: tuple[Curve, ...], phase: int) -> 
 @pytest.mark.parametrize("objective", ["effort", "margin"])
 @pytest.mark.parametrize("phase", [0, 2, 4])
 def test_other_objectives_converge(curves: tuple[Curve, ...], phase: int, objective: str) -> None:
-    coarse, fine = (plan(curves[phase], objective, intervals) for intervals in (80, 160))
+    duration = ALLOWED if objective == "margin" else None
+    coarse, fine = (
+        plan_path(curves[phase], EPSILON, PlanOptions(objective, accuracy=own), 1, duration)
+        for own in (1e-4, 1e-5)
+    )
     assert coarse.value == pytest.approx(fine.value, rel=3e-4 if objective == "effort" else 1e-3)
     better = fine.value - coarse.value
     assert (better if objective == "margin" else -better) > -1e-6
@@ -342,7 +346,7 @@ def test_shortfall_is_that_of_a_linear_program(
 ) -> None:
     problem = edited(**changes)
     with pytest.raises(InfeasibleError) as caught:
-        solve(problem, intervals=20)
+        solve(problem, intervals=40)
     message = str(caught.value)
     found = re.match(
         r"phase (\d) is infeasible: (.*?) is (\S+) N( m)? short at t = 0\.0000 s \(x = ", message
@@ -392,6 +396,6 @@ def test_a_stuck_solver_does_not_blame_the_limits(monkeypatch: pytest.MonkeyPatc
         nlp = build_path_nlp(shape, intervals, goal)
         return replace(nlp, solver=Stopped()) if goal is Objective.TIME else nlp
 
-    monkeypatch.setattr(path_plan, "build_path_nlp", build)
+    monkeypatch.setattr(rounds, "build_path_nlp", build)
     with pytest.raises(SolverError, match=r"Ipopt stopped with Max.* although limits can be kept"):
         Toy(constant(1.0, 0.0, 3.0)).plan(intervals=20)

@@ -120,9 +120,9 @@ def test_velocities_are_derivatives(plans: dict[str, Trajectory], objective: str
         )
         here = motion.evaluate(t)
         scale = np.abs(here.z_dot).max()
-        # Fourth order away from kinks of s'', second order across one.
+        # Fourth order away from steps of s'', first order across one.
         error = np.abs((4 * near - far) / 3 - here.z_dot).max(axis=1) / scale
-        assert np.median(error) < 1e-9 and error.max() < 1e-5
+        assert np.median(error) < 1e-9 and error.max() < 2e-4
         bend = (motion.evaluate(t + h).z_dot - motion.evaluate(t - h).z_dot) / (2 * h)
         error = np.abs(bend - here.z_ddot).max(axis=1) / np.abs(here.z_ddot).max()
         # First order across a step of s'' at a reversal.
@@ -182,8 +182,8 @@ def test_objectives_trade_against_each_other(plans: dict[str, Trajectory]) -> No
 def test_more_time_never_lowers_the_margin(heptagon: Problem, trajectory: Trajectory) -> None:
     least = trajectory.duration
     values = [
-        solve(heptagon, "margin", duration=part * least, intervals=20).meta["value"]
-        for part in (1.02, 1.3, 6.0)
+        solve(heptagon, "margin", duration=part * least, intervals=40).meta["value"]
+        for part in (1.02, 1.3, 3.0)
     ]
     assert (np.diff(values) >= -1e-5).all()
     assert values[0] >= heptagon.epsilon and values[-1] > values[0] + 0.1
@@ -220,13 +220,17 @@ def test_meta_says_how_it_was_made(
     meta = json.loads(json.dumps(dict(trajectory.meta)))
     assert meta == trajectory.meta
     assert (meta["status"], meta["objective"]) == ("solved", objective)
-    assert (meta["epsilon"], meta["intervals"]) == (0.05, 80)
+    assert (meta["epsilon"], meta["intervals"], meta["accuracy"]) == (0.05, None, 1e-4)
     assert meta["name"] == heptagon.name and meta["problem"] == heptagon.table
     assert meta["value_unit"] == {"time": "s", "effort": "(N m)^2 s", "margin": "N"}[objective]
     assert sum(meta["phase_durations"]) == pytest.approx(trajectory.duration, rel=1e-14)
-    assert all(len(meta[key]) == 5 for key in ("phase_values", "iterations", "solves"))
+    assert all(
+        len(meta[key]) == 5 for key in ("phase_values", "phase_errors", "iterations", "solves")
+    )
     combine = min if objective == "margin" else sum
     assert meta["value"] == pytest.approx(combine(meta["phase_values"]))
+    assert 0 <= min(meta["phase_errors"]) <= meta["error"] <= max(meta["phase_errors"])
+    assert meta["error"] < 1e-4
     assert {"trace", "build", "solve", "plan"} <= set(meta["timings"])
     assert all(seconds >= 0 for seconds in meta["timings"].values())
     assert {"wholearm", "casadi", "numpy", "python"} <= set(meta["versions"])
@@ -254,8 +258,9 @@ def test_plan_survives_its_file(trajectory: Trajectory, tmp_path: Any) -> None:
     assert loaded.meta == trajectory.meta
     t = np.random.default_rng(4).uniform(0, trajectory.duration, 200)
     np.testing.assert_array_equal(loaded.torque.at(t), trajectory.torque.at(t))
-    # Quintics over 1/200 of a phase; a kink of s'' inside one costs the most.
-    np.testing.assert_allclose(loaded.at(t).z, trajectory.at(t).z, rtol=0, atol=1e-7)
+    # Quintics over 1/200 of a phase; a step of s'' inside one costs the most, 200 rad/s^2 over 8
+    # times the square of 0.6 ms.
+    np.testing.assert_allclose(loaded.at(t).z, trajectory.at(t).z, rtol=0, atol=1e-5)
 
 
 def test_a_plan_says_how_it_was_discretised(trajectory: Trajectory) -> None:

@@ -165,7 +165,7 @@ def test_a_replay_that_jams_refines_the_phase(
     pieces = len(spoiled.build(spoiled.planning).torque.coefficients)
     monkeypatch.setattr(self_check, "inspect", jam(2, pieces + 1))
     planning, trajectory, _ = spoiled.run()
-    assert [block.finer for block in planning.blocks] == [0, 1, 0]
+    assert [block.finer > 0 for block in planning.blocks] == [False, True, False]
     assert verify(slide, trajectory).ok
     monkeypatch.setattr(self_check, "inspect", jam(2, 10**6))
     with pytest.raises(ReplayError, match=r"8 times the intervals: v1-palm jams in phase 2 at t"):

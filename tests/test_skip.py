@@ -10,7 +10,9 @@ from wholearm.benchmark import skip
 from wholearm.benchmark.alone import Cost, measure_alone
 from wholearm.benchmark.skip import Expense, Pair, format_pair, list_pairs, run_skip, spend
 
-INTERVALS, TIME_INTERVALS, POINTS, CONTACTS = 10, 4, 3, 4
+INTERVALS, TIME_INTERVALS, POINTS, CONTACTS = 12, 4, 3, 4
+NODES = 15
+"""Five for each element of four intervals."""
 ABSENT = ("friction of joints", "speed limits that never bind")
 """Parts that are coefficients and bounds, where they are."""
 
@@ -26,17 +28,17 @@ def pairs() -> dict[str, Pair]:
 def measure_rows(contacts: int, rolling: int) -> int:
     """Rows along a curve.
 
-    How the speed goes on, the acceleration at both ends, and at each node contact forces, both
-    sides of the cones of rolling contacts, and torques.
+    How the speed goes on, and at each node contact forces, both sides of the cones of rolling
+    contacts, and torques.
     """
-    return INTERVALS + 2 + (contacts + 2 * rolling + 2) * (INTERVALS + 1)
+    return NODES - 1 + (contacts + 2 * rolling + 2) * NODES
 
 
 @pytest.mark.parametrize("part", ["friction of contacts", *ABSENT])
 def test_friction_and_limits_are_free_along_curves(pairs: dict[str, Pair], part: str) -> None:
     pair = pairs[f"{part}, along curves"]
     # Speed, acceleration and squeeze at each node, but for the speed at both ends, where it is 0.
-    bare = (3 * (INTERVALS + 1) - 2, measure_rows(CONTACTS, 0))
+    bare = (3 * NODES - 2, measure_rows(CONTACTS, 0))
     assert spend(pair.without)[:2] == spend(pair.having)[:2] == bare
 
 
@@ -67,9 +69,9 @@ def test_phases_that_stop_are_problems_of_their_own(pairs: dict[str, Pair]) -> N
     stopped, joined = spend(pair.without), spend(pair.having)
     assert stopped.rows == measure_rows(CONTACTS, 0)
     # Both phases, an interval of no length between them, and no more: without the ends of one.
-    nodes = 2 * (INTERVALS + 1)
+    nodes = 2 * NODES
     assert joined.unknowns == 3 * nodes - 2
-    assert joined.rows == nodes - 1 + 2 + (CONTACTS + 2) * nodes
+    assert joined.rows == nodes - 1 + (CONTACTS + 2) * nodes
 
 
 def test_the_table_has_a_row_for_each_part(

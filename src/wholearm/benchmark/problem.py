@@ -15,9 +15,9 @@ from ..common.errors import WholearmError
 from ..common.files import make_folder
 from ..common.sharing import exclusive
 from ..geometry.tracing import trace_phases
-from ..planning.options import Objective, PlanOptions
+from ..planning.options import Objective
 from ..planning.path_domain.data import prepare
-from ..planning.path_domain.motion import make_grid
+from ..planning.path_domain.mesh import Mesh
 from ..planning.path_domain.nlp import build_path_nlp
 from ..planning.path_domain.terms import LimitShape
 from ..planning.plan import solve
@@ -105,8 +105,8 @@ def measure_parts(problem: Problem) -> list[Row]:
         timed("read", lambda: read_problem(problem.source))
     timed("trace", lambda: trace_phases(problem), forget)
     curve = trace_phases(problem)[0]
-    limits = prepare(curve, problem.epsilon, make_grid(curve, 20), 1).limits
-    shape, intervals = LimitShape.of(limits), PlanOptions().intervals
+    data = prepare(curve, problem.epsilon, Mesh().make_grid(curve, 10), 1)
+    shape, intervals = LimitShape.of(data.limits), len(data.grid.steps)
     timed("build the NLP", lambda: build_path_nlp(shape, intervals, Objective.TIME), forget)
     plan = timed("plan and sample (NLP built)", lambda: solve(problem))
     rows.append(Row("parts", "Ipopt alone", "", plan.timings.solve, None))

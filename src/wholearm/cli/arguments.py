@@ -17,7 +17,10 @@ def add_solve(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--objective", default="time", help="time, effort or margin (default: time)"
     )
-    parser.add_argument("--intervals", type=int, help="intervals of each phase's grid")
+    text = "relative error of the objective below which refining ends (1e-4)"
+    parser.add_argument("--accuracy", type=float, help=text)
+    text = "intervals of each phase along a curve, instead of as many as the accuracy needs"
+    parser.add_argument("--intervals", type=int, help=text)
     parser.add_argument("--duration", type=float, help="longest duration [s], for margin")
     parser.add_argument("--time-weight", type=float, help="weight of time [(N m)^2], for effort")
     parser.add_argument("--samples", type=int, help="rows per phase of the trajectory file")

@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     from ..results.replay_figures import ReplayFigures
 
 
+_LEAST_ERROR = 1e-9
+"""Least estimate of a relative error that is printed: limits are kept to more than that."""
+
+
 def summarise(plan: Plan, output: str, table: Mapping[str, Any] | None = None) -> str:
     """What has been planned, as text.
 
@@ -39,6 +43,7 @@ def summarise(plan: Plan, output: str, table: Mapping[str, Any] | None = None) -
     lines += [] if plan.certificate is None else _list_bounds(plan.certificate)
     lines += _list_table(table) if table is not None else []
     value = f"{plan.status.value}: {plan.options.goal.value} = {plan.value:.6f} {plan.unit}"
+    value += "" if math.isnan(plan.error) else f" (to {max(plan.error, _LEAST_ERROR):.0e})"
     return "\n".join([*lines, f"{value}, {plan.duration:.6f} s in all; wrote {output}"])
 
 

@@ -32,6 +32,8 @@ from .stops import Plans, end_of
 
 PLAIN = -1
 """Number of doublings that stands for as many intervals as at first, and no search for modes."""
+COARSE = 80
+"""Intervals along a curve that refining doubles where none are asked for."""
 FINEST = 64
 """Most intervals of a phase in the time domain that refining asks for."""
 AMPLE = 1.1
@@ -247,7 +249,8 @@ def _refine(options: PlanOptions, known: BlockPlan | None, finer: int) -> PlanOp
     wanted = options.time_intervals
     if known is not None and known.chain is None:
         wanted = min(known.intervals * 2 ** (finer - known.finer), FINEST)
-    return replace(options, intervals=options.intervals * 2**finer, time_intervals=wanted)
+    along = (options.intervals or COARSE) * 2**finer
+    return replace(options, intervals=along, time_intervals=wanted)
 
 
 def _plan_block(

@@ -29,6 +29,8 @@ CHOICES = tuple(
 )
 """Objectives that a user can ask for."""
 
+ACCURACIES = (1e-8, 0.1)
+"""Least and largest relative error of an objective that can be asked for."""
 OPENING = 0.01
 """Least acceleration of a gap that opens, over gravity."""
 CLEARANCE = 5e-4
@@ -46,7 +48,7 @@ class PlanOptions:
     """
 
     objective: Objective | str = Objective.TIME
-    intervals: int = 80
+    intervals: int | None = None
     time_weight: float = 1.0
     duration: float | None = None
     samples: int = 201
@@ -59,6 +61,7 @@ class PlanOptions:
     replay: bool = True
     mode_search: bool = True
     certify: bool = False
+    accuracy: float = 1e-4
 
     def __post_init__(self) -> None:
         given = self.objective
@@ -67,7 +70,7 @@ class PlanOptions:
         object.__setattr__(self, "objective", Objective(given))
         for key, least in (("intervals", 10), ("samples", 2), ("time_intervals", 4), ("degree", 2)):
             value = getattr(self, key)
-            if value is None and key == "time_intervals":
+            if value is None and key.endswith("intervals"):
                 continue
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
                 raise InputError("", key, f"{value!r} is not a whole number of {least} or more")
@@ -87,6 +90,11 @@ class PlanOptions:
             object.__setattr__(self, key, value)
         weight = require_number(self.time_weight, "time_weight", positive=True)
         object.__setattr__(self, "time_weight", weight)
+        accuracy = require_number(self.accuracy, "accuracy", positive=True)
+        if not ACCURACIES[0] <= accuracy <= ACCURACIES[1]:
+            allowed = "{:g} to {:g}".format(*ACCURACIES)
+            raise InputError("", "accuracy", f"{accuracy:g} given; allowed are {allowed}")
+        object.__setattr__(self, "accuracy", accuracy)
         if self.duration is not None:
             duration = require_number(self.duration, "duration", positive=True)
             object.__setattr__(self, "duration", duration)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
@@ -33,6 +34,8 @@ class PhasePlan(NamedTuple, Generic[M_co]):
         Name of the guess that led to it; none along curves.
     stages : sequence
         The stages that it was solved on, in the scene's own units; none along curves.
+    error : float
+        Estimate of how far the value of all phases in one NLP is from their best, relative to it.
     """
 
     motion: M_co
@@ -42,6 +45,7 @@ class PhasePlan(NamedTuple, Generic[M_co]):
     complete: bool = True
     attempt: str = ""
     stages: Sequence[object] = ()
+    error: float = math.nan
 
 
 @dataclass

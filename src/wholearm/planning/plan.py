@@ -48,8 +48,11 @@ def solve(
         largest least normal force within `duration`.
     progress : callable, optional
         Told in a few words what is being done.
-    intervals : int, default 80
-        Intervals of the grid of each phase along a curve, at least 10.
+    accuracy : float, default 1e-4
+        Relative error of the objective, from 1e-8 to 0.1, below whose estimate refining ends.
+    intervals : int, optional
+        Intervals of the grid of each phase along a curve, at least 10, in elements of four; by
+        default as many as the accuracy needs.
     time_weight : float, default 1, [(N m)^2]
         Weight of the duration against the effort, for `effort`.
     duration : float, optional, [s]
@@ -189,6 +192,7 @@ def _list_phases(planning: Planning, ledger: Ledger) -> tuple[PlannedPhase, ...]
             plan.sequences,
             plan.complete,
             plan.attempt,
+            plan.error,
             ledger.of(phase.number),
         )
         for phase, plan in zip(planning.problem.phases, planning.plans, strict=True)

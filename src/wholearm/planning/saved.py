@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from math import isnan, nan
 from typing import Any
 
 from ..common.errors import InputError
@@ -20,7 +21,7 @@ from .result import Plan, PlannedPhase, Status, Timings
 
 _OPTIONS = (
     "intervals", "transcription", "time_weight", "duration", "time_intervals", "degree", "scheme",
-    "opening", "clearance", "samples", "mode_search", "certify",
+    "opening", "clearance", "samples", "mode_search", "certify", "accuracy",
 )  # fmt: skip
 """Options that stand in `meta` by themselves; `objective` and `replay` do in other ways."""
 
@@ -34,6 +35,7 @@ def write_meta(plan: Plan) -> dict[str, Any]:
         "objective": options.goal.value,
         "value": plan.value,
         "value_unit": plan.unit,
+        "error": None if isnan(plan.error) else plan.error,
         "epsilon": plan.problem.epsilon,
         "phase_values": [phase.value for phase in phases],
         "rolling": [list(phase.rolling) for phase in phases],
@@ -41,6 +43,7 @@ def write_meta(plan: Plan) -> dict[str, Any]:
         "sequences": [phase.sequences for phase in phases],
         "complete": [phase.complete for phase in phases],
         "attempts": [phase.attempt for phase in phases],
+        "phase_errors": [None if isnan(phase.error) else phase.error for phase in phases],
         "phase_durations": [phase.duration for phase in phases],
         **{name: getattr(options, name) for name in _OPTIONS},
         "iterations": [phase.statistics.iterations for phase in phases],
@@ -79,6 +82,10 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
         raise InputError(source, f"meta.{error.key}", error.problem) from None
 
 
+def _read_error(given: Any) -> float:
+    return nan if given is None else float(given)
+
+
 def _read(trajectory: Trajectory, problem: Problem) -> Plan:
     meta = trajectory.meta
     count = len(trajectory.motions)
@@ -111,6 +118,7 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
             int(column("sequences", 0)[k]),
             bool(column("complete", True)[k]),
             str(column("attempts", "")[k]),
+            _read_error(column("phase_errors", None)[k]),
             statistics[k],
         )
         for k in range(count)

@@ -132,7 +132,8 @@ def find_lowest(
     slope = (fall * right + rise * left) / (left + right)
     with np.errstate(divide="ignore", invalid="ignore"):
         shift = -slope / (2 * bend)
-    inside = (bend > 0) & (shift > -left) & (shift < right)
+    # Where the middle is not the least of three, a curve that flattens out would seem to dip.
+    inside = (fall <= 0) & (rise >= 0) & (bend > 0) & (shift > -left) & (shift < right)
     if inside.any():
         lowest = middle[inside] + slope[inside] * shift[inside] / 2
         k = int(lowest.argmin())

@@ -46,7 +46,7 @@ from .verdict import (
 
 _ENDS = (EventKind.ARRIVAL, EventKind.RELEASE)
 _CHANGES = {EventKind.STICK: "sticks", EventKind.SLIP: "slips", EventKind.REVERSAL: "reverses"}
-SAMPLES = 400
+SAMPLES = 1200
 """About how many instants normal forces are looked at, besides the simulation's own steps."""
 ROWS = 20
 """About how many rows of each phase of a trajectory its replay is compared with."""

@@ -14,7 +14,7 @@ import numpy as np
 from ...planning.lower_bound.lower_bound import bound_least_time
 from ...planning.options import Objective, PlanOptions
 from ...planning.path_domain.data import prepare
-from ...planning.path_domain.motion import make_grid
+from ...planning.path_domain.mesh import Mesh
 from ...planning.path_domain.nlp import build_path_nlp
 from ...planning.path_domain.plan import plan_path
 from ...planning.path_domain.terms import LimitShape
@@ -33,8 +33,8 @@ from .yapss_peer import build_yapss
 LEAST_TIME, NO_DRAG = "least time", "least time without viscous friction"
 IMPLICIT = "least time, contacts not given"
 """Studies: all phases, the same without viscous friction, and one phase from random starts."""
-FINE = 1600
-"""Intervals along curves of a plan whose duration is the reference where there is no bound."""
+FINE = 1e-7
+"""Accuracy of a plan along a curve whose duration is the reference where there is no bound."""
 NEAR = 1e-7
 """Distance over the duration in which a step of the torques is that of a reversal."""
 IMPLICIT_PHASE = "heptagon_four_contacts 4"
@@ -116,7 +116,7 @@ def find_least_time(instance: Instance) -> float:
     bound = bound_least_time((curve,), epsilon)
     if bound is not None:
         return bound.value
-    return plan_path(curve, epsilon, PlanOptions(intervals=FINE), 1).motion.duration
+    return plan_path(curve, epsilon, PlanOptions(accuracy=FINE), 1).motion.duration
 
 
 def list_plan_tasks(study: str, instance: Instance, files: tuple[str, ...]) -> list[PlanTask]:
@@ -139,10 +139,10 @@ def is_installed(method: str) -> bool:
 def _build_on_curve(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
     """Ours along the curve; its NLP is built anew."""
     curve, epsilon = instance.curve, instance.problem.epsilon
-    options = PlanOptions(intervals=int(setting))
+    options = PlanOptions(accuracy=float(setting))
     build_path_nlp.cache_clear()
-    limits = prepare(curve, epsilon, make_grid(curve, 20), 1).limits
-    build_path_nlp(LimitShape.of(limits), options.intervals, Objective.TIME)
+    data = prepare(curve, epsilon, Mesh().make_grid(curve, 10), 1)
+    build_path_nlp(LimitShape.of(data.limits), len(data.grid.steps), Objective.TIME)
     return lambda: _convert(instance, plan_path(curve, epsilon, options, 1))
 
 
@@ -176,12 +176,12 @@ def _convert(instance: Instance, plan: PhasePlan[Any]) -> PeerPlan:
     return PeerPlan(OPTIMUM, motion.duration, plan.torque, tuple(marks))
 
 
-_CURVE = ("10", "20", "40", "80", "160", "320", "640")
+_CURVE = ("1e-2", "1e-3", "1e-4", "1e-5", "1e-6")
 _TIME = ("8 x 3", "16 x 3", "32 x 3", "16 x 2", "16 x 4")
 _NODES = ("20", "40", "80")
 PLANNERS = {
     "wholearm, curve": Planner(
-        "limits tightened between nodes included",
+        "accuracy; limits tightened between nodes included",
         _build_on_curve,
         _CURVE,
         studies=(LEAST_TIME, NO_DRAG),

@@ -13,7 +13,8 @@ from ...geometry.curve import Curve, Segment
 from ...mechanics.dynamics import build_force_rows
 from ...planning.path_domain.data import prepare
 from ...planning.path_domain.first_guess import guess
-from ...planning.path_domain.motion import PathMotion, make_grid
+from ...planning.path_domain.mesh import Mesh
+from ...planning.path_domain.motion import PathMotion
 from ...results.torque import TorqueProfile
 from ...results.trajectory import Samples
 from .instances import Instance
@@ -95,7 +96,8 @@ def sample_slow_motion(instance: Instance, counts: list[int]) -> list[tuple[Arra
     It keeps all limits, with its squeeze amid the range that they allow.
     """
     curve = instance.curve
-    data = prepare(curve, instance.problem.epsilon, make_grid(curve, 20 + len(curve.segments)), 0)
+    grid = Mesh().make_grid(curve, 5 + len(curve.segments))
+    data = prepare(curve, instance.problem.epsilon, grid, 0)
     motion = PathMotion(curve, data.grid, guess(data)[0])
     last = np.flatnonzero(np.diff(motion.grid.segment, append=-1))
     marks = np.append(0.0, motion.times[last])

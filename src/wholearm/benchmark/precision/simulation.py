@@ -15,7 +15,8 @@ from ...geometry.tracing import trace_phases
 from ...planning.options import PlanOptions
 from ...planning.path_domain.data import prepare
 from ...planning.path_domain.first_guess import guess
-from ...planning.path_domain.motion import PathMotion, make_grid
+from ...planning.path_domain.mesh import Mesh
+from ...planning.path_domain.motion import PathMotion
 from ...planning.path_domain.plan import plan_path
 from ...problem.read import read_problem
 from ...results.torque import TorqueProfile
@@ -118,7 +119,7 @@ def make_course(instance: Instance, study: str) -> Course | None:
 
 def make_slow_motion(curve: Curve, epsilon: float) -> PathMotion:
     """A slow smooth motion with its squeeze amid the range that limits allow."""
-    data = prepare(curve, epsilon, make_grid(curve, 3 + len(curve.segments)), 0)
+    data = prepare(curve, epsilon, Mesh().make_grid(curve, 2 + len(curve.segments)), 0)
     profile, _ = guess(data)
     calm = profile._replace(a=SLOW * profile.a, b=SLOW * profile.b)
     return PathMotion(curve, data.grid, calm)

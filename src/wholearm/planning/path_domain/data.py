@@ -20,11 +20,12 @@ from ...geometry.curve import Curve, describe_pose
 from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
 from ...mechanics.limits import PRESS, SPEED, TORQUE, LimitSet, make_limits
 from ...results.torque import TorqueProfile
-from .motion import Grid, PathMotion, Profile, directions_of
+from .elements import Elements, Grid, Profile
+from .motion import PathMotion, directions_of
 
 TORQUE_ERROR = 5e-7
 """Largest error of the torque's polynomials between the knots, over the torque limit."""
-PLACES = 9
+PLACES = 13
 """Places that they go through where that is exceeded."""
 
 
@@ -76,8 +77,6 @@ class PhaseData(NamedTuple):
         At the knots of every solid interval, interval by interval.
     checks : Places
         At the checks of every solid interval, interval by interval.
-    nonempty : ndarray of int
-        The intervals that have a length.
     """
 
     curve: Curve
@@ -89,7 +88,11 @@ class PhaseData(NamedTuple):
     sampling: Sampling
     knots: Places
     checks: Places
-    nonempty: NDArray[np.int64]
+
+    @property
+    def nonempty(self) -> NDArray[np.int64]:
+        """The intervals that have a length."""
+        return self.grid.nonempty
 
     @property
     def torque_limit(self) -> Array:
@@ -154,11 +157,7 @@ class PhaseData(NamedTuple):
 
     def interpolate(self, profile: Profile, fractions: Array) -> Profile:
         """The profile at `fractions` of every solid interval, interval by interval."""
-        k, x, h = self.nonempty, fractions, self.grid.steps[self.nonempty, None]
-        a, rise = profile.a[k, None], (profile.a[k + 1] - profile.a[k])[:, None]
-        b = profile.b[k, None] + h * x * (2 * a + x * rise)
-        squeeze = profile.squeeze[k, None] * (1 - x) + profile.squeeze[k + 1, None] * x
-        return Profile((a + x * rise).ravel(), np.maximum(b, 0.0).ravel(), squeeze.ravel())
+        return Elements(self.grid, profile).at(fractions)
 
     def misses(self, profile: Profile, margin: float) -> tuple[Array, Array]:
         """What limits miss inside each solid interval, shape (n_solid, n_sides) [N, N m].
@@ -197,7 +196,7 @@ def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
     JammingError
         If friction makes the reduced inertia vanish or turn negative anywhere.
     """
-    nonempty = np.flatnonzero(grid.steps > 0)
+    nonempty = grid.nonempty
     sampling = choose_sampling(len(grid.s))
     inner = sampling.knots[1:-1]
     between = (grid.s[nonempty, None] + inner * grid.steps[nonempty, None]).ravel()
@@ -233,7 +232,7 @@ def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
     nodes = every.pick(slice(None, len(grid.s)))
     limits = make_limits(formation, epsilon)
     kept = limits.without(SPEED), limits.only(SPEED)
-    return PhaseData(curve, epsilon, *kept, grid, nodes, sampling, knots, checks, nonempty)
+    return PhaseData(curve, epsilon, *kept, grid, nodes, sampling, knots, checks)
 
 
 def join(parts: Sequence[PhaseData]) -> PhaseData:
@@ -241,11 +240,12 @@ def join(parts: Sequence[PhaseData]) -> PhaseData:
 
     Where two meet, the grid has an interval of length zero, as where a direction reverses.
     """
+    if len(parts) == 1:
+        return parts[0]
     if any(not np.array_equal(part.limits.rows, parts[0].limits.rows) for part in parts):
         raise ValueError("phases with different rows of limits cannot be joined")
     starts = np.cumsum([0.0, *(part.grid.s[-1] for part in parts)])
     segments = np.cumsum([0, *(part.grid.segment[-1] + 1 for part in parts)])
-    nodes = np.cumsum([0, *(len(part.grid.s) for part in parts)])
 
     def chain(arrays: Iterable[NDArray[Any]], firsts: NDArray[Any]) -> Any:
         pairs = zip(arrays, firsts[:-1], strict=True)
@@ -260,11 +260,11 @@ def join(parts: Sequence[PhaseData]) -> PhaseData:
         grid=Grid(
             chain((part.grid.s for part in parts), starts),
             chain((part.grid.segment for part in parts), segments),
+            (parts[0].grid.rests[0], parts[-1].grid.rests[1]),
         ),
         nodes=stack([part.nodes for part in parts]),
         knots=stack([part.knots for part in parts]),
         checks=stack([part.checks for part in parts]),
-        nonempty=chain((part.nonempty for part in parts), nodes),
     )
 
 
@@ -281,7 +281,7 @@ def choose_sampling(nodes: int) -> Sampling:
     Looks are as the cosine of evenly spaced angles: near rest the speed, and with it viscous
     friction, goes with the root of the way.
     """
-    knots, checks = (5, 25) if nodes > 64 else (13, 97)
+    knots, checks = (5, 25) if nodes > 64 else (9, 33)
     angles = np.linspace(0.0, np.pi, checks)
     return Sampling(np.linspace(0.0, 1.0, knots), (1 - np.cos(angles)) / 2)
 
@@ -303,11 +303,11 @@ def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, floa
     """
     knots, checks = data.sampling
     torque = _fit(data, motion, data.knots, knots)
-    times = motion.times[data.nonempty, None] + motion.durations(checks)[data.nonempty]
+    times = motion.times[data.nonempty, None] + motion.durations(checks)
     wanted = data.checks.forces.tau(*data.interpolate(motion.profile, checks))
     inner = np.tile((checks > 0) & (checks < 1), len(data.nonempty))
     misfit = torque.at(times.ravel()[inner]) - wanted[inner]
-    if np.abs(misfit / data.torque_limit).max() > TORQUE_ERROR and len(knots) < PLACES:
+    if np.abs(misfit / data.torque_limit).max() > TORQUE_ERROR:
         every = (len(checks) - 1) // (PLACES - 1)
         rows = np.tile(np.arange(len(checks)) % every == 0, len(data.nonempty))
         torque = _fit(data, motion, data.checks.pick(rows), checks[::every])
@@ -318,8 +318,8 @@ def _fit(data: PhaseData, motion: PathMotion, places: Places, fractions: Array) 
     """Polynomials through the torques at `fractions` of every solid interval."""
     k = data.nonempty
     values = places.forces.tau(*data.interpolate(motion.profile, fractions))
-    spans = motion.durations(fractions)[k]
-    if not (np.isfinite(spans).all() and (np.diff(spans, axis=1) > 0).all()):
+    spans = motion.durations(fractions)
+    if motion.stalls or not (np.diff(spans, axis=1) > 0).all():
         raise StalledError("the motion all but stops between two nodes; plan with more intervals")
     x = 2 * spans / spans[:, -1:] - 1
     vandermonde = x[..., None] ** np.arange(len(fractions))

@@ -32,7 +32,8 @@ from ..advice import (
 )
 from ..options import Objective
 from .data import PhaseData, cut, fit_torque, join
-from .motion import PathMotion, Profile
+from .elements import Profile
+from .motion import PathMotion
 from .nlp import (
     Relaxation,
     Tightening,

@@ -6,7 +6,7 @@ import numpy as np
 
 from ...common.arrays import Array
 from .data import PhaseData
-from .motion import Profile
+from .elements import Profile
 from .nlp import Units
 
 _SLOW = -12
@@ -31,7 +31,7 @@ def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
     def possible(height: float) -> bool:
         low, high = _squeeze_range(data, height)
         b = _parabola(data, height)[1]
-        return bool((low <= high).all() and (b <= b_max).all())
+        return bool(((low <= high) & (low < np.inf)).all() and (b <= b_max).all())
 
     # Bisection over heights from 2^-12 to 2^8 times that of a fall over this length.
     low_power, high_power = float(_SLOW), 8.0
@@ -85,7 +85,9 @@ def _squeeze_range(data: PhaseData, height: float) -> tuple[Array, Array]:
     rate = signs * data.find_terms().squeeze[:, rows]
     with np.errstate(divide="ignore", invalid="ignore"):
         bound = -slack / rate
-    low = np.where(rate > 0, bound, -np.inf).max(axis=1)
+    # What no squeeze mends leaves no range.
+    never = np.where((rate == 0) & (slack < 0), np.inf, -np.inf)
+    low = np.where(rate > 0, bound, never).max(axis=1)
     high = np.where(rate < 0, bound, np.inf).min(axis=1)
     return low, high
 

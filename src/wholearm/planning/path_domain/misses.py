@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from ...common.arrays import Array
 from .data import PhaseData
-from .motion import PathMotion, Profile
-from .nlp import Tightening
+from .elements import Profile
+from .motion import PathMotion
+from .nlp import PathNLP, Tightening, Units
 
 MISS = 2.5e-7
 """Largest miss of a limit between nodes.
@@ -22,11 +25,25 @@ OVER = 1.05
 
 
 class PathSolution(NamedTuple):
-    """What the solver has found: a motion, the margin over epsilon, and multipliers."""
+    """What the solver has found, or where it is to start.
+
+    Attributes
+    ----------
+    profile : Profile
+    margin : float, [N]
+        Over epsilon.
+    multipliers : dict
+    cost : float
+        In the units of the NLP.
+    lasts : float, [s]
+        What the NLP takes the duration for, where that has a bound.
+    """
 
     profile: Profile
     margin: float
     multipliers: dict[str, Array]
+    cost: float = np.inf
+    lasts: float = 0.0
 
 
 class Misses(NamedTuple):
@@ -51,6 +68,22 @@ class Misses(NamedTuple):
     def find_worst(self, data: PhaseData) -> float:
         """The largest, over what is much."""
         return float(max((self.short / data.spans).max(), self.speeding.max(), self.late))
+
+    def price(self, nlp: PathNLP, data: PhaseData, units: Units, solution: PathSolution) -> Array:
+        """What tightening would cost for each solid interval, to first order, in the NLP's units.
+
+        That is the multipliers of its nodes times what is missed.
+        """
+        rows, signs, _ = data.limits.sides
+        n = len(data.grid.s)
+        on_limits = solution.multipliers["lam_g0"][nlp.columns.g["limits"]].reshape(n, -1)
+        on_sides = np.maximum(-signs * on_limits[:, rows], 0.0) / units.of(data.limits)[rows]
+        on_b = np.zeros(nlp.free.shape)
+        on_b[nlp.free] = solution.multipliers["lam_x0"]
+        on_b = np.maximum(on_b[:, 0], 0.0) * solution.profile.b / units.profile[0]
+        k = data.nonempty
+        price = ((on_sides[k] + on_sides[k + 1]) * self.short).sum(axis=1)
+        return np.asarray(price + (on_b[k] + on_b[k + 1]) * self.speeding)
 
     def tighten(
         self, data: PhaseData, tightening: Tightening, solution: PathSolution

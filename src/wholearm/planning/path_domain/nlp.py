@@ -22,7 +22,7 @@ from ...solvers.ipopt import build_solver
 from ...solvers.statistics import SolverStatistics, book
 from ..options import Objective
 from .data import PhaseData
-from .motion import Grid, Profile
+from .elements import Grid, Profile
 from .terms import CHAINED, LEAST_B, SOFT, LimitShape, NLPColumns, list_columns, write_terms
 
 _MU = 1e-2
@@ -210,6 +210,8 @@ def make_bounds(
     b_max = data.largest_b(data.nodes, relaxation.parameter if relaxation else None)
     low[:, node["b"]] = LEAST_B
     high[:, 0] = np.maximum(b_max * speed_share / units.profile[0], 2 * LEAST_B)
+    # From rest and to rest, with no way back.
+    low[0, node["a"]], high[-1, node["a"]] = LEAST_B, -LEAST_B
     low[:, node["extra"]] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
     rows, signs, bounds = data.limits.sides
     # The constant part of what limits are of is on this side.
@@ -281,9 +283,8 @@ def unpack(nlp: PathNLP, grid: Grid, x: Array, units: Units) -> tuple[Profile, f
     table = np.zeros(nlp.free.shape)
     table[nlp.free] = x
     a, squeeze = table[:, 1] * units.profile[1], table[:, 2] * units.profile[2]
-    steps = grid.steps
-    a = a - np.dot(steps, a[1:] + a[:-1]) / (2 * grid.s[-1])
-    b = np.concatenate([[0.0], np.cumsum(steps * (a[1:] + a[:-1]))])
+    a = a - grid.integrate(a)[-1] / (2 * grid.s[-1])
+    b = grid.integrate(a)
     # Where phases are joined at next to no speed, rounding can take b below zero.
     b = np.maximum(b, 0.0)
     b[-1] = 0.0
@@ -292,26 +293,24 @@ def unpack(nlp: PathNLP, grid: Grid, x: Array, units: Units) -> tuple[Profile, f
 
 
 def move_multipliers(
-    nlp: PathNLP, multipliers: dict[str, Array], old: Grid, new: Grid
+    before: PathNLP, after: PathNLP, multipliers: dict[str, Array], old: Grid, new: Grid
 ) -> dict[str, Array]:
-    """Interpolate multipliers from one grid to another with the same segments."""
-    nodes = np.arange(len(old.s))
-    place = np.empty(len(nodes))
-    for segment in range(int(old.segment[-1]) + 1):
-        mine = old.segment == segment
-        place[mine] = np.interp(new.s[mine], old.s[mine], nodes[mine])
+    """Interpolate multipliers from one grid to another of the same curves."""
 
-    def interpolate(table: Array) -> Array:
-        columns = [np.interp(place, nodes, column) for column in table.T]
-        return np.column_stack(columns)
+    def interpolate(table: Array, weights: tuple[Array, Array] | None = None) -> Array:
+        first, last = weights or (np.ones(len(old.s)), np.ones(len(new.s)))
+        columns = [last * old.interpolate(column / first, new) for column in table.T]
+        return np.column_stack(columns) if columns else np.zeros((len(new.s), 0))
 
-    on_x, on_g, rows = multipliers["lam_x0"], multipliers["lam_g0"], nlp.columns.g
-    table = np.zeros(nlp.free.shape)
-    table[nlp.free] = on_x
-    middles = (place[1:] + place[:-1]) / 2
+    on_x, on_g, rows = multipliers["lam_x0"], multipliers["lam_g0"], before.columns.g
+    weights = old.weights, new.weights
+    table = np.zeros(before.free.shape)
+    table[before.free] = on_x
     blocks = {name: on_g[rows[name]] for name in rows.sizes}
     for name in ("links", "chain"):
         if rows.sizes[name]:
-            blocks[name] = np.interp(middles, nodes[:-1] + 0.5, blocks[name])
-    blocks["limits"] = interpolate(blocks["limits"].reshape(len(nodes), -1)).ravel()
-    return {"lam_x0": interpolate(table)[nlp.free], "lam_g0": rows.join(**blocks)}
+            blocks[name] = interpolate(np.append(blocks[name], 0.0)[:, None])[:-1, 0]
+    limits = blocks["limits"].reshape(len(old.s), -1)
+    blocks["limits"] = interpolate(limits, weights).ravel()
+    table = interpolate(table, weights)
+    return {"lam_x0": table[after.free], "lam_g0": after.columns.g.join(**blocks)}

@@ -1,78 +1,37 @@
 """Planning one-freedom phases: first guess, NLP, and limits that hold between nodes too.
 
-The NLP of `nlp` keeps the limits at its nodes. Once it is solved, nodes are redistributed towards
-where limits are missed most between them (where the plan switches from one to another). Then
-limits are tightened by what they miss and the NLP is solved again from where it was, until nothing
-misses more than `MISS`.
+The NLP of `nlp` keeps the limits at its nodes. It is solved on few elements first. What it switches
+there says where elements should end, and what its limits miss between nodes, whether more of them
+are needed (`mesh`). Then limits are tightened by what they miss and the NLP is solved again from
+where it was, until nothing misses more than `MISS`. What that costs is an estimate of the error:
+the untightened solution is too good about as much as the tightened one is too bad.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
-
-from ...common.arrays import Array
 from ...common.errors import InfeasibleError, JammingError, SolverError, WholearmError
 from ...common.shortfalls import Parameter
 from ...geometry.curve import Curve
 from ..advice import describe_changes, find_changes, name_phases
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
-from .data import PhaseData, StalledError, cut, fit_torque, join, prepare
-from .first_guess import guess, guess_slowly
-from .misses import MISS, ROUNDS, Misses, PathSolution
-from .motion import Grid, PathMotion, Profile, make_grid, redistribute_nodes
-from .nlp import (
-    PathNLP,
-    Tightening,
-    Units,
-    build_path_nlp,
-    first_multipliers,
-    make_bounds,
-    move_multipliers,
-    pack,
-    parameters,
-    unpack,
-)
-from .terms import LimitShape
+from .data import PhaseData, StalledError, join
+from .first_guess import guess_slowly
+from .misses import MISS, ROUNDS
+from .motion import PathMotion
+from .nlp import Tightening
+from .rounds import Plans, Round, Task
 
-_COARSE = 1.5e-4
-"""Miss, over the typical force or torque, above which the grid is drawn together."""
-_FAST = 1e-2
-"""The same for the square of a speed limit, relatively."""
-_LEVER = 30.0
-"""Lever at which the typical force makes the typical torque, in radii of gyration."""
+_MESHES = 6
+"""Most times that the mesh is changed before limits are tightened."""
+_AGAIN = 3
+"""Most times that limits are tightened, each on a mesh that is finer than the one before."""
 _FINER = (1, 2, 4)
-"""Intervals to try, over those that are asked for."""
-
-
-@dataclass(frozen=True)
-class _Task:
-    """What is planned: see `plan_curves`."""
-
-    curves: Sequence[Curve]
-    epsilon: float
-    options: PlanOptions
-    phases: Sequence[int]
-    duration: float | None
-
-    @property
-    def name(self) -> str:
-        """The phases, for messages."""
-        return name_phases(self.phases)
-
-    @property
-    def lost(self) -> float:
-        """Least normal force below which a margin is none [N]."""
-        return self.epsilon - MISS * self.curves[0].formation.scene.scales.force
-
-    def prepare(self, grids: Iterable[Grid]) -> list[PhaseData]:
-        """What each phase gives the NLP on its grid."""
-        given = zip(self.curves, grids, self.phases, strict=True)
-        return [prepare(curve, self.epsilon, grid, phase) for curve, grid, phase in given]
+"""Elements to try, over those that are asked for."""
 
 
 class _Stuck(NamedTuple):
@@ -90,9 +49,6 @@ class _Stuck(NamedTuple):
     parts: list[PhaseData]
     reason: str
     between: bool
-
-
-_Plans = list[PhasePlan[PathMotion]]
 
 
 def plan_path(
@@ -140,7 +96,7 @@ def plan_curves(
     SolverError
         If the solver stops without an answer.
     """
-    task = _Task(curves, epsilon, options, phases, duration)
+    task = Task(curves, epsilon, options, phases, duration)
 
     def replan(changed: Sequence[Curve], least: float) -> object:
         return _insist(_plan_finer(replace(task, curves=changed, epsilon=least)))
@@ -168,7 +124,7 @@ def plan_curves(
     return plans
 
 
-def _explain_duration(task: _Task) -> InfeasibleError | None:
+def _explain_duration(task: Task) -> InfeasibleError | None:
     """Say so if the duration is shorter than the least time, and which one would do."""
     duration = task.duration
     if duration is None:
@@ -197,113 +153,77 @@ def _explain_duration(task: _Task) -> InfeasibleError | None:
     )
 
 
-def _insist(found: _Plans | _Stuck) -> _Plans:
+def _insist(found: Plans | _Stuck) -> Plans:
     """The plans, or an error."""
     if isinstance(found, _Stuck):
         raise SolverError(found.reason)
     return found
 
 
-def _plan_finer(task: _Task) -> _Plans | _Stuck:
+def _plan_finer(task: Task) -> Plans | _Stuck:
     """Plan, on a finer grid where limits that hold between the nodes leave nothing, or no time."""
     for finer in _FINER:
-        own = replace(task.options, intervals=finer * task.options.intervals)
-        found = _plan(replace(task, options=own))
+        found = _plan(task, finer)
         if isinstance(found, _Stuck):
-            if not found.between:
+            # What so few elements cannot keep at their nodes, twice as many may.
+            if not found.between and finer > 1:
                 break
-        elif own.goal is not Objective.MARGIN or found[0].value >= task.lost:
+        elif task.options.goal is not Objective.MARGIN or found[0].value >= task.lost:
             break
     return found
 
 
-def _plan(task: _Task) -> _Plans | _Stuck:
-    """Solve, redistribute nodes once and tighten limits until they hold between nodes too."""
-    options = task.options
-    parts = task.prepare(make_grid(curve, options.intervals) for curve in task.curves)
-    data = join(parts)
-    nlp = build_path_nlp(LimitShape.of(data.limits), len(data.grid.steps), options.goal)
-    profile, units = guess(data, options.time_weight)
-    tightening = Tightening.none(data, task.duration)
-    solution = PathSolution(profile, 0.0, first_multipliers(nlp, data, profile, units))
-    for solves in range(1, ROUNDS + 1):
-        found = _solve(nlp, data, units, tightening, solution, options.time_weight)
-        if isinstance(found, str):
-            return _Stuck(parts, f"{task.name}: {found}", between=solves > 1)
-        solution = found
-        pairs = zip(parts, cut(parts, solution.profile), strict=True)
-        motions = [PathMotion(part.curve, part.grid, own) for part, own in pairs]
-        misses = Misses.of(data, solution, motions, task.duration)
+def _plan(task: Task, finer: int = 1) -> Plans | _Stuck:
+    """Solve on meshes that suit the plan more and more, and make limits hold between nodes too."""
+    round_ = Round.begin(task, finer)
+    found = round_.solve()
+    if isinstance(found, str):
+        return _Stuck(round_.parts, f"{task.name}: {found}", between=False)
+    best: Plans | _Stuck | None = None
+    for _ in range(_AGAIN):
+        found = _suit(found)
+        plans = _enforce_between(found)
+        if best is not None and isinstance(plans, _Stuck):
+            return best
+        best = plans
+        if isinstance(plans, _Stuck) or plans[0].error <= task.options.accuracy:
+            break
+        better = found.adapt(dearer=True)[1]
+        refined = better.solve() if better else ""
+        if isinstance(refined, str):
+            break
+        found = refined
+    assert best is not None
+    return best
+
+
+def _suit(found: Round) -> Round:
+    """Change the mesh until switches stay where they are and little is missed between nodes."""
+    for _ in range(_MESHES):
+        found, better = found.adapt()
+        if better is None:
+            break
+        refined = better.solve()
+        if isinstance(refined, str) or (found.is_split and refined.merit > found.merit):
+            break
+        found = refined
+    return found
+
+
+def _enforce_between(round_: Round) -> Plans | _Stuck:
+    """Tighten limits until they hold between nodes too."""
+    task, data, first = round_.task, round_.data, round_.solution.cost
+    tightening = Tightening.none(data, round_.duration)
+    for _ in range(ROUNDS):
+        misses = round_.misses
         if misses.find_worst(data) <= MISS:
             try:
-                return _summarise(task, parts, motions, solution)
+                return round_.summarise((round_.solution.cost - first) / round_.value)
             except StalledError as stall:
-                return _Stuck(parts, f"{task.name}: {stall}", between=True)
-        coarse = _weigh(data, misses, units)
-        if solves == 1 and coarse.max() > 1:
-            old = data.grid
-            shares = np.split(coarse, np.cumsum([len(part.nonempty) for part in parts])[:-1])
-            parts = task.prepare(
-                redistribute_nodes(part.grid, part.nonempty, share)
-                for part, share in zip(parts, shares, strict=True)
-            )
-            data = join(parts)
-            moved = Profile(*(np.interp(data.grid.s, old.s, part) for part in solution.profile))
-            multipliers = move_multipliers(nlp, solution.multipliers, old, data.grid)
-            solution = solution._replace(profile=moved, multipliers=multipliers)
-        else:
-            tightening = misses.tighten(data, tightening, solution)
-    return _Stuck(parts, f"{task.name}: {misses.describe(data)}", between=True)
-
-
-def _summarise(
-    task: _Task,
-    parts: Sequence[PhaseData],
-    motions: Sequence[PathMotion],
-    solution: PathSolution,
-) -> _Plans:
-    """The plan of each phase."""
-    plans: _Plans = []
-    for part, motion in zip(parts, motions, strict=True):
-        torque, squares = fit_torque(part, motion)
-        value = {
-            Objective.TIME: motion.duration,
-            Objective.EFFORT: squares + task.options.time_weight * motion.duration,
-            Objective.MARGIN: task.epsilon + solution.margin,
-        }[task.options.goal]
-        plans.append(PhasePlan(motion, torque, value))
-    return plans
-
-
-def _weigh(data: PhaseData, misses: Misses, units: Units) -> Array:
-    """How much each solid interval misses of what draws the grid together, shape (n_solid,)."""
-    lever = _LEVER * data.curve.formation.scene.scales.length
-    of_torque = np.isin(data.limits.sides[0], np.flatnonzero(data.limits.columns[1].any(axis=1)))
-    forces = (misses.short / np.where(of_torque, lever, 1.0)).max(axis=1)
-    return np.asarray(np.maximum(forces / (_COARSE * units.force), misses.speeding / _FAST))
-
-
-def _solve(
-    nlp: PathNLP,
-    data: PhaseData,
-    units: Units,
-    tightening: Tightening,
-    start: PathSolution,
-    time_weight: float,
-) -> PathSolution | str:
-    """Solve once; the solution, or in words how the solver ended."""
-    bounds = make_bounds(nlp, data, units, tightening)
-    if (bounds["lbg"] > bounds["ubg"]).any():
-        return "limits that hold between the nodes too leave nothing"
-    result = nlp.solver(
-        x0=pack(nlp, start.profile, units, start.margin),
-        p=parameters(nlp, data, units, time_weight),
-        **bounds,
-        **start.multipliers,
-    )
-    stats = nlp.solver.stats()
-    if not stats["success"]:
-        return f"Ipopt stopped with {stats['return_status']}"
-    profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], units)
-    multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
-    return PathSolution(profile, margin, multipliers)
+                return _Stuck(round_.parts, f"{task.name}: {stall}", between=True)
+        tightening = misses.tighten(data, tightening, round_.solution)
+        found = round_.solve(tightening)
+        if isinstance(found, str):
+            return _Stuck(round_.parts, f"{task.name}: {found}", between=True)
+        round_ = found
+    return _Stuck(round_.parts, f"{task.name}: {misses.describe(data)}", between=True)

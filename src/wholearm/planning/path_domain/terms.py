@@ -1,15 +1,14 @@
 """The expressions of the planning NLP of one-freedom phases.
 
 On a curve z(s) everything is affine in a = s'', b = s'^2 and the squeeze lambda, but for viscous
-friction (`mechanics.dynamics.PathForces`). At the nodes s_k of a grid the unknowns are a_k, b_k and
-lambda_k; between two nodes a and lambda are linear in s, and b' = 2 a (dash: d/ds) is then exact:
+friction (`mechanics.dynamics.PathForces`). The unknowns are a_k, b_k and lambda_k at the nodes s_k
+of `elements`: inside each, a and lambda are polynomials, and b' = 2 a (dash: d/ds) is exact,
 
-    b_k+1 = b_k + (s_k+1 - s_k) (a_k + a_k+1),
+    b_k+1 = b_k + h sum of links_kj a_j over the nodes j of the element of length h,
     low <= rows (c, tau, theta') <= high at every node (`mechanics.limits`),
-    T = sum of 2 (s_k+1 - s_k) / (sqrt(b_k) + sqrt(b_k+1)).
+    T = sum of h weights_k / sqrt(b_k) (next to rest as said in `_write_times`).
 
-Where a direction reverses, the grid has an interval of length zero: b is the same on its two sides,
-a and lambda may jump.
+Where two elements meet, b is the same and a and lambda may jump.
 
 The least margin, and the relaxation of a limit, have an unknown at every node with m_k+1 = m_k. A
 column through all rows would make building the Jacobian quadratic in the number of nodes.
@@ -17,7 +16,7 @@ column through all rows would make building the Jacobian quadratic in the number
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -26,6 +25,7 @@ from ...common.arrays import Expression
 from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ..columns import Columns, Symbols
 from ..options import Objective
+from .elements import DEGREE, FROM_REST, INSIDE, TO_REST, find_basis
 
 CHAINED = (Objective.MARGIN, Objective.RELAX)
 """Objectives with one more unknown, which every node has a copy of."""
@@ -33,10 +33,16 @@ SOFT = (Objective.ELASTIC, Objective.RELAX)
 """Objectives for which limits give way, so that each side of a limit has a row of its own."""
 LEAST_B = 1e-8
 """Least b away from rest, in units of the typical one; keeps the square root differentiable."""
-_CALM = 1e-4
+_CALM = 1e-6
 """Weight of the squeeze against the objective: picks one among equally good ones."""
-_SMOOTH = 1e-5
-"""Weight of changes of a and lambda: rules out ripple that the objective does not see."""
+_ROUGH = 0.1
+"""Weight of the highest polynomial of a and lambda in each element: rules out that they bend at a
+single node towards other limits than around it. It falls fast where the plan is smooth."""
+_EVEN = 1e-4
+"""Weight of changes of a from node to node where limits give way."""
+_STIFF = 1e3
+"""The same, over that, where limits give way, for s'' that is not linear in an element, or next to
+rest not constant."""
 
 
 class LimitShape(NamedTuple):
@@ -87,8 +93,8 @@ class NLPColumns(NamedTuple):
         the weight of each joint, for `relax` by how much each limit gives way with the relaxation,
         and b's coefficients in the speed limit.
     g : Columns
-        The N of b' = 2 a; those that `chain` the margin or the relaxation; the changes of a over
-        the first and the last interval (`ends`); node by node the `limits`, side by side where they
+        The N of b' = 2 a; those that `chain` the margin or the relaxation; node by node the
+        `limits`, side by side where they
         are soft, and the speed for `relax`; the `duration` for `margin`.
     """
 
@@ -109,7 +115,7 @@ def list_columns(shape: LimitShape, intervals: int, objective: Objective) -> NLP
     elif relax:
         p |= {"gives": m + 1, "rates": n}
     rows = (len(shape.sides) if objective in SOFT else m) + relax
-    g = {"links": intervals, "chain": intervals * chained, "ends": 2, "limits": n * rows}
+    g = {"links": intervals, "chain": intervals * chained, "limits": n * rows}
     g |= {"duration": int(objective is Objective.MARGIN)}
     return NLPColumns(Columns(b=1, a=1, squeeze=1, extra=extra), Columns(**p), Columns(**g))
 
@@ -132,42 +138,83 @@ def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict
     )
     b = ca.vertcat(ends[0] ** 2, b_inner, ends[1] ** 2)
     speed = ca.vertcat(ends[0], ca.sqrt(b_inner), ends[1])
-    interval_times = 2 * h / (speed[:-1] + speed[1:])
+    times = _write_times(a, speed, h)
     values = _write_values(shape, given, (a, b, squeeze, speed))
     # What is relaxed has to be as little as possible, whatever the motion is like.
     share = 1e-3 if objective is Objective.RELAX else 1.0
     squeezed, node_weights = given.calm * squeeze, ca.vertcat(0, h) + ca.vertcat(h, 0)
     node_costs = share * _CALM * node_weights * squeezed**2
-    link_costs = share * _SMOOTH * h * ((a[1:] - a[:-1]) ** 2 + (squeezed[1:] - squeezed[:-1]) ** 2)
+    rough = _find_bends(a, DEGREE) + _find_bends(squeezed, DEGREE)
+    if objective is Objective.ELASTIC:
+        # Limits that give way would otherwise be spared by motions that turn back between nodes.
+        slopes, bends = _find_bends(a, 1), _find_bends(a, 2)
+        rough += _STIFF * ca.horzcat(slopes[0], bends[1:-1], slopes[-1])
+        node_costs[:-1] += _EVEN * (a[1:] - a[:-1]) ** 2
+    node_costs[0] += share * _ROUGH * ca.sum2(_find_lengths(h) * rough)
     if objective is Objective.TIME:
-        link_costs += interval_times
+        node_costs += times
     elif objective is Objective.EFFORT:
-        squares = _square_torques(shape, given, values) @ given.joints / 3
-        link_costs += interval_times * (squares + given.weight)
+        torques = values[:, list(shape.torques)] + ca.reshape(given.torque, n, 2)
+        node_costs += times * (torques**2 @ given.joints + given.weight)
     elif objective is Objective.MARGIN:
         node_costs[0] -= extra[0]
     elif objective is Objective.ELASTIC:
         # Every node counts alike: where intervals are short, being short must not be cheap.
         node_costs += ca.sum2(extra) / n
-        link_costs += 1e-4 * interval_times
+        node_costs += 1e-4 * times
     else:
         node_costs[0] += extra[0]
-        link_costs += 1e-5 * interval_times
+        node_costs += 1e-5 * times
     nodes = ca.horzcat(b, a, squeeze, extra).T
     chained, late = objective in CHAINED, objective is Objective.MARGIN
     rows = _write_limits(shape, objective, given, values, extra, b)
     return {
         "x": ca.vertcat(nodes[1:, 0], ca.vec(nodes[:, 1:-1]), nodes[1:, -1]),
         "p": given.every,
-        "f": ca.sum1(link_costs) + ca.sum1(node_costs),
+        "f": ca.sum1(node_costs),
         "g": columns.g.write(
-            links=b[1:] - b[:-1] - h * (a[1:] + a[:-1]),
+            links=b[1:] - b[:-1] - _write_rises(a, h),
             chain=extra[1:] - extra[:-1] if chained else ca.SX(0, 1),
-            ends=ca.vertcat(a[1] - a[0], a[-1] - a[-2]),
             limits=rows.T,
-            duration=ca.sum1(interval_times) if late else ca.SX(0, 1),
+            duration=ca.sum1(times) if late else ca.SX(0, 1),
         ),
     }
+
+
+def _find_lengths(h: Expression) -> Expression:
+    """Length of each element, shape (1, E)."""
+    return ca.sum1(ca.reshape(ca.vertcat(h, 0), DEGREE + 1, -1))
+
+
+def _write_rises(a: Expression, h: Expression) -> Expression:
+    """By how much b rises from each node to the next, shape (N,)."""
+    table, lengths = ca.reshape(a, DEGREE + 1, -1), _find_lengths(h)
+    count = lengths.numel()
+    kinds = [FROM_REST, *[INSIDE] * (count - 2), TO_REST]
+    links = [ca.DM(link) for link in find_basis().links]
+    rises = ca.horzcat(*(links[kind] @ table[:, k] for k, kind in enumerate(kinds)))
+    rises = rises * ca.repmat(lengths, DEGREE, 1)
+    return ca.vec(ca.vertcat(rises, ca.SX(1, count)))[:-1]
+
+
+def _write_times(a: Expression, speed: Expression, h: Expression) -> Expression:
+    """What each node's share of the duration is, shape (N + 1,), by Lobatto's quadrature."""
+    basis = find_basis()
+    lengths = _find_lengths(h)
+    rates = ca.reshape(speed, DEGREE + 1, -1)
+    # Next to rest the speed is linear in the local variable but for a factor that is smooth.
+    for kind, e in ((FROM_REST, 0), (TO_REST, lengths.numel() - 1)):
+        rest = 0 if kind == FROM_REST else DEGREE
+        for j, y in enumerate(basis.y[kind].tolist()):
+            start = ca.sqrt(2 * lengths[e] * (a[0] if kind == FROM_REST else -a[-1]))
+            rates[j, e] = (start if j == rest else rates[j, e] / y) / 2
+    return ca.vec(ca.DM(basis.weights) @ lengths / rates)
+
+
+def _find_bends(values: Expression, degree: int) -> Expression:
+    """Sum of the squared Legendre coefficients of each element from a degree on, shape (1, E)."""
+    modes = ca.DM(find_basis().modes[degree:]) @ ca.reshape(values, DEGREE + 1, -1)
+    return ca.sum1(modes**2)
 
 
 def _write_values(shape: LimitShape, given: Symbols, motion: tuple[Expression, ...]) -> Expression:
@@ -181,13 +228,6 @@ def _write_values(shape: LimitShape, given: Symbols, motion: tuple[Expression, .
     values = scale("a", a, m) + scale("b", b, m) + scale("squeeze", squeeze, m)
     values[:, fast] += scale("speed", speed, len(fast))
     return values
-
-
-def _square_torques(shape: LimitShape, given: Symbols, values: Any) -> Expression:
-    """Three times the mean square of each torque over each interval, shape (N, 2)."""
-    # The bounds hold the constant part, so it is passed as a parameter for this only.
-    full = values[:, list(shape.torques)] + ca.reshape(given.torque, values.size1(), 2)
-    return full[:-1, :] ** 2 + full[:-1, :] * full[1:, :] + full[1:, :] ** 2
 
 
 def _write_limits(

@@ -1,0 +1,219 @@
+"""Elements of a curve: stretches on which s'' and the squeeze are polynomials, with steps between.
+
+An element has `DEGREE` + 1 nodes, the Lobatto points of a local variable y from 0 to 1. Inside a
+motion s is linear in y. Next to rest s is quadratic in it, measured from where the motion rests:
+there the speed, and with it viscous friction, goes with the root of the way, and is smooth in y.
+With b = s'^2 and b' = 2 s'' (dash: d/ds), b is a polynomial in y too.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+
+from ...common.arrays import Array
+
+DEGREE = 4
+"""Degree of the polynomials."""
+INSIDE, FROM_REST, TO_REST = 0, 1, 2
+"""Kinds of elements: amid a motion, at its start and at its end."""
+
+
+class Basis(NamedTuple):
+    """What nodal values of each kind of element mean.
+
+    Attributes
+    ----------
+    y : ndarray, shape (3, p + 1)
+        The nodes, from 0 to 1; for `TO_REST` from 1 to 0.
+    to_powers : ndarray, shape (3, p + 1, p + 1)
+        Coefficients of the powers of y of a polynomial from its values at the nodes.
+    links : ndarray, shape (3, p, p + 1)
+        By how much b rises from each node to the next, over the element's length, for s'' at the
+        nodes.
+    weights : ndarray, shape (p + 1,)
+        Of Lobatto's quadrature over y.
+    modes : ndarray, shape (p + 1, p + 1)
+        Coefficients of Legendre polynomials from values at the nodes of an element amid a motion.
+    """
+
+    y: Array
+    to_powers: Array
+    links: Array
+    weights: Array
+    modes: Array
+
+
+@lru_cache(maxsize=8)
+def find_basis(degree: int = DEGREE) -> Basis:
+    """The basis of elements of a degree."""
+    inner = legendre.legroots(legendre.legder([0.0] * degree + [1.0]))
+    x = (np.concatenate([[-1.0], inner, [1.0]]) + 1) / 2
+    y = np.stack([x, x, 1 - x])
+    powers = np.arange(degree + 1)
+    to_powers = np.linalg.inv(y[..., None] ** powers)
+    plain = 2 * np.diff(y[0][:, None] ** (powers + 1), axis=0) / (powers + 1)
+    rooted = 4 * np.diff(y[1:, :, None] ** (powers + 2), axis=1) / (powers + 2)
+    rises = np.stack([plain, rooted[0], -rooted[1]])
+    weights = (1 / (powers + 1)) @ to_powers[0]
+    modes = np.linalg.inv(legendre.legvander(2 * x - 1, degree))
+    links = np.asarray(rises @ to_powers, dtype=float)
+    return Basis(
+        y, np.asarray(to_powers, dtype=float), links, weights, np.asarray(modes, dtype=float)
+    )
+
+
+class Grid(NamedTuple):
+    """Nodes on a curve.
+
+    Attributes
+    ----------
+    s : ndarray, shape (N + 1,), [m]
+        Those of one element after the other, never decreasing: equal where two elements meet.
+    segment : ndarray of int, shape (N + 1,)
+        The segment of the curve that each node's forces belong to.
+    rests : tuple of bool
+        Whether the motion starts and ends at rest.
+    """
+
+    s: Array
+    segment: NDArray[np.int64]
+    rests: tuple[bool, bool] = (True, True)
+
+    @property
+    def steps(self) -> Array:
+        """Lengths of the intervals between nodes, shape (N,) [m]."""
+        return np.diff(self.s)
+
+    @property
+    def nonempty(self) -> NDArray[np.int64]:
+        """The intervals inside elements."""
+        k = np.arange(len(self.s) - 1)
+        return k[k % (DEGREE + 1) < DEGREE]
+
+    @property
+    def edges(self) -> Array:
+        """Start and stop of each element, shape (E, 2) [m]."""
+        return self.s.reshape(-1, DEGREE + 1)[:, [0, -1]]
+
+    @property
+    def kinds(self) -> NDArray[np.int64]:
+        """Kind of each element, shape (E,)."""
+        kinds = np.full(len(self.s) // (DEGREE + 1), INSIDE)
+        kinds[0] = FROM_REST if self.rests[0] else INSIDE
+        kinds[-1] = TO_REST if self.rests[1] else kinds[-1]
+        return kinds
+
+    @property
+    def weights(self) -> Array:
+        """Length that each node stands for, shape (N + 1,) [m]."""
+        steps = self.steps
+        return np.asarray(np.append(0.0, steps) + np.append(steps, 0.0))
+
+    def interpolate(self, values: Array, other: Grid) -> Array:
+        """Values at the nodes of another grid of the same curves, linear between those here."""
+        # Of two nodes at one place, each belongs to the side of its element.
+        hair = 1e-9 * (self.s[-1] - self.s[0])
+        return np.interp(other._lean(2 * hair), self._lean(hair), values)
+
+    def _lean(self, by: float) -> Array:
+        """The nodes, those at the ends of elements moved inwards a little."""
+        s = self.s.copy().reshape(-1, DEGREE + 1)
+        s[:, 0] += by
+        s[:, -1] -= by
+        return s.ravel()
+
+    def integrate(self, a: Array) -> Array:
+        """B at the nodes for s'' there, from rest, shape (N + 1,)."""
+        lengths = np.diff(self.edges)
+        table = a.reshape(-1, DEGREE + 1, 1)
+        rises = lengths * (find_basis().links[self.kinds] @ table)[..., 0]
+        return np.cumsum(np.hstack([np.zeros_like(lengths), rises]).ravel())
+
+
+def lay_out(edges: Array, segment: NDArray[np.int64], rests: tuple[bool, bool]) -> Grid:
+    """The grid of elements with these edges, shape (E, 2) [m], on segments of shape (E,)."""
+    grid = Grid(np.repeat(edges[:, 0], DEGREE + 1), np.repeat(segment, DEGREE + 1), rests)
+    kinds = grid.kinds[:, None]
+    y = find_basis().y[grid.kinds]
+    share = np.where(kinds == INSIDE, y, np.where(kinds == FROM_REST, y**2, 1 - y**2))
+    s = edges[:, :1] + share * np.diff(edges)
+    s[:, -1] = edges[:, 1]
+    return grid._replace(s=s.ravel())
+
+
+class Profile(NamedTuple):
+    """Motion at n places of a curve: a = s'' [m/s^2], b = s'^2 [m^2/s^2] and squeeze [N]."""
+
+    a: Array
+    b: Array
+    squeeze: Array
+
+
+class Elements:
+    """The polynomials of a profile on a grid.
+
+    Parameters
+    ----------
+    grid : Grid
+    profile : Profile
+        At its nodes.
+    """
+
+    def __init__(self, grid: Grid, profile: Profile) -> None:
+        self.grid = grid
+        basis, kinds = find_basis(), grid.kinds
+        self._y = basis.y[kinds].ravel()
+        self._rooted = kinds > 0
+        table = np.stack([profile.a, profile.squeeze], axis=-1)
+        table = table.reshape(len(kinds), DEGREE + 1, 2)
+        self._motion = basis.to_powers[kinds] @ table
+        powers = np.arange(DEGREE + 1)[:, None]
+        a = np.diff(grid.edges)[:, :, None] * self._motion[..., :1]
+        sign = np.where(kinds == TO_REST, -1.0, 1.0)[:, None, None]
+        first = profile.b.reshape(-1, DEGREE + 1)[:, :1, None]
+        plain = np.concatenate([first, 2 * a / (powers + 1)], axis=1)
+        rooted = np.concatenate([4 * sign * a / (powers + 2), np.zeros_like(first)], axis=1)
+        self._b = np.where(self._rooted[:, None, None], rooted, plain)[..., 0]
+
+    def find_y(self, k: NDArray[np.int64], done: Array, left: Array) -> Array:
+        """Local variable where a part of an interval is done and one is left, which add up to 1."""
+        rooted = self._rooted[k // (DEGREE + 1)]
+        y, later = self._y[k], self._y[k + 1]
+        squares = np.sqrt(np.maximum(left * y**2 + done * later**2, 0.0))
+        return np.where(rooted, squares, left * y + done * later)
+
+    def evaluate(self, k: NDArray[np.int64], y: Array) -> tuple[Profile, Array]:
+        """Profile and speed [m/s] at places y of intervals k."""
+        element = k // (DEGREE + 1)
+        a, squeeze = self._motion[element, -1].T
+        for power in reversed(range(DEGREE)):
+            a, squeeze = (
+                a * y + self._motion[element, power, 0],
+                squeeze * y + (self._motion[element, power, 1]),
+            )
+        b = self._b[element, -1]
+        for power in reversed(range(DEGREE + 1)):
+            b = b * y + self._b[element, power]
+        speed = np.sqrt(np.maximum(b, 0.0)) * np.where(self._rooted[element], y, 1.0)
+        return Profile(a, speed**2, squeeze), speed
+
+    def at(self, fractions: Array) -> Profile:
+        """Profile at `fractions` of every interval inside elements, interval by interval."""
+        k = np.repeat(self.grid.nonempty, len(fractions))
+        x = np.tile(fractions, len(self.grid.nonempty))
+        return self.evaluate(k, self.find_y(k, x, 1 - x))[0]
+
+    def move(self, grid: Grid) -> Profile:
+        """The profile at the nodes of another grid of the same curves."""
+        old = self.grid
+        place = old.interpolate(np.arange(len(old.s), dtype=float), grid)
+        k = np.clip(np.floor(place).astype(int), 0, len(old.s) - 2)
+        k = np.where(k % (DEGREE + 1) == DEGREE, k + 1, k)
+        k = np.minimum(k, len(old.s) - 2)
+        done = np.clip((grid.s - old.s[k]) / np.maximum(old.steps[k], 1e-300), 0.0, 1.0)
+        return self.evaluate(k, self.find_y(k, done, 1 - done))[0]

@@ -1,0 +1,145 @@
+"""Elements where a plan needs them: ends at its switches, and more of them where limits are dear.
+
+What limits miss between nodes costs their multipliers times that, to first order, once they are
+tightened: the price. It falls with the sixth power of an element's length where the plan is smooth,
+so elements end where it switches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ...common.arrays import Array
+from ...geometry.curve import Curve
+from ..options import Objective
+from .data import PhaseData
+from .elements import DEGREE, Grid, Profile, lay_out
+from .switches import Switch, find_switches
+
+START = {Objective.EFFORT: 20}
+"""Elements of a phase to begin with, if not 10: a plan of least effort switches more softly."""
+MOST = 80
+"""Elements of a phase from which on they are not doubled."""
+SHIFTED = 0.02
+"""Relative loss of an end of an element that is so far from a switch, over the curve's length."""
+_ORDER = 6
+"""Power of an element's length that its price falls with."""
+_APART = 1e-5
+"""Least length of an element that switches lead to, over the curve's."""
+_NEAR = 0.02
+"""Distance at which a switch is the one that a break was for, over the curve's length."""
+_CHEAP = 1e-3
+"""Least price of a stretch that counts, over that of all."""
+
+
+class Mesh(NamedTuple):
+    """The elements of one phase.
+
+    Attributes
+    ----------
+    breaks : ndarray, [m]
+        Where elements end for the plan's sake, increasing.
+    weights : ndarray or None
+        How many elements each stretch between breaks and reversals gets, as a ratio; None for as
+        many as its part of a half turn, fine towards the ends.
+    """
+
+    breaks: Array = np.zeros(0)
+    weights: Array | None = None
+
+    def make_grid(
+        self, curve: Curve, elements: int, rests: tuple[bool, bool] = (True, True)
+    ) -> Grid:
+        """Grid of a curve, fine towards its ends (where the motion is slow)."""
+        ends = find_ends(curve, self.breaks)
+        angles = np.arccos(1 - 2 * np.clip(ends / curve.length, 0.0, 1.0))
+        weights = np.diff(angles) if self.weights is None else self.weights
+        # Halves go up whatever their last bit is.
+        wanted = weights / weights.sum() * elements + 0.5 + 1e-6
+        counts = np.maximum(1, np.floor(wanted).astype(int))
+        while counts.sum() != elements:
+            counts[np.argmax(counts)] += np.sign(elements - counts.sum())
+        places = np.repeat(np.arange(len(counts)), counts)
+        done = np.concatenate([np.arange(count) / count for count in counts])
+        starts = angles[places] + done * np.diff(angles)[places]
+        edges = curve.length * (1 - np.cos(starts)) / 2
+        edges[done == 0] = ends[:-1]
+        pairs = np.stack([edges, np.append(edges[1:], ends[-1])], axis=1)
+        stops = [segment.stop for segment in curve.segments]
+        return lay_out(pairs, np.searchsorted(stops[:-1], pairs.mean(axis=1)), rests)
+
+
+def find_ends(curve: Curve, breaks: Array) -> Array:
+    """Ends of the stretches between breaks and reversals of a curve [m]."""
+    return np.union1d([0.0, *(segment.stop for segment in curve.segments)], breaks)
+
+
+def adapt(
+    goal: Objective | None,
+    part: PhaseData,
+    profile: Profile,
+    margin: float,
+    prices: Array,
+    before: Mesh,
+) -> tuple[Mesh, float]:
+    """A mesh for what has been found on another, and how far breaks have shifted.
+
+    Parameters
+    ----------
+    goal : Objective or None
+        None where switches are not to be looked for.
+    part : PhaseData
+        Of the phase.
+    profile : Profile
+    margin : float, [N]
+    prices : ndarray
+        Of each interval between nodes that has a length.
+    before : Mesh
+        The other one.
+
+    Returns
+    -------
+    tuple
+        The mesh, and how far breaks are from where they were, over the curve's length; infinite if
+        there is one where s'' jumps from one extreme to the other and none was.
+    """
+    breaks, shift = before.breaks, 0.0
+    if goal in (Objective.TIME, Objective.MARGIN):
+        switches = find_switches(part, profile, margin)
+        breaks, shift = _match(before.breaks, switches, part.curve)
+    if len(breaks) != len(before.breaks):
+        return Mesh(breaks), shift
+    ends = find_ends(part.curve, before.breaks)
+    middles = part.grid.edges.mean(axis=1)
+    owner = np.searchsorted(ends, middles) - 1
+    per_element = prices.reshape(len(middles), DEGREE).sum(axis=1)
+    counts = np.bincount(owner, minlength=len(ends) - 1)
+    price = np.bincount(owner, per_element, len(ends) - 1)
+    price = np.maximum(price, _CHEAP * price.sum() + 1e-300)
+    return Mesh(breaks, counts * (price / counts) ** (1 / _ORDER)), shift
+
+
+def _match(known: Array, switches: Sequence[Switch], curve: Curve) -> tuple[Array, float]:
+    """Breaks that have moved to switches near them, with those that are new, and their shift.
+
+    None is given up: on an element's end a switch may not show.
+    """
+    fixed, least = find_ends(curve, np.zeros(0)), _APART * curve.length
+    moved, fresh, shift = dict[int, float](), list[float](), 0.0
+    for place, jumps in switches:
+        far = np.abs(known - place)
+        far[list(moved)] = np.inf
+        if far.min(initial=np.inf) < _NEAR * curve.length:
+            moved[int(far.argmin())] = place
+            shift = max(shift, float(far.min()) / curve.length)
+        elif np.abs(np.concatenate([fixed, known, fresh]) - place).min() > least:
+            fresh.append(place)
+            shift = np.inf if jumps or not len(known) else shift
+    kept = list[float]()
+    for place in sorted([*(moved.get(k, place) for k, place in enumerate(known)), *fresh]):
+        if np.abs(np.append(fixed, kept) - place).min() > least:
+            kept.append(place)
+    return np.array(kept), shift

@@ -1,0 +1,276 @@
+"""Solving along curves on a mesh, and what a solution says of a better mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ...common.arrays import Array
+from ...geometry.curve import Curve
+from ..advice import name_phases
+from ..options import Objective, PlanOptions
+from ..phase_plan import PhasePlan
+from .data import PhaseData, cut, fit_torque, join, prepare
+from .elements import DEGREE, Elements
+from .first_guess import guess
+from .mesh import MOST, SHIFTED, START, Mesh, adapt, find_ends
+from .misses import MISS, Misses, PathSolution
+from .motion import PathMotion
+from .nlp import (
+    PathNLP,
+    Tightening,
+    Units,
+    build_path_nlp,
+    first_multipliers,
+    make_bounds,
+    move_multipliers,
+    pack,
+    parameters,
+    unpack,
+)
+from .terms import LimitShape
+
+_SHARE = 0.5
+"""Share of the accuracy that is allowed for shifted switches."""
+_DEAR = {Objective.TIME: 1.0, Objective.MARGIN: 1.0, Objective.EFFORT: 0.2}
+"""Share of the accuracy that missed limits may cost by first order: efforts have other errors."""
+_LONGER = 0.2
+"""Most that the NLP's duration may be allowed to be longer, relatively."""
+_SETTLED = 0.1
+"""Share of the accuracy below which switches are not looked for again."""
+
+Plans = list[PhasePlan[PathMotion]]
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is planned: see `plan_curves`."""
+
+    curves: Sequence[Curve]
+    epsilon: float
+    options: PlanOptions
+    phases: Sequence[int]
+    duration: float | None
+
+    @property
+    def name(self) -> str:
+        """The phases, for messages."""
+        return name_phases(self.phases)
+
+    @property
+    def lost(self) -> float:
+        """Least normal force below which a margin is none [N]."""
+        return self.epsilon - MISS * self.curves[0].formation.scene.scales.force
+
+    @property
+    def elements(self) -> int:
+        """Elements of each phase to begin with."""
+        intervals = self.options.intervals
+        if intervals is None:
+            return START.get(self.options.goal, 10)
+        return max(-(-intervals // DEGREE), 3)
+
+    def lay_out(
+        self, meshes: Sequence[Mesh], wanted: int
+    ) -> tuple[int, list[PhaseData], PhaseData, PathNLP]:
+        """Each phase on its mesh, all as one, and the NLP for that.
+
+        Each has as many elements, also returned, as are wanted if that is enough for its ends.
+        """
+        pairs = zip(self.curves, meshes, strict=True)
+        elements = max(wanted, *(len(find_ends(curve, mesh.breaks)) for curve, mesh in pairs))
+        parts = self.prepare(meshes, elements)
+        data = join(parts)
+        shape = LimitShape.of(data.limits)
+        nlp = build_path_nlp(shape, len(data.grid.steps), self.options.goal)
+        return elements, parts, data, nlp
+
+    def prepare(self, meshes: Sequence[Mesh], elements: int) -> list[PhaseData]:
+        """What each phase gives the NLP on its grid."""
+        found, last = [], len(meshes) - 1
+        for k, (curve, mesh) in enumerate(zip(self.curves, meshes, strict=True)):
+            grid = mesh.make_grid(curve, elements, (k == 0, k == last))
+            found.append(prepare(curve, self.epsilon, grid, self.phases[k]))
+        return found
+
+
+@dataclass(frozen=True)
+class Round:
+    """A mesh, and what is known on it.
+
+    Attributes
+    ----------
+    task : Task
+    elements : int
+        Of each phase.
+    meshes : tuple of Mesh
+    parts : list of PhaseData
+    data : PhaseData
+        All phases as one.
+    nlp : PathNLP
+    units : Units
+    solution : PathSolution
+        The last one, or where to start.
+    duration : float or None, [s]
+        What the NLP may take for the duration, which is longer than allowed if it errs so.
+    shift : float
+        How far switches seem to be from the mesh's breaks, over the curve's length.
+    """
+
+    task: Task
+    elements: int
+    meshes: tuple[Mesh, ...]
+    parts: list[PhaseData]
+    data: PhaseData
+    nlp: PathNLP
+    units: Units
+    solution: PathSolution
+    duration: float | None
+    shift: float = np.inf
+
+    @staticmethod
+    def begin(task: Task, finer: int) -> Round:
+        """A first guess on elements that know of nothing but reversals."""
+        meshes = tuple(Mesh() for _ in task.curves)
+        elements, parts, data, nlp = task.lay_out(meshes, finer * task.elements)
+        profile, units = guess(data, task.options.time_weight)
+        start = PathSolution(profile, 0.0, first_multipliers(nlp, data, profile, units))
+        return Round(task, elements, meshes, parts, data, nlp, units, start, task.duration)
+
+    @cached_property
+    def motions(self) -> list[PathMotion]:
+        """The motion of each phase."""
+        pairs = zip(self.parts, cut(self.parts, self.solution.profile), strict=True)
+        return [PathMotion(part.curve, part.grid, own) for part, own in pairs]
+
+    @cached_property
+    def misses(self) -> Misses:
+        """What limits miss between nodes."""
+        return Misses.of(self.data, self.solution, self.motions, self.task.duration)
+
+    @property
+    def value(self) -> float:
+        """What errors of the cost are relative to."""
+        if self.task.options.goal is Objective.MARGIN:
+            return max(abs(self.task.epsilon + self.solution.margin) / self.units.force, 1e-9)
+        return max(abs(self.solution.cost), 1e-9)
+
+    @cached_property
+    def prices(self) -> Array:
+        """What tightening limits would cost in each solid interval, relatively."""
+        price = self.misses.price(self.nlp, self.data, self.units, self.solution)
+        return np.asarray(price / self.value)
+
+    @property
+    def spared(self) -> float:
+        """What the NLP takes the duration for, over what it is, less one."""
+        total = sum(motion.duration for motion in self.motions)
+        return max(self.solution.lasts / total - 1, 0.0)
+
+    @property
+    def unspent(self) -> float:
+        """What the time that is spared would gain, to first order, relatively."""
+        row = self.nlp.columns.g["duration"]
+        each = float(self.solution.multipliers["lam_g0"][row].sum()) * self.solution.lasts
+        return max(each, 0.0) * self.spared / self.units.time / self.value
+
+    @property
+    def merit(self) -> float:
+        """What the cost is likely to be once limits hold between nodes."""
+        return self.solution.cost + self.value * float(self.prices.sum())
+
+    @property
+    def is_split(self) -> bool:
+        """Whether elements end where the plan switches."""
+        return any(len(mesh.breaks) for mesh in self.meshes)
+
+    def solve(self, tightening: Tightening | None = None) -> Round | str:
+        """Solve on this mesh; in words how the solver ended if there is no solution."""
+        tightening = tightening or Tightening.none(self.data, self.duration)
+        weight = self.task.options.time_weight
+        found = _solve(self.nlp, self.data, self.units, tightening, self.solution, weight)
+        return found if isinstance(found, str) else replace(self, solution=found)
+
+    def adapt(self, dearer: bool = False) -> tuple[Round, Round | None]:
+        """The round with its shift, and a better one to go on from; None if this one will do.
+
+        Parameters
+        ----------
+        dearer : bool
+            Whether tightening limits has turned out to be dearer than it may be.
+        """
+        task, most = self.task, self.task.options.accuracy
+        prices = self.prices
+        shares = np.split(prices, np.cumsum([len(part.nonempty) for part in self.parts])[:-1])
+        # Once switches have settled they need not be looked for.
+        settled = SHIFTED * self.shift < _SETTLED * most
+        goal = None if settled else task.options.goal
+        found = [
+            adapt(goal, part, motion.profile, self.solution.margin, share, mesh)
+            for part, motion, share, mesh in zip(
+                self.parts, self.motions, shares, self.meshes, strict=True
+            )
+        ]
+        shift = self.shift if settled else max(own for _, own in found)
+        moved = max(SHIFTED * shift, self.unspent) > _SHARE * most
+        # What is missed where elements do not end at switches yet says little.
+        begun = self.is_split or not np.isinf(shift)
+        dear = dearer or (begun and prices.sum() > _DEAR[task.options.goal] * most)
+        dear = dear and self.elements < MOST and task.options.intervals is None
+        if not (moved or dear):
+            return replace(self, shift=shift), None
+        meshes = tuple(mesh for mesh, _ in found)
+        elements, parts, data, nlp = task.lay_out(meshes, self.elements * (2 if dear else 1))
+        old, new, solution = self.data.grid, data.grid, self.solution
+        carried = solution._replace(
+            profile=Elements(old, solution.profile).move(new),
+            multipliers=move_multipliers(self.nlp, nlp, solution.multipliers, old, new),
+        )
+        allowed = task.duration and task.duration * (1 + min(self.spared, _LONGER))
+        known = elements, meshes, parts, data, nlp, self.units, carried, allowed, shift
+        return self, Round(task, *known)
+
+    def summarise(self, gap: float) -> Plans:
+        """The plan of each phase, given what tightening limits has cost, relatively."""
+        options = self.task.options
+        plans: Plans = []
+        for part, motion in zip(self.parts, self.motions, strict=True):
+            torque, squares = fit_torque(part, motion)
+            value = {
+                Objective.TIME: motion.duration,
+                Objective.EFFORT: squares + options.time_weight * motion.duration,
+                Objective.MARGIN: self.task.epsilon + self.solution.margin,
+            }[options.goal]
+            error = float(abs(gap) + SHIFTED * min(self.shift, 1.0) + self.unspent)
+            plans.append(PhasePlan(motion, torque, value, error=error))
+        return plans
+
+
+def _solve(
+    nlp: PathNLP,
+    data: PhaseData,
+    units: Units,
+    tightening: Tightening,
+    start: PathSolution,
+    time_weight: float,
+) -> PathSolution | str:
+    """Solve once; the solution, or in words how the solver ended."""
+    bounds = make_bounds(nlp, data, units, tightening)
+    if (bounds["lbg"] > bounds["ubg"]).any():
+        return "limits that hold between the nodes too leave nothing"
+    result = nlp.solver(
+        x0=pack(nlp, start.profile, units, start.margin),
+        p=parameters(nlp, data, units, time_weight),
+        **bounds,
+        **start.multipliers,
+    )
+    stats = nlp.solver.stats()
+    if not stats["success"]:
+        return f"Ipopt stopped with {stats['return_status']}"
+    profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], units)
+    multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
+    lasts = float(result["g"][-1]) * units.time if tightening.duration else 0.0
+    return PathSolution(profile, margin, multipliers, float(result["f"]), lasts)
