@@ -42,7 +42,7 @@ MOST = 64
 """Intervals of each phase from which on none is halved."""
 _PATIENCE = 80
 """Most iterations of one solve on finer intervals, that starts from a solution."""
-_ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 50}
+_ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 40}
 """Most iterations of one solve, if not 150."""
 _DEARER = 0.2
 """Largest relative cost increase accepted from tightening."""
