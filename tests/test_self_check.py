@@ -198,7 +198,8 @@ def test_meta_keeps_the_figures(heptagon: Problem, trajectory: Trajectory) -> No
     figures = trajectory.meta["replay"]
     report = verify(heptagon, trajectory)
     margins = [(c.least, c.contact, p.number) for p in report.phases for c in p.contacts]
-    assert figures["least_c_n"]["value"] == pytest.approx(min(margins)[0], abs=1e-6)
+    # Parabolas through other instants dip a little differently.
+    assert figures["least_c_n"]["value"] == pytest.approx(min(margins)[0], abs=1e-5)
     assert (figures["least_c_n"]["contact"], figures["least_c_n"]["phase"]) in [
         margin[1:] for margin in margins if margin[0] < min(margins)[0] + 1e-6
     ]

@@ -43,7 +43,7 @@ RESIDUAL = 1e-8
 speed: rounding leaves 1e-13."""
 ROWS = 8
 """Parts of a phase at whose ends replay and plan are compared."""
-PIECES = 80
+PIECES = 40
 """Parts of a phase at whose ends normal forces are looked at."""
 _CLOSER = 4
 """Factor on the number of parts, if a parabola through few instants dips too low."""
