@@ -8,8 +8,11 @@ import pytest
 
 from wholearm.benchmark.precision.check import check_plan
 from wholearm.benchmark.precision.figure import draw_runs
-from wholearm.benchmark.precision.instances import Instance, list_instances
+from wholearm.benchmark.precision.implicit import STARTS
+from wholearm.benchmark.precision.instances import Instance, find_files, list_instances
 from wholearm.benchmark.precision.planning import (
+    IMPLICIT,
+    IMPLICIT_PHASE,
     LEAST_TIME,
     NO_DRAG,
     PLANNERS,
@@ -71,6 +74,12 @@ def test_what_a_replay_does_not_keep_is_no_solution() -> None:
     lost = check_plan(phase(4), plan._replace(torque=TorqueProfile(plan.torque.breaks, none)))
     assert "contact is lost" in lost.outcome and lost.violation > 0.02
     assert check_plan(phase(4), plan._replace(status="stopped")).outcome == "stopped"
+
+
+def test_random_starts_are_made_on_a_phase_that_there_is() -> None:
+    instances = list_instances(find_files(str(Path(FILES[0]).parent)))
+    tasks = [task for one in instances for task in list_plan_tasks(IMPLICIT, one, FILES)]
+    assert len(tasks) == STARTS and {task.instance for task in tasks} == {IMPLICIT_PHASE}
 
 
 def test_peers_that_are_missing_have_no_tasks(monkeypatch: pytest.MonkeyPatch) -> None:

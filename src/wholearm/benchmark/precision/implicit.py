@@ -27,6 +27,7 @@ RELAXED = (1.0, 1e-1, 1e-2, 1e-3, 1e-4)
 ITERATIONS = 100
 """Largest number of iterations for each of them."""
 STARTS = 50
+"""Number of random starts."""
 
 
 def build_implicit(instance: Instance, setting: str) -> Callable[[], PeerPlan]:

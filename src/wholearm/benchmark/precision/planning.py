@@ -37,7 +37,7 @@ FINE = 1e-7
 """Accuracy of a plan along a curve whose duration is the reference where there is no bound."""
 NEAR = 1e-7
 """Distance over the duration in which a step of the torques is that of a reversal."""
-IMPLICIT_PHASE = "heptagon_four_contacts 4"
+IMPLICIT_PHASE = "heptagon 4"
 """Phase of the random starts."""
 
 
