@@ -11,9 +11,9 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple, TypeVar
 
-REPEATS = 5
+REPEATS = 25
 """Largest number of runs that a median is of."""
-BUDGET = 0.3
+BUDGET = 0.1
 """Time after which a run is not repeated any more [s]."""
 LIMIT = 60.0
 """Processor time that one setting of a method may take on one phase [s]."""
