@@ -9,6 +9,7 @@ from wholearm.benchmark.precision.report import Comparison, find_times
 from wholearm.benchmark.precision.runs import (
     REPEATS,
     SHIFT,
+    SHORT,
     Run,
     find_mean,
     find_medians,
@@ -61,5 +62,6 @@ def test_means_are_geometric_but_for_their_shift() -> None:
 
 
 def test_what_is_quick_is_run_several_times() -> None:
-    answers = [answer for _, _, answer in repeat(lambda: lambda: 7)]
-    assert answers == REPEATS * [7]
+    found = list(repeat(lambda: lambda: 7))
+    assert found and {answer for _, _, answer in found} == {7} and len(found) <= REPEATS
+    assert max(took for _, took, _ in found) < SHORT

@@ -82,11 +82,11 @@ def format_report(runs: Sequence[Run], limit: float = LIMIT) -> str:
     lines = ["# Run time against error, with peers", "", stamp(), ""]
     lines += [f"{_name_processor()}; {'; '.join(_list_versions())}.", ""]
     lines += [
-        f"Times are medians over up to {REPEATS} runs (one where that takes over {BUDGET:g} s) in "
-        f"one thread, of processor time, or by the wall clock below {SHORT:g} s. Means are "
-        f"geometric ones, shifted by {1e3 * SHIFT:g} ms, over the phases of all problems, each "
-        "with the setting that reaches the error soonest; what does not reach it counts with the "
-        f"time limit, {limit:g} s.",
+        f"Times are medians of processor time over up to {REPEATS} runs (one where that takes over "
+        f"{BUDGET:g} s) in one thread; what takes less than {SHORT:g} s is averaged over that "
+        f"time. Means are geometric ones, shifted by {1e3 * SHIFT:g} ms, over the phases of all "
+        "problems, each with the setting that reaches the error soonest; what does not reach it "
+        f"counts with the time limit, {limit:g} s.",
         "",
         "Phases whose slow motion would lose a contact have no few pieces of torque, and where a "
         "method was not run on a phase, ours does not count there either.",

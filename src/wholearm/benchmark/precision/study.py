@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -43,8 +44,8 @@ METHODS = [*SIMULATORS, *PLANNERS]
 PARTS = ("simulation", "planning")
 SWING_FILE = "heptagon_four_contacts.toml"
 """Problem file whose object swings."""
-KEPT_EVERY = 20
-"""Number of tasks after which runs are written to their file."""
+KEPT_EVERY = 5.0
+"""Time after which runs are written to their file [s]."""
 
 
 @dataclass(frozen=True)
@@ -94,11 +95,13 @@ def run_precision(
     if options.fresh:
         runs = [run for run in runs if not _is_chosen(options, run.method)]
     done = {run.key for run in runs}
-    for count, answer in enumerate(_measure(options, files, done, say), start=1):
+    kept = time.monotonic()
+    for answer in _measure(options, files, done, say):
         runs += _read_answer(answer)
         say(f"{answer.task.study}: {answer.task.method}, {answer.task.instance}")
-        if count % KEPT_EVERY == 0:
+        if time.monotonic() > kept + KEPT_EVERY:
             write_text(paths[0], format_runs(runs))
+            kept = time.monotonic()
     runs.sort(key=lambda run: (run.study, METHODS.index(run.method), run.instance))
     with together():
         write_text(paths[0], format_runs(runs))
