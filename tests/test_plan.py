@@ -179,10 +179,11 @@ def test_objectives_trade_against_each_other(plans: dict[str, Trajectory]) -> No
     assert least[2] > 0.3 and min(least[:2]) >= margin.meta["epsilon"] - 1e-6
 
 
-def test_more_time_never_lowers_the_margin(heptagon: Problem, trajectory: Trajectory) -> None:
-    least = trajectory.duration
+def test_more_time_never_lowers_the_margin(heptagon: Problem) -> None:
+    problem = replace(heptagon, phases=heptagon.phases[:2])
+    least = solve(problem, intervals=40, replay=False).duration
     values = [
-        solve(heptagon, "margin", duration=part * least, intervals=40).meta["value"]
+        solve(problem, "margin", duration=part * least, intervals=40, replay=False).value
         for part in (1.02, 1.3, 3.0)
     ]
     assert (np.diff(values) >= -1e-5).all()

@@ -124,7 +124,8 @@ def test_momentum_is_that_of_the_impulses(problem: Problem, replayed: Simulation
 def test_the_loss_goes_to_impact(problem: Problem, replayed: Simulation) -> None:
     energies, formation = replayed.energies, problem.phases[0].formation
     lost = np.diff(energies.impact)
-    assert (lost > -1e-12).all()
+    # Energies are as exact as the steps, to 1e-9.
+    assert (lost > -1e-9 * energies.work[-1]).all()
     for event in replayed.find(EventKind.IMPACT):
         last, first = joints(replayed, event.phase)
         stored = energy(formation, replayed.z[[last, first]], replayed.z_dot[[last, first]])
@@ -205,7 +206,7 @@ def chords(torque: TorqueProfile, count: int) -> TorqueProfile:
 
 def test_a_planned_stop_is_that_of_a_phase_that_ends_at_rest(problem: Problem) -> None:
     """Linear torques between rows bring it there a little early, and not quite at rest."""
-    torque = chords(plan_of(IMPACTS, "margin").torque, 8)
+    torque = chords(plan_of(IMPACTS, "margin").torque, 64)
     first, second, *others = problem.phases
     stops = [dataclasses.replace(phase, end=End.REST) for phase in others]
     resting = dataclasses.replace(problem, phases=(first, second, *stops))

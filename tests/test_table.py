@@ -78,7 +78,8 @@ def test_both_ways_to_another_friction_plan_the_same(heptagon: Problem) -> None:
     plan = solve(rough)
     torque = plan.trajectory.torque
     assert simulate(by_name, torque).outcome.reached
-    assert not simulate(first, torque).missed_by == pytest.approx(0.0, abs=1e-7)
+    other = simulate(first, torque).t[-1]
+    assert other != pytest.approx(plan.duration, rel=1e-3)
     assert plan.meta["problem"]["friction"]["palm"] == 0.2
 
 

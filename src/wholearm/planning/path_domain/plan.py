@@ -33,6 +33,9 @@ _AGAIN = 3
 _FINER = (1, 2, 4)
 """Elements to try, over those that are asked for."""
 
+_ROUGH = 1e-2
+"""Accuracy of plans that are made to see whether there are any."""
+
 
 class _Stuck(NamedTuple):
     """What has come instead of a plan.
@@ -99,7 +102,8 @@ def plan_curves(
     task = Task(curves, epsilon, options, phases, duration)
 
     def replan(changed: Sequence[Curve], least: float) -> object:
-        return _insist(_plan_finer(replace(task, curves=changed, epsilon=least)))
+        changes = replace(task, curves=changed, epsilon=least, options=_roughen(options))
+        return _insist(_plan_finer(changes, insist=False))
 
     try:
         plans = _plan_finer(task)
@@ -138,9 +142,11 @@ def _explain_duration(task: Task) -> InfeasibleError | None:
     if least <= duration:
         return None
 
+    rough = replace(task, options=_roughen(task.options))
+
     def can_plan(_: Parameter, value: float) -> bool:
         try:
-            return _insist(_plan(replace(task, duration=value)))[0].value >= task.epsilon
+            return _insist(_plan(replace(rough, duration=value)))[0].value >= task.epsilon
         except SolverError:
             return False
 
@@ -153,6 +159,11 @@ def _explain_duration(task: Task) -> InfeasibleError | None:
     )
 
 
+def _roughen(options: PlanOptions) -> PlanOptions:
+    """Options for plans of which only matters that there are any."""
+    return replace(options, accuracy=max(options.accuracy, _ROUGH))
+
+
 def _insist(found: Plans | _Stuck) -> Plans:
     """The plans, or an error."""
     if isinstance(found, _Stuck):
@@ -160,14 +171,19 @@ def _insist(found: Plans | _Stuck) -> Plans:
     return found
 
 
-def _plan_finer(task: Task) -> Plans | _Stuck:
-    """Plan, on a finer grid where limits that hold between the nodes leave nothing, or no time."""
+def _plan_finer(task: Task, insist: bool = True) -> Plans | _Stuck:
+    """Plan, on a finer grid where limits that hold between the nodes leave nothing, or no time.
+
+    What so few elements cannot keep at their nodes, twice as many may: they are tried if that is
+    insisted on. What is said of why there is no plan is said of the fewer.
+    """
+    stuck: _Stuck | None = None
     for finer in _FINER:
         found = _plan(task, finer)
         if isinstance(found, _Stuck):
-            # What so few elements cannot keep at their nodes, twice as many may.
-            if not found.between and finer > 1:
-                break
+            if not found.between and (stuck or not insist):
+                return stuck or found
+            stuck = found
         elif task.options.goal is not Objective.MARGIN or found[0].value >= task.lost:
             break
     return found
