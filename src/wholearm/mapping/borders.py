@@ -229,9 +229,8 @@ def _circle_track(
 
     def centre(phi: Array) -> Array:
         (corner,) = _corners_at(scene, phi, vertex, index)
-        if edge is None:
-            return np.asarray(corner)
-        return np.asarray(corner + link.radius * _outward(scene, edge, phi))
+        apart = 0.0 if edge is None else link.radius * _outward(scene, edge, phi)
+        return np.asarray(corner + apart)
 
     def pose(phi: Array) -> tuple[Array, Array]:
         place = centre(phi)
@@ -265,8 +264,7 @@ def _circle_track(
             aside = ASIDE * scene.scales.length
             beside = [close_fingers(scene, x + d, phi).touched[:, finger] for d in (-aside, aside)]
             pair = np.sort(np.column_stack(beside), axis=1)
-            about = (pair == side) | (pair == first + count + index)
-            about |= pair == first + count + (index - 1) % count
+            about = np.isin(pair, [side, *(first + count + (index - k) % count for k in (0, 1))])
             supported = about.all(axis=1) & (pair[:, 0] != pair[:, 1])
         same = _is_closed(closed, finger, angle, pair)
         labels[:, [2 + 2 * finger, 3 + 2 * finger]] = pair

@@ -51,8 +51,7 @@ def solve(
     accuracy : float, default 1e-4
         Relative error of the objective, from 1e-8 to 0.1, below whose estimate refining ends.
     intervals : int, optional
-        Intervals of the grid of each phase along a curve, at least 10, in elements of four; by
-        default as many as the accuracy needs.
+        Of the grid of each phase along a curve, at least 10; by default what the accuracy needs.
     time_weight : float, default 1, [(N m)^2]
         Weight of the duration against the effort, for `effort`.
     duration : float, optional, [s]
@@ -60,16 +59,15 @@ def solve(
     samples : int, default 201
         Rows per phase of the trajectory, at least 2.
     transcription : {"auto", "time"}
-        ``"auto"`` plans phases with one freedom that are joined at rest or by impacts along their
-        curves and others in the time domain; ``"time"`` plans all in the time domain.
+        ``"auto"`` plans phases with one freedom, joined at rest or by impacts, along their curves
+        and others in the time domain; ``"time"`` plans all there.
     time_intervals : int, optional
-        Intervals of each phase in the time domain, at least 4; by default 32 for a phase with one
-        freedom that is planned alone and 10 for others.
+        Of each phase in the time domain, at least 4; by default 32 for a phase with one freedom
+        that is planned alone and 10 for others.
     degree, scheme : int, default 3; {"radau", "legendre"}
         Number of collocation points per interval in the time domain, from 2 to 6, and which.
     opening : float, default 0.01
-        Least acceleration, over gravity, with which the gap of a contact that a smooth phase lets
-        go opens in the time domain.
+        Least acceleration, over gravity, with which the gap of a contact let go opens there.
     clearance : float, default 5e-4
         Least such gap over the object's radius of gyration, from a third of the first stage on.
     mode_search : bool, default True
@@ -88,10 +86,9 @@ def solve(
     ------
     InputError
         If an option is out of its range or the problem's phases cannot be traced.
-    InfeasibleError, JammingError, SolverError
-        If there is no plan; the message names the phase, the limit, the place and the time.
-    ReplayError
-        If a plan does not hold when it is replayed; the message says where.
+    InfeasibleError, JammingError, SolverError, ReplayError
+        If there is no plan, or none that holds when it is replayed; the message names the phase,
+        the limit, the place and the time.
     """
     return solve_with(problem, PlanOptions(objective=objective, **options), progress)
 

@@ -92,8 +92,7 @@ def plan_curves(
     Raises
     ------
     InfeasibleError
-        If no motion keeps the limits; names what is short, where and by how much, and each single
-        limit with which there would be a plan.
+        If no motion keeps the limits; names what is short, where, and what would have to change.
     JammingError
         If friction jams a formation somewhere on its curve.
     SolverError

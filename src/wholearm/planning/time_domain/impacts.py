@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -52,9 +53,7 @@ def plan_with_impacts(
         Longest duration of the block, for the objective `margin`.
     to_go : CostToGo, optional
         What follows a block without impacts.
-    ample : float, [N]
-    fastest : list of PhasePlan, optional
-    pinned : bool
+    ample, fastest, pinned
         As of `plan_phases`; a block with impacts makes its own.
 
     Raises
@@ -64,19 +63,8 @@ def plan_with_impacts(
     """
     ends = _find_impacts(block)
     if not ends:
-        known = fastest or ()
-        own = plan_phases(
-            problem,
-            block,
-            z,
-            options,
-            duration,
-            to_go=to_go,
-            ample=ample,
-            fastest=known,
-            pinned=pinned,
-        )
-        return [*own]
+        own = partial(plan_phases, problem, block, z, options, duration, to_go=to_go, ample=ample)
+        return [*own(fastest=fastest or (), pinned=pinned)]
     explained = plan_parts_of(problem, block, ample, explained=True)
     # A duration that is too short for stops need not be so without them.
     probe = (

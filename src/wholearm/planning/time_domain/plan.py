@@ -67,20 +67,18 @@ def plan_phases(
     Parameters
     ----------
     problem, options : Problem, PlanOptions
-    phases : sequence of Phase
-        All but the last one end in motion.
-    z : ndarray, shape (5,)
+    phases, z : sequence of Phase, ndarray of shape (5,)
+        All but the last phase end in motion.
     duration : float, optional, [s]
-        Longest duration of all these phases, for the objective `margin`.
+        Longest duration of all these phases, for `margin`.
     to_go : CostToGo, optional
         What follows, where the phases leave open where they end.
     ample : float, [N]
         Least normal force from which on more decides nothing, as other phases keep less anyway.
     fastest : sequence of PhasePlan
-        Plans of least time of these phases from `z`, for the objective `margin`: where no guess
-        leads to more, it starts from them or is them.
+        Plans of least time from `z`, for `margin`: it starts from them, or is them.
     pinned : bool
-        Whether it ends where they do.
+        Whether it ends there.
     explained : bool
         Whether to look for a change that would make a plan possible, where there is none.
     patient : bool
@@ -88,26 +86,14 @@ def plan_phases(
 
     Raises
     ------
-    InputError
-        If a phase's contacts do not touch or its end cannot be reached.
-    InfeasibleError, SolverError
-        If there is no plan.
+    InputError, InfeasibleError, SolverError
+        If a phase's contacts do not touch, its end cannot be reached, or there is no plan.
     """
     search = Search.of(problem, options, duration, to_go, ample)
     attempts = Attempts(problem, phases, z, search, to_go, patient)
-    known = [stage for plan in fastest for stage in plan.stages if isinstance(stage, Stage)]
-    if known and search.goal is Objective.MARGIN:
-        usual = fastest[0].attempt == attempts.first.name
-        slowed = _slow_down(search, known, attempts.first, usual, pinned)
-        if slowed is not None:
-            return _summarise(problem, search, phases, slowed, fastest[0].attempt)
-    begun = solve_attempt(search, attempts.first)
-    if search.goal is Objective.MARGIN and not begun.success:
-        quick = solve_attempt(search.aiming(Objective.TIME), attempts.first)
-        if quick.success:
-            begun = _slow_down(search, quick.stages, attempts.first, False, pinned) or begun
+    begun, name = _begin(search, attempts.first, fastest, pinned)
     if begun.success:
-        return _summarise(problem, search, phases, begun, attempts.first.name)
+        return _summarise(problem, search, phases, begun, name)
     from .explain import explain, refuse
 
     def replan(other: Problem) -> object:
@@ -115,14 +101,32 @@ def plan_phases(
         return plan_phases(other, own, z, options, explained=False, patient=False)
 
     refuse(search, problem, phases, attempts.first.stages, replan if explained else None)
-    outcomes = _try_all(search, problem, attempts, begun)
-    last = outcomes[-1]
+    *_, last = outcomes = _try_all(search, problem, attempts, begun)
     if last.solution.success:
         return _summarise(problem, search, phases, last.solution, last.name)
-    tried = dict.fromkeys([NEAREST, *(outcome.name for outcome in outcomes)])
-    reason = f"none was found, also of least shortfalls, from {', '.join(tried)}"
-    short = [outcome.short for outcome in outcomes if outcome.short]
+    tried = ", ".join(dict.fromkeys([NEAREST, *(own.name for own in outcomes)]))
+    reason = f"none was found, also of least shortfalls, from {tried}"
+    short = [own.short for own in outcomes if own.short]
     raise explain(search, problem, phases, short, reason, replan if explained else None)
+
+
+def _begin(
+    search: Search, first: Attempt, fastest: Sequence[PhasePlan[Motion]], pinned: bool
+) -> tuple[Solution, str]:
+    """What the first guess leads to, or for a margin plans of least time, and the guess's name."""
+    slows = search.goal is Objective.MARGIN
+    known = [stage for plan in fastest for stage in plan.stages if isinstance(stage, Stage)]
+    if known and slows:
+        usual = fastest[0].attempt == first.name
+        slowed = _slow_down(search, known, first, usual, pinned)
+        if slowed is not None:
+            return slowed, fastest[0].attempt
+    begun = solve_attempt(search, first)
+    if slows and not begun.success:
+        quick = solve_attempt(search.aiming(Objective.TIME), first)
+        if quick.success:
+            begun = _slow_down(search, quick.stages, first, False, pinned) or begun
+    return begun, first.name
 
 
 class _Outcome(NamedTuple):
