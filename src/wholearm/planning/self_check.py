@@ -28,7 +28,7 @@ from ..results.trajectory import Samples, Trajectory, assemble
 from ..scene.model import Scales
 from ..verification.newton_euler import balance
 from ..verification.verdict import Allowance, find_least_force, measure_departure
-from ..verification.verify import choose_times, inspect
+from ..verification.verify import CLOSER, SAMPLES, choose_times, inspect
 from .blocks import PLAIN, BlockPlan, Planning, plan_alone, refine_block
 
 REFINEMENTS = 3
@@ -154,7 +154,7 @@ def replay_plan(
     usual, strict = Allowance(), Allowance().scale(STRICT)
     while True:
         report("replaying the plan")
-        every = choose_times(trajectory.torque, trajectory)
+        every = choose_times(trajectory.torque, trajectory, CLOSER * SAMPLES)
         for times in (None, pick_times(trajectory, _CLOSER * PIECES), every):
             check = check_plan(problem, trajectory, strict, times)
             if check.failure is None or check.is_final:

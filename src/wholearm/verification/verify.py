@@ -48,6 +48,8 @@ _ENDS = (EventKind.ARRIVAL, EventKind.RELEASE)
 _CHANGES = {EventKind.STICK: "sticks", EventKind.SLIP: "slips", EventKind.REVERSAL: "reverses"}
 SAMPLES = 1200
 """About how many instants normal forces are looked at, besides the simulation's own steps."""
+CLOSER = 8
+"""Factor on the number of instants, if a parabola through few of them may dip too low."""
 ROWS = 20
 """About how many rows of each phase of a trajectory its replay is compared with."""
 MANY = 150
@@ -99,8 +101,13 @@ def verify(
     if plan is not None and set(plan.contacts) != names:
         odd = ", ".join(sorted(set(plan.contacts) ^ names))
         raise InputError("", "contacts", f"trajectory and problem differ in {odd}")
-    times = choose_times(torque, plan)
-    return inspect(problem, torque, plan, times, allowance, tolerance, reduced)
+    report = inspect(
+        problem, torque, plan, choose_times(torque, plan, SAMPLES), allowance, tolerance, reduced
+    )
+    if report.reached and (report.failures or report.warnings):
+        times = choose_times(torque, plan, CLOSER * SAMPLES)
+        report = inspect(problem, torque, plan, times, allowance, tolerance, reduced)
+    return report
 
 
 def inspect(
@@ -164,9 +171,9 @@ def _list_reduced(problem: Problem, simulation: Simulation) -> tuple[ReducedStat
     return list_reduced_states(problem, simulation)
 
 
-def choose_times(torque: TorqueProfile, plan: Trajectory | None) -> Array:
-    """Instants inside every piece of the torques, at least one, and rows of the plan."""
-    count = max(1, SAMPLES // len(torque.coefficients))
+def choose_times(torque: TorqueProfile, plan: Trajectory | None, samples: int) -> Array:
+    """About so many instants, one or more inside every piece of torques, and rows of the plan."""
+    count = max(1, samples // len(torque.coefficients))
     share = np.arange(1, count + 1) / (count + 1)
     inside = torque.breaks[:-1, None] + np.diff(torque.breaks)[:, None] * share
     times = [inside.ravel()]
