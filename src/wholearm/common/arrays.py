@@ -1,4 +1,4 @@
-"""Types of arrays and of expressions."""
+"""Types of arrays and of expressions, and what NumPy takes long for."""
 
 from __future__ import annotations
 
@@ -11,3 +11,12 @@ Array = NDArray[np.float64]
 """Floating-point numbers."""
 Expression = Any
 """What CasADi computes with: SX, MX, DM or Function, for which it has no types."""
+
+
+def sort_unique(values: Array) -> Array:
+    """Different values in increasing order, shape (n,), as `np.unique` has them.
+
+    That imports masked arrays, which take as long as a plan's replay.
+    """
+    ordered = np.sort(values, axis=None)
+    return ordered[np.diff(ordered, prepend=-np.inf) > 0]

@@ -24,7 +24,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..common.arrays import Array
+from ..common.arrays import Array, sort_unique
 from ..common.errors import InputError, JammingError, SimulationError
 from ..common.sharing import exclusive
 from ..problem.check import require_phases
@@ -102,11 +102,10 @@ def simulate(
 
 def _sort_times(name: str, given: ArrayLike | None) -> Array:
     """Instants that are asked for, increasing, shape (n,) [s]."""
-    times = np.sort(np.asarray([] if given is None else given, dtype=float).ravel())
+    times = np.asarray([] if given is None else given, dtype=float)
     if not np.isfinite(times).all():
         raise InputError("", name, "holds numbers that are not finite")
-    # NumPy would import its masked arrays for that.
-    return times[np.diff(times, prepend=-np.inf) > 0]
+    return sort_unique(times)
 
 
 def _simulate(run: Replay, progress: Callable[[str], None] | None) -> Simulation | None:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...common.arrays import Array
+from ...common.arrays import Array, sort_unique
 from ...geometry.curve import Curve
 from ..options import Objective
 from .data import PhaseData
@@ -74,7 +74,7 @@ class Mesh(NamedTuple):
 
 def find_ends(curve: Curve, breaks: Array) -> Array:
     """Ends of the stretches between breaks and reversals of a curve [m]."""
-    return np.union1d([0.0, *(segment.stop for segment in curve.segments)], breaks)
+    return sort_unique(np.array([0.0, *(segment.stop for segment in curve.segments), *breaks]))
 
 
 def adapt(
