@@ -345,11 +345,11 @@ def test_values_are_those_of_the_objective(
     assert plans[0].value < least + SLACK
     assert plans[0].value == pytest.approx(least, rel=2e-3)
     assert plans[0].value > 0.5
-    # Modes are left as they are first found where another phase has less.
+    # Where another phase has less, modes are left as they are first found, and that is enough.
     options = PlanOptions("margin", time_intervals=COARSE)
     start = trace_phases(landing())[-1].end
     fewer = plan_phases(landing(), landing().phases[4:], start, options, allowed, ample=0.5)
-    assert fewer[0].sequences == 1 and fewer[0].value > 0.5
+    assert fewer[0].sequences == 1 and 0.5 < fewer[0].value < 0.55
 
 
 def test_the_effort_of_a_gentle_plan_is_least(

@@ -31,7 +31,8 @@ class Status(Enum):
     SOLVED = "solved"
     BEST = "solved, best of several sequences of contact modes"
     STOPPED = "stopped early, with the best so far"
-    """The search for contact modes has tried as many sequences as it may, with more to try."""
+    """The search for contact modes has tried as many sequences as it may, with more to try, or no
+    larger margin was found than that of a plan of least time."""
 
     @staticmethod
     def of(phases: tuple[PlannedPhase, ...]) -> Status:

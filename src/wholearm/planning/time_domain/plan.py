@@ -264,6 +264,7 @@ def _slow_down(
         solution = solve_attempt(search, attempt._replace(stages=given, gradual=gradual))
         if solution.success:
             return solution
+    search.tried.complete = False
     nlp = search.build(fastest)
     return Solution(fastest, 0.0, 0.0, solution.status, True, nlp, {})
 

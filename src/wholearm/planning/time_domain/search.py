@@ -18,7 +18,7 @@ from ..options import Objective, PlanOptions
 from ..phase_plan import Tried
 from .between import Limits, check_between, find_misses, monitor_missed, raise_bounds
 from .collocation import Scheme, make_scheme
-from .layout import pack, unpack
+from .layout import MARGIN, pack, unpack
 from .limits import Target, price_sides
 from .motion import StageMotion, make_motions
 from .nlp import TimeNLP, bound_unknowns, build_time_nlp
@@ -44,6 +44,8 @@ _PATIENCE = 80
 """Most iterations of one solve on finer intervals, that starts from a solution."""
 _ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 40}
 """Most iterations of one solve, if not 150."""
+_CAP = 1.1
+"""Largest margin that is looked for, over the one from which on more decides nothing."""
 _DEARER = 0.2
 """Largest relative cost increase accepted from tightening."""
 _COARSE = 0.1
@@ -175,8 +177,12 @@ class Search:
 
     def has_ample(self, solution: Solution) -> bool:
         """Whether c_n is as large as another phase allows anyway, for the objective `margin`."""
-        most = self.ample - self.problem.epsilon
-        return self.goal is Objective.MARGIN and solution.margin > most
+        return self.goal is Objective.MARGIN and solution.margin > self.most_margin
+
+    @property
+    def most_margin(self) -> float:
+        """What c_n has over epsilon where it is ample."""
+        return self.ample - self.problem.epsilon
 
     def solve(
         self,
@@ -228,6 +234,9 @@ class Search:
         low_g, high_g = raise_bounds(nlp, stages, limits, (low, high))
         if self.duration is not None and nlp.duration_row >= 0:
             high_g[nlp.duration_row] = self.duration
+        if self.goal is Objective.MARGIN:
+            # Beyond what is ample there is nothing to look for, and it takes long.
+            high[nlp.layouts[-1].nodes[-1, MARGIN]] = _CAP * self.most_margin
         if (low > high).any():
             status = "limits that hold between points too leave nothing"
             return Solution(list(stages), np.inf, 0.0, status, False, nlp, {})
