@@ -41,8 +41,10 @@ class StageRows:
         How z and z' go on.
     points : ndarray of int, shape (K, d, m)
         What holds at the points.
+    balance : ndarray of int, shape (K, d, 5)
+        Of these, the equations of motion.
     senses : ndarray of int, shape (K, d, n_rubbing)
-        Of these, the senses of contacts that slide with friction.
+        And the senses of contacts that slide with friction.
     limits : LimitRows
     monitor_rows : ndarray of int, shape (K, d, m)
         Limits of the formation.
@@ -50,6 +52,7 @@ class StageRows:
 
     states: Indices
     points: Indices
+    balance: Indices
     senses: Indices
     limits: LimitRows
     monitor_rows: Indices
@@ -65,20 +68,18 @@ def add_stage(
 ) -> StageRows:
     """What holds in a stage."""
     formation = stage.formation
-    node, coming = layout.nodes[:-1], layout.nodes[1:]
-    chain = rows.linear(*node.shape)
-    rows.add_entries(chain, coming, 1.0)
-    rows.add_entries(chain[:, :MARGIN], layout.ends, -1.0)
-    rows.add_entries(chain[:, MARGIN:], node[:, MARGIN:], -1.0)
+    node, ends = layout.nodes[:-1], layout.nodes[1:]
+    chain = rows.linear(*node[:, MARGIN:].shape)
+    rows.add_entries(chain, ends[:, MARGIN:], 1.0)
+    rows.add_entries(chain, node[:, MARGIN:], -1.0)
     states = np.hstack([chain, _collocate(rows, stage, layout, scheme)])
     _share(rows, stage, layout)
-    points, senses = _balance(rows, stage, layout, scheme, last)
+    points, balance, senses = _balance(rows, stage, layout, scheme, last)
     first = node[:, Z] if formation.rolling else node[:, :0]
     if not scheme.ends:
         kernel = end_kernel(formation)
         own = rows.nonlinear(stage.intervals, kernel.outputs)
-        z, v = layout.ends[:, Z], layout.ends[:, V]
-        rows.add_copies(kernel, kernel.x.join(z=z, v=v, first=first), own)
+        rows.add_copies(kernel, kernel.x.join(z=ends[:, Z], v=ends[:, V], first=first), own)
         states = np.hstack([states, own])
     monitor_rows = _add_monitor_rows(rows, stage, layout, scheme)
     gained = [formation.limits[k].gained for k in stage.released]
@@ -97,7 +98,7 @@ def add_stage(
         end = layout.nodes[-1]
         rows.add_copies(goal, goal.x.join(z=end[Z], v=end[V]), rows.nonlinear(goal.outputs))
     limits = add_limits(rows, stage, layout, scheme, target)
-    return StageRows(states, points, senses, limits, monitor_rows)
+    return StageRows(states, points, balance, senses, limits, monitor_rows)
 
 
 def _list_free_turns(stage: Stage) -> tuple[int, ...]:
@@ -128,7 +129,7 @@ def _collocate(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) ->
         columns = kernel.x.join(
             start=layout.nodes[:-1, part],
             points=state.reshape(K, -1),
-            end=layout.ends[:, :0] if scheme.ends else layout.ends[:, part],
+            end=layout.nodes[1:, part][:, : 5 * (not scheme.ends)],
             rates=rate.reshape(K, -1),
             h=layout.h[:, None],
         )
@@ -156,10 +157,10 @@ def _share(rows: Rows, stage: Stage, layout: StageLayout) -> None:
 
 def _balance(
     rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool
-) -> tuple[Indices, Indices]:
+) -> tuple[Indices, Indices, Indices]:
     """The equations of motion, constraints and senses at every point, shape (K, d, n).
 
-    And the rows of the senses alone, shape (K, d, n_rubbing).
+    And the rows of the equations of motion and of the senses alone.
     """
     formation, shape = stage.formation, layout.z.shape[:2]
     gradual = stage.onset > 0
@@ -191,7 +192,7 @@ def _balance(
     low[-1, -1, senses][[k in still for k in formation.rubbing_rows]] = -np.inf
     own = rows.nonlinear(*shape, kernel.outputs, low=low, high=high)
     rows.add_copies(kernel, columns, own, parameters)
-    return own, own[..., senses]
+    return own, own[..., kernel.y["balance"]], own[..., senses]
 
 
 def least_rates(stage: Stage, places: Array) -> Array:
