@@ -216,7 +216,7 @@ class Search:
             multipliers = None
             if before is not None and before.monitored == [stage.monitored for stage in stages]:
                 multipliers = carry_multipliers(
-                    before.multipliers, before.nlp, nlp, before.stages, stages
+                    before.multipliers, before.nlp, nlp, self.scheme, before.stages, stages
                 )
             plain = [Limits.none(stage) for stage in stages]
             margin = before.margin if before else 0.0
