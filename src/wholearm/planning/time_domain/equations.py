@@ -37,8 +37,8 @@ class StageRows:
 
     Attributes
     ----------
-    chain : ndarray of int, shape (K, 0) or (K, 1)
-        How a margin goes on.
+    chain : ndarray of int, shape (K, m)
+        How a margin goes on, and contacts at the end of an interval, if no point is there.
     states : ndarray of int, shape (K, 2, rungs, f)
         Collocation of z and of z', along the columns of `bases`.
     bases : ndarray, shape (K, 5, f)
@@ -89,6 +89,7 @@ def add_stage(
         kernel = end_kernel(formation)
         own = rows.nonlinear(stage.intervals, kernel.outputs)
         rows.add_copies(kernel, kernel.x.join(z=ends[:, Z], v=ends[:, V], first=first), own)
+        chain = np.hstack([chain, own])
     monitor_rows = _add_monitor_rows(rows, stage, layout, scheme)
     gained = [formation.limits[k].gained for k in stage.released]
     for contact in [c for c in gained if c is not None and stage.opens]:

@@ -97,14 +97,13 @@ def list_moves(
         left = release_earlier(stages, index)
         if left is not None:
             yield link(merge(left))
-    runs = [
-        (run, index)
-        for index, stage in enumerate(stages)
-        for run in [
-            *(r for r in _find_held(stage, scheme) if not savings or _pays(r, stage, savings[index])),
-            *_find_leaning(stage, scheme, own[index], epsilon),
-        ]
-    ]
+    runs = list[tuple[Run, int]]()
+    for index, stage in enumerate(stages):
+        held = _find_held(stage, scheme)
+        if savings:
+            held = [run for run in held if _pays(run, stage, savings[index])]
+        leaning_too = _find_leaning(stage, scheme, own[index], epsilon)
+        runs += [(run, index) for run in [*held, *leaning_too]]
     yield from _apply(stages, scheme, own, runs)
 
 
