@@ -15,6 +15,7 @@ from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
 from .data import PhaseData, cut, fit_torque, join, prepare
 from .elements import DEGREE, Elements
+from .fastest import find_fastest
 from .first_guess import guess
 from .mesh import MOST, SHIFTED, START, Mesh, adapt, find_ends
 from .misses import MISS, Misses, PathSolution
@@ -24,13 +25,14 @@ from .nlp import (
     Tightening,
     Units,
     build_path_nlp,
-    first_multipliers,
     make_bounds,
     move_multipliers,
     pack,
     parameters,
     unpack,
 )
+from .start import start_at
+from .switches import Switch
 from .terms import LimitShape
 
 _SHARE = 0.5
@@ -88,6 +90,22 @@ class Task:
         nlp = build_path_nlp(shape, len(data.grid.steps), self.options.goal)
         return elements, parts, data, nlp
 
+    def place_breaks(self, switches: Sequence[Switch]) -> tuple[Mesh, ...]:
+        """Meshes with elements that end at switches, which are at places along all curves."""
+        starts = np.cumsum([0.0, *(curve.length for curve in self.curves)])
+        of_curve = np.searchsorted(starts[1:-1], [place for place, _ in switches])
+        return tuple(
+            Mesh.of(
+                curve,
+                [
+                    own._replace(place=own.place - start)
+                    for own, owner in zip(switches, of_curve, strict=True)
+                    if owner == k
+                ],
+            )
+            for k, (curve, start) in enumerate(zip(self.curves, starts, strict=False))
+        )
+
     def prepare(self, meshes: Sequence[Mesh], elements: int) -> list[PhaseData]:
         """What each phase gives the NLP on its grid."""
         found, last = [], len(meshes) - 1
@@ -137,7 +155,13 @@ class Round:
         meshes = tuple(Mesh() for _ in task.curves)
         elements, parts, data, nlp = task.lay_out(meshes, finer * task.elements)
         profile, units = guess(data, task.options.time_weight)
-        start = PathSolution(profile, 0.0, first_multipliers(nlp, data, profile, units))
+        found = None if task.options.goal is Objective.EFFORT else find_fastest(data, task.duration)
+        if found is None:
+            start = PathSolution(profile, 0.0, {})
+        else:
+            meshes = task.place_breaks(found.switches)
+            elements, parts, data, nlp = task.lay_out(meshes, finer * task.elements)
+            start = start_at(nlp, data, units, found)
         return Round(task, elements, meshes, parts, data, nlp, units, start, task.duration)
 
     @cached_property
