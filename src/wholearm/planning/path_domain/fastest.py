@@ -19,8 +19,8 @@ from .switches import Sights, Switch
 
 _SPEEDS = 2
 """Sweeps until viscous friction is linearised about the right speed."""
-_SHARES = {Mode.PUSH: 0.0, Mode.BRAKE: 1.0}
-"""How far s'' is from its largest, over the range that limits allow; for other modes half."""
+_SHARES = {Mode.PUSH: 0.0, Mode.SWITCH: 0.0, Mode.BRAKE: 1.0, Mode.HELD: 0.5}
+"""How far s'' is from its largest, over the range that limits allow."""
 _CLOSE = 1e-4
 """Error of the duration that is good enough for a margin, relatively."""
 _TRIES = 20
@@ -77,10 +77,21 @@ def find_fastest(data: PhaseData, duration: float | None) -> Fastest | None:
 def _find_at(data: PhaseData, margin: float) -> Fastest:
     sights = Sights.of(data, margin)
     s, b, modes = _sweep(sights)
-    share = np.repeat([_SHARES.get(Mode(mode), 0.5) for mode in modes.tolist()], 2)
-    element = np.arange(len(share)) // 2
-    switches = sights.find_switches(np.interp(sights.s, s, b), share, element)
-    return Fastest(s, b, modes, switches, margin)
+    steps, middle = np.diff(s), sights.rows.pick(slice(1, None, 2))
+    near = np.interp(sights.s[1::2], s, b)
+    pushed, braked = (middle.extreme(near, largest).a for largest in (True, False))
+    # In an interval with a switch s'' is first the largest, then the least.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first = (np.diff(b) / 2 - braked * steps) / (pushed - braked)
+    places, index = sights.s, np.arange(len(sights.s)) // 2
+    switched = modes[index] == Mode.SWITCH
+    late = switched & (places - s[index] > first[index])
+    share = np.array([_SHARES[Mode(mode)] for mode in modes.tolist()])[index] + late
+    here = np.interp(places, s, b)
+    before = (b[:-1] - 2 * pushed * s[:-1])[index] + 2 * pushed[index] * places
+    after = (b[1:] - 2 * braked * s[1:])[index] + 2 * braked[index] * places
+    here = np.where(switched, np.where(late, after, before), here)
+    return Fastest(s, b, modes, sights.find_switches(here, share, index), margin)
 
 
 def _sweep(sights: Sights) -> tuple[Array, Array, NDArray[np.int64]]:
