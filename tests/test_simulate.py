@@ -240,7 +240,7 @@ def test_what_happens_between_the_ends_of_steps_is_not_missed(
     """Steps end where a look shows something that no step has ended at, and nowhere else."""
     problem, trajectory = plan()
     looks, shown = np.linspace(0.05, 1.9, 50), 0.7
-    monkeypatch.setattr(within, "_shows", lambda step, *_: step.t < shown < step.t + step.h)
+    monkeypatch.setattr(within, "shows", lambda step, *_: step.t < shown < step.t + step.h)
     at = simulate(problem, trajectory, times=[shown])
     again = simulate(problem, trajectory, closer=lambda _, k: () if k else [*looks, shown])
     assert again.steps == at.steps

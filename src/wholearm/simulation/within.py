@@ -42,7 +42,7 @@ def look_within(run: Replay, times: Array) -> list[float]:
             section.times.append(time)
             section.rows.append(stepper.outputs.copy())
             section.impacts.append(step.impact)
-            if _shows(step, stepper, slack):
+            if shows(step, stepper, slack):
                 missed.append(time)
     return missed
 
@@ -57,7 +57,7 @@ def _measure_slack(run: Replay, section: Section, stepper: Stepper) -> Array:
     return slack
 
 
-def _shows(step: Step, stepper: Stepper, slack: Array) -> bool:
+def shows(step: Step, stepper: Stepper, slack: Array) -> bool:
     """Whether something happens in a step up to the place just looked at.
 
     One that ends with the phase may have passed its end, and turned back.
