@@ -40,3 +40,9 @@ def curves(heptagon: Problem) -> tuple[Curve, ...]:
 def trajectory() -> Trajectory:
     """The plan for the heptagon with every option at its default."""
     return plan_of(HEPTAGON)
+
+
+@pytest.fixture
+def unadvised(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Why there is no plan, without what would change that, which takes long to find."""
+    monkeypatch.setattr("wholearm.planning.advice.find_changes", lambda *_: [])

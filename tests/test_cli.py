@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 import wholearm
-from shipped import BOX, HEPTAGON, IMPACTS, plan_of
+from shipped import BOX, HEPTAGON, IMPACTS, plan_of, solved
 from tipping import scale, tipped
 from wholearm.cli.command import build_parser, main
+from wholearm.cli.summary import summarise
 from wholearm.results.torque_table import format_rows, place_rows
 from wholearm.results.trajectory import Trajectory
 from wholearm.results.trajectory_file import load_trajectory
@@ -45,9 +46,9 @@ def write_problem(folder: Path, edit: Edit) -> str:
     return str(path)
 
 
-def keep_first(table: dict[str, Any]) -> None:
-    """Leave the first phase."""
-    del table["phases"][1:]
+def keep(count: int) -> Edit:
+    """An edit that leaves the first phases."""
+    return lambda table: table["phases"].__delitem__(slice(count, None))
 
 
 def put(*keys: Any) -> Edit:
@@ -119,8 +120,9 @@ def test_solve_writes_the_plan(folder: Path, capsys: pytest.CaptureFixture[str])
 def test_solve_writes_samples_and_what_becomes_of_them(
     folder: Path, capsys: pytest.CaptureFixture[str], more: list[str]
 ) -> None:
+    path = write_problem(folder, keep(2))
     given = ["--intervals", "20", *(["--interpolation", *more] if more else [])]
-    command = ["solve", str(HEPTAGON), "-o", "a.npz", "--torques", "a.csv", "--sample-rate", "200"]
+    command = ["solve", path, "-o", "a.npz", "--torques", "a.csv", "--sample-rate", "200"]
     assert main([*command, *given, "--json"]) == 0
     plan, table = load_trajectory("a.npz"), wholearm.read_torque_csv("a.csv")
     figures = json.loads(capsys.readouterr().out)["torques"]
@@ -134,20 +136,20 @@ def test_solve_writes_samples_and_what_becomes_of_them(
     expected = samples if kind == "hold" else (samples + later) / 2
     np.testing.assert_allclose(middle, expected, atol=1e-9)
     phases = figures["replay"]["phases"]
-    assert [row["phase"] for row in phases] == [1, 2, 3, 4, 5]
+    assert [row["phase"] for row in phases] == [1, 2]
     planned = [row["planned_arrival"] for row in phases]
     np.testing.assert_allclose(planned, plan.phase_starts[1:])
     # What is lost is told, here and by verify, but is no error of solve.
-    assert main(["verify", str(HEPTAGON), "a.csv"]) == (0 if figures["replay"]["ok"] else 1)
+    assert main(["verify", path, "a.csv"]) == (0 if figures["replay"]["ok"] else 1)
     first = capsys.readouterr().out.splitlines()[0]
     assert figures["replay"]["reason"].split(" at t = ")[0] in first
     assert main([*command, *given]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert f"{kind} at 200 Hz; its replay " in lines[7]
-    assert lines[8].split("  ") == [
+    assert f"{kind} at 200 Hz; its replay " in lines[4]
+    assert lines[5].split("  ") == [
         "phase", "arrival [s]", "planned [s]", "least c_n [N]", "planned [N]", "contact"
     ]  # fmt: skip
-    assert [line.split()[0] for line in lines[9:14]] == ["1", "2", "3", "4", "5"]
+    assert [line.split()[0] for line in lines[6:8]] == ["1", "2"]
 
 
 @pytest.mark.parametrize(
@@ -166,31 +168,32 @@ def test_solve_writes_samples_and_what_becomes_of_them(
 def test_bad_sampling(
     folder: Path, capsys: pytest.CaptureFixture[str], given: list[str], message: str
 ) -> None:
-    assert message in fails(capsys, 2, "solve", str(HEPTAGON), "--intervals", "20", *given)
-    assert not list(folder.iterdir())
+    path = write_problem(folder, keep(1))
+    assert message in fails(capsys, 2, "solve", path, "--intervals", "20", *given)
+    assert [entry.name for entry in folder.iterdir()] == ["problem.toml"]
 
 
 def test_solve_without_a_replay(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    command = ["solve", str(HEPTAGON), "-o", "a.npz", "--intervals", "20", "--no-replay"]
+    path = write_problem(folder, keep(1))
+    command = ["solve", path, "-o", "a.npz", "--intervals", "20", "--no-replay"]
     assert main([*command, "--torques", "a.csv"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[6] == "the plan was not replayed" and lines[7].endswith(" rows")
+    assert lines[2] == "the plan was not replayed" and lines[3].endswith(" rows")
     assert load_trajectory("a.npz").meta["replay"] is None
 
 
 def test_solve_names_its_output_after_the_problem(folder: Path) -> None:
-    assert main(["solve", str(HEPTAGON), "--intervals", "20"]) == 0
-    assert [path.name for path in folder.iterdir()] == ["heptagon_four_contacts.npz"]
+    assert main(["solve", write_problem(folder, keep(1)), "--intervals", "20"]) == 0
+    assert {path.name for path in folder.iterdir()} == {"problem.npz", "problem.toml"}
 
 
 def test_solve_lists_the_impacts(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    impacts = str(IMPACTS)
-    assert main(["solve", impacts, "-o", "a.npz", "--intervals", "20"]) == 0
-    out, err = capsys.readouterr()
-    lines = out.splitlines()
-    assert err == "" and lines[6] == lines[12] == ""
+    plan = solved(IMPACTS)
+    plan.save("a.npz")
+    lines = summarise(plan, "a.npz").splitlines()
+    assert lines[6] == lines[12] == ""
     assert lines[7].split("  ")[0].strip() == "after phase" and lines[7].endswith("saves [s]")
-    rows = load_trajectory("a.npz").meta["transitions"]
+    rows = plan.meta["transitions"]
     for line, row in zip(lines[8:12], rows, strict=True):
         cells = line.split()
         assert int(cells[0]) == row["phase"]
@@ -202,7 +205,7 @@ def test_solve_lists_the_impacts(folder: Path, capsys: pytest.CaptureFixture[str
             assert float(cells[5]) == pytest.approx(row["saves"], abs=5e-7)
         else:
             assert cells[5] == "-" and line.endswith(f"stops: {row['reason']}")
-    assert main(["verify", impacts, "a.npz"]) == 0
+    assert main(["verify", str(IMPACTS), "a.npz"]) == 0
     assert "least impulse [N s]" in capsys.readouterr().out
 
 
@@ -225,7 +228,7 @@ def test_files_of_an_earlier_run_are_left_and_named(
 ) -> None:
     Path("a.npz").write_bytes(b"old")
     options = ["-o", "a.npz", "--torques", "a.csv", "--objective", "margin", "--duration", "1e-3"]
-    assert main(["solve", str(HEPTAGON), *options]) == 1
+    assert main(["solve", write_problem(folder, keep(1)), *options]) == 1
     stale, reason = capsys.readouterr().err.splitlines()
     assert stale == "wholearm: a.npz: left as it was, from an earlier run"
     assert "duration = 0.001 s" in reason
@@ -235,7 +238,7 @@ def test_files_of_an_earlier_run_are_left_and_named(
 def test_a_phase_is_planned_in_the_time_domain_when_asked(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = write_problem(folder, keep_first)
+    path = write_problem(folder, keep(1))
     options = ["-o", "a.npz", "--transcription", "time", "--time-intervals", "8"]
     assert main(["solve", path, *options]) == 0
     assert load_trajectory("a.npz").meta["transcription"] == "time"
@@ -246,16 +249,17 @@ def test_a_phase_is_planned_in_the_time_domain_when_asked(
 def test_solve_prints_json(
     folder: Path, capsys: pytest.CaptureFixture[str], objective: str
 ) -> None:
-    extra = {"effort": ["--time-weight", "2"], "margin": ["--duration", "0.8"]}
+    extra = {"effort": ["--time-weight", "2"], "margin": ["--duration", "0.2"]}
     options = ["--objective", objective, "--intervals", "20", *extra.get(objective, [])]
-    assert main(["solve", str(HEPTAGON), "-o", "a.npz", "--json", *options]) == 0
+    path = write_problem(folder, keep(1))
+    assert main(["solve", path, "-o", "a.npz", "--json", *options]) == 0
     meta = json.loads(capsys.readouterr().out)
     assert meta == load_trajectory("a.npz").meta
     assert meta["objective"] == objective and meta["intervals"] == 20
     if objective == "effort":
         assert meta["time_weight"] == 2.0
     if objective == "margin":
-        assert 0.05 < meta["value"] < 1 and sum(meta["phase_durations"]) <= 0.8 * (1 + 1e-6)
+        assert 0.05 < meta["value"] < 1 and sum(meta["phase_durations"]) <= 0.2 * (1 + 1e-6)
 
 
 def clockwise(table: dict[str, Any]) -> None:
@@ -321,6 +325,7 @@ def test_bad_problems(folder: Path, capsys: pytest.CaptureFixture[str], case: st
     assert [entry.name for entry in folder.iterdir()] == ["problem.toml"]
 
 
+@pytest.mark.usefixtures("unadvised")
 @pytest.mark.parametrize(
     "edit, words",
     [
@@ -343,11 +348,6 @@ def test_problems_without_a_plan(
     message = fails(capsys, 1, "solve", path, "-o", "a.npz", "--torques", "a.csv", *coarse)
     assert all(word in message for word in words), message
     assert [entry.name for entry in folder.iterdir()] == ["problem.toml"]
-
-
-def test_an_edited_problem_still_solves(folder: Path) -> None:
-    """The failures above are those of their edits, not of writing the file."""
-    assert main(["solve", write_problem(folder, lambda table: None), "--intervals", "20"]) == 0
 
 
 @pytest.mark.parametrize(
@@ -403,8 +403,9 @@ def test_output_in_a_read_only_folder(folder: Path, capsys: pytest.CaptureFixtur
     assert "cannot be written: no permission" in message
 
 
-def test_output_that_is_a_device(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["solve", str(HEPTAGON), "-o", os.devnull, "--intervals", "20"]) == 0
+def test_output_that_is_a_device(folder: Path) -> None:
+    path = write_problem(folder, keep(1))
+    assert main(["solve", path, "-o", os.devnull, "--intervals", "20"]) == 0
     assert Path(os.devnull).is_char_device()
 
 
@@ -439,7 +440,7 @@ def test_bad_arguments(
 def test_a_duration_below_the_least_time(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["solve", str(HEPTAGON), "--objective", "margin", "--duration", "0.3"]
     message = fails(capsys, 1, *arguments)
-    assert "duration = 0.3 s is not longer than the least time" in message
+    assert "duration = 0.3 s is not longer than the least time, 0.49" in message
     assert "; feasible with duration = 0.50" in message
     assert list(folder.iterdir()) == []
 
@@ -568,19 +569,18 @@ def test_version() -> None:
     assert result.stdout == f"wholearm {wholearm.__version__}\n"
 
 
-@pytest.mark.parametrize("more", [[], ["--no-replay"]])
-def test_solve_imports_only_what_it_needs(folder: Path, more: list[str]) -> None:
+def test_solve_imports_only_what_it_needs(folder: Path) -> None:
     """What the process costs over importing casadi and numpy is its own work."""
     code = (
         "import sys\nfrom wholearm.cli.command import main\n"
-        f"assert main(['solve', {str(HEPTAGON)!r}, '-o', 'a.npz', *{more!r}]) == 0\n"
         "unwanted = ['scipy', 'matplotlib', 'wholearm.figures.plots']\n"
-        f"unwanted += ['wholearm.simulation.simulate'] if {more!r} else []\n"
-        "print([name for name in unwanted if name in sys.modules])"
+        "for more in ['--no-replay'], []:\n"
+        f"    assert main(['solve', {str(HEPTAGON)!r}, '-o', 'a.npz', *more]) == 0\n"
+        "    named = [*unwanted, 'wholearm.simulation.simulate'] if more else unwanted\n"
+        "    assert not [name for name in named if name in sys.modules]"
     )
     result = run("-c", code, cwd=folder)
     assert result.returncode == 0, result.stderr
-    assert result.stdout.splitlines()[-1] == "[]"
 
 
 def test_bad_input_is_told_before_anything_heavy_is_imported() -> None:
@@ -620,7 +620,7 @@ def run_in_shell(command: str, redirection: str) -> tuple[int, str, bytes]:
 def test_output_that_cannot_be_written_is_no_traceback(
     folder: Path, redirection: str, status: int, message: str
 ) -> None:
-    path = write_problem(folder, keep_first)
+    path = write_problem(folder, keep(1))
     plan = f"solve '{path}' -o out.npz --intervals 10"
     got, errors, written = run_in_shell(plan, redirection)
     assert (got, errors) == (status, message and f"wholearm: standard output: {message}")
@@ -628,7 +628,7 @@ def test_output_that_cannot_be_written_is_no_traceback(
 
 
 def test_a_closed_pipe_is_no_traceback(folder: Path) -> None:
-    path = write_problem(folder, keep_first)
+    path = write_problem(folder, keep(1))
     command = [sys.executable, "-m", "wholearm", "solve", path, "-o", "a.npz"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout is not None and process.stderr is not None

@@ -1,8 +1,6 @@
 from __future__ import annotations
 
-import copy
 import re
-import tomllib
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -14,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from plane import with_speed_limit
-from shipped import HEPTAGON, IMPACTS, problem_of
+from shipped import HEPTAGON, IMPACTS, plan_of, problem_of
 from toys import Toy, constant
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, JammingError, SolverError
@@ -33,14 +31,13 @@ from wholearm.planning.path_domain.terms import LimitShape
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.problem.definition import Problem
-from wholearm.problem.read import build_problem
 from wholearm.solvers.statistics import open_ledger
 
 PHASES = range(5)
 OBJECTIVES = ["time", "effort", "margin"]
 EPSILON = 0.05
 LIMIT = 2.0
-COARSE = 40
+COARSE = 20
 """Intervals where only what a plan is for is looked at, not how good it is."""
 ALLOWED = 0.2
 """Duration for the objective margin [s]: about twice the least time of each phase."""
@@ -60,13 +57,12 @@ def inner_times(chosen: PhasePlan[PathMotion], fractions: Array) -> Array:
     return np.asarray((times[k, None] + fractions * spans[k, None]).ravel())
 
 
-@pytest.mark.parametrize("intervals", [10, COARSE])
 @pytest.mark.parametrize("objective", OBJECTIVES)
-@pytest.mark.parametrize("phase", PHASES)
+@pytest.mark.parametrize("phase", [1, 4])
 def test_limits_hold_at_random_instants(
-    curves: tuple[Curve, ...], phase: int, objective: str, intervals: int
+    curves: tuple[Curve, ...], phase: int, objective: str
 ) -> None:
-    chosen = plan(curves[phase], objective, intervals)
+    chosen = plan(curves[phase], objective, 10)
     fractions = np.random.default_rng(phase).uniform(0, 1, 50)
     samples = chosen.motion.evaluate(inner_times(chosen, fractions))
     # What is asked of a plan.
@@ -92,8 +88,8 @@ def test_a_phase_that_only_a_quick_motion_carries(curves: tuple[Curve, ...]) -> 
     """Slow motions cannot press v1 on the palm so hard in phase 3."""
     epsilon = 0.8
     slow = with_speed_limit(curves[2], (0.3, 0.3))
-    with pytest.raises(InfeasibleError):
-        plan_path(slow, epsilon, PlanOptions(intervals=20), 3)
+    with pytest.raises(SolverError):
+        plan_curves((slow,), epsilon, PlanOptions(intervals=20), (3,), explained=False)
     bound = bound_least_time([curves[2]], epsilon)
     chosen = plan_path(curves[2], epsilon, PlanOptions(intervals=160), 3)
     assert bound is not None and 0 <= chosen.value / bound.value - 1 < 2e-4
@@ -110,17 +106,14 @@ def chain() -> ImpactSequence:
 
 
 @cache
-def plan_joined(
-    chain: ImpactSequence, objective: str, intervals: int
-) -> list[PhasePlan[PathMotion]]:
-    options = PlanOptions(objective=objective, intervals=intervals)
+def plan_joined(chain: ImpactSequence, objective: str) -> list[PhasePlan[PathMotion]]:
+    options = PlanOptions(objective=objective, intervals=12)
     return plan_sequence(chain, EPSILON, options, 0.5 if objective == "margin" else None)
 
 
-@pytest.mark.parametrize("intervals", [12, COARSE])
 @pytest.mark.parametrize("objective", OBJECTIVES)
-def test_limits_hold_along_a_chain(chain: ImpactSequence, objective: str, intervals: int) -> None:
-    plans = plan_joined(chain, objective, intervals)
+def test_limits_hold_along_a_chain(chain: ImpactSequence, objective: str) -> None:
+    plans = plan_joined(chain, objective)
     fractions = np.random.default_rng(6).uniform(0, 1, 50)
     for chosen in plans:
         samples = chosen.motion.evaluate(inner_times(chosen, fractions))
@@ -133,7 +126,7 @@ def test_limits_hold_along_a_chain(chain: ImpactSequence, objective: str, interv
 
 
 def test_a_chain_is_one_problem(chain: ImpactSequence) -> None:
-    plans = plan_joined(chain, "time", COARSE)
+    plans = plan_joined(chain, "time")
     assert all(plan.value == plan.motion.duration for plan in plans)
     motions = [plan.motion for plan in plans]
     speeds = [np.sqrt(motion.profile.b[[0, -1]]) for motion in motions]
@@ -148,28 +141,16 @@ def test_a_chain_is_one_problem(chain: ImpactSequence) -> None:
 @pytest.mark.parametrize("objective", OBJECTIVES)
 def test_two_halves_are_one_whole(objective: str) -> None:
     half, whole = Toy(constant(1.0, 0.5, 0.2)), Toy(constant(1.0, 0.5, 0.2), length=2.0)
-    options = PlanOptions(objective=objective, intervals=160)
+    options = PlanOptions(objective=objective, intervals=80)
     duration = 6.0 if objective == "margin" else None
     with half.in_place():
         parts = plan_curves((half.curve, half.curve), half.epsilon, options, (1, 2), duration)
-    one = whole.plan(duration, objective=objective, intervals=320)
+    one = whole.plan(duration, objective=objective, intervals=160)
     values = [part.value for part in parts]
     value = values[0] if objective == "margin" else sum(values)
     assert value == pytest.approx(one.value, rel=1e-4)
     middle = float(np.sqrt(np.interp(1.0, one.motion.grid.s, one.motion.profile.b)))
     assert np.sqrt(parts[0].motion.profile.b[-1]) == pytest.approx(middle, rel=1e-2)
-
-
-def test_a_chain_without_a_plan_names_the_phase(chain: ImpactSequence) -> None:
-    with pytest.raises(InfeasibleError) as caught:
-        plan_sequence(chain, 1.0, PlanOptions(intervals=20))
-    found = re.match(
-        r"phases 1 to 3 are infeasible: c_n of (\S+) >= epsilon = 1 N is \S+ N short at "
-        r"t = \d\.\d{4} s \(x = .*? mm, phi = .*? deg\), phase ([123])",
-        str(caught.value),
-    )
-    assert found is not None, str(caught.value)
-    assert found[1] in chain.phases[int(found[2]) - 1].formation.names
 
 
 @pytest.mark.parametrize("phase", PHASES)
@@ -183,8 +164,7 @@ def test_fastest_motion_is_at_a_limit(curves: tuple[Curve, ...], phase: int) -> 
     assert (near.sum(axis=1) >= 2).mean() > 0.75
 
 
-@pytest.mark.parametrize("objective", ["effort", "margin"])
-@pytest.mark.parametrize("phase", [0, 4])
+@pytest.mark.parametrize("phase, objective", [(0, "effort"), (4, "margin")])
 def test_other_objectives_converge(curves: tuple[Curve, ...], phase: int, objective: str) -> None:
     duration = ALLOWED if objective == "margin" else None
     coarse, fine = (
@@ -218,13 +198,14 @@ def test_swings_are_counted() -> None:
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
 @pytest.mark.parametrize("phase", PHASES)
-def test_torques_do_not_jitter(curves: tuple[Curve, ...], phase: int, objective: str) -> None:
-    motion = plan(curves[phase], objective).motion
+def test_torques_do_not_jitter(phase: int, objective: str) -> None:
+    motion = plan_of(HEPTAGON, objective).motions[phase]
+    assert isinstance(motion, PathMotion)
     steps = np.flatnonzero(motion.grid.steps == 0)
     ends = [0.0, *motion.times[steps], motion.duration]
     hair = 1e-9 * motion.duration
     for start, stop in pairwise(ends):
-        t = np.linspace(start + hair, stop - hair, 2001)
+        t = np.linspace(start + hair, stop - hair, 601)
         for tau in motion.evaluate(t).tau.T:
             # A swing is one of 1 % of the limit. A plan has a few switches, not dozens.
             assert count_swings(tau, 0.01 * LIMIT) <= 5
@@ -292,16 +273,6 @@ def test_small_dips_between_slack_nodes_are_lifted(
 # No plan: why, where and by how much.
 
 
-def edited(**changes: Any) -> Problem:
-    table: dict[str, Any] = copy.deepcopy(tomllib.loads(HEPTAGON.read_text(encoding="utf-8")))
-    table["epsilon"] = changes.get("epsilon", EPSILON)
-    for key in ("palm", "finger1", "finger2"):
-        table["friction"][key] = changes.get("friction", 0.1)
-    for key in ("1", "2"):
-        table["fingers"][key]["torque_limit"] = changes.get("torque", {}).get(key, LIMIT)
-    return build_problem(table)
-
-
 def least_shortfall(problem: Problem, phase: int, s: float, row: int) -> float:
     """Least shortfall of one limit when all others hold, by a linear program at one place.
 
@@ -338,15 +309,16 @@ def least_shortfall(problem: Problem, phase: int, s: float, row: int) -> float:
     [
         ({"epsilon": 1.0}, 1, "c_n of v1-palm >= epsilon = 1 N"),
         ({"friction": 0.3}, 1, "c_n of v1-palm >= epsilon = 0.05 N"),
-        ({"torque": {"2": 0.05}}, 5, "torque limit of finger 2 = 0.05 N m"),
+        ({"torque_limit2": 0.05}, 5, "torque limit of finger 2 = 0.05 N m"),
     ],
 )
+@pytest.mark.usefixtures("unadvised")
 def test_shortfall_is_that_of_a_linear_program(
     changes: dict[str, Any], row: int, limit: str
 ) -> None:
-    problem = edited(**changes)
+    problem = problem_of(HEPTAGON).with_(changes)
     with pytest.raises(InfeasibleError) as caught:
-        solve(problem, intervals=40)
+        solve(problem, intervals=20)
     message = str(caught.value)
     found = re.match(
         r"phase (\d) is infeasible: (.*?) is (\S+) N( m)? short at t = 0\.0000 s \(x = ", message
@@ -358,26 +330,27 @@ def test_shortfall_is_that_of_a_linear_program(
     assert exact > 0.01 and float(found[3]) == pytest.approx(exact, rel=0.03)
 
 
+@pytest.mark.usefixtures("unadvised")
 @pytest.mark.parametrize(
     "changes, words",
     [
         ({"epsilon": 50.0}, ["c_n of v1-palm >= epsilon = 50 N", "N short at t = "]),
-        ({"torque": {"1": 0.05, "2": 0.05}}, ["torque limit of finger 1 = 0.05 N m", "N m short"]),
-        ({"torque": {"1": 1e-4, "2": 1e-4}}, ["torque limit of finger 1 = 0.0001 N m"]),
+        ({"torque_limit": 1e-4}, ["torque limit of finger 1 = 0.0001 N m", "N m short"]),
     ],
 )
 def test_infeasible_limits_are_named(changes: dict[str, Any], words: list[str]) -> None:
     with pytest.raises(InfeasibleError, match=r"^phase \d is infeasible: ") as caught:
-        solve(edited(**changes), intervals=10)
+        solve(problem_of(HEPTAGON).with_(changes), intervals=10)
     message = str(caught.value)
     assert all(word in message for word in words), message
     assert re.search(r"at t = \d+\.\d{4} s \(x = -?[\d.]+ mm, phi = -?[\d.]+ deg\)", message)
     assert "\n" not in message and caught.value.exit_status == 1
 
 
+@pytest.mark.usefixtures("unadvised")
 def test_jamming_friction_is_named() -> None:
     with pytest.raises(JammingError, match=r"phase 1: v0-palm .* jams at x = 16\.68 mm") as caught:
-        solve(edited(friction=1.0), intervals=20)
+        solve(problem_of(HEPTAGON).with_(friction=1.0), intervals=20)
     assert caught.value.exit_status == 1
 
 

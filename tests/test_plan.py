@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
+from once import once
 from plane import measure_gaps, measure_slip, unbalance
 from shipped import HEPTAGON, TWICE, plan_of, problem_of
 from thrown import shove
@@ -180,10 +181,10 @@ def test_objectives_trade_against_each_other(plans: dict[str, Trajectory]) -> No
 
 
 def test_more_time_never_lowers_the_margin(heptagon: Problem) -> None:
-    problem = replace(heptagon, phases=heptagon.phases[:2])
-    least = solve(problem, intervals=40, replay=False).duration
+    problem = replace(heptagon, phases=heptagon.phases[:1])
+    least = plan_of(HEPTAGON).meta["phase_durations"][0]
     values = [
-        solve(problem, "margin", duration=part * least, intervals=40, replay=False).value
+        solve(problem, "margin", duration=part * least, intervals=20, replay=False).value
         for part in (1.02, 1.3, 3.0)
     ]
     assert (np.diff(values) >= -1e-5).all()
@@ -191,26 +192,22 @@ def test_more_time_never_lowers_the_margin(heptagon: Problem) -> None:
 
 
 def test_a_heavier_weight_on_time_makes_it_faster(heptagon: Problem) -> None:
+    problem = replace(heptagon, phases=heptagon.phases[:2])
     plans = [
-        solve(heptagon, "effort", time_weight=weight, intervals=20) for weight in (0.1, 1.0, 10.0)
+        solve(problem, "effort", time_weight=weight, intervals=20, replay=False)
+        for weight in (0.1, 1.0, 10.0)
     ]
     durations = [plan.duration for plan in plans]
     assert durations[0] > durations[1] > durations[2]
     assert [plan.meta["time_weight"] for plan in plans] == [0.1, 1.0, 10.0]
 
 
-def test_default_margin_takes_twice_the_least_time(
-    heptagon: Problem, trajectory: Trajectory
-) -> None:
-    default = solve(heptagon, "margin", intervals=20)
-    least = solve(heptagon, intervals=20).duration
-    given = solve(heptagon, "margin", intervals=20, duration=2 * least)
+def test_default_margin_takes_twice_the_least_time(heptagon: Problem) -> None:
+    problem = replace(heptagon, phases=heptagon.phases[:2])
+    default = solve(problem, "margin", intervals=20, replay=False)
+    least = solve(problem, intervals=20, replay=False).duration
+    given = solve(problem, "margin", intervals=20, replay=False, duration=2 * least)
     assert default.meta["value"] == pytest.approx(given.meta["value"], rel=1e-9)
-
-
-def test_too_short_a_duration(heptagon: Problem, trajectory: Trajectory) -> None:
-    with pytest.raises(InfeasibleError, match=r"duration = 0\.4 s .* least time, 0\.49\d+ s"):
-        solve(heptagon, "margin", duration=0.4)
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
@@ -320,6 +317,13 @@ def test_a_block_that_starts_elsewhere_gets_another_share() -> None:
     assert min(plan.value for plan in planning.plans) >= problem.epsilon
 
 
+@once
+def shoved_in() -> list[float]:
+    """Least durations of the phases of a square that is shoved [s]."""
+    durations: list[float] = solve(shove()[0], time_intervals=4).meta["phase_durations"]
+    return durations
+
+
 @pytest.mark.parametrize("low", [1, 2])
 def test_a_phase_without_margin_is_named(monkeypatch: pytest.MonkeyPatch, low: int) -> None:
     problem, _ = shove()
@@ -332,7 +336,7 @@ def test_a_phase_without_margin_is_named(monkeypatch: pytest.MonkeyPatch, low: i
         return plans
 
     monkeypatch.setattr(time_impacts, "plan_phases", plan_tightly)
-    least = solve(problem, time_intervals=4).meta["phase_durations"][low - 1]
+    least = shoved_in()[low - 1]
     with pytest.raises(InfeasibleError) as caught:
         solve(problem, "margin", time_intervals=4)
     assert str(caught.value) == (

@@ -12,7 +12,7 @@ import pytest
 
 from shipped import HEPTAGON, problem_of
 from thrown import shove
-from wholearm.common.errors import InfeasibleError, JammingError
+from wholearm.common.errors import InfeasibleError
 from wholearm.figures import plots
 from wholearm.planning.plan import solve
 from wholearm.problem.definition import Problem
@@ -60,7 +60,10 @@ def test_a_change_can_be_made(along: InfeasibleError) -> None:
     assert along.changes
     for change in along.changes:
         own = change.parameter
-        assert solve(pressing(6.0).with_({own.key: change.value}), intervals=20).value > 0
+        assert (
+            solve(pressing(6.0).with_({own.key: change.value}), intervals=20, replay=False).value
+            > 0
+        )
         assert (change.value > own.value) == (own.sign > 0)
 
 
@@ -89,13 +92,3 @@ def test_a_duration_that_is_too_short_is_a_change() -> None:
     (change,) = error.changes
     assert change.parameter.key == "duration" and change.parameter.value == 0.05
     solve(pressing(0.05), "margin", duration=change.value, intervals=20)
-
-
-def test_jamming_says_which_friction_would_do() -> None:
-    rough = problem_of(HEPTAGON).with_(friction=1.5)
-    rough = replace(rough, phases=rough.phases[:1])
-    with pytest.raises(JammingError) as caught:
-        solve(rough, intervals=10)
-    assert caught.value.changes
-    for change in caught.value.changes:
-        assert change.parameter.key.startswith("friction.") and str(change) in str(caught.value)

@@ -1,0 +1,61 @@
+"""Why there is no plan for the heptagon with other limits, each of them asked for once."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from once import once
+from shipped import HEPTAGON, problem_of
+from wholearm.common.errors import InfeasibleError
+from wholearm.geometry.tracing import trace_phases
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.path_domain.plan import plan_curves
+from wholearm.problem.definition import Problem
+
+INTERVALS = 15
+OPTIONS = PlanOptions(intervals=INTERVALS)
+
+
+def edited(limits: dict[str, float], friction: float = 0.1, viscous: float = 0.01) -> Problem:
+    """The heptagon with other limits, under the names that messages have."""
+
+    def key(name: str) -> str:
+        what, _, finger = name.partition(" limit of finger ")
+        return f"fingers.{finger}.{what}_limit" if finger else name
+
+    changes = {key(name): value for name, value in limits.items()}
+    return problem_of(HEPTAGON).with_(changes, friction=friction, viscous=viscous)
+
+
+def plan(problem: Problem, phase: int, explained: bool = True) -> None:
+    curve = trace_phases(problem)[phase - 1]
+    plan_curves((curve,), problem.epsilon, OPTIONS, (phase,), explained=explained)
+
+
+@once
+def ask(phase: int, friction: float = 0.1, viscous: float = 0.01, **limits: float) -> str:
+    """Why a phase has no plan with such `limits`, and what is advised."""
+    with pytest.raises(InfeasibleError) as caught:
+        plan(edited(limits, friction, viscous), phase)
+    message = str(caught.value)
+    assert message.startswith(f"phase {phase} is infeasible: ") and "\n" not in message
+    return message
+
+
+def read_advice(message: str) -> dict[str, float]:
+    """Advised values by limit, without friction."""
+    _, _, advice = message.rpartition("; ")
+    if advice == "no single limit makes it feasible":
+        return {}
+    assert advice.startswith("feasible with ")
+    parts = advice.removeprefix("feasible with ").split(", or ")
+    found = {}
+    for part in parts:
+        if part.startswith("friction of "):
+            continue
+        match = re.fullmatch(r"(.+) = (\S+) (?:N m|N|rad/s|s) instead of (\S+)", part)
+        assert match is not None, part
+        found[match[1]] = float(match[2])
+    return found
