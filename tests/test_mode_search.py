@@ -16,9 +16,10 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
-from wholearm.planning.time_domain.mode_search import WORTH, improve
+from wholearm.planning.time_domain.mode_search import improve
 from wholearm.planning.time_domain.modes import in_mode, link, mode_of, sign_sequence, split
 from wholearm.planning.time_domain.motion import TimeMotion
+from wholearm.planning.time_domain.moves import WORTH
 from wholearm.planning.time_domain.plan import plan_phases
 from wholearm.planning.time_domain.search import MOST, Search, Solution
 from wholearm.planning.time_domain.stage import Stage

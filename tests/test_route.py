@@ -104,6 +104,8 @@ def test_routes_that_cannot_be_followed_are_named(heptagon: Problem) -> None:
         list_formations(heptagon, start, start)
     with pytest.raises(InputError, match=r"cannot start at .*: finger 1 is too short"):
         list_formations(heptagon, (0.4, start[1]), start)
+    with pytest.raises(InputError, match=r"route: -63\.7 given; allowed are .* m "):
+        list_formations(heptagon, start, (-63.7, start[1]))
 
 
 def test_lists_do_not_depend_on_units(heptagon: Problem) -> None:

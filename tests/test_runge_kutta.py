@@ -47,26 +47,6 @@ def test_order_on_a_known_solution() -> None:
     assert np.log2(errors[0] / errors[1]) > 7.5
 
 
-def test_rows_within_a_step_sum_to_nodes() -> None:
-    sums = [sum(row.values()) for row in runge_kutta.WITHIN_ROWS]
-    assert np.allclose(sums, runge_kutta.WITHIN_NODES, atol=2e-14, rtol=0)
-
-
-def test_order_within_a_step_of_a_known_solution() -> None:
-    """The error within one step of y' = y cos t falls with its length to the eighth power."""
-    y, t, h = ca.SX.sym("y", 1), ca.SX.sym("t"), ca.SX.sym("h")
-    terms = runge_kutta.build_extension(lambda state, time: state * ca.cos(time), y, t, h, 1)
-    extend = ca.Function("extend", [y, t, h], [terms])
-    x, errors = np.linspace(0.0, 1.0, 21), []
-    for length in (1.0, 0.5):
-        found = extend(1.0, 0.0, length).full()
-        start, rows = np.ones((len(x), 1)), np.broadcast_to(found, (len(x), *found.shape))
-        states = runge_kutta.interpolate(start, rows, x)
-        errors.append(np.abs(states[:, 0] - np.exp(np.sin(length * x))).max())
-        assert states[0, 0] == 1.0
-    assert np.log2(errors[0] / errors[1]) > 7.5
-
-
 def test_error_estimate_bounds_the_error() -> None:
     y, t, h = ca.SX.sym("y", 1), ca.SX.sym("t"), ca.SX.sym("h")
     end, fifth, third = runge_kutta.build_step(lambda s, _: -s, y, t, h, 1)

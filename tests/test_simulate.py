@@ -21,12 +21,11 @@ from wholearm.mechanics.dynamics import Directions
 from wholearm.problem.definition import Phase, Problem, Until
 from wholearm.results.torque import TorqueProfile
 from wholearm.scene.model import Finger, Friction, Scene
-from wholearm.simulation import simulate as simulation_module
+from wholearm.simulation import within
 from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.simulation.simulate import simulate
 from wholearm.simulation.statics import balances
 from wholearm.simulation.sticking import find_rest
-from wholearm.simulation.within import fill
 
 
 def pick(index: int) -> tuple[Problem, CosineMotion]:
@@ -209,35 +208,43 @@ def test_states_do_not_depend_on_the_times_asked_for() -> None:
 def test_looks_are_as_good_as_steps_and_end_none() -> None:
     problem, motion = pick(1)
     torque = motion.fit(1, 24)
-    times = np.linspace(0.03, 0.4, 60)
+    times = np.linspace(0.03, 0.39, 60)
     reference = simulate(problem, torque, tolerance=1e-13, times=times)
-    bare = simulate(problem, torque, tolerance=1e-9)
-    looked = simulate(problem, torque, tolerance=1e-9, within=times)
+    bare = simulate(problem, torque)
+    looked = simulate(problem, torque, closer=lambda _, looks: times[looks::2] if looks < 2 else [])
     assert (looked.steps, looked.outcome) == (bare.steps, bare.outcome)
-    for name, bound in (("z", 1e-7), ("z_dot", 1e-7), ("z_ddot", 1e-5), ("c_n", 1e-5)):
+    assert len(looked.t) == len(bare.t) + len(times) and (np.diff(looked.t) >= 0).all()
+    for name, bound in (("z", 1e-8), ("z_dot", 1e-8), ("z_ddot", 1e-6), ("c_n", 1e-6)):
         own, exact = (
             np.array([getattr(run, name)[np.flatnonzero(run.t == t)[-1]] for t in times])
             for run in (looked, reference)
         )
         assert np.allclose(own, exact, rtol=0, atol=bound * (1 + np.nanmax(np.abs(exact))))
-    # They are moved onto the contacts, however far the interpolation leaves them.
-    formation = problem.phases[0].formation
-    rows = [np.flatnonzero(looked.t == t)[-1] for t in times]
-    assert np.abs(formation.evaluate(looked.z[rows], looked.z_dot[rows]).C).max() < 1e-14
+
+
+def test_glimpses_of_forces_are_nearly_those_of_looks() -> None:
+    problem, trajectory = plan()
+    bare = simulate(problem, trajectory.torque)
+    glimpses, force = bare.glimpses, problem.scene.scales.force
+    chosen = np.arange(0, len(glimpses.t), 40)
+    wanted = glimpses.t[chosen]
+    looked = simulate(problem, trajectory.torque, closer=lambda _, k: () if k else wanted)
+    rows = [np.flatnonzero(looked.t == t)[0] for t in wanted]
+    assert (looked.phase[rows] == glimpses.phase[chosen]).all()
+    np.testing.assert_allclose(looked.c_n[rows], glimpses.c_n[chosen], rtol=0, atol=1e-4 * force)
 
 
 def test_what_happens_between_the_ends_of_steps_is_not_missed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Where a look shows something that no step has ended at, steps end at looks."""
+    """Steps end where a look shows something that no step has ended at, and nowhere else."""
     problem, trajectory = plan()
-    times = np.linspace(0.05, 1.9, 50)
-    close = simulate(problem, trajectory, times=times)
-    answers = iter([False, True])
-    monkeypatch.setattr(simulation_module, "fill", lambda pairs: fill(pairs) and next(answers))
-    again = simulate(problem, trajectory, within=times)
-    assert again.steps == close.steps
-    np.testing.assert_array_equal(again.z, close.z)
+    looks, shown = np.linspace(0.05, 1.9, 50), 0.7
+    monkeypatch.setattr(within, "shows", lambda step, *_: step.t < shown < step.t + step.h)
+    at = simulate(problem, trajectory, times=[shown])
+    again = simulate(problem, trajectory, closer=lambda _, k: () if k else [*looks, shown])
+    assert again.steps == at.steps
+    np.testing.assert_array_equal(again.at(shown), at.at(shown))
 
 
 def test_energy_is_conserved_without_friction() -> None:

@@ -67,14 +67,15 @@ def make_stages(name: str, degree: int, ends_in_impact: bool) -> list[Stage]:
 
 
 def owners(layouts: Sequence[StageLayout]) -> Array:
-    """How often each unknown occurs in the layouts, but for `ends` that are points'."""
+    """How often each unknown occurs in the layouts, but for ends of intervals that are points'."""
     counts = np.zeros(layouts[-1].stop)
     for layout in layouts:
-        tables = [*(getattr(layout, n) for n in ("nodes", "h", "tau", "z", "v", "a", "forces"))]
-        for table in (*tables, layout.short, layout.impulses):
+        last = np.concatenate([layout.z[:, -1], layout.v[:, -1]], axis=1)
+        own = ~np.isin(layout.nodes, last)
+        assert own[1:, :STATE].all() or not own[1:, :STATE].any()
+        tables = [*(getattr(layout, n) for n in ("h", "tau", "z", "v", "a", "forces"))]
+        for table in (layout.nodes[own], *tables, layout.short, layout.impulses):
             np.add.at(counts, table.ravel().astype(int), 1)
-        if layout.ends[0, 0] != layout.z[0, -1, 0]:
-            np.add.at(counts, layout.ends.ravel(), 1)
     return counts
 
 
@@ -100,13 +101,17 @@ def test_every_unknown_has_one_place(
 
 @pytest.mark.parametrize("name, degree", SCHEMES)
 def test_unknowns_are_in_the_order_of_time(name: str, degree: int) -> None:
-    for layout in lay_out(make_stages(name, degree, True), make_scheme(name, degree)):
+    scheme = make_scheme(name, degree)
+    for layout in lay_out(make_stages(name, degree, True), scheme):
         for k in range(len(layout.tau)):
             assert layout.nodes[k].max() < layout.h[k] < layout.tau[k].min() < layout.z[k].min()
             for before, after in pairwise(range(degree)):
                 assert layout.forces[k, before].max() < layout.z[k, after].min()
-            assert layout.forces[k].max() < layout.nodes[k + 1].min()
-            assert layout.ends[k].max() < layout.nodes[k + 1].min()
+            ends = np.concatenate([layout.z[k, -1], layout.v[k, -1]])
+            if scheme.ends:
+                np.testing.assert_array_equal(layout.nodes[k + 1], ends)
+            else:
+                assert layout.forces[k].max() < layout.nodes[k + 1].min()
 
 
 @pytest.mark.parametrize("with_margin", [False, True])
@@ -129,6 +134,5 @@ def test_points_are_packed_and_unpacked(
         np.testing.assert_array_equal(x[layout.nodes[:, Z]], part.nodes[:, 0])
         np.testing.assert_array_equal(x[layout.nodes[:, V]], part.nodes[:, 1])
         np.testing.assert_array_equal(x[layout.a], part.a)
-        np.testing.assert_array_equal(x[layout.ends], x[layout.nodes[1:, :STATE]])
         if with_margin:
             np.testing.assert_array_equal(x[layout.nodes[:, MARGIN]], 0.7)

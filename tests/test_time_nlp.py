@@ -83,13 +83,11 @@ def collocation(name: str, degree: int, count: int, contacts: int) -> tuple[Arra
     nlp = build([stage], scheme)
     equations, _ = misses(nlp, packed(nlp, [stage]))
     rows = nlp.rows_of[0]
-    n_p = stage.formation.n_constraints
-    free, rungs = 5 - n_p, degree + (not scheme.ends)
-    width = 2 * rungs * free
-    own = equations[rows.states[:, 10 : 10 + width]].reshape(count, 2, rungs, free)
-    # Everything else holds at once: nodes, contacts, balances, and contacts at the ends.
-    rest = rows.states[:, np.r_[:10, 10 + width : rows.states.shape[1]]]
-    assert equations[rest].max() < EXACT and equations[rows.points].max() < EXACT
+    own = equations[rows.states]
+    assert own.shape == (count, 2, degree + (not scheme.ends), 5 - stage.formation.n_constraints)
+    # Everything else holds at once: contacts, balances, and contacts at the ends.
+    assert equations[rows.chain].max(initial=0.0) < EXACT
+    assert equations[rows.points].max() < EXACT
     return own[:, :, :-1].max(), own[:, :, -1].max()
 
 

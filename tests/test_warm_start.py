@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -12,8 +13,14 @@ from wholearm.planning.time_domain.collocation import make_scheme
 from wholearm.planning.time_domain.own_units import in_own_units
 from wholearm.planning.time_domain.refinement import bisect_intervals
 from wholearm.planning.time_domain.search import Search, Solution
+from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.staging import guess_stages
-from wholearm.planning.time_domain.warm_start import carry_multipliers, first_multipliers
+from wholearm.planning.time_domain.warm_start import (
+    carry_multipliers,
+    find_costate,
+    first_multipliers,
+)
+from wholearm.problem.definition import Problem
 
 SCHEME = make_scheme("radau", 3)
 
@@ -31,6 +38,11 @@ def coarse(objective: str) -> Solution:
     solution = search_for(objective).solve(stages)
     assert solution.success
     return solution
+
+
+def replace_scene(stages: list[Stage], problem: Problem) -> list[Stage]:
+    """The same stages on the formations of another scene."""
+    return [replace(stage, formation=problem.phases[stage.phase].formation) for stage in stages]
 
 
 @pytest.mark.parametrize("objective", ["time", "effort"])
@@ -64,7 +76,7 @@ def test_multipliers_are_shared_among_the_intervals_that_replace_one() -> None:
     nlp = search.build(stages)
     rng = np.random.default_rng(2)
     given = {key: rng.normal(size=len(table)) for key, table in solution.multipliers.items()}
-    carried = carry_multipliers(given, solution.nlp, nlp, solution.stages, stages)
+    carried = carry_multipliers(given, solution.nlp, nlp, SCHEME, solution.stages, stages)
     assert len(carried["lam_g0"]) == len(nlp.rows.bounds[0])
     for k, own in enumerate(marked):
         parent = np.repeat(np.arange(len(own)), 1 + own)
@@ -78,6 +90,38 @@ def test_multipliers_are_shared_among_the_intervals_that_replace_one() -> None:
             total = np.zeros_like(before)
             np.add.at(total, parent, after)
             np.testing.assert_allclose(total, before, rtol=1e-12)
+
+
+def test_costates_of_the_same_intervals_are_those_before() -> None:
+    # Tangent spaces are those of guesses: from a solution they stay as they are.
+    search, first = search_for("time"), coarse("time")
+    solution = search.solve(first.stages, first)
+    nlp = search.build(solution.stages)
+    both = solution.nlp, nlp, SCHEME, solution.stages, solution.stages
+    before = solution.multipliers["lam_g0"]
+    carried = carry_multipliers(solution.multipliers, *both)["lam_g0"]
+    np.testing.assert_array_equal(carried[:10], before[:10])
+    for old, new in zip(solution.nlp.rows_of, nlp.rows_of, strict=True):
+        one, other = find_costate(old, before, SCHEME), find_costate(new, carried, SCHEME)
+        assert np.abs(other - one).max() < 1e-4 * np.abs(one).max()
+
+
+@pytest.mark.parametrize("contact", ["palm", "finger1", "finger2"])
+def test_friction_is_worth_what_a_little_less_of_it_saves(contact: str) -> None:
+    solution, share = coarse("effort"), 1e-3
+    mu = getattr(landing().scene.friction, contact)
+    other = Search.of(
+        landing().with_({f"friction_{contact}": (1 - share) * mu}), PlanOptions(objective="effort")
+    )
+    less = other.solve(replace_scene(solution.stages, other.problem))
+    assert less.success
+    own = [
+        solution.price_friction(k)[..., [n.endswith(contact) for n in stage.formation.names]].sum()
+        for k, stage in enumerate(solution.stages)
+    ]
+    # The other way is less by twice of all there is.
+    worth = pytest.approx(share / 2 * sum(own), rel=0.02, abs=1e-7 * solution.cost)
+    assert solution.cost - less.cost == worth
 
 
 def test_multipliers_of_a_solution_are_those_of_its_limits() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -17,6 +18,7 @@ from ..contacts.elemental import Contact
 from ..geometry.path_guess import guess_phase
 from ..geometry.tracing import trace_phases
 from ..problem.definition import Problem, Until
+from ..scene.ranges import TURN, check_place
 from .borders import Window
 from .legs import describe_place
 from .nearby import describe_miss, find_miss, tolerance
@@ -104,6 +106,9 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
     if len(poses) < 2:
         raise InputError("", "route", f"{len(poses)} pose given; two or more are needed")
     given = [np.array(pose, dtype=float) for pose in poses]
+    for x, phi in given:
+        check_place(problem.scene, "route", float(x))
+        TURN.check("route", math.degrees(phi), "degrees")
     near = tolerance(problem.scene)
     for one, two in pairwise(given):
         if not (np.abs(two - one) > near).any():

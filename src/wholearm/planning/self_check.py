@@ -1,8 +1,7 @@
 """What `solve` checks of its own plan, and how it refines what does not hold.
 
 The plan is replayed in the simulator, which is told the torques and nothing else, and the equations
-of motion are written out anew for its samples (`verification.newton_euler`). The replay is looked
-at in few instants, since those are what it costs: the plan keeps its limits in between by itself.
+of motion are written out anew for its samples (`verification.newton_euler`).
 """
 
 from __future__ import annotations
@@ -23,12 +22,11 @@ from ..common.errors import (
 from ..problem.definition import Problem
 from ..results.replay_figures import LeastForce, ReplayedPhase, ReplayFigures
 from ..results.report import Report
-from ..results.torque import TorqueProfile
 from ..results.trajectory import Samples, Trajectory, assemble
 from ..scene.model import Scales
 from ..verification.newton_euler import balance
 from ..verification.verdict import Allowance, find_least_force, measure_departure
-from ..verification.verify import CLOSER, SAMPLES, choose_times, inspect
+from ..verification.verify import judge, observe
 from .blocks import PLAIN, BlockPlan, Planning, plan_alone, refine_block
 
 REFINEMENTS = 3
@@ -37,16 +35,10 @@ ROUGH = 2
 """Most doublings in the time domain, before contact modes are left as they come: a plan that hangs
 on a contact that comes to rest need not hold, however fine it is."""
 STRICT = 0.5
-"""Share of what `verify` allows that a plan may use: `verify` looks at more instants."""
+"""Share of what `verify` allows that a plan may use, if another plan is to be had."""
 RESIDUAL = 1e-8
 """Largest residual of the equations of motion, relative to the scene's force or torque, length or
 speed: rounding leaves 1e-13."""
-ROWS = 8
-"""Parts of a phase at whose ends replay and plan are compared."""
-PIECES = 40
-"""Parts of a phase at whose ends normal forces are looked at."""
-_CLOSER = 4
-"""Factor on the number of parts, if a parabola through few instants dips too low."""
 DENSE = 201
 """Rows per phase for the equations of motion, if the trajectory has not half as many."""
 
@@ -93,13 +85,6 @@ class Check(NamedTuple):
             return None
         assert self.report.failed_phase is not None
         return self.report.failed_phase, self.report.reason
-
-    @property
-    def is_final(self) -> bool:
-        """Whether it fails however many instants are looked at, and whatever is allowed."""
-        if self.residual.size > RESIDUAL or not isinstance(self.report, Report):
-            return True
-        return not self.report.reached
 
     def find_culprit(self, scales: Scales, allowance: Allowance, durations: Array) -> int:
         """Number of the phase to refine: the first that departs or does not stop, or that fails.
@@ -154,14 +139,9 @@ def replay_plan(
     usual, strict = Allowance(), Allowance().scale(STRICT)
     while True:
         report("replaying the plan")
-        every = choose_times(trajectory.torque, trajectory, CLOSER * SAMPLES)
-        for times in (None, pick_times(trajectory, _CLOSER * PIECES), every):
-            check = check_plan(problem, trajectory, strict, times)
-            if check.failure is None or check.is_final:
-                break
+        check, accepted = check_plan(problem, trajectory, strict, usual)
         if check.failure is None:
             break
-        accepted = check if check.is_final else check_plan(problem, trajectory, usual, every)
         durations = np.diff(trajectory.phase_starts)
         number = check.find_culprit(problem.scene.scales, strict, durations)
         better = _improve(planning, number, accepted.failure is not None, report)
@@ -193,60 +173,20 @@ def _improve(
     return refined
 
 
-def check_plan(
-    problem: Problem, trajectory: Trajectory, allowance: Allowance, times: Array | None = None
-) -> Check:
+def check_plan(problem: Problem, trajectory: Trajectory, *allowances: Allowance) -> list[Check]:
     """Replay a plan, and see what its samples leave of the equations of motion.
 
-    It is looked at in few instants, or at `times`, shape (n,) [s].
+    Returns
+    -------
+    list of Check
+        By each of the allowances.
     """
-    times = pick_times(trajectory) if times is None else times
     residual = find_residual(problem, trajectory)
     try:
-        replayed = inspect(problem, trajectory.torque, trajectory, times, allowance, 1e-9)
+        seen = observe(problem, trajectory.torque, trajectory)
     except (JammingError, SimulationError) as error:
-        return Check(error, residual)
-    return Check(replayed, residual)
-
-
-def pick_times(trajectory: Trajectory, pieces: int = PIECES) -> Array:
-    """Few instants to look at: some rows of each phase, and some in long pieces of the torques.
-
-    Parameters
-    ----------
-    trajectory : Trajectory
-    pieces : int
-        Into how many parts of a phase its torques are divided at least.
-    """
-    times: list[Array] = []
-    for index in range(len(trajectory.motions)):
-        rows = np.flatnonzero(trajectory.phase == index)
-        picked = np.linspace(0, len(rows) - 1, ROWS + 1).round().astype(int)
-        times.append(trajectory.t[rows[picked]])
-    starts = trajectory.phase_starts
-    times.append(divide_pieces(trajectory.torque, starts, np.diff(starts) / pieces))
-    return np.concatenate(times)
-
-
-def divide_pieces(torque: TorqueProfile, starts: Array, longest: Array) -> Array:
-    """Instants that divide the pieces of torques into parts of the `longest` length of a phase [s].
-
-    Parameters
-    ----------
-    torque : TorqueProfile
-    starts : ndarray, shape (n_phases + 1,), [s]
-        When phases start, and when the last one ends.
-    longest : ndarray, shape (n_phases,), [s]
-    """
-    middle = (torque.breaks[1:] + torque.breaks[:-1]) / 2
-    owner = np.clip(np.searchsorted(starts, middle, side="right") - 1, 0, len(longest) - 1)
-    counts = np.floor(np.diff(torque.breaks) / longest[owner]).astype(int)
-    parts = [
-        start + (stop - start) * np.arange(1, count + 1) / (count + 1)
-        for start, stop, count in zip(torque.breaks[:-1], torque.breaks[1:], counts, strict=True)
-        if count
-    ]
-    return np.concatenate([np.zeros(0), *parts])
+        return [Check(error, residual) for _ in allowances]
+    return [Check(judge(seen, allowance), residual) for allowance in allowances]
 
 
 def find_residual(problem: Problem, trajectory: Trajectory) -> Residual:
@@ -300,8 +240,7 @@ def _describe(block: BlockPlan, number: int, check: Check) -> str:
 def _collect_figures(planning: Planning, check: Check) -> ReplayFigures:
     """What a plan keeps of its replay."""
     assert isinstance(check.report, Report)
-    scene = planning.problem.scene
-    found = [(find_least_force(scene, phase), phase.number) for phase in check.report.phases]
+    found = [(find_least_force(phase), phase.number) for phase in check.report.phases]
     known = [(least, number) for least, number in found if least is not None]
     least, number = min(known, key=lambda pair: pair[0].least)
     return ReplayFigures(

@@ -14,10 +14,8 @@ from ..problem.definition import Problem
 from ..results.report import Report
 from ..results.torque_table import ERROR, format_rows, place_rows, read_rows, sample_rows
 from ..results.trajectory import Trajectory
-from ..scene.model import Scene
 from ..verification.verdict import Allowance, find_least_force
-from ..verification.verify import inspect
-from .self_check import PIECES, divide_pieces, pick_times
+from ..verification.verify import judge, observe
 
 FINER = 8.0
 """Divisor of the error of the rows of a table when its replay does not hold."""
@@ -66,21 +64,21 @@ def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) ->
     rows = place_rows(trajectory.torque)
     if not replay:
         return Table(rows, {"rows": len(rows), "replay": None})
-    times = pick_times(trajectory)
     for attempt in range(ATTEMPTS):
         rows = place_rows(trajectory.torque, ERROR / FINER**attempt)
         # The table has to keep the limits of the plan, and to stay near it.
-        report = inspect(problem, read_rows(rows), trajectory, times, Allowance(), 1e-9)
+        seen = observe(problem, read_rows(rows), trajectory)
+        report = judge(seen, Allowance())
         if report.ok:
             break
     else:
-        report = inspect(problem, read_rows(rows), None, times, Allowance(), 1e-9)
+        report = judge(seen._replace(plan=None), Allowance())
     if not report.ok:
         raise ReplayError(
             f"the torques as a table of {len(rows)} rows do not hold in their replay: "
             f"{report.reason}; --no-replay (replay=False) leaves the check out"
         )
-    return Table(rows, {"rows": len(rows), "replay": _compare(problem.scene, trajectory, report)})
+    return Table(rows, {"rows": len(rows), "replay": _compare(trajectory, report)})
 
 
 def sample_table(
@@ -108,30 +106,26 @@ def sample_table(
     }
     if not replay:
         return Table(rows, figures)
-    torque, starts = read_rows(rows), trajectory.phase_starts
-    times = divide_pieces(torque, starts, np.diff(starts) / PIECES)
     try:
-        report = inspect(problem, torque, None, times, Allowance(), 1e-9)
+        seen = observe(problem, read_rows(rows), trajectory)
     except (JammingError, SimulationError) as error:
         return Table(rows, figures | {"replay": {"ok": False, "reason": str(error), "phases": []}})
-    return Table(rows, figures | {"replay": _compare(problem.scene, trajectory, report)})
+    report = judge(seen._replace(plan=None), Allowance())
+    return Table(rows, figures | {"replay": _compare(trajectory, report)})
 
 
-def _compare(scene: Scene, trajectory: Trajectory, report: Report) -> dict[str, Any]:
+def _compare(trajectory: Trajectory, report: Report) -> dict[str, Any]:
     """Arrival and least normal force of each phase of a replay, beside those of the plan."""
     return {
         "ok": report.ok,
         "reason": report.reason,
         "phases": [
-            _compare_phase(scene, trajectory, index, report)
-            for index in range(len(trajectory.motions))
+            _compare_phase(trajectory, index, report) for index in range(len(trajectory.motions))
         ],
     }
 
 
-def _compare_phase(
-    scene: Scene, trajectory: Trajectory, index: int, report: Report
-) -> dict[str, Any]:
+def _compare_phase(trajectory: Trajectory, index: int, report: Report) -> dict[str, Any]:
     c_n = trajectory.c_n[trajectory.phase == index]
     found: dict[str, Any] = {
         "phase": index + 1,
@@ -143,7 +137,7 @@ def _compare_phase(
     }
     if index < len(report.phases):
         phase = report.phases[index]
-        least = find_least_force(scene, phase)
+        least = find_least_force(phase)
         found["arrival"] = phase.arrival
         if least is not None:
             found |= {"least_c_n": least.least, "contact": least.contact}

@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
+from ..contacts.elemental import Contact
 from ..mechanics.dynamics import energy
 from ..problem.definition import Phase, Problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from .layout import Outputs
+from .runge_kutta import GLIMPSES, NODES
 
 
 class EventKind(Enum):
@@ -130,6 +132,22 @@ class Energies:
         return np.asarray(self.work - (self.stored - self.stored[0]) - losses)
 
 
+class Glimpses(NamedTuple):
+    """Normal forces within steps, as good as the stages of Runge-Kutta steps know the state.
+
+    Attributes
+    ----------
+    t : ndarray, shape (k,), [s]
+    phase : ndarray of int, shape (k,)
+    c_n : ndarray, shape (k, m), [N]
+        NaN where a contact is not in the formation.
+    """
+
+    t: Array
+    phase: NDArray[np.int64]
+    c_n: Array
+
+
 @dataclass(frozen=True, eq=False)
 class Simulation:
     """A simulated motion, at every accepted step and every instant asked for.
@@ -147,6 +165,7 @@ class Simulation:
         Every contact of the problem.
     c_n, c_t : ndarray, shape (n, m), [N]
         NaN where a contact is not in the formation, and at rest, where forces are indeterminate.
+    glimpses : Glimpses
     problem : Problem
     torque : TorqueProfile
         What was simulated.
@@ -169,6 +188,7 @@ class Simulation:
     contacts: tuple[str, ...]
     c_n: Array
     c_t: Array
+    glimpses: Glimpses
     problem: Problem = field(repr=False)
     torque: TorqueProfile = field(repr=False)
     events: tuple[Event, ...]
@@ -203,6 +223,31 @@ class Simulation:
         return np.concatenate([self.z[index], self.z_dot[index]])
 
 
+class Step(NamedTuple):
+    """A step that has been made.
+
+    Attributes
+    ----------
+    t, h : float, [s]
+        Its start and length.
+    inputs : ndarray
+        Its packed inputs.
+    c_n : ndarray, shape (len(GLIMPSES) n_c,), [N]
+        At some of its stages.
+    impact : float, [J]
+        Energy lost to impacts so far.
+    arrives : bool
+        Whether it ends where the phase ends, which it has passed by rounding.
+    """
+
+    t: float
+    h: float
+    inputs: Array
+    c_n: Array
+    impact: float
+    arrives: bool
+
+
 @dataclass(frozen=True, eq=False)
 class Section:
     """What is recorded while one phase is simulated, row by row.
@@ -214,9 +259,8 @@ class Section:
         Layout of the rows.
     times, rows, impacts : list
         Instants [s], packed outputs, and the energy lost to impacts so far [J].
-    within : list of (ndarray, ndarray)
-        Steps that rows lie within which are still to be evaluated (`within.fill`): the packed
-        inputs of the step, and the numbers of the rows.
+    steps : list of Step
+        Those that may be looked into.
     """
 
     phase: Phase
@@ -224,7 +268,7 @@ class Section:
     times: list[float] = field(default_factory=list)
     rows: list[Array] = field(default_factory=list)
     impacts: list[float] = field(default_factory=list)
-    within: list[tuple[Array, NDArray[np.int64]]] = field(default_factory=list)
+    steps: list[Step] = field(default_factory=list)
 
 
 def collect(
@@ -241,15 +285,17 @@ def collect(
     columns: list[tuple[Array, ...]] = []
     for section in sections:
         to, formation = section.to, section.phase.formation
-        rows = np.array(section.rows).reshape(-1, to.size)
+        # What has been seen within steps comes last there.
+        order = np.argsort(section.times, kind="stable")
+        rows = np.array(section.rows).reshape(-1, to.size)[order]
         forces = np.full((2, len(rows), len(contacts)), np.nan)
         where = [contacts.index(contact) for contact in formation.contacts]
         forces[:, :, where] = rows[:, to.c_n], rows[:, to.c_t]
         y = rows[:, to.y]
         stored = energy(formation, y[:, :5], y[:, 5:10])
         index = np.full(len(rows), section.phase.index)
-        parts = np.array(section.times), y, rows[:, to.acceleration], rows[:, to.tau]
-        columns.append((*parts, index, *forces, stored, np.array(section.impacts)))
+        parts = np.array(section.times)[order], y, rows[:, to.acceleration], rows[:, to.tau]
+        columns.append((*parts, index, *forces, stored, np.array(section.impacts)[order]))
     t, y, z_ddot, tau, phase, c_n, c_t, stored, impact = (
         np.concatenate(column) for column in zip(*columns, strict=True)
     )
@@ -263,6 +309,7 @@ def collect(
         contacts=tuple(contact.name for contact in contacts),
         c_n=c_n,
         c_t=c_t,
+        glimpses=_list_glimpses(sections, contacts),
         problem=problem,
         torque=torque,
         events=tuple(sorted(events, key=lambda event: event.time)),
@@ -272,3 +319,20 @@ def collect(
         steps=counts[0],
         rejected=counts[1],
     )
+
+
+def _list_glimpses(sections: Sequence[Section], contacts: Sequence[Contact]) -> Glimpses:
+    """What the stages of all steps have seen."""
+    nodes = np.array(NODES)[list(GLIMPSES)]
+    columns = [(np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, len(contacts))))]
+    for section in sections:
+        if not section.steps:
+            continue
+        own = section.phase.formation.contacts
+        places = np.array([(step.t, step.h) for step in section.steps])
+        t = (places[:, :1] + nodes * places[:, 1:]).ravel()
+        c_n = np.full((len(t), len(contacts)), np.nan)
+        seen = np.array([step.c_n for step in section.steps]).reshape(len(t), len(own))
+        c_n[:, [contacts.index(contact) for contact in own]] = seen
+        columns.append((t, np.full(len(t), section.phase.index), c_n))
+    return Glimpses(*(np.concatenate(column) for column in zip(*columns, strict=True)))

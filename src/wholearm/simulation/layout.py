@@ -68,6 +68,8 @@ class Outputs(NamedTuple):
         Least of the event values plus their slacks: below zero something has happened.
     dip : int
         Least c_n and reserve of friction at the stages within the step, in units of the scene.
+    glimpses : slice
+        c_n at the stages of `GLIMPSES`, one after the other [N]; zero without a step.
     until_rate : int
         Time derivative of the distance to the phase's end.
     events : slice
@@ -85,6 +87,7 @@ class Outputs(NamedTuple):
     error: int
     worst: int
     dip: int
+    glimpses: slice
     until_rate: int
     events: slice
     size: int

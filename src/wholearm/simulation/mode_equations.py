@@ -55,8 +55,8 @@ class Mechanics(NamedTuple):
     at : Inputs
         Layout of the packed inputs.
     stage : callable
-        (z and z', time, packed, rows) -> rates of the state, and the least that holds it in units
-        of the scene.
+        (z and z', time, packed, rows) -> rates of the state, the least that holds it in units of
+        the scene, and c_n.
     report : callable
         (state, time, packed, rows) -> outputs up to the ratio, events before and after the limits,
         and the least of these events with their slacks.
@@ -121,12 +121,12 @@ class _Model:
         )
         inputs = [self.t, self.packed, *self.rows]
         rates, c, v_t, tau, K, P = self._move()
-        held = self._hold(c)
+        held, c_n = self._hold(c), c[: self.mode.formation.n_contacts]
         least = ca.mmin(held / self.mode.force_limit_units)
         report = self._report(rates, c, v_t, tau, K, P, held, slack, stall)
         return Mechanics(
             self.at,
-            ca.Function("stage", [self.y[:MOVING], *inputs], [rates, least]),
+            ca.Function("stage", [self.y[:MOVING], *inputs], [rates, least, c_n]),
             ca.Function("report", [self.y, *inputs], report),
             self._build_correction(),
             self._build_error(),

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..problem.definition import End
-from .events import EventKind, Outcome, OutcomeKind
+from .events import EventKind, Outcome, OutcomeKind, Step
 from .jumps import (
     Arrival,
     Ending,
@@ -26,7 +26,6 @@ from .locate import find_first
 from .replay import Replay
 from .runge_kutta import ORDER
 from .tolerances import REACHED, SHORTEST_STEP, SLOW, measure_units
-from .within import keep_wanted
 
 _GROWTH = 40.0
 """Largest growth of a step: at order 8 an error of 1e-13 of the tolerance allows it."""
@@ -38,17 +37,18 @@ def move(run: Replay) -> Ending:
     run.h = min(run.h, run.tolerances.first_step)
     while True:
         outputs, to = run.stepper.outputs, run.stepper.to
-        while run.ends[run.next_end] <= run.t:
-            run.next_end += 1
-        target = min(run.breaks[run.piece + 1], run.ends[run.next_end])
+        while run.wanted[run.next_wanted] <= run.t:
+            run.next_wanted += 1
+        target = min(run.breaks[run.piece + 1], run.wanted[run.next_wanted])
         h, whole = _try_step(run, target)
-        if outputs[to.worst] < 0 and not (whole and _is_at_end(run, target)):
+        arrives = bool(outputs[to.worst] < 0)
+        if arrives and not (whole and _is_at_end(run, target)):
             ending = _stop_at_event(run, start, h)
             if ending is not None:
                 return ending
             start = run.stepper.outputs.copy()
             continue
-        start = _accept(run, target if whole else run.t + h)
+        start = _accept(run, target if whole else run.t + h, arrives)
         if whole and target == run.breaks[run.piece + 1]:
             ending = _pass_break(run)
             if ending is not None:
@@ -56,11 +56,15 @@ def move(run: Replay) -> Ending:
             start = run.stepper.outputs.copy()
 
 
-def _accept(run: Replay, t: float) -> Array:
-    """Take the step just made, to time `t`, and what is wanted within it."""
-    keep_wanted(run, t)
-    if run.wanted[run.next_wanted] == t:
-        run.next_wanted += 1
+def _accept(run: Replay, t: float, arrives: bool = False) -> Array:
+    """Take the step just made, to time `t`; `arrives`: the end of the phase is passed by rounding.
+
+    It is kept, so that more can be seen of what lies within it.
+    """
+    s = run.stepper
+    c_n = s.outputs[s.to.glimpses].copy()
+    step = Step(run.t, t - run.t, s.inputs.copy(), c_n, run.impact, arrives)
+    run.sections[-1].steps.append(step)
     return run.accept(t)
 
 

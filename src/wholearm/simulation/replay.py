@@ -51,9 +51,8 @@ class Replay:
         Unit of the distance to the end of the phase.
     moving : bool
         Whether the motion goes on into the phase that is entered.
-    wanted, ends : list of float
-        Instants that are to be recorded, and those of them at which steps have to end; infinity is
-        last.
+    wanted : list of float
+        Instants at which steps have to end; infinity is last.
     stuck : set of int
         Contacts, then joints, of the phase's formation that stay while the rest moves.
     """
@@ -71,7 +70,6 @@ class Replay:
         torque: TorqueProfile,
         tolerance: float,
         wanted: Array,
-        ends: Array,
     ) -> None:
         self.problem, self.torques, self.tolerance = problem, torque, tolerance
         self.tolerances = find_tolerances(problem.scene)
@@ -80,11 +78,9 @@ class Replay:
         self.coefficients = torque.coefficients
         self.steps_at = _find_steps(torque, self.tolerances.torque_step)
         self.step_times = [b for b, s in zip(self.breaks, self.steps_at, strict=False) if s]
-        self.wanted, self.ends = (
-            [*times[(times >= self.breaks[0]) & (times <= self.breaks[-1])].tolist(), math.inf]
-            for times in (wanted, ends)
-        )
-        self.next_wanted = self.next_end = 0
+        known = wanted[(wanted >= self.breaks[0]) & (wanted <= self.breaks[-1])]
+        self.wanted = [*known.tolist(), math.inf]
+        self.next_wanted = 0
         self.t, self.piece = self.breaks[0], 0
         self.y = np.zeros(STATE)
         self.y[:5] = problem.start
@@ -174,10 +170,10 @@ class Replay:
             column.pop()
 
     def repeats(self) -> bool:
-        """Whether the last two records are of the same instant of one phase."""
+        """Whether the last two records are of the same instant of one phase, but for rounding."""
         own = [section for section in self.sections if section.phase is self.phase]
         times = [time for section in own[-2:] for time in section.times[-2:]]
-        return len(times) > 1 and times[-2] == self.t
+        return len(times) > 1 and self.t - times[-2] <= self.tolerances.settling
 
     def note(
         self,

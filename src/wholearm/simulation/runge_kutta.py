@@ -15,9 +15,8 @@ from collections.abc import Callable
 from functools import lru_cache
 
 import casadi as ca
-import numpy as np
 
-from ..common.arrays import Array, Expression
+from ..common.arrays import Expression
 
 ORDER = 8
 
@@ -72,6 +71,8 @@ NODES = (
     0.3333333333333333, 0.25, 0.3076923076923077, 0.6512820512820513, 0.6, 0.8571428571428571, 1.0,
 )
 """Times of the stages, as shares of a step."""
+GLIMPSES = (3, 5, 9, 10)
+"""Stages that are spread over the step and know the state well, if not as well as its end."""
 WEIGHTS = {
     0: 0.054293734116568765, 5: 4.450312892752409, 6: 1.8915178993145003, 7: -5.801203960010585,
     8: 0.3111643669578199, 9: -0.1521609496625161, 10: 0.20136540080403034,
@@ -87,54 +88,6 @@ ERROR_5 = {
 _THIRD = {0: 0.2440944881889764, 8: 0.7338466882816118, 11: 0.022058823529411766}
 ERROR_3 = {j: w - _THIRD.get(j, 0.0) for j, w in WEIGHTS.items()}
 """Differences of the weights of order 8 from those of order 3."""
-WITHIN_ROWS: tuple[dict[int, float], ...] = (
-    WEIGHTS,
-    {
-        0: 0.056167502283047954, 6: 0.25350021021662483, 7: -0.2462390374708025,
-        8: -0.12419142326381637, 9: 0.15329179827876568, 10: 0.00820105229563469,
-        11: 0.007567897660545699, 12: -0.008298,
-    },
-    {
-        0: 0.03183464816350214, 5: 0.028300909672366776, 6: 0.053541988307438566,
-        7: -0.05492374857139099, 10: -0.00010834732869724932, 11: 0.0003825710908356584,
-        12: -0.00034046500868740456, 13: 0.1413124436746325,
-    },
-    {
-        0: -0.42889630158379194, 5: -4.697621415361164, 6: 7.683421196062599,
-        7: 4.06898981839711, 8: 0.3567271874552811, 12: -0.0013990241651590145,
-        13: 2.9475147891527724, 14: -9.15095847217987,
-    },
-)
-"""Weights of the stages before, for the end of a step and three more stages within it."""
-WITHIN_NODES = (1.0, 0.1, 0.2, 0.7777777777777778)
-"""Times of these stages."""
-WITHIN: tuple[dict[int, float], ...] = (
-    {
-        0: -8.428938276109013, 5: 0.5667149535193777, 6: -3.0689499459498917,
-        7: 2.38466765651207, 8: 2.117034582445028, 9: -0.871391583777973, 10: 2.2404374302607883,
-        11: 0.6315787787694688, 12: -0.08899033645133331, 13: 18.148505520854727,
-        14: -9.194632392478356, 15: -4.436036387594894,
-    },
-    {
-        0: 10.427508642579134, 5: 242.28349177525817, 6: 165.20045171727028,
-        7: -374.5467547226902, 8: -22.113666853125306, 9: 7.733432668472264,
-        10: -30.674084731089398, 11: -9.332130526430229, 12: 15.697238121770845,
-        13: -31.139403219565178, 14: -9.35292435884448, 15: 35.81684148639408,
-    },
-    {
-        0: 19.985053242002433, 5: -387.0373087493518, 6: -189.17813819516758,
-        7: 527.8081592054236, 8: -11.57390253995963, 9: 6.8812326946963, 10: -1.0006050966910838,
-        11: 0.7777137798053443, 12: -2.778205752353508, 13: -60.19669523126412,
-        14: 84.32040550667716, 15: 11.99229113618279,
-    },
-    {
-        0: -25.69393346270375, 5: -154.18974869023643, 6: -231.5293791760455,
-        7: 357.6391179106141, 8: 93.40532418362432, 9: -37.45832313645163, 10: 104.0996495089623,
-        11: 29.8402934266605, 12: -43.53345659001114, 13: 96.32455395918828,
-        14: -39.17726167561544, 15: -149.72683625798564,
-    },
-)
-"""Weights of all stages in the last four terms of the continuous extension, of order 7."""
 # fmt: on
 
 
@@ -172,74 +125,26 @@ def build_step(
 
 
 @lru_cache(maxsize=8)
-def _build_combinations(
-    n: int, moving: int, within: bool = False
-) -> tuple[list[Expression], Expression]:
+def _build_combinations(n: int, moving: int) -> tuple[list[Expression], Expression]:
     """CasADi functions of y, t, h and rates of stages, for states of length n.
 
     Those of the stages return where and when each one's rate is taken, from the rates that it
-    takes in; the last one, from all rates, the end and both errors, or the terms of what is
-    `within` the step. They are the same for every right-hand side, and each step calls them.
+    takes in; the last one, from all rates, the end and both errors. They are the same for every
+    right-hand side, and each step calls them.
     """
-    table, nodes = (*ROWS, *WITHIN_ROWS) if within else ROWS, (*NODES, *WITHIN_NODES)
     y, t, h = ca.SX.sym("y", n), ca.SX.sym("t"), ca.SX.sym("h")
-    rates = [ca.SX.sym(f"rate_{j}", n) for j in range(len(table))]
+    rates = [ca.SX.sym(f"rate_{j}", n) for j in range(len(ROWS))]
 
     def combine(weights: dict[int, float], count: int = n) -> Expression:
         used = ca.horzcat(ca.SX(count, 0), *(rates[stage][:count] for stage in weights))
         return h * (used @ ca.DM(list(weights.values())))
 
     stages = []
-    for node, row in zip(nodes, table, strict=False):
+    for node, row in zip(NODES, ROWS, strict=True):
         place = [y[:moving] + combine(row, moving), t + node * h]
         stages.append(ca.Function("stage", [y, t, h, *(rates[j] for j in row)], place))
-    if within:
-        whole, first, last = combine(WEIGHTS), h * rates[0], h * rates[len(ROWS)]
-        terms = [whole, first - whole, 2 * whole - (first + last), *map(combine, WITHIN)]
-        ends = [ca.horzcat(*terms)]
-    else:
-        ends = [y + combine(WEIGHTS), combine(ERROR_5, moving), combine(ERROR_3, moving)]
+    ends = [y + combine(WEIGHTS), combine(ERROR_5, moving), combine(ERROR_3, moving)]
     return stages, ca.Function("last", [y, t, h, *rates], ends)
-
-
-def build_extension(
-    rate: Callable[[Expression, Expression], Expression],
-    y: Expression,
-    t: Expression,
-    h: Expression,
-    moving: int,
-) -> Expression:
-    """Terms of the continuous extension of a step, shape (n, 7), for `interpolate`.
-
-    Parameters
-    ----------
-    rate, y, t, h, moving
-        As of `build_step`.
-    """
-    stages, last = _build_combinations(y.shape[0], moving, within=True)
-    rates: list[Expression] = []
-    for combine, row in zip(stages, (*ROWS, *WITHIN_ROWS), strict=True):
-        place = combine(y, t, h, *(rates[j] for j in row)) if row else (y[:moving], t)
-        rates.append(rate(*place))
-    return last(y, t, h, *rates)
-
-
-def interpolate(y: Array, terms: Array, x: Array) -> Array:
-    """States within n steps, shape (n, m).
-
-    Parameters
-    ----------
-    y : ndarray, shape (n, m)
-        At the start of each step.
-    terms : ndarray, shape (n, m, 7)
-        See `build_extension`.
-    x : ndarray, shape (n,)
-        Where in the step, from 0 to 1.
-    """
-    value = np.zeros_like(y)
-    for k in range(terms.shape[2] - 1, -1, -1):
-        value = (value + terms[:, :, k]) * (1 - x if k % 2 else x)[:, None]
-    return np.asarray(y + value)
 
 
 def build_error(

@@ -37,7 +37,13 @@ from .replay import Replay
 from .starting import Departure
 from .sticking import Collapse, Rest, find_rest
 from .transitions import collide, enter, go_on, set_off
-from .within import fill
+from .within import look_within
+
+ROUNDS = 8
+"""Most simulations, each with more steps that end where something showed within those before."""
+
+Closer = Callable[[Simulation, int], ArrayLike]
+"""Gives, from what is known and the number of looks so far, instants to look at too, or none."""
 
 
 @exclusive
@@ -47,7 +53,7 @@ def simulate(
     *,
     tolerance: float = 1e-9,
     times: ArrayLike | None = None,
-    within: ArrayLike | None = None,
+    closer: Closer | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Simulation:
     """Replay joint torques open loop from the problem's start at rest.
@@ -62,9 +68,10 @@ def simulate(
     times : array_like, shape (n,), optional, [s]
         Instants at which the state is wanted; steps end there. Those outside the torques' time
         are left out.
-    within : array_like, shape (n,), optional, [s]
-        More of them, for which no step has to end: there the state has some ten times the error of
-        a step, at a tenth of the cost.
+    closer : callable, optional
+        Takes the simulation and the number of looks so far, from 0, and gives instants within steps
+        that are to be seen, too, shape (n,) [s], until it gives none. That changes no step, unless
+        something shows there that the ends of steps do not show.
     progress : callable, optional
         Receives a line at the start of each phase.
 
@@ -87,29 +94,38 @@ def simulate(
     profile, _ = narrow(torque)
     if not 1e-14 <= tolerance <= 1e-2:
         raise InputError("", "tolerance", f"{tolerance!r} is not between 1e-14 and 1e-2")
-    ends, inner = (
-        _sort_times(name, given) for name, given in (("times", times), ("within", within))
-    )
-    wanted = _sort_times("looks", np.concatenate([ends, inner]))
-    run = Replay(problem, profile, tolerance, wanted, ends)
-    # Where something shows within a step that its end does not show, steps are to end there.
-    found = _simulate(run, progress)
-    if found is None:
-        found = _simulate(Replay(problem, profile, tolerance, wanted, wanted), None)
-    assert found is not None
+    wanted = _sort_times(times)
+    for left in range(ROUNDS, 0, -1):
+        run = Replay(problem, profile, tolerance, wanted)
+        found, missed = _look_closer(run, _simulate(run, progress), closer)
+        if not missed or left == 1:
+            break
+        wanted, progress = _sort_times([*wanted, *missed]), None
     return found
 
 
-def _sort_times(name: str, given: ArrayLike | None) -> Array:
+def _sort_times(given: ArrayLike | None) -> Array:
     """Instants that are asked for, increasing, shape (n,) [s]."""
     times = np.asarray([] if given is None else given, dtype=float)
     if not np.isfinite(times).all():
-        raise InputError("", name, "holds numbers that are not finite")
+        raise InputError("", "times", "holds numbers that are not finite")
     return sort_unique(times)
 
 
-def _simulate(run: Replay, progress: Callable[[str], None] | None) -> Simulation | None:
-    """Simulate phase after phase; None if something within a step has been missed."""
+def _look_closer(
+    run: Replay, ended: tuple[Outcome, float], closer: Closer | None
+) -> tuple[Simulation, list[float]]:
+    """What is recorded, and instants within steps at which something showed that they missed."""
+    found, looks = _collect(run, *ended), 0
+    missed: list[float] = []
+    while closer and not missed and len(wanted := _sort_times(closer(found, looks))):
+        missed = look_within(run, wanted)
+        found, looks = _collect(run, *ended), looks + 1
+    return found, missed
+
+
+def _simulate(run: Replay, progress: Callable[[str], None] | None) -> tuple[Outcome, float]:
+    """Simulate phase after phase; how that ends, and how far from the end of the last one."""
     problem = run.problem
     for phase, following in zip(problem.phases, [*problem.phases[1:], None], strict=True):
         if progress is not None:
@@ -120,14 +136,11 @@ def _simulate(run: Replay, progress: Callable[[str], None] | None) -> Simulation
             error.phase = phase.number
             raise
         if outcome is not None:
-            break
-    else:
-        goal = problem.phases[-1].until
-        text = f"{goal} is reached at t = {run.t:.5g} s, the end of phase {len(problem.phases)}"
-        outcome = Outcome(OutcomeKind.GOAL_REACHED, text)
-    if not fill(zip(run.sections, run.steppers, strict=True)):
-        return None
-    return _collect(run, outcome)
+            release = phase.until.is_release
+            return outcome, math.nan if release else run.value(run.stepper.rows.until)
+    goal = problem.phases[-1].until
+    text = f"{goal} is reached at t = {run.t:.5g} s, the end of phase {len(problem.phases)}"
+    return Outcome(OutcomeKind.GOAL_REACHED, text), math.nan if goal.is_release else 0.0
 
 
 def _play(run: Replay, phase: Phase, following: Phase | None) -> Outcome | None:
@@ -259,13 +272,10 @@ def _collapse(run: Replay, rest: Rest, change: Collapse) -> Released | Switched 
     return run.lose(change.contact, change.c_n)
 
 
-def _collect(run: Replay, outcome: Outcome) -> Simulation:
+def _collect(run: Replay, outcome: Outcome, missed_by: float) -> Simulation:
     """Put everything recorded together."""
-    missed = 0.0 if outcome.reached else run.value(run.stepper.rows.until)
-    if run.phase.until.is_release:
-        missed = math.nan
     counts = (run.steps, run.rejected)
-    return collect(run.problem, run.sections, run.events, run.torques, outcome, missed, counts)
+    return collect(run.problem, run.sections, run.events, run.torques, outcome, missed_by, counts)
 
 
 __all__ = ["simulate"]

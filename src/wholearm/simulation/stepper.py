@@ -6,22 +6,22 @@ from, is one CasADi function of one packed vector, so that a step costs one call
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..common.batch import Batch
 from ..contacts.elemental import GapLimit, build_features, build_gap
 from ..contacts.formation import Formation
 from ..problem.definition import Until
 from .layout import MOVING, STATE, EventRows, Inputs, Outputs, lay_out
 from .mode_equations import Mechanics, share_mechanics
 from .modes import FREE, Grips, Mode
-from .runge_kutta import build_extension, build_step
+from .runge_kutta import GLIMPSES, build_step
 from .tolerances import find_tolerances
 
 
@@ -31,7 +31,7 @@ class Compiled:
 
     Attributes
     ----------
-    equations : _Equations
+    mode : Mode
     at, to : Inputs, Outputs
         Layouts of the packed vectors.
     rows : EventRows
@@ -41,28 +41,13 @@ class Compiled:
         Of the packed inputs.
     """
 
-    equations: _Equations
+    mode: Mode
     at: Inputs
     to: Outputs
     rows: EventRows
     slack: Array
     step: Expression
     look: Expression
-
-    @cached_property
-    def extend(self) -> Batch:
-        """Terms of the continuous extensions of steps, shape (STATE, 7): of their packed inputs."""
-        own = self.equations
-        y, t, h = (own.packed[place] for place in (self.at.y, self.at.t, self.at.h))
-        terms = build_extension(own.rate, y, t, h, MOVING)
-        return Batch(ca.Function("extend", [own.packed], [ca.densify(terms)]))
-
-    @cached_property
-    def sample(self) -> Batch:
-        """Outputs at many states within steps: of (packed, state, time), shape (to.size, 1)."""
-        own, state, time = self.equations, ca.MX.sym("state", STATE), ca.MX.sym("time")
-        outputs = own.report(own.project(state), time, 0, 0)
-        return Batch(ca.Function("sample", [own.packed, state, time], [outputs]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +68,6 @@ class Stepper:
         How far below zero each event value counts as rounding.
     step, look : callable
         A step of length h; the same outputs at the state given, without a step.
-    compiled : Compiled
     """
 
     mode: Mode
@@ -95,7 +79,6 @@ class Stepper:
     slack: Array
     step: Any
     look: Any
-    compiled: Compiled
     _keep: Any
 
     @property
@@ -133,8 +116,8 @@ def build_stepper(
         buffer.set_arg(0, inputs.data)
         buffer.set_res(0, results.data)
     step, look = (call for _, call in buffers)
-    known = c.equations.mode, inputs, results, c.at, c.to, c.rows, c.slack
-    return Stepper(*known, step, look, c, buffers)
+    known = c.mode, inputs, results, c.at, c.to, c.rows, c.slack
+    return Stepper(*known, step, look, buffers)
 
 
 class _Equations:
@@ -152,23 +135,27 @@ class _Equations:
         self._measure = _build_measure(formation, until, side, self.short)
         self._stage = _build_stage(mode, self.mechanics)
         self.packed = ca.MX.sym("packed", self.mechanics.at.size)
-        self.forces: list[Expression] = []
+        self.least: Expression = math.inf
+        self.c_n: list[Expression] = []
 
     def rate(self, state: Expression, time: Expression) -> Expression:
-        """Rates of the state; the least that holds it is appended to `forces`."""
-        rates, force = self._stage(state, time, self.packed)
-        self.forces.append(force)
+        """Rates of the state at the next stage, whose forces are kept."""
+        rates, least, c_n = self._stage(state, time, self.packed)
+        self.least = ca.fmin(self.least, least)
+        self.c_n.append(c_n)
         return rates
 
     def report(self, state: Expression, time: Expression, *errors: Expression) -> Expression:
-        """Outputs at a state, with the error of the step that led there and its dip."""
+        """Outputs at a state, with error, dip and glimpses of the step that led there."""
         mechanics, packed = self.mechanics, self.packed
         _, *constraints = self.mode.build_constraints(state[:5], state[5:10])
         outputs, events, speed, least = mechanics.report(state, time, packed, *constraints)
         values, distance, approach, closest = self._measure(state[:5], state[5:10])
-        error, dip = errors
+        error, dip, glimpses = errors
         worst = ca.fmin(least, closest)
-        return ca.vertcat(outputs, error, worst, dip, approach, events, values, distance, speed)
+        return ca.vertcat(
+            outputs, error, worst, dip, glimpses, approach, events, values, distance, speed
+        )
 
     def project(self, state: Expression) -> Expression:
         """The state moved onto the contacts and what friction keeps."""
@@ -184,19 +171,21 @@ def _compile(
     at, n_c, held = mechanics.at, formation.n_contacts, len(mode.holders)
     limits = len(open_limits(formation, until))
     rows = EventRows(*lay_out(n_c, 2 * held, n_c, 2, limits, None, None))
-    to = Outputs(*lay_out(STATE, 5, n_c, n_c, 2, 5, None, None, None, None, None, rows.size))
+    brief = len(GLIMPSES) * n_c
+    to = Outputs(*lay_out(STATE, 5, n_c, n_c, 2, 5, None, None, None, None, brief, None, rows.size))
     slack = np.concatenate([mechanics.slack, np.full(limits, own.short), [0.0, mechanics.stall]])
     y, t, h = packed[at.y], packed[at.t], packed[at.h]
     end, fifth, third = build_step(own.rate, y, t, h, MOVING)
     error = mechanics.error(fifth, third, packed)
-    dip = ca.mmin(ca.vertcat(*own.forces))
-    step = ca.Function("step", [packed], [own.report(own.project(end), t + h, error, dip)])
-    look = ca.Function("look", [packed], [own.report(y, t, 0, 0)])
-    return Compiled(own, at, to, rows, slack, step, look)
+    glimpses = ca.vertcat(*(own.c_n[stage] for stage in GLIMPSES))
+    seen = own.report(own.project(end), t + h, error, own.least, glimpses)
+    step = ca.Function("step", [packed], [seen])
+    look = ca.Function("look", [packed], [own.report(y, t, 0, 0, ca.DM.zeros(brief))])
+    return Compiled(mode, at, to, rows, slack, step, look)
 
 
 def _build_stage(mode: Mode, mechanics: Mechanics) -> Expression:
-    """CasADi function (state, time, packed) -> (its rates, the least that holds it)."""
+    """CasADi function (state, time, packed) -> (its rates, the least that holds it, c_n)."""
     state, time = ca.SX.sym("state", MOVING), ca.SX.sym("time")
     packed = ca.SX.sym("packed", mechanics.at.size)
     _, *rows = mode.build_constraints(state[:5], state[5:10])

@@ -1,56 +1,69 @@
-"""What is wanted within steps: states by the continuous extension, evaluated all at once.
+"""What is to be seen within steps: the same steps, ended earlier.
 
 A step ends where the integration or an event says so, not where somebody wants to look.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 
-from .events import Section
+from ..common.arrays import Array
+from .events import Section, Step
 from .replay import Replay
-from .runge_kutta import interpolate
 from .stepper import Stepper
+from .tolerances import ROUNDING_LIMIT, STANDING, measure_until
 
 
-def keep_wanted(run: Replay, stop: float) -> None:
-    """Set aside the instants that are wanted within the step just made, which ends at `stop`.
+def look_within(run: Replay, times: Array) -> list[float]:
+    """Record the states at increasing instants, shape (n,) [s], within steps that have been made.
 
-    Its start is recorded already.
+    Instants that lie within none are left out.
+
+    Returns
+    -------
+    list of float, [s]
+        Where something has happened that the steps missed.
     """
-    while run.wanted[run.next_wanted] <= run.t:
-        run.next_wanted += 1
-    if run.wanted[run.next_wanted] >= stop:
-        return
-    section = run.sections[-1]
-    first, blank = len(section.times), np.full(section.to.size, np.nan)
-    while run.wanted[run.next_wanted] < stop:
-        section.times.append(run.wanted[run.next_wanted])
-        section.rows.append(blank)
-        section.impacts.append(run.impact)
-        run.next_wanted += 1
-    section.within.append((run.stepper.inputs.copy(), np.arange(first, len(section.times))))
-
-
-def fill(sections: Iterable[tuple[Section, Stepper]]) -> bool:
-    """Evaluate what has been set aside; whether nothing had happened there that steps missed."""
-    calm = True
-    for section, stepper in sections:
-        if not section.within:
+    missed: list[float] = []
+    for section, stepper in zip(run.sections, run.steppers, strict=True):
+        if not section.steps:
             continue
-        at, compiled = stepper.at, stepper.compiled
-        packed = np.array([inputs for inputs, _ in section.within])
-        (terms,) = compiled.extend(packed)
-        step = np.repeat(np.arange(len(packed)), [len(rows) for _, rows in section.within])
-        rows = np.concatenate([rows for _, rows in section.within])
-        times = np.array(section.times)[rows]
-        x = (times - packed[step, at.t]) / packed[step, at.h]
-        states = interpolate(packed[step, at.y], terms[step], x)
-        (outputs,) = compiled.sample(packed[step], states, times[:, None])
-        for row, values in zip(rows, outputs[:, :, 0], strict=True):
-            section.rows[row] = values
-        calm &= bool((outputs[:, stepper.to.worst] >= 0).all())
-        section.within.clear()
-    return calm
+        at, slack = stepper.at, _measure_slack(run, section, stepper)
+        begins = np.array([step.t for step in section.steps])
+        owners = np.searchsorted(begins, times, side="left") - 1
+        for time, owner in zip(times.tolist(), owners.tolist(), strict=True):
+            step = section.steps[max(owner, 0)]
+            h = time - step.t
+            if owner < 0 or h >= step.h:
+                continue
+            stepper.inputs[:] = step.inputs
+            stepper.inputs[at.h] = h
+            stepper.step()
+            section.times.append(time)
+            section.rows.append(stepper.outputs.copy())
+            section.impacts.append(step.impact)
+            if shows(step, stepper, slack):
+                missed.append(time)
+    return missed
+
+
+def _measure_slack(run: Replay, section: Section, stepper: Stepper) -> Array:
+    """How far below zero each event value counts as rounding within a step."""
+    rows, slack, scales = stepper.rows, stepper.slack.copy(), run.problem.scene.scales
+    slack[rows.slide] = slack[rows.speed] = STANDING * scales.speed
+    slack[rows.speed] *= scales.mass**0.5
+    slack[rows.joint] = STANDING / scales.time
+    slack[rows.until] = ROUNDING_LIMIT * measure_until(run.problem.scene, section.phase.until)
+    return slack
+
+
+def shows(step: Step, stepper: Stepper, slack: Array) -> bool:
+    """Whether something happens in a step up to the place just looked at.
+
+    One that ends with the phase may have passed its end, and turned back.
+    """
+    short = stepper.outputs[stepper.to.events] + slack < 0
+    if step.arrives:
+        rows = stepper.rows
+        short[rows.until] = short[rows.speed] = short[rows.slide] = short[rows.joint] = False
+    return bool(short.any())

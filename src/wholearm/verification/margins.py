@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,17 +27,67 @@ MISSED = 1e-6
 """Miss of a limit, over what is much for it, from which on it is reported."""
 
 
+class Parabolas(NamedTuple):
+    """Parabolas through three successive samples each whose vertex lies between the outer ones.
+
+    Attributes
+    ----------
+    start, stop, time : ndarray, shape (n,), [s]
+        The outer samples, and the vertex.
+    lowest : ndarray, shape (n,)
+        Value there.
+    dips : ndarray of bool, shape (n,)
+        Whether the middle sample is the least of the three.
+    """
+
+    start: Array
+    stop: Array
+    time: Array
+    lowest: Array
+    dips: NDArray[np.bool_]
+
+
+def list_normal_forces(
+    problem: Problem, simulation: Simulation, phase: Phase, rows: NDArray[np.int64]
+) -> dict[str, Array]:
+    """Normal forces by contact in a phase, which the simulation has at `rows` [N].
+
+    A contact that is let go without a jump of the torques passes epsilon on its way to zero: what
+    it has below epsilon on that way is NaN.
+    """
+    gone = {
+        name
+        for event in simulation.find(EventKind.RELEASE)
+        if event.phase == phase.index
+        for name in event.contact.split(", ")
+    }
+    forces = {}
+    for name in phase.formation.names:
+        values = simulation.c_n[rows, simulation.contacts.index(name)]
+        pressed = np.flatnonzero(values >= problem.epsilon)
+        if name in gone and len(pressed) and values[-1] < problem.epsilon / 2:
+            values[pressed[-1] + 1 :] = math.nan
+        forces[name] = values
+    return forces
+
+
+def list_slips(simulation: Simulation, phase: Phase, rows: NDArray[np.int64]) -> dict[str, Array]:
+    """Margins to slipping by rolling contact in a phase, which the simulation has at `rows` [N]."""
+    formation = phase.formation
+    columns = [simulation.contacts.index(name) for name in formation.names]
+    c_n, c_t = simulation.c_n[rows][:, columns], simulation.c_t[rows][:, columns]
+    names = [formation.names[row] for row in formation.rolling_rows]
+    return dict(zip(names, slip_margins(formation, c_n, c_t).T, strict=True))
+
+
 def list_contact_margins(
     problem: Problem, simulation: Simulation, rows: NDArray[np.int64], phase: Phase, breaks: Array
 ) -> tuple[ContactMargin, ...]:
     """Least normal forces in a phase, which the simulation has at `rows`."""
     lost = {e.contact: e for e in simulation.find(EventKind.CONTACT_LOST) if e.phase == phase.index}
     shortest, contacts = SHORTEST * problem.scene.scales.time, []
-    for name in phase.formation.names:
-        column = simulation.contacts.index(name)
-        least, time = find_lowest(
-            simulation.t[rows], simulation.c_n[rows, column], breaks, shortest
-        )
+    for name, values in list_normal_forces(problem, simulation, phase, rows).items():
+        least, time = find_lowest(simulation.t[rows], values, breaks, shortest)
         if name in lost and not least <= lost[name].value:
             least, time = lost[name].value, lost[name].time
         contacts.append(ContactMargin(name, least, time, least - problem.epsilon))
@@ -47,15 +98,9 @@ def list_slip_margins(
     phase: Phase, simulation: Simulation, rows: NDArray[np.int64], breaks: Array
 ) -> tuple[SlipMargin, ...]:
     """Least margins to slipping in a phase, which the simulation has at `rows`."""
-    formation = phase.formation
-    columns = [simulation.contacts.index(name) for name in formation.names]
-    c_n, c_t = simulation.c_n[rows][:, columns], simulation.c_t[rows][:, columns]
     slipped = {e.contact: e for e in simulation.find(EventKind.SLIP) if e.phase == phase.index}
-    shortest, margins = SHORTEST * formation.scene.scales.time, []
-    for row, values in zip(
-        formation.rolling_rows, slip_margins(formation, c_n, c_t).T, strict=True
-    ):
-        name = formation.names[row]
+    shortest, margins = SHORTEST * phase.formation.scene.scales.time, []
+    for name, values in list_slips(simulation, phase, rows).items():
         least, time = find_lowest(simulation.t[rows], values, breaks, shortest)
         if name in slipped and not least <= slipped[name].value:
             least, time = slipped[name].value, slipped[name].time
@@ -103,14 +148,8 @@ def find_lowest(
 
     Parameters
     ----------
-    t : ndarray, shape (n,), [s]
-        Never decreasing; a jump is there twice.
-    values : ndarray, shape (n,)
-        NaN where unknown.
-    breaks : ndarray, [s]
-        Where the function may have a kink: no parabola has one inside.
-    shortest : float, [s]
-        Interval below which the function may jump.
+    t, values, breaks, shortest
+        As of `fit_parabolas`.
 
     Returns
     -------
@@ -121,25 +160,44 @@ def find_lowest(
         return math.nan, math.nan
     first = int(np.nanargmin(values))
     least, time = float(values[first]), float(t[first])
+    found = fit_parabolas(t, values, breaks, shortest)
+    # Where the middle is not the least of three, a curve that flattens out would seem to dip.
+    lowest = np.where(found.dips, found.lowest, math.inf)
+    if len(lowest) and lowest.min() < least:
+        k = int(lowest.argmin())
+        least, time = float(lowest[k]), float(found.time[k])
+    return least, time
+
+
+def fit_parabolas(t: Array, values: Array, breaks: Array, shortest: float = 0.0) -> Parabolas:
+    """Parabolas with a vertex below their samples, inside smooth stretches of a sampled function.
+
+    Parameters
+    ----------
+    t : ndarray, shape (n,), [s]
+        Never decreasing; a jump is there twice.
+    values : ndarray, shape (n,)
+        NaN where unknown.
+    breaks : ndarray, [s]
+        Where the function may have a kink: no parabola has one inside.
+    shortest : float, [s]
+        Interval below which the function may jump.
+    """
     left, right = np.diff(t)[:-1], np.diff(t)[1:]
     smooth = (left > shortest) & (right > shortest) & ~_is_among(t[1:-1], breaks)
     smooth &= ~np.isnan(values[:-2] + values[1:-1] + values[2:])
-    left, right = left[smooth], right[smooth]
-    middle = values[1:-1][smooth]
+    left, right, time, middle = left[smooth], right[smooth], t[1:-1][smooth], values[1:-1][smooth]
     fall = (values[1:-1] - values[:-2])[smooth] / left
     rise = (values[2:] - values[1:-1])[smooth] / right
     bend = (rise - fall) / (left + right)
     slope = (fall * right + rise * left) / (left + right)
     with np.errstate(divide="ignore", invalid="ignore"):
         shift = -slope / (2 * bend)
-    # Where the middle is not the least of three, a curve that flattens out would seem to dip.
-    inside = (fall <= 0) & (rise >= 0) & (bend > 0) & (shift > -left) & (shift < right)
-    if inside.any():
-        lowest = middle[inside] + slope[inside] * shift[inside] / 2
-        k = int(lowest.argmin())
-        if lowest[k] < least:
-            least, time = float(lowest[k]), float((t[1:-1][smooth] + shift)[inside][k])
-    return least, time
+    inside = (bend > 0) & (shift > -left) & (shift < right)
+    left, right, time, shift = left[inside], right[inside], time[inside], shift[inside]
+    lowest = middle[inside] + slope[inside] * shift / 2
+    dips = (fall[inside] <= 0) & (rise[inside] >= 0)
+    return Parabolas(time - left, time + right, time + shift, lowest, dips)
 
 
 def _is_among(t: Array, breaks: Array) -> NDArray[np.bool_]:

@@ -18,7 +18,6 @@ from ..problem.definition import End, Problem
 from ..results.report import ContactMargin, Deviation, Failure, FingerGap, PhaseReport
 from ..scene.model import Scene
 from ..simulation.events import EventKind, OutcomeKind, Simulation
-from .margins import SHORTEST
 
 DEPARTURE = 1e-3
 """Largest distance of a replay from its plan, relative to the scene's length, and in rad."""
@@ -68,6 +67,10 @@ class Allowance:
     def scale(self, share: float) -> Allowance:
         """A share of what is allowed from the plan; the speed that passes for rest stays."""
         return Allowance(share * self.departure, self.rest_speed, share * self.stray)
+
+    def measure_stray(self, problem: Problem) -> float:
+        """How far normal forces of a plan may fall below epsilon [N]."""
+        return ROUNDING * problem.scene.scales.force + self.stray * problem.epsilon
 
 
 def describe_overlap(
@@ -169,18 +172,9 @@ def measure_departure(deviation: Deviation, length: float) -> float:
 def describe_thin_margins(
     problem: Problem, phases: Sequence[PhaseReport], simulation: Simulation, allowance: Allowance
 ) -> list[Failure]:
-    """Sentences on the normal forces below epsilon, but for contacts where they were lost.
-
-    A contact that is let go without a jump of the torques passes epsilon on its way to zero.
-    """
-    let_go = {
-        (e.phase + 1, n): e.time
-        for e in simulation.find(EventKind.RELEASE)
-        for n in e.contact.split(", ")
-    }
+    """Sentences on the normal forces below epsilon, but for contacts where they were lost."""
     lost = {(e.phase + 1, e.contact) for e in simulation.find(EventKind.CONTACT_LOST)}
-    shortest = SHORTEST * problem.scene.scales.time
-    allowed = ROUNDING * problem.scene.scales.force + allowance.stray * problem.epsilon
+    allowed = allowance.measure_stray(problem)
     return [
         Failure(
             phase.number,
@@ -189,27 +183,11 @@ def describe_thin_margins(
         )
         for phase in phases
         for c in phase.contacts
-        if c.margin < -allowed
-        and (phase.number, c.contact) not in lost
-        and abs(c.time - let_go.get((phase.number, c.contact), math.inf)) > shortest
+        if c.margin < -allowed and (phase.number, c.contact) not in lost
     ]
 
 
-def find_least_force(scene: Scene, phase: PhaseReport) -> ContactMargin | None:
-    """The contact with the least normal force in a phase; None if nothing moved.
-
-    Contacts that are let go count until just before.
-    """
-    shortest = SHORTEST * scene.scales.time
-    released = phase.until.startswith("release of ") and phase.arrival is not None
-    known = [
-        margin
-        for margin in phase.contacts
-        if not math.isnan(margin.least)
-        and not (
-            released
-            and margin.contact in phase.until
-            and abs(margin.time - (phase.arrival or 0.0)) <= shortest
-        )
-    ]
+def find_least_force(phase: PhaseReport) -> ContactMargin | None:
+    """The contact with the least normal force in a phase; None if nothing moved."""
+    known = [margin for margin in phase.contacts if not math.isnan(margin.least)]
     return min(known, key=lambda margin: margin.least, default=None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from ..results.report import (
     Deviation,
     EnergyBalance,
     Failure,
+    FingerGap,
     LeastImpulse,
     ModeChange,
     PhaseReport,
@@ -25,6 +27,7 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..simulation.events import Event, EventKind, Simulation
 from ..simulation.simulate import simulate
+from .look_closer import choose_times, make_closer
 from .margins import (
     MISSED,
     describe_misses,
@@ -46,15 +49,31 @@ from .verdict import (
 
 _ENDS = (EventKind.ARRIVAL, EventKind.RELEASE)
 _CHANGES = {EventKind.STICK: "sticks", EventKind.SLIP: "slips", EventKind.REVERSAL: "reverses"}
-SAMPLES = 1200
-"""About how many instants normal forces are looked at, besides the simulation's own steps."""
-CLOSER = 8
-"""Factor on the number of instants, if a parabola through few of them may dip too low."""
-ROWS = 20
-"""About how many rows of each phase of a trajectory its replay is compared with."""
-MANY = 150
-"""Instants of a phase from which on it costs less to evaluate them within steps than to end steps
-there: what evaluates them is compiled for each formation."""
+
+
+class Observation(NamedTuple):
+    """A replay, and what was seen of it, whatever is allowed.
+
+    Attributes
+    ----------
+    problem : Problem
+    torque : TorqueProfile
+    plan : Trajectory or None
+        What it is compared with.
+    tolerance : float
+        Of the simulation.
+    simulation : Simulation
+    phases : tuple of PhaseReport
+    gap : FingerGap or None
+    """
+
+    problem: Problem
+    torque: TorqueProfile
+    plan: Trajectory | None
+    tolerance: float
+    simulation: Simulation
+    phases: tuple[PhaseReport, ...]
+    gap: FingerGap | None
 
 
 @exclusive
@@ -101,43 +120,53 @@ def verify(
     if plan is not None and set(plan.contacts) != names:
         odd = ", ".join(sorted(set(plan.contacts) ^ names))
         raise InputError("", "contacts", f"trajectory and problem differ in {odd}")
-    report = inspect(
-        problem, torque, plan, choose_times(torque, plan, SAMPLES), allowance, tolerance, reduced
-    )
-    if report.reached and (report.failures or report.warnings):
-        times = choose_times(torque, plan, CLOSER * SAMPLES)
-        report = inspect(problem, torque, plan, times, allowance, tolerance, reduced)
-    return report
+    return judge(observe(problem, torque, plan, tolerance), allowance, reduced)
 
 
-def inspect(
-    problem: Problem,
-    torque: TorqueProfile,
-    plan: Trajectory | None,
-    times: Array,
-    allowance: Allowance,
-    tolerance: float,
-    reduced: bool = False,
-) -> Report:
-    """Replay torques, look at what happens at `times` [s] and judge it; see `verify`."""
-    none = times[:0]
-    ends, within = (times, none) if len(times) <= MANY * len(problem.phases) else (none, times)
-    simulation = simulate(problem, torque, tolerance=tolerance, times=ends, within=within)
+def observe(
+    problem: Problem, torque: TorqueProfile, plan: Trajectory | None, tolerance: float = 1e-9
+) -> Observation:
+    """Replay torques and look at what happens, closer where that may decide something.
+
+    Parameters
+    ----------
+    problem : Problem
+    torque : TorqueProfile
+    plan : Trajectory or None
+        What to compare the replay with.
+    tolerance : float
+        Of the simulation.
+
+    Raises
+    ------
+    JammingError, SimulationError
+        If the simulation cannot go on.
+    """
+    even = np.linspace(torque.breaks[0], torque.breaks[-1], len(problem.phases) + 1)
+    times = choose_times(torque, even if plan is None else plan.phase_starts, plan)
+    closer = make_closer(problem, torque.breaks)
+    simulation = simulate(problem, torque, tolerance=tolerance, times=times, closer=closer)
     phases = tuple(
         _report_phase(problem, simulation, torque, plan, index)
         for index in range(int(simulation.phase[-1]) + 1)
     )
+    gap = find_finger_gap(problem.scene, simulation, torque.breaks)
+    return Observation(problem, torque, plan, tolerance, simulation, phases, gap)
+
+
+def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Report:
+    """Say whether a replay holds; see `verify`."""
+    problem, simulation, phases, gap = seen.problem, seen.simulation, seen.phases, seen.gap
     reached, outcome = judge_end(problem, simulation, allowance)
     failures = [] if reached else [Failure(len(phases), outcome)]
     failures += describe_stops(problem, simulation, allowance)
-    gap = find_finger_gap(problem.scene, simulation, torque.breaks)
     failures += describe_overlap(problem.scene, phases, gap) if reached else []
     thin = describe_thin_margins(problem, phases, simulation, allowance)
-    warnings = _describe_torques(problem, torque)
+    warnings = _describe_torques(problem, seen.torque)
     for phase in problem.phases[: len(phases)]:
         rows = np.flatnonzero(simulation.phase == phase.index)
-        warnings += describe_misses(phase, simulation, rows, torque)
-    if plan is not None:
+        warnings += describe_misses(phase, simulation, rows, seen.torque)
+    if seen.plan is not None:
         failures += thin + describe_departures(problem, phases, allowance)
     else:
         warnings += [failure.text for failure in thin]
@@ -153,7 +182,7 @@ def inspect(
         phases=phases,
         energy=_balance(problem, simulation),
         finger_gap=gap,
-        tolerance=tolerance,
+        tolerance=seen.tolerance,
         steps=simulation.steps,
         changes=tuple(
             ModeChange(float(e.time), e.phase + 1, e.contact, _CHANGES[e.kind])
@@ -169,19 +198,6 @@ def _list_reduced(problem: Problem, simulation: Simulation) -> tuple[ReducedStat
     from .reduced import list_reduced_states
 
     return list_reduced_states(problem, simulation)
-
-
-def choose_times(torque: TorqueProfile, plan: Trajectory | None, samples: int) -> Array:
-    """About so many instants, one or more inside every piece of torques, and rows of the plan."""
-    count = max(1, samples // len(torque.coefficients))
-    share = np.arange(1, count + 1) / (count + 1)
-    inside = torque.breaks[:-1, None] + np.diff(torque.breaks)[:, None] * share
-    times = [inside.ravel()]
-    if plan is not None:
-        owned = (np.flatnonzero(plan.phase == index) for index in range(len(plan.motions)))
-        picked = (own[np.linspace(0, len(own) - 1, ROWS + 1).astype(int)] for own in owned)
-        times += [plan.t[rows] for rows in picked]
-    return np.concatenate(times)
 
 
 def _report_phase(

@@ -100,26 +100,35 @@ def evaluate_rows(curve: Curve, epsilon: float, s: Array, segment: NDArray[np.in
     def measure(of_forces: Array, of_torques: Array) -> Array:
         return np.asarray((of_forces @ of_c + of_torques @ of_tau)[:, rows] * scale)
 
-    squeeze = measure(forces.Cl, forces.Tl)
-    i, j = np.triu_indices(len(rows), 1)
-    opposite = squeeze[:, i] * squeeze[:, j] <= 0
-    one, other = (np.where(opposite, np.abs(squeeze[:, k]), 0) for k in (j, i))
-    # A pair that leaves nothing is 0 >= -1.
-    size = np.where(one + other > 0, one + other, 1)
-
-    def combine(of_limits: Array) -> Array:
-        return np.asarray((one * of_limits[:, i] + other * of_limits[:, j]) / size)
-
     constant = measure(forces.C0, forces.T0) - bounds * scale + GIVE
     cap = np.full(len(s), np.inf)
     for limit in every.only(SPEED).limits:
         rates = np.abs(point.z_s[:, 3:] @ limit.rows[0, -2:])
         with np.errstate(divide="ignore"):
             cap = np.minimum(cap, (limit.high[0] / rates) ** 2 * (1 + GIVE))
-    return Rows(
-        combine(measure(forces.Ca, forces.Ta)),
-        combine(measure(forces.Cb, forces.Tb)),
-        combine(measure(0 * forces.C0, forces.Tv)),
-        np.where(one + other > 0, combine(constant), 1.0),
+    return eliminate(
+        measure(forces.Cl, forces.Tl),
+        measure(forces.Ca, forces.Ta),
+        measure(forces.Cb, forces.Tb),
+        measure(0 * forces.C0, forces.Tv),
+        constant,
         cap,
     )
+
+
+def eliminate(squeeze: Array, a: Array, b: Array, v: Array, one: Array, cap: Array) -> Rows:
+    """Rows without the squeeze, one for each pair of limits, of limits with it, (n, k) each.
+
+    Pairs are in the order of `numpy.triu_indices(k, 1)`.
+    """
+    i, j = np.triu_indices(squeeze.shape[1], 1)
+    opposite = squeeze[:, i] * squeeze[:, j] <= 0
+    first, second = (np.where(opposite, np.abs(squeeze[:, k]), 0) for k in (j, i))
+    # A pair that leaves nothing is 0 >= -1.
+    left = first + second > 0
+    size = np.where(left, first + second, 1)
+
+    def combine(of_limits: Array) -> Array:
+        return np.asarray((first * of_limits[:, i] + second * of_limits[:, j]) / size)
+
+    return Rows(combine(a), combine(b), combine(v), np.where(left, combine(one), 1.0), cap)

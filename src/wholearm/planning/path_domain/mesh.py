@@ -50,6 +50,11 @@ class Mesh(NamedTuple):
     breaks: Array = np.zeros(0)
     weights: Array | None = None
 
+    @staticmethod
+    def of(curve: Curve, switches: Sequence[Switch]) -> Mesh:
+        """The mesh for a motion that switches at some places."""
+        return Mesh(_match(np.zeros(0), switches, curve)[0])
+
     def make_grid(
         self, curve: Curve, elements: int, rests: tuple[bool, bool] = (True, True)
     ) -> Grid:

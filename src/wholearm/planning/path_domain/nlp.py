@@ -25,9 +25,6 @@ from .data import PhaseData
 from .elements import Grid, Profile
 from .terms import CHAINED, LEAST_B, SOFT, LimitShape, NLPColumns, list_columns, write_terms
 
-_MU = 1e-2
-"""Complementarity of the first guess's multipliers: the barrier parameter to start from."""
-
 
 class Units(NamedTuple):
     """Units of the NLP, in which its numbers are near 1 whatever the scene's size and mass are.
@@ -234,29 +231,6 @@ def make_bounds(
         "ubg": np.concatenate(
             [equal, rows_high.ravel(), np.full(late, (duration or np.inf) / units.time)]
         ),
-    }
-
-
-def first_multipliers(
-    nlp: PathNLP, data: PhaseData, profile: Profile, units: Units
-) -> dict[str, Array]:
-    """Multipliers that put the first guess near the central path of the barrier problem."""
-    if nlp.objective is not Objective.TIME:
-        return {}
-    rows, signs, _ = data.limits.sides
-    pull = (
-        -_MU
-        * signs
-        / np.maximum(data.slack(data.nodes, profile) / units.of(data.limits)[rows], 1e-3)
-    )
-    on_rows = np.zeros((len(data.grid.s), nlp.shape.rows))
-    for k, row in enumerate(rows):
-        on_rows[:, row] += pull[:, k]
-    on_b = np.zeros(nlp.free.shape)
-    on_b[:, 0] = -_MU / np.maximum(profile.b / units.profile[0], 1e-3)
-    return {
-        "lam_x0": on_b[nlp.free],
-        "lam_g0": np.append(np.zeros(nlp.columns.g["limits"].start), on_rows),
     }
 
 

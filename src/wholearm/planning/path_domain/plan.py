@@ -220,7 +220,7 @@ def _suit(found: Round) -> Round:
             break
         refined = better.solve()
         if isinstance(refined, str) or (found.is_split and refined.merit > found.merit):
-            break
+            return replace(found, shift=better.shift)
         found = refined
     return found
 

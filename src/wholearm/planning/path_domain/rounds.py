@@ -15,6 +15,7 @@ from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
 from .data import PhaseData, cut, fit_torque, join, prepare
 from .elements import DEGREE, Elements
+from .fastest import Fastest, find_fastest
 from .first_guess import guess
 from .mesh import MOST, SHIFTED, START, Mesh, adapt, find_ends
 from .misses import MISS, Misses, PathSolution
@@ -24,13 +25,14 @@ from .nlp import (
     Tightening,
     Units,
     build_path_nlp,
-    first_multipliers,
     make_bounds,
     move_multipliers,
     pack,
     parameters,
     unpack,
 )
+from .start import start_at
+from .switches import Switch
 from .terms import LimitShape
 
 _SHARE = 0.5
@@ -88,6 +90,22 @@ class Task:
         nlp = build_path_nlp(shape, len(data.grid.steps), self.options.goal)
         return elements, parts, data, nlp
 
+    def place_breaks(self, switches: Sequence[Switch]) -> tuple[Mesh, ...]:
+        """Meshes with elements that end at switches, which are at places along all curves."""
+        starts = np.cumsum([0.0, *(curve.length for curve in self.curves)])
+        of_curve = np.searchsorted(starts[1:-1], [place for place, _ in switches])
+        return tuple(
+            Mesh.of(
+                curve,
+                [
+                    own._replace(place=own.place - start)
+                    for own, owner in zip(switches, of_curve, strict=True)
+                    if owner == k
+                ],
+            )
+            for k, (curve, start) in enumerate(zip(self.curves, starts, strict=False))
+        )
+
     def prepare(self, meshes: Sequence[Mesh], elements: int) -> list[PhaseData]:
         """What each phase gives the NLP on its grid."""
         found, last = [], len(meshes) - 1
@@ -114,6 +132,8 @@ class Round:
     units : Units
     solution : PathSolution
         The last one, or where to start.
+    fastest : Fastest or None
+        The motion of a sweep, near which plans are looked for.
     duration : float or None, [s]
         What the NLP may take for the duration, which is longer than allowed if it errs so.
     shift : float
@@ -128,6 +148,7 @@ class Round:
     nlp: PathNLP
     units: Units
     solution: PathSolution
+    fastest: Fastest | None
     duration: float | None
     shift: float = np.inf
 
@@ -137,8 +158,14 @@ class Round:
         meshes = tuple(Mesh() for _ in task.curves)
         elements, parts, data, nlp = task.lay_out(meshes, finer * task.elements)
         profile, units = guess(data, task.options.time_weight)
-        start = PathSolution(profile, 0.0, first_multipliers(nlp, data, profile, units))
-        return Round(task, elements, meshes, parts, data, nlp, units, start, task.duration)
+        found = None if task.options.goal is Objective.EFFORT else find_fastest(data, task.duration)
+        if found is None:
+            start = PathSolution(profile, 0.0, {})
+        else:
+            meshes = task.place_breaks(found.switches)
+            elements, parts, data, nlp = task.lay_out(meshes, finer * task.elements)
+            start = start_at(nlp, data, units, found)
+        return Round(task, elements, meshes, parts, data, nlp, units, start, found, task.duration)
 
     @cached_property
     def motions(self) -> list[PathMotion]:
@@ -205,8 +232,12 @@ class Round:
         task, most = self.task, self.task.options.accuracy
         prices = self.prices
         shares = np.split(prices, np.cumsum([len(part.nonempty) for part in self.parts])[:-1])
-        # Once switches have settled they need not be looked for.
+        coarse = self.elements < MOST and task.options.intervals is None
+        dear = dearer or bool(prices.sum() > _DEAR[task.options.goal] * most)
+        # Once switches have settled they need not be looked for, and where much is missed they are
+        # not better known than by a sweep.
         settled = SHIFTED * self.shift < _SETTLED * most
+        settled = settled or (self.fastest is not None and dear and coarse)
         goal = None if settled else task.options.goal
         found = [
             adapt(goal, part, motion.profile, self.solution.margin, share, mesh)
@@ -217,21 +248,37 @@ class Round:
         shift = self.shift if settled else max(own for _, own in found)
         moved = max(SHIFTED * shift, self.unspent) > _SHARE * most
         # What is missed where elements do not end at switches yet says little.
-        begun = self.is_split or not np.isinf(shift)
-        dear = dearer or (begun and prices.sum() > _DEAR[task.options.goal] * most)
-        dear = dear and self.elements < MOST and task.options.intervals is None
+        begun = dearer or self.is_split or not np.isinf(shift)
+        dear = dear and begun and coarse
         if not (moved or dear):
             return replace(self, shift=shift), None
         meshes = tuple(mesh for mesh, _ in found)
         elements, parts, data, nlp = task.lay_out(meshes, self.elements * (2 if dear else 1))
+        carried = self._carry(data, nlp)
+        allowed = task.duration and task.duration * (1 + min(self.spared, _LONGER))
+        known = (
+            elements,
+            meshes,
+            parts,
+            data,
+            nlp,
+            self.units,
+            carried,
+            self.fastest,
+            allowed,
+            shift,
+        )
+        return self, Round(task, *known)
+
+    def _carry(self, data: PhaseData, nlp: PathNLP) -> PathSolution:
+        """Where to start from on another grid."""
         old, new, solution = self.data.grid, data.grid, self.solution
-        carried = solution._replace(
+        if self.fastest is not None:
+            return start_at(nlp, data, self.units, self.fastest)
+        return solution._replace(
             profile=Elements(old, solution.profile).move(new),
             multipliers=move_multipliers(self.nlp, nlp, solution.multipliers, old, new),
         )
-        allowed = task.duration and task.duration * (1 + min(self.spared, _LONGER))
-        known = elements, meshes, parts, data, nlp, self.units, carried, allowed, shift
-        return self, Round(task, *known)
 
     def summarise(self, gap: float) -> Plans:
         """The plan of each phase, given what tightening limits has cost, relatively."""

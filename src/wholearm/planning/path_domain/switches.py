@@ -8,23 +8,21 @@ what it loses at the other.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from .data import PhaseData, Places
+from ..lower_bound.rows import Rows
+from .corners import LimitSides
+from .data import PhaseData
 from .elements import DEGREE, Elements, Profile
 
-_TOLERANCE = 1e-3
-"""How far beyond a limit a corner may be, over the terms that the limit is the sum of."""
 _PICARD = 4
 """Rounds in which speeds and extremes of s'' are made to agree."""
 _LOOKS = 320
 """Places at which corners are looked for, at least two in an interval between nodes."""
-_ROUNDING = 1e-9
-"""The same where a corner is within the limits."""
 _CAPPED = np.iinfo(np.int64).max
 """Label of places where a speed limit decides."""
 _AT_CAP = 1e-3
@@ -35,23 +33,6 @@ _FLICKER = 4e-3
 """Length over which changes of corners count as one, over that of the curve."""
 _THIN = 1e-3
 """Range of s'', over its largest, below which limits leave no choice."""
-
-
-class _Corners(NamedTuple):
-    """Largest and least s'' that limits allow at n places, and the pair of sides that meet there.
-
-    Infinite where no corner is within the limits.
-    """
-
-    high: Array
-    low: Array
-    at_high: NDArray[np.int64]
-    at_low: NDArray[np.int64]
-
-    def pick(self, rows: Any) -> _Corners:
-        """Return the places that `rows` indexes."""
-        high, low, at_high, at_low = self
-        return _Corners(high[rows], low[rows], at_high[rows], at_low[rows])
 
 
 class Switch(NamedTuple):
@@ -67,31 +48,79 @@ def find_switches(data: PhaseData, profile: Profile, margin: float) -> list[Swit
     Parameters
     ----------
     data : PhaseData
-        Of one phase.
     profile : Profile
         At its nodes, roughly that of a plan.
     margin : float, [N]
         Least margin of normal forces over epsilon.
     """
-    looks = _Looks.take(data, profile, margin)
-    changes = np.flatnonzero(looks.label[1:] != looks.label[:-1])
-    if not len(changes):
-        return []
-    apart = np.diff(looks.s[changes]) > _FLICKER * data.grid.s[-1]
-    found = list[Switch]()
-    for cluster in np.split(changes, np.flatnonzero(apart) + 1):
-        first, last = int(cluster[0]), int(cluster[-1]) + 1
-        if looks.label[first] == looks.label[last]:
-            continue
-        if looks.label[first] == _CAPPED or looks.label[last] == _CAPPED:
-            place = looks.find_jump(first, last)
-        elif looks.rises[first] == looks.rises[last]:
-            found.append(Switch(looks.find_crossing(first, last), False))
-            continue
-        else:
-            place = looks.find_jump(first, last)
-        found += [] if place is None else [Switch(place, True)]
-    return found
+    sights = Sights.of(data, margin)
+    here = Elements(data.grid, profile).at(sights.fractions)
+    high, low = (sights.rows.extreme(here.b, largest).a for largest in (True, False))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = (high - here.a) / (high - low)
+    element = np.arange(len(here.b)) // (len(sights.fractions) * DEGREE)
+    return sights.find_switches(here.b, share, element)
+
+
+class Sights(NamedTuple):
+    """Places of curves at which limits are looked at.
+
+    Attributes
+    ----------
+    fractions : ndarray
+        Of every interval inside elements.
+    s : ndarray, shape (n,), [m]
+        Interval by interval.
+    sides : LimitSides
+        Of limits there.
+    rows : Rows
+        The same without the squeeze.
+    segment : ndarray of int, shape (n,)
+        Of the curves.
+    length : float, [m]
+        Of the curves.
+    """
+
+    fractions: Array
+    s: Array
+    sides: LimitSides
+    rows: Rows
+    segment: NDArray[np.int64]
+    length: float
+
+    @staticmethod
+    def of(data: PhaseData, margin: float) -> Sights:
+        """Some of the checks between nodes: an even number in each interval, with its start."""
+        fractions, k = data.sampling.checks, data.nonempty
+        wanted = max(_LOOKS // len(k), 2)
+        picked = np.arange(0, len(fractions) - 1, max(1, (len(fractions) - 1) // wanted))
+        places = (len(fractions) * np.arange(len(k))[:, None] + picked).ravel()
+        sides = LimitSides.of(data, data.checks.pick(places), margin)
+        s = (data.grid.s[k, None] + fractions[picked] * data.grid.steps[k, None]).ravel()
+        segment = np.repeat(data.grid.segment[k], len(picked))
+        length = float(data.grid.s[-1])
+        return Sights(fractions[picked], s, sides, sides.eliminate(), segment, length)
+
+    def find_switches(self, b: Array, share: Array, element: NDArray[np.int64]) -> list[Switch]:
+        """Where a motion switches; see `_Looks` for what it has to be known of."""
+        high, low = (self.rows.extreme(b, largest) for largest in (True, False))
+        # Across a reversal limits are others, and an element ends there anyway.
+        span, found = high.a - low.a, list[Switch]()
+        choice = np.isfinite(span) & (span > _THIN * np.abs(high.a))
+        for segment in np.unique(self.segment).tolist():
+            own = np.flatnonzero(choice & (self.segment == segment))
+            looks = _Looks(
+                self.s[own],
+                b[own],
+                self.sides.pick(own),
+                self.rows.pick(own),
+                high.row[own],
+                low.row[own],
+                share[own],
+                element[own],
+            )
+            found += looks.find_switches(_FLICKER * self.length)
+        return found
 
 
 class _Looks(NamedTuple):
@@ -100,12 +129,12 @@ class _Looks(NamedTuple):
     Attributes
     ----------
     s : ndarray, [m]
-    here : Profile
-        The motion there.
-    terms : _Terms
-    corners : _Corners
-    largest : ndarray, [m^2/s^2]
-        The b that the speed limits allow.
+    b : ndarray, [m^2/s^2]
+        Of the motion there.
+    sides : LimitSides
+    rows : Rows
+    at_high, at_low : ndarray of int
+        Which of them set the largest and the least s''.
     share : ndarray
         How far s'' is from its largest, over the range that limits allow.
     element : ndarray of int
@@ -113,36 +142,13 @@ class _Looks(NamedTuple):
     """
 
     s: Array
-    here: Profile
-    terms: _Terms
-    corners: _Corners
-    largest: Array
+    b: Array
+    sides: LimitSides
+    rows: Rows
+    at_high: NDArray[np.int64]
+    at_low: NDArray[np.int64]
     share: Array
     element: NDArray[np.int64]
-
-    @staticmethod
-    def take(data: PhaseData, profile: Profile, margin: float) -> _Looks:
-        """Look at some of the checks between nodes."""
-        fractions, k = data.sampling.checks, data.nonempty
-        wanted = max(_LOOKS // len(k), 2)
-        picked = np.arange(0, len(fractions) - 1, max(1, (len(fractions) - 1) // wanted))
-        rows = (len(fractions) * np.arange(len(k))[:, None] + picked).ravel()
-        terms = _Terms.of(data, data.checks.pick(rows), margin)
-        here = Elements(data.grid, profile).at(fractions[picked])
-        s = (data.grid.s[k, None] + fractions[picked] * data.grid.steps[k, None]).ravel()
-        corners = terms.find_corners(here.b)
-        span = corners.high - corners.low
-        known = np.flatnonzero(span > _THIN * np.abs(corners.high))
-        element = np.arange(len(s)) // (len(picked) * DEGREE)
-        return _Looks(
-            s[known],
-            Profile(*(part[known] for part in here)),
-            terms.pick(known),
-            corners.pick(known),
-            data.largest_b(data.checks.pick(rows))[known],
-            ((corners.high - here.a)[known] / span[known]),
-            element[known],
-        )
 
     @property
     def rises(self) -> NDArray[np.bool_]:
@@ -151,18 +157,39 @@ class _Looks(NamedTuple):
 
     @property
     def label(self) -> NDArray[np.int64]:
-        """The corner that the motion is at, or nearest to; negative for the least s''.
+        """The limits that the motion is at, or nearest to; negative for the least s''.
 
         `_CAPPED` where it is a speed limit that decides.
         """
-        corner = np.where(self.rises, self.corners.at_high, -1 - self.corners.at_low)
-        return np.where(self.here.b > (1 - _AT_CAP) * self.largest, _CAPPED, corner)
+        row = np.where(self.rises, self.at_high, -1 - self.at_low)
+        return np.where(self.b > (1 - _AT_CAP) * self.rows.cap, _CAPPED, row)
+
+    def find_switches(self, flicker: float) -> list[Switch]:
+        """Where limits take turns; changes nearer to each other than `flicker` [m] are one."""
+        label = self.label
+        changes = np.flatnonzero(label[1:] != label[:-1])
+        if not len(changes):
+            return []
+        apart, found = np.diff(self.s[changes]) > flicker, list[Switch]()
+        for cluster in np.split(changes, np.flatnonzero(apart) + 1):
+            first, last = int(cluster[0]), int(cluster[-1]) + 1
+            if label[first] == label[last]:
+                continue
+            capped = _CAPPED in (label[first], label[last])
+            if not capped and self.rises[first] == self.rises[last]:
+                found.append(Switch(self.find_crossing(first, last), False))
+                continue
+            place = self.find_jump(first, last)
+            found += [] if place is None else [Switch(place, True)]
+        return found
 
     def find_crossing(self, first: int, last: int) -> float:
-        """Where another corner takes over as that of the extreme s'', between two places [m]."""
+        """Where other limits take over as those of the extreme s'', between two places [m]."""
         ends = np.array([first, last])
-        pairs = (self.corners.at_high if self.rises[first] else self.corners.at_low)[ends]
-        before, after = self.terms.pick(ends).find_pairs(self.here.b[ends], pairs).T
+        own = (self.at_high if self.rises[first] else self.at_low)[ends]
+        sides = self.sides.pick(ends)
+        # A pair of sides that bounds s'' here may not do so there, but they meet somewhere.
+        before, after = (sides.meet(self.b[ends], sides.pair(row))[0] for row in own)
         lead = before - after
         done = lead[0] / (lead[0] - lead[1]) if lead[0] * lead[1] < 0 else 0.5
         return float(self.s[first] + done * (self.s[last] - self.s[first]))
@@ -180,85 +207,28 @@ class _Looks(NamedTuple):
         first = int(np.flatnonzero(~off[: first + 1]).max(initial=0))
         last = last + int(np.argmin(off[last:]))
         within = (self.element >= self.element[first]) & (self.element <= self.element[last])
-        rows = np.flatnonzero(within)
+        own = np.flatnonzero(within)
         # The first place of the next element is where this one ends.
-        rows = np.append(rows, rows[-1] + 1) if rows[-1] + 1 < len(self.s) else rows
+        own = np.append(own, own[-1] + 1) if own[-1] + 1 < len(self.s) else own
         rises = bool(self.rises[first])
-        s, b, terms = self.s[rows], self.here.b[rows], self.terms.pick(rows)
+        s, b, rows = self.s[own], self.b[own], self.rows.pick(own)
         steps, one, other = np.diff(s), b, b
+        largest = rises or bool(along.any()), not rises and not along.any()
         for _ in range(_PICARD):
-            here, there = (terms.find_corners(np.maximum(part, 0.0)) for part in (one, other))
-            rates = (here.high, there.low) if rises or along.any() else (here.low, there.high)
+            rates = (
+                rows.extreme(np.maximum(part, 0.0), most).a
+                for part, most in zip((one, other), largest, strict=True)
+            )
             before, after = (np.where(np.isfinite(rate), rate, 0.0) for rate in rates)
             one = b[0] + np.append(0.0, np.cumsum(steps * (before[1:] + before[:-1])))
             gained = np.append(0.0, np.cumsum(steps * (after[1:] + after[:-1])))
             other = b[-1] + gained - gained[-1]
             one, other = (
-                np.where(cap, self.largest[rows], part)
-                for cap, part in zip(along, (one, other), strict=True)
+                np.where(cap, rows.cap, part) for cap, part in zip(along, (one, other), strict=True)
             )
-        ahead = (other - one) * (1 if rises or along.any() else -1)
+        ahead = (other - one) * (1 if largest[0] else -1)
         passed = np.flatnonzero((ahead[1:] <= 0) & (ahead[:-1] > 0))
         if not len(passed):
             return None
         k = int(passed[0])
         return float(s[k] + steps[k] * ahead[k] / (ahead[k] - ahead[k + 1]))
-
-
-class _Terms(NamedTuple):
-    """What sides of limits are of at n places: rest + b bend + a rate + squeeze press, (n, m) each.
-
-    `drag` is that of the speed; all over what is much.
-    """
-
-    rest: Array
-    bend: Array
-    drag: Array
-    rate: Array
-    press: Array
-
-    @staticmethod
-    def of(data: PhaseData, places: Places, margin: float) -> _Terms:
-        """The terms of the limits of a phase."""
-        of_c, of_tau, of_rates = (part.T for part in data.limits.columns)
-        rows, signs, _ = data.limits.sides
-        forces, scale = places.forces, signs / data.spans
-        zero = np.zeros(len(places.rates))
-        return _Terms(
-            data.slack(places, Profile(zero, zero, zero), margin) / data.spans,
-            (forces.Cb @ of_c + forces.Tb @ of_tau)[:, rows] * scale,
-            (forces.Tv @ of_tau + places.rates @ of_rates)[:, rows] * scale,
-            (forces.Ca @ of_c + forces.Ta @ of_tau)[:, rows] * scale,
-            (forces.Cl @ of_c + forces.Tl @ of_tau)[:, rows] * scale,
-        )
-
-    def find_pairs(self, b: Array, pairs: NDArray[np.int64]) -> Array:
-        """The s'' at which some pairs of limits meet, shape (n, pairs)."""
-        rest = self.rest + self.bend * b[:, None] + self.drag * np.sqrt(b)[:, None]
-        i, j = (side[pairs] for side in np.triu_indices(rest.shape[1], 1))
-        det = self.rate[:, i] * self.press[:, j] - self.rate[:, j] * self.press[:, i]
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            return np.asarray((rest[:, j] * self.press[:, i] - rest[:, i] * self.press[:, j]) / det)
-
-    def pick(self, rows: Any) -> _Terms:
-        """Some of the places."""
-        return _Terms(*(part[rows] for part in self))
-
-    def find_corners(self, b: Array) -> _Corners:
-        """Corners of what limits allow for squares of speeds, shape (n,) [m^2/s^2]."""
-        rest = self.rest + self.bend * b[:, None] + self.drag * np.sqrt(b)[:, None]
-        i, j = np.triu_indices(rest.shape[1], 1)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            det = self.rate[:, i] * self.press[:, j] - self.rate[:, j] * self.press[:, i]
-            a = (rest[:, j] * self.press[:, i] - rest[:, i] * self.press[:, j]) / det
-            squeeze = (self.rate[:, j] * rest[:, i] - self.rate[:, i] * rest[:, j]) / det
-            terms = self.rate[:, None] * a[..., None], self.press[:, None] * squeeze[..., None]
-            size = 1 + np.abs(terms[0]) + np.abs(terms[1])
-            beyond = -(rest[:, None] + terms[0] + terms[1]) / size
-        pairs = np.arange(len(i))
-        beyond[:, pairs, i] = beyond[:, pairs, j] = 0.0
-        worst = np.where(np.isfinite(a), beyond.max(axis=2), np.inf)
-        # Where the speed is slightly too large for any corner, the nearest to one will do.
-        ok = worst <= np.minimum(2 * worst.min(axis=1, keepdims=True) + _ROUNDING, _TOLERANCE)
-        high, low = np.where(ok, a, -np.inf), np.where(ok, a, np.inf)
-        return _Corners(high.max(axis=1), low.min(axis=1), high.argmax(axis=1), low.argmin(axis=1))

@@ -42,6 +42,11 @@ class Scheme(NamedTuple):
         """Whether the last point is the end of the interval."""
         return bool(self.points[-1] == 1.0)
 
+    @property
+    def rungs(self) -> Array:
+        """Rows of the integrals to every point, and to the end if no point is there."""
+        return self.integrals if self.ends else np.vstack([self.integrals, self.weights])
+
     def interpolate(self, places: Array) -> Array:
         """Values at `places`, shape (n,), from those at the points: a matrix of shape (n, d)."""
         powers = np.arange(self.degree)

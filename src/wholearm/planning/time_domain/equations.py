@@ -37,27 +37,39 @@ class StageRows:
 
     Attributes
     ----------
-    states : ndarray of int, shape (K, m)
-        How z and z' go on.
+    chain : ndarray of int, shape (K, m)
+        How a margin goes on, and contacts at the end of an interval, if no point is there.
+    states : ndarray of int, shape (K, 2, rungs, f)
+        Collocation of z and of z', along the columns of `bases`.
+    bases : ndarray, shape (K, 5, f)
+        The tangent space of each interval.
+    shares : ndarray of int
+        What keeps the lengths of intervals to one another.
     points : ndarray of int, shape (K, d, m)
         What holds at the points.
+    balance : ndarray of int, shape (K, d, 5)
+        Of these, the equations of motion.
     senses : ndarray of int, shape (K, d, n_rubbing)
-        Of these, the senses of contacts that slide with friction.
+        And the senses of contacts that slide with friction.
     limits : LimitRows
     monitor_rows : ndarray of int, shape (K, d, m)
         Limits of the formation.
     """
 
+    chain: Indices
     states: Indices
+    bases: Array
+    shares: Indices
     points: Indices
+    balance: Indices
     senses: Indices
     limits: LimitRows
     monitor_rows: Indices
 
     @property
-    def groups(self) -> tuple[Indices, ...]:
-        """All of them."""
-        return (self.states, self.points, *self.limits.groups, self.monitor_rows)
+    def even(self) -> tuple[Indices, ...]:
+        """Those whose multipliers go with the length of an interval."""
+        return (self.chain, self.points, *self.limits.groups, self.monitor_rows)
 
 
 def add_stage(
@@ -65,21 +77,19 @@ def add_stage(
 ) -> StageRows:
     """What holds in a stage."""
     formation = stage.formation
-    node, coming = layout.nodes[:-1], layout.nodes[1:]
-    chain = rows.linear(*node.shape)
-    rows.add_entries(chain, coming, 1.0)
-    rows.add_entries(chain[:, :MARGIN], layout.ends, -1.0)
-    rows.add_entries(chain[:, MARGIN:], node[:, MARGIN:], -1.0)
-    states = np.hstack([chain, _collocate(rows, stage, layout, scheme)])
-    _share(rows, stage, layout)
-    points, senses = _balance(rows, stage, layout, scheme, last)
+    node, ends = layout.nodes[:-1], layout.nodes[1:]
+    chain = rows.linear(*node[:, MARGIN:].shape)
+    rows.add_entries(chain, ends[:, MARGIN:], 1.0)
+    rows.add_entries(chain, node[:, MARGIN:], -1.0)
+    states, bases = _collocate(rows, stage, layout, scheme)
+    shares = _share(rows, stage, layout)
+    points, balance, senses = _balance(rows, stage, layout, scheme, last)
     first = node[:, Z] if formation.rolling else node[:, :0]
     if not scheme.ends:
         kernel = end_kernel(formation)
         own = rows.nonlinear(stage.intervals, kernel.outputs)
-        z, v = layout.ends[:, Z], layout.ends[:, V]
-        rows.add_copies(kernel, kernel.x.join(z=z, v=v, first=first), own)
-        states = np.hstack([states, own])
+        rows.add_copies(kernel, kernel.x.join(z=ends[:, Z], v=ends[:, V], first=first), own)
+        chain = np.hstack([chain, own])
     monitor_rows = _add_monitor_rows(rows, stage, layout, scheme)
     gained = [formation.limits[k].gained for k in stage.released]
     for contact in [c for c in gained if c is not None and stage.opens]:
@@ -97,7 +107,7 @@ def add_stage(
         end = layout.nodes[-1]
         rows.add_copies(goal, goal.x.join(z=end[Z], v=end[V]), rows.nonlinear(goal.outputs))
     limits = add_limits(rows, stage, layout, scheme, target)
-    return StageRows(states, points, senses, limits, monitor_rows)
+    return StageRows(chain, states, bases, shares, points, balance, senses, limits, monitor_rows)
 
 
 def _list_free_turns(stage: Stage) -> tuple[int, ...]:
@@ -115,30 +125,32 @@ def _list_free_turns(stage: Stage) -> tuple[int, ...]:
     return tuple(found[:freedoms] if freedoms > 1 else found)
 
 
-def _collocate(rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme) -> Indices:
-    """Collocate z and z' along the tangent space, shape (K, m)."""
+def _collocate(
+    rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme
+) -> tuple[Indices, Array]:
+    """Collocate z and z' along the tangent space, and the bases of that."""
     middles = stage.guess.z[:, scheme.degree // 2]
-    bases = [tangent_basis(stage.formation, z) for z in middles]
-    kernel = collocation_kernel(scheme.name, scheme.degree, bases[0].shape[1])
-    parameters = np.array([N.ravel(order="F") for N in bases])
-    K, collected = stage.intervals, []
-    if not kernel.outputs:
-        return np.zeros((K, 0), dtype=np.int64)
+    bases = np.array([tangent_basis(stage.formation, z) for z in middles])
+    K, _, f = bases.shape
+    kernel = collocation_kernel(scheme.name, scheme.degree, f)
+    parameters, collected = bases.transpose(0, 2, 1).reshape(K, -1), []
+    if not f:
+        return np.zeros((K, 2, len(scheme.rungs), 0), dtype=np.int64), bases
     for state, rate, part in ((layout.z, layout.v, Z), (layout.v, layout.a, V)):
         columns = kernel.x.join(
             start=layout.nodes[:-1, part],
             points=state.reshape(K, -1),
-            end=layout.ends[:, :0] if scheme.ends else layout.ends[:, part],
+            end=layout.nodes[1:, part][:, : 5 * (not scheme.ends)],
             rates=rate.reshape(K, -1),
             h=layout.h[:, None],
         )
         own = rows.nonlinear(K, kernel.outputs)
         rows.add_copies(kernel, columns, own, kernel.p.join(N=parameters))
-        collected.append(own)
-    return np.hstack(collected)
+        collected.append(own.reshape(K, -1, f))
+    return np.stack(collected, axis=1), bases
 
 
-def _share(rows: Rows, stage: Stage, layout: StageLayout) -> None:
+def _share(rows: Rows, stage: Stage, layout: StageLayout) -> Indices:
     """Intervals keep their shares of the stage, or are not too uneven."""
     before, after = layout.h[:-1], layout.h[1:]
     if not stage.adapts:
@@ -147,19 +159,19 @@ def _share(rows: Rows, stage: Stage, layout: StageLayout) -> None:
         shares = stage.intervals * stage.guess.fractions
         rows.add_entries(own, before, shares[1:])
         rows.add_entries(own, after, -shares[:-1])
-        return
-    for shorter, longer in ((before, after), (after, before)):
-        own = rows.linear(len(before), high=np.inf)
-        rows.add_entries(own, shorter, 1.0)
-        rows.add_entries(own, longer, -EVEN)
+        return own
+    own = rows.linear(2, len(before), high=np.inf)
+    rows.add_entries(own, [before, after], 1.0)
+    rows.add_entries(own, [after, before], -EVEN)
+    return own.ravel()
 
 
 def _balance(
     rows: Rows, stage: Stage, layout: StageLayout, scheme: Scheme, last: bool
-) -> tuple[Indices, Indices]:
+) -> tuple[Indices, Indices, Indices]:
     """The equations of motion, constraints and senses at every point, shape (K, d, n).
 
-    And the rows of the senses alone, shape (K, d, n_rubbing).
+    And the rows of the equations of motion and of the senses alone.
     """
     formation, shape = stage.formation, layout.z.shape[:2]
     gradual = stage.onset > 0
@@ -191,7 +203,7 @@ def _balance(
     low[-1, -1, senses][[k in still for k in formation.rubbing_rows]] = -np.inf
     own = rows.nonlinear(*shape, kernel.outputs, low=low, high=high)
     rows.add_copies(kernel, columns, own, parameters)
-    return own, own[..., senses]
+    return own, own[..., kernel.y["balance"]], own[..., senses]
 
 
 def least_rates(stage: Stage, places: Array) -> Array:

@@ -131,8 +131,7 @@ def collocation_kernel(name: str, degree: int, freedoms: int) -> NamedKernel:
     the columns of N.
     """
     scheme: Scheme = make_scheme(name, degree)
-    rungs = degree + (not scheme.ends)
-    table = scheme.integrals.tolist() + ([] if scheme.ends else [scheme.weights.tolist()])
+    table, rungs = scheme.rungs, len(scheme.rungs)
     x = Columns(start=5, points=5 * degree, end=5 * (rungs - degree), rates=5 * degree, h=1)
     s, p = x.make_symbols(), Columns(N=5 * freedoms).make_symbols()
     here = ca.reshape(ca.vertcat(s.points, s.end), 5, rungs)

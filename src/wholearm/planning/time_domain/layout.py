@@ -25,6 +25,8 @@ class StageLayout:
     Attributes
     ----------
     nodes : ndarray of int, shape (K + 1, n)
+        z and z' at the start and at the end of each interval: those of its last point, if that is
+        there. With a margin, that follows.
     h : ndarray of int, shape (K,)
         Durations of the intervals.
     tau : ndarray of int, shape (K, 4)
@@ -32,8 +34,6 @@ class StageLayout:
     z, v, a : ndarray of int, shape (K, d, 5)
         z, z' and z'' at the collocation points.
     forces : ndarray of int, shape (K, d, n_f)
-    ends : ndarray of int, shape (K, 10)
-        z and z' at the end of each interval: those of its last point, if that is there.
     short : ndarray of int, shape (K, n) or (K, 0)
         Shortfalls of limits in each interval.
     impulses : ndarray of int
@@ -47,14 +47,13 @@ class StageLayout:
     v: Indices
     a: Indices
     forces: Indices
-    ends: Indices
     short: Indices
     impulses: Indices
 
     @property
     def stop(self) -> int:
         """Past its last unknown."""
-        return int(self.nodes[-1, -1]) + 1 + len(self.impulses)
+        return 1 + max(int(part.max(initial=-1)) for part in vars(self).values())
 
 
 def lay_out(
@@ -75,35 +74,35 @@ def lay_out(
         How many shortfalls each interval of a stage has, if any.
     """
     layouts: list[StageLayout] = []
-    first, d = 0, scheme.degree
+    stop, d = 0, scheme.degree
     for k, (stage, coming) in enumerate(zip(stages, [*stages[1:], None], strict=True)):
         point = Columns(z=5, v=5, a=5, forces=stage.formation.n_constraints)
         end, short = (0 if scheme.ends else STATE), shortfalls[k] if shortfalls else 0
-        interval = Columns(
-            node=STATE + with_margin, h=1, tau=4, points=d * point.count, end=end, short=short
-        )
-        starts = first + interval.count * np.arange(stage.intervals + 1)
+        interval = Columns(h=1, tau=4, points=d * point.count, end=end, short=short, m=with_margin)
+        first = stop + np.arange(STATE + with_margin)
+        starts = first[-1] + 1 + interval.count * np.arange(stage.intervals)
         own = {
             name: starts[:, None] + np.arange(part.start, part.stop)
             for name, part in interval.slices.items()
         }
-        points = own["points"][:-1].reshape(stage.intervals, d, point.count)
+        points = own["points"].reshape(stage.intervals, d, point.count)
         at = {name: points[..., part] for name, part in point.slices.items()}
-        nodes = own["node"]
+        ends = points[:, -1, :STATE] if scheme.ends else own["end"]
+        nodes = np.vstack([first, np.hstack([ends, own["m"]])])
+        stop = int(first[-1]) + 1 + interval.count * stage.intervals
         ends_in_impact = coming is not None and stage.ends_in_impact
         extra = coming.formation.n_constraints if coming is not None and ends_in_impact else 0
         layouts.append(
             StageLayout(
                 nodes=nodes,
-                h=own["h"][:-1, 0],
-                tau=own["tau"][:-1],
+                h=own["h"][:, 0],
+                tau=own["tau"],
                 **at,
-                ends=points[:, -1, :STATE] if scheme.ends else own["end"][:-1],
-                short=own["short"][:-1],
-                impulses=nodes[-1, -1] + 1 + np.arange(extra),
+                short=own["short"],
+                impulses=stop + np.arange(extra),
             )
         )
-        first = layouts[-1].stop
+        stop += extra
     return layouts
 
 
@@ -115,7 +114,6 @@ def pack(points: Sequence[StagePoints], layouts: Sequence[StageLayout], margin: 
         x[layout.forces], x[layout.tau] = part.forces, part.tau.reshape(-1, 4)
         x[layout.h], x[layout.short] = part.duration * part.fractions, 1.0
         x[layout.nodes[:, Z]], x[layout.nodes[:, V]] = part.nodes[:, 0], part.nodes[:, 1]
-        x[layout.ends] = x[layout.nodes[1:, :STATE]]
         x[layout.nodes[:, MARGIN:]] = margin
         x[layout.impulses] = part.impulses
     return x

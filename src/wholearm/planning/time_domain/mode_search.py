@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from .modes import sign_sequence
-from .moves import list_moves
+from .moves import WORTH, list_moves
 from .search import Search, Solution
 from .stage import Stage
 
@@ -18,8 +18,6 @@ PATIENCE = 60
 STRETCH = 1e-3
 """Price of changing the durations of all intervals by as much as they are, over the cost: of many
 equal choices the nearest is made."""
-WORTH = 1e-4
-"""Least gain of a move over the cost; dropping what has shrunk to nothing may cost as much."""
 
 
 def improve(search: Search, solution: Solution) -> Solution:
@@ -65,8 +63,9 @@ def adapt(search: Search, solution: Solution) -> Solution:
 def list_neighbours(search: Search, solution: Solution, leaning: bool = False) -> list[list[Stage]]:
     """Sequences of stages that one move leads to from those of a solution."""
     own = [search.problem.phases[stage.phase].formation for stage in solution.stages]
-    epsilon = search.problem.epsilon
-    return list(list_moves(solution.stages, search.scheme, own, epsilon, leaning))
+    worth = [solution.price_friction(k) / abs(solution.cost) for k in range(len(own))]
+    given = (solution.stages, search.scheme, own, search.problem.epsilon, leaning)
+    return list(list_moves(*given, savings=worth))
 
 
 def _rolls(stages: list[Stage]) -> int:

@@ -1,8 +1,9 @@
 """Changes of a sequence of modes that a solution asks for.
 
 Where the least rate of a sense holds a contact back over a stretch, rolling there allows what the
-stretch does and more; where a rolling contact leans on one side of its cone over a stretch, so does
-sliding that way. A stage that has shrunk to nothing is in the way of others.
+stretch does and more, if friction the other way is worth something; where a rolling contact leans
+on one side of its cone over a stretch, so does sliding that way. A stage that has shrunk to nothing
+is in the way of others.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ _SLOW = 1e-2
 """Rate over the largest one below which what is held back stays in all of an interval."""
 _LEANS = 1e-4
 """Margin to the friction cone over mu c_n at which a rolling contact counts as leaning on it."""
+WORTH = 1e-4
+"""Least gain of a move over the cost; dropping what has shrunk to nothing may cost as much."""
 _GONE = 2e-4
 """Mean duration of an interval, in the scene's unit of time, below which its stage counts as shrunk
 to nothing."""
@@ -61,6 +64,7 @@ def list_moves(
     own: Sequence[Formation],
     epsilon: float,
     leaning: bool = False,
+    savings: Sequence[Array] = (),
 ) -> Iterator[list[Stage]]:
     """Sequences of stages that a solution asks for, the most promising ones first.
 
@@ -73,6 +77,8 @@ def list_moves(
     epsilon : float
     leaning : bool
         Whether only contacts count that lean on their cones.
+    savings : sequence of ndarray, shape (K, d, n_c)
+        What friction the other way is worth in each stage over the cost, if that is known.
     """
     if leaning:
         runs = [
@@ -91,14 +97,13 @@ def list_moves(
         left = release_earlier(stages, index)
         if left is not None:
             yield link(merge(left))
-    runs = [
-        (run, index)
-        for index, stage in enumerate(stages)
-        for run in [
-            *_find_held(stage, scheme),
-            *_find_leaning(stage, scheme, own[index], epsilon),
-        ]
-    ]
+    runs = list[tuple[Run, int]]()
+    for index, stage in enumerate(stages):
+        held = _find_held(stage, scheme)
+        if savings:
+            held = [run for run in held if _pays(run, stage, savings[index])]
+        leaning_too = _find_leaning(stage, scheme, own[index], epsilon)
+        runs += [(run, index) for run in [*held, *leaning_too]]
     yield from _apply(stages, scheme, own, runs)
 
 
@@ -128,6 +133,23 @@ def _apply(
             yield link(merge([*stages[:index], *found, *stages[index + 1 :]]))
 
 
+def _pays(run: Run, stage: Stage, savings: Array) -> bool:
+    """Whether what is held back in a run might gain by rolling there, if it can."""
+    if not _can_roll(stage, run):
+        return True
+    return float(savings[run.begin : run.stop, :, run.row].clip(min=0.0).sum()) > WORTH
+
+
+def _can_roll(stage: Stage, run: Run) -> bool:
+    """Whether what is held back in a run may roll: by itself, with friction and freedoms left."""
+    formation = stage.formation
+    if run.row >= formation.n_contacts or formation.n_constraints >= 4:
+        return False
+    middle = stage.guess.z[(run.begin + run.stop) // 2, 0]
+    alone = len(find_tied(formation, middle, run.row)) == 1
+    return bool(alone and formation.friction[run.row] > 0)
+
+
 def _comes_to_rest(stages: Sequence[Stage], index: int, own: Sequence[Formation], row: int) -> bool:
     """Whether a contact slides until its phase ends, since the next phase lets it roll."""
     stage = stages[index]
@@ -149,12 +171,8 @@ def _change(
     stage, formation = stages[index], stages[index].formation
     middle = stage.guess.z[(run.begin + run.stop) // 2, 0]
     rows = find_tied(formation, middle, run.row)
-    if sign == 0:
-        full = formation.n_constraints >= 4
-        if run.row >= formation.n_contacts or len(rows) > 1 or full:
-            return None
-        if formation.friction[run.row] == 0:
-            return None
+    if sign == 0 and not _can_roll(stage, run):
+        return None
     mode = mode_of(stage).changed(rows, sign)
     # Where the neighbour is in that mode already, the place between them has been chosen.
     at_start, at_end = run.begin == 0, run.stop == stage.intervals

@@ -91,6 +91,20 @@ class Solution(NamedTuple):
         """Where the stages end, shape (5,)."""
         return np.asarray(self.stages[-1].guess.nodes[-1, 0])
 
+    def price_friction(self, k: int) -> Array:
+        """What friction at full strength the other way would save to first order, (K, d, n_c).
+
+        Of each contact of stage `k`, at every point; for one that its sense holds back, this bounds
+        what it saves to let it roll.
+        """
+        stage = self.stages[k]
+        formation, part = stage.formation, stage.guess
+        A_t = formation.evaluate(part.z.reshape(-1, 5), part.v.reshape(-1, 5)).A_t
+        pull = self.multipliers["lam_g0"][self.nlp.rows_of[k].balance].reshape(-1, 5)
+        c_n = part.forces[..., : formation.n_contacts]
+        price = np.einsum("nij,nj->ni", A_t, pull).reshape(c_n.shape)
+        return np.asarray(2 * price * stage.directions.Xi * formation.friction * c_n)
+
     @property
     def is_lost(self) -> bool:
         """Whether it was one on coarse intervals, and did not hold on finer ones."""
@@ -202,7 +216,7 @@ class Search:
             multipliers = None
             if before is not None and before.monitored == [stage.monitored for stage in stages]:
                 multipliers = carry_multipliers(
-                    before.multipliers, before.nlp, nlp, before.stages, stages
+                    before.multipliers, before.nlp, nlp, self.scheme, before.stages, stages
                 )
             plain = [Limits.none(stage) for stage in stages]
             margin = before.margin if before else 0.0

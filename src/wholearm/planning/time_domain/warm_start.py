@@ -7,6 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...common.arrays import Array
+from .assembly import Indices
+from .collocation import Scheme
+from .equations import StageRows
 from .nlp import TimeNLP
 from .stage import Stage
 
@@ -37,15 +40,20 @@ def carry_multipliers(
     multipliers: Multipliers,
     old: TimeNLP,
     new: TimeNLP,
+    scheme: Scheme,
     old_stages: Sequence[Stage],
     new_stages: Sequence[Stage],
 ) -> Multipliers:
     """Multipliers of the same stages on other intervals.
 
-    Those of inequalities go with the length of an interval, as their sum over time matters.
+    What is said at points goes with the length of an interval, as the sum over time matters. Those
+    of collocation are costates, which are continuous.
     """
     on_x, on_g = multipliers["lam_x0"], multipliers["lam_g0"]
     lam_x, lam_g = np.zeros(new.layouts[-1].stop), np.zeros(len(new.rows.bounds[0]))
+    once = [_list_once(nlp) for nlp in (new, old)]
+    if len(once[0]) == len(once[1]):
+        lam_g[once[0]] = on_g[once[1]]
     for k, (before, after) in enumerate(zip(old_stages, new_stages, strict=True)):
         part, finer = before.guess, after.guess
         middles = finer.breaks[:-1] + finer.fractions / 2
@@ -55,7 +63,29 @@ def carry_multipliers(
             mine, theirs = getattr(new.layouts[k], name), getattr(old.layouts[k], name)
             values = on_x[theirs[parent]]
             lam_x[mine] = values * share.reshape(-1, *[1] * (values.ndim - 1))
-        for mine, theirs in zip(new.rows_of[k].groups, old.rows_of[k].groups, strict=True):
+        rows, known = new.rows_of[k], old.rows_of[k]
+        for mine, theirs in zip(rows.even, known.even, strict=True):
             values = on_g[theirs[parent]]
             lam_g[mine] = values * share.reshape(-1, *[1] * (values.ndim - 1))
+        costate = find_costate(known, on_g, scheme)[parent]
+        places = (finer.places(scheme.points) - part.breaks[parent, None]) / part.fractions[
+            parent, None
+        ]
+        moved = np.stack(
+            [scheme.interpolate(x) @ own for x, own in zip(places, costate, strict=True)]
+        )
+        along = np.einsum("kdf,ksjd->ksjf", rows.bases, moved * scheme.weights[:, None])
+        lam_g[rows.states] = np.linalg.pinv(scheme.rungs.T) @ along
     return {"lam_x0": lam_x, "lam_g0": lam_g}
+
+
+def find_costate(rows: StageRows, on_g: Array, scheme: Scheme) -> Array:
+    """What z and z' at the points are worth, by the multipliers of rows, shape (K, 2, d, 5)."""
+    shares = scheme.rungs.T @ on_g[rows.states] / scheme.weights[:, None]
+    return np.asarray(np.einsum("kdf,ksjf->ksjd", rows.bases, shares))
+
+
+def _list_once(nlp: TimeNLP) -> Indices:
+    """Rows that are there once, and not in each interval."""
+    own = [part.ravel() for r in nlp.rows_of for part in (*r.even, r.states, r.shares)]
+    return np.setdiff1d(np.arange(len(nlp.rows.bounds[0])), np.concatenate(own))

@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from wholearm.geometry.curve import Curve
+from wholearm.planning.lower_bound.lower_bound import bound_least_time
+from wholearm.planning.options import Objective
+from wholearm.planning.path_domain.data import PhaseData, join, prepare
+from wholearm.planning.path_domain.fastest import Fastest, find_fastest
+from wholearm.planning.path_domain.first_guess import guess
+from wholearm.planning.path_domain.mesh import Mesh
+from wholearm.planning.path_domain.motion import PathMotion
+from wholearm.planning.path_domain.nlp import build_path_nlp, pack, parameters
+from wholearm.planning.path_domain.start import start_at
+from wholearm.planning.path_domain.terms import LimitShape
+
+EPSILON = 0.05
+ELEMENTS = 10
+
+
+def prepare_on(curve: Curve, mesh: Mesh, phase: int = 1) -> PhaseData:
+    return prepare(curve, EPSILON, mesh.make_grid(curve, ELEMENTS), phase)
+
+
+def find(curve: Curve, duration: float | None = None) -> Fastest:
+    found = find_fastest(prepare_on(curve, Mesh()), duration)
+    assert found is not None
+    return found
+
+
+def measure(found: Fastest) -> float:
+    """Duration of a motion with a constant s'' in each interval [s]."""
+    speed = np.sqrt(found.b)
+    return float((2 * np.diff(found.s) / (speed[1:] + speed[:-1])).sum())
+
+
+@pytest.mark.parametrize("phase", range(2))
+def test_a_sweep_takes_about_the_least_time(curves: tuple[Curve, ...], phase: int) -> None:
+    bound = bound_least_time([curves[phase]], EPSILON)
+    assert bound is not None
+    assert measure(find(curves[phase])) == pytest.approx(bound.value, rel=2e-4)
+
+
+def test_a_margin_takes_the_duration_that_is_allowed(curves: tuple[Curve, ...]) -> None:
+    fastest = find(curves[0])
+    allowed = 1.5 * measure(fastest)
+    slower = find(curves[0], allowed)
+    assert measure(slower) == pytest.approx(allowed, rel=1e-3)
+    assert slower.margin > 0
+    # With that margin no motion is faster.
+    bound = bound_least_time([curves[0]], EPSILON + slower.margin)
+    assert bound is not None
+    assert bound.value == pytest.approx(allowed, rel=1e-3)
+    assert find_fastest(prepare_on(curves[0], Mesh()), 0.9 * measure(fastest)) is None
+
+
+def test_no_motion_is_found_that_is_not_there(curves: tuple[Curve, ...]) -> None:
+    assert find_fastest(prepare_on(curves[0], Mesh())._replace(epsilon=EPSILON), None) is not None
+    hard = prepare(curves[0], 50.0, Mesh().make_grid(curves[0], ELEMENTS), 1)
+    assert find_fastest(hard, None) is None
+
+
+@pytest.mark.parametrize("goal", [Objective.TIME, Objective.MARGIN])
+def test_the_start_is_near_a_solution(curves: tuple[Curve, ...], goal: Objective) -> None:
+    """The conditions of optimality of the NLP itself, derived by CasADi, almost hold."""
+    curve = curves[0]
+    coarse = prepare_on(curve, Mesh())
+    least = measure(find(curve))
+    duration = 1.5 * least if goal is Objective.MARGIN else None
+    found = find_fastest(coarse, duration)
+    assert found is not None
+    data = prepare_on(curve, Mesh.of(curve, found.switches))
+    nlp = build_path_nlp(LimitShape.of(data.limits), len(data.grid.steps), goal)
+    units = guess(coarse)[1]
+    start = start_at(nlp, data, units, found)
+    assert start.margin == found.margin
+    # Limits are kept at the nodes, and so is the duration.
+    slack = data.slack(data.nodes, start.profile, start.margin) / data.spans
+    assert slack.min() > -1e-6
+    motion = PathMotion(curve, data.grid, start.profile)
+    assert motion.duration == pytest.approx(duration or least, rel=1e-3)
+    oracle = nlp.solver.function.oracle()
+    x, p = oracle.mx_in(0), oracle.mx_in(1)
+    f, g = oracle(x, p)
+    gradient = ca.Function("gradient", [x, p], [ca.gradient(f, x), ca.jacobian(g, x)])
+    here = pack(nlp, start.profile, units, start.margin)
+    of_f, of_g = (part.full() for part in gradient(here, parameters(nlp, data, units, 0.0)))
+    multipliers = start.multipliers["lam_x0"] + of_g.T @ start.multipliers["lam_g0"]
+    left = of_f[:, 0] + multipliers
+    assert np.abs(left).max() < 0.03 * np.abs(of_f).max()
+
+
+def test_phases_that_are_joined_switch_within_each(curves: tuple[Curve, ...]) -> None:
+    """A reversal, and where phases meet, are ends of elements anyway."""
+    parts = [
+        prepare(curve, EPSILON, Mesh().make_grid(curve, ELEMENTS, rests), 1)
+        for curve, rests in ((curves[0], (True, False)), (curves[0], (False, True)))
+    ]
+    found = find_fastest(join(parts), None)
+    assert found is not None
+    lengths = curves[0].length
+    ends = [lengths, *(k * lengths + part.stop for k in (0, 1) for part in curves[0].segments)]
+    for place, _ in found.switches:
+        assert np.abs(np.array(ends) - place).min() > 0
+    assert sum(jumps for _, jumps in found.switches) >= 1
