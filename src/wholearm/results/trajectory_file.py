@@ -20,6 +20,8 @@ _ARRAYS = {
     "t": (), "q": (3,), "theta": (2,), "q_dot": (3,), "theta_dot": (2,), "q_ddot": (3,),
     "theta_ddot": (2,), "tau": (2,), "c_n": (-1,), "c_t": (-1,), "phase": (),
 }  # fmt: skip
+_FARTHEST = 1e6
+"""Largest coordinate [m or rad]: nothing in a problem is farther away or turned more."""
 
 
 def write_trajectory(trajectory: Trajectory, path: str | os.PathLike[str]) -> None:
@@ -84,8 +86,9 @@ def _check_shape(source: str, name: str, arrays: Mapping[str, Any], tail: tuple[
         raise InputError(source, name, f"holds {array.dtype}; numbers are needed")
     elif np.isinf(array).any() or (name not in ("c_n", "c_t") and np.isnan(array).any()):
         raise InputError(source, name, "holds numbers that are not finite")
-    elif (np.abs(array.astype(float)) > MOST).any():
-        raise InputError(source, name, f"holds numbers beyond {MOST:g}, the largest allowed")
+    most = _FARTHEST if name in ("q", "theta") else MOST
+    if name != "contacts" and (np.abs(array.astype(float)) > most).any():
+        raise InputError(source, name, f"holds numbers beyond {most:g}, the largest allowed")
 
 
 def _check_order(source: str, arrays: Mapping[str, Any]) -> None:

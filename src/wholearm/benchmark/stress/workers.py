@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import multiprocessing as mp
 import os
 import signal
@@ -20,7 +19,7 @@ MEMORY = 6 * 2**30
 
 PATIENCE = 20.0
 """Wall-clock time that a task may take over its bound of processor time: others may run too."""
-_CPU = getattr(signal, "SIGXCPU", 24)
+_CPU = getattr(signal, "SIGPROF", 27)
 """Signal that ends a process whose processor time is used up."""
 
 
@@ -188,16 +187,12 @@ def _serve(pipe: Connection, run: Callable[[Any], Any], bound: float) -> None:
 
 
 def _limit_time(bound: float) -> None:
-    """Let the process end when it has used up its time from now on; between tasks it idles."""
-    try:
-        import resource
-    except ImportError:
-        return
-    hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
-    soft = math.ceil(time.process_time() + bound)
-    if hard != resource.RLIM_INFINITY:
-        soft = min(soft, hard)
-    resource.setrlimit(resource.RLIMIT_CPU, (soft, hard))
+    """Let the process end when it has used up its time from now on; between tasks it idles.
+
+    A limit of the whole process would drift: it is counted in other ticks than can be read.
+    """
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_PROF, bound)
 
 
 def _limit_memory() -> None:
