@@ -115,8 +115,9 @@ def test_a_planted_miss_is_found(
     data = prepare(curves[phase], EPSILON, Mesh().make_grid(curves[phase], 21), 1)
     motion = plan_path(curves[phase], EPSILON, PlanOptions(intervals=81), 1).motion
     data = prepare(curves[phase], EPSILON, motion.grid, 1)
-    short, speeding = data.misses(motion.profile, 0.0)
+    short, speeding, spare = data.misses(motion.profile, 0.0)
     assert short.max() <= 5e-7 and speeding.max() == 0.0
+    assert spare.min() >= 0.0 and not (spare * short).any()
     row = min(row, len(data.checks.rates) - 1)
     here = data.slack(data.checks, data.interpolate(motion.profile, data.sampling.checks))[
         row, contact
@@ -124,7 +125,7 @@ def test_a_planted_miss_is_found(
     C0 = data.checks.forces.C0.copy()
     C0[row, contact] -= here + 0.25
     planted = data._replace(checks=Places(data.checks.forces._replace(C0=C0), data.checks.rates))
-    short, _ = planted.misses(motion.profile, 0.0)
+    short, *_ = planted.misses(motion.profile, 0.0)
     interval = row // len(data.sampling.checks)
     # A parabola through the place and its neighbours may dip a little beyond it.
     assert 0.25 - 1e-9 <= short[interval, contact] <= 0.25 + 0.04
@@ -176,7 +177,7 @@ def test_speed_limits_bound_b(curves: tuple[Curve, ...]) -> None:
     largest = data.largest_b(data.nodes)
     np.testing.assert_allclose(np.abs(data.nodes.rates[:, 0]) * np.sqrt(largest), 1.5, rtol=1e-12)
     profile = random_profile(data, 5)
-    _, speeding = data.misses(profile, 0.0)
+    _, speeding, _ = data.misses(profile, 0.0)
     b = data.interpolate(profile, data.sampling.checks).b.reshape(len(data.nonempty), -1)
     rates = data.checks.rates[:, 0].reshape(b.shape)
     over = np.maximum(b * rates**2 / 1.5**2 - 1, 0.0).max(axis=1)

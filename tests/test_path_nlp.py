@@ -122,7 +122,7 @@ def test_constraints_are_the_limits(
     _, g = evaluate(nlp, data, pack(nlp, profile, UNITS, margin))
     rng = np.random.default_rng(3)
     tight = rng.uniform(0, 0.1, (len(data.grid.s), 8))
-    tightening = Tightening(tight, np.ones(len(data.grid.s)), 0.5)
+    tightening = Tightening(tight, np.ones(len(data.grid.s)), 0.5, tight)
     bounds = make_bounds(nlp, data, UNITS, tightening)
     assert len(bounds["lbx"]) == len(bounds["ubx"]) == nlp.solver.function.size1_in("x0")
     assert len(bounds["lbg"]) == len(bounds["ubg"]) == len(g)

@@ -74,7 +74,7 @@ def test_the_start_is_near_a_solution(curves: tuple[Curve, ...], goal: Objective
     data = prepare_on(curve, Mesh.of(curve, found.switches))
     nlp = build_path_nlp(LimitShape.of(data.limits), len(data.grid.steps), goal)
     units = guess(coarse)[1]
-    start = start_at(nlp, data, units, found)
+    start = start_at(nlp, data, units, found)[0]
     assert start.margin == found.margin
     # Limits are kept at the nodes, and so is the duration.
     slack = data.slack(data.nodes, start.profile, start.margin) / data.spans

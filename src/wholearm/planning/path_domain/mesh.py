@@ -16,7 +16,7 @@ from ...common.arrays import Array, sort_unique
 from ...geometry.curve import Curve
 from ..options import Objective
 from .data import PhaseData
-from .elements import DEGREE, Grid, Profile, lay_out
+from .elements import Grid, Profile, lay_out
 from .switches import Switch, find_switches
 
 START = {Objective.EFFORT: 20}
@@ -101,7 +101,7 @@ def adapt(
     profile : Profile
     margin : float, [N]
     prices : ndarray
-        Of each interval between nodes that has a length.
+        Of each node.
     before : Mesh
         The other one.
 
@@ -120,7 +120,7 @@ def adapt(
     ends = find_ends(part.curve, before.breaks)
     middles = part.grid.edges.mean(axis=1)
     owner = np.searchsorted(ends, middles) - 1
-    per_element = prices.reshape(len(middles), DEGREE).sum(axis=1)
+    per_element = prices.reshape(len(middles), -1).sum(axis=1)
     counts = np.bincount(owner, minlength=len(ends) - 1)
     price = np.bincount(owner, per_element, len(ends) - 1)
     price = np.maximum(price, _CHEAP * price.sum() + 1e-300)

@@ -22,6 +22,8 @@ ROUNDS = 40
 """Most times that the NLP is solved for one phase."""
 OVER = 1.05
 """Factor on the miss by which a limit is tightened."""
+_NEAR = 1e-3
+"""Least miss of a start that plans do not have, over what is much."""
 
 
 class PathSolution(NamedTuple):
@@ -51,6 +53,7 @@ class Misses(NamedTuple):
 
     short: Array
     speeding: Array
+    spare: Array
     late: float
 
     @staticmethod
@@ -69,22 +72,6 @@ class Misses(NamedTuple):
         """The largest, over what is much."""
         return float(max((self.short / data.spans).max(), self.speeding.max(), self.late))
 
-    def price(self, nlp: PathNLP, data: PhaseData, units: Units, solution: PathSolution) -> Array:
-        """What tightening would cost for each solid interval, to first order, in the NLP's units.
-
-        That is the multipliers of its nodes times what is missed.
-        """
-        rows, signs, _ = data.limits.sides
-        n = len(data.grid.s)
-        on_limits = solution.multipliers["lam_g0"][nlp.columns.g["limits"]].reshape(n, -1)
-        on_sides = np.maximum(-signs * on_limits[:, rows], 0.0) / units.of(data.limits)[rows]
-        on_b = np.zeros(nlp.free.shape)
-        on_b[nlp.free] = solution.multipliers["lam_x0"]
-        on_b = np.maximum(on_b[:, 0], 0.0) * solution.profile.b / units.profile[0]
-        k = data.nonempty
-        price = ((on_sides[k] + on_sides[k + 1]) * self.short).sum(axis=1)
-        return np.asarray(price + (on_b[k] + on_b[k + 1]) * self.speeding)
-
     def tighten(
         self, data: PhaseData, tightening: Tightening, solution: PathSolution
     ) -> Tightening:
@@ -94,6 +81,10 @@ class Misses(NamedTuple):
         return tightening.by(
             data.spread_to_nodes(reach), OVER * short, OVER * speeding, OVER * self.late
         )
+
+    def find_spare(self, data: PhaseData) -> Array:
+        """How far each side is from being missed about each node, shape (n, n_sides)."""
+        return -data.spread_to_nodes(-self.spare, -np.inf)
 
     def describe(self, data: PhaseData) -> str:
         """What is still missed after all solves."""
@@ -105,3 +96,32 @@ class Misses(NamedTuple):
             over = max(self.speeding.max(), self.late)
             missed = f"the speed limit or the duration is still exceeded by {over:.2g} of it"
         return f"after {ROUNDS} solves {missed}; plan with more intervals"
+
+
+def anticipate(data: PhaseData, start: PathSolution, tightening: Tightening) -> Tightening:
+    """Tighten by what a start misses, but for speeds and what it alone misses."""
+    short, speeding, spare = data.misses(start.profile, start.margin)
+    short = np.where(short < _NEAR * data.spans, short, 0.0)
+    return Misses(short, 0 * speeding, spare, 0.0).tighten(data, tightening, start)
+
+
+def price(
+    nlp: PathNLP,
+    data: PhaseData,
+    units: Units,
+    solution: PathSolution,
+    tightened: tuple[Array, Array],
+) -> Array:
+    """What tightening costs at each node, to first order, in the NLP's units, shape (n,).
+
+    That is multipliers times by how much limits, (n, n_sides), and b, (n,), are `tightened`.
+    """
+    rows, signs, _ = data.limits.sides
+    on_limits = solution.multipliers["lam_g0"][nlp.columns.g["limits"]].reshape(
+        len(data.grid.s), -1
+    )
+    on_sides = np.maximum(-signs * on_limits[:, rows], 0.0) / units.of(data.limits)[rows]
+    on_b = np.zeros(nlp.free.shape)
+    on_b[nlp.free] = solution.multipliers["lam_x0"]
+    on_b = np.maximum(on_b[:, 0], 0.0) * solution.profile.b / units.profile[0]
+    return np.asarray((on_sides * tightened[0]).sum(axis=1) + on_b * tightened[1])

@@ -93,18 +93,26 @@ class Tightening(NamedTuple):
         Factor on the largest b.
     duration : float or None, [s]
         Longest duration, if there is one.
+    missed : ndarray, shape (N + 1, n_sides), [N, N m]
+        The part of `limits` beyond what was slack anyway.
     """
 
     limits: Array
     speed_share: Array
     duration: float | None
+    missed: Array
 
     @staticmethod
     def none(data: PhaseData, duration: float | None) -> Tightening:
         """Limits as they are."""
         count = len(data.grid.s)
         limits = np.zeros((count, len(data.spans)))
-        return Tightening(limits, np.ones(count), duration)
+        return Tightening(limits, np.ones(count), duration, limits)
+
+    def ease(self, spare: Array) -> Tightening:
+        """Tighten less, by what limits are from being missed about each node."""
+        eased = np.minimum(self.missed, spare)
+        return self._replace(limits=self.limits - eased, missed=self.missed - eased)
 
     def by(self, reach: Array, limits: Array, speed_share: Array, late: float) -> Tightening:
         """Tighten further: limits by so much, b and the duration by a relative amount.
@@ -113,7 +121,8 @@ class Tightening(NamedTuple):
         """
         duration = None if self.duration is None else self.duration * (1 - late)
         raised = np.maximum(self.limits, reach) + limits
-        return Tightening(raised, self.speed_share * (1 - speed_share), duration)
+        share = self.speed_share * (1 - speed_share)
+        return Tightening(raised, share, duration, self.missed + limits)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +210,7 @@ def make_bounds(
     relaxation: Relaxation | None = None,
 ) -> dict[str, Array]:
     """Bounds of the NLP, with every limit tightened."""
-    tight, speed_share, duration = tightening
+    tight, speed_share, duration, _ = tightening
     n, node = len(data.grid.s), nlp.columns.node
     low, high = np.full((n, node.count), -np.inf), np.full((n, node.count), np.inf)
     b_max = data.largest_b(data.nodes, relaxation.parameter if relaxation else None)

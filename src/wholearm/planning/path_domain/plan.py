@@ -23,7 +23,6 @@ from .data import PhaseData, StalledError, join
 from .first_guess import guess_slowly
 from .misses import MISS, ROUNDS
 from .motion import PathMotion
-from .nlp import Tightening
 from .rounds import Plans, Round, Task
 
 _MESHES = 6
@@ -32,7 +31,8 @@ _AGAIN = 3
 """Most times that limits are tightened, each on a mesh that is finer than the one before."""
 _FINER = (1, 2, 4)
 """Elements to try, over those that are asked for."""
-
+_WASTED = 0.02
+"""Share of the accuracy that limits may cost by being tightened more than they need."""
 _ROUGH = 1e-2
 """Accuracy of plans that are made to see whether there are any."""
 
@@ -227,18 +227,17 @@ def _suit(found: Round) -> Round:
 
 def _enforce_between(round_: Round) -> Plans | _Stuck:
     """Tighten limits until they hold between nodes too."""
-    task, data, first = round_.task, round_.data, round_.solution.cost
-    tightening = Tightening.none(data, round_.duration)
+    task, data = round_.task, round_.data
+    wasteful = float(round_.wasted.sum()) > _WASTED * task.options.accuracy
     for _ in range(ROUNDS):
         misses = round_.misses
-        if misses.find_worst(data) <= MISS:
+        if misses.find_worst(data) <= MISS and not wasteful:
             try:
-                return round_.summarise((round_.solution.cost - first) / round_.value)
+                return round_.summarise()
             except StalledError as stall:
                 return _Stuck(round_.parts, f"{task.name}: {stall}", between=True)
-        tightening = misses.tighten(data, tightening, round_.solution)
-        found = round_.solve(tightening)
+        found = round_.tighten(wasteful).solve()
         if isinstance(found, str):
             return _Stuck(round_.parts, f"{task.name}: {found}", between=True)
-        round_ = found
+        round_, wasteful = found, False
     return _Stuck(round_.parts, f"{task.name}: {misses.describe(data)}", between=True)

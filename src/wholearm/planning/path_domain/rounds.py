@@ -18,7 +18,7 @@ from .elements import DEGREE, Elements
 from .fastest import Fastest, find_fastest
 from .first_guess import guess
 from .mesh import MOST, SHIFTED, START, Mesh, adapt, find_ends
-from .misses import MISS, Misses, PathSolution
+from .misses import MISS, Misses, PathSolution, anticipate, price
 from .motion import PathMotion
 from .nlp import (
     PathNLP,
@@ -41,6 +41,8 @@ _DEAR = {Objective.TIME: 1.0, Objective.MARGIN: 1.0, Objective.EFFORT: 0.2}
 """Share of the accuracy that missed limits may cost by first order: efforts have other errors."""
 _LONGER = 0.2
 """Most that the NLP's duration may be allowed to be longer, relatively."""
+_EARLY = 1e-5
+"""Accuracy from which on limits are tightened before anything is solved."""
 _SETTLED = 0.1
 """Share of the accuracy below which switches are not looked for again."""
 
@@ -132,6 +134,8 @@ class Round:
     units : Units
     solution : PathSolution
         The last one, or where to start.
+    tightening : Tightening
+        By how much limits are tightened for that.
     fastest : Fastest or None
         The motion of a sweep, near which plans are looked for.
     duration : float or None, [s]
@@ -148,6 +152,7 @@ class Round:
     nlp: PathNLP
     units: Units
     solution: PathSolution
+    tightening: Tightening
     fastest: Fastest | None
     duration: float | None
     shift: float = np.inf
@@ -159,13 +164,31 @@ class Round:
         elements, parts, data, nlp = task.lay_out(meshes, finer * task.elements)
         profile, units = guess(data, task.options.time_weight)
         found = None if task.options.goal is Objective.EFFORT else find_fastest(data, task.duration)
+        start, none = PathSolution(profile, 0.0, {}), Tightening.none(data, task.duration)
+        known = task, elements, meshes, parts, data, nlp, units, start, none, found, task.duration
+        begun = Round(*known)
         if found is None:
-            start = PathSolution(profile, 0.0, {})
+            return begun
+        return begun._restart(task.place_breaks(found.switches), finer * task.elements)
+
+    def _restart(self, meshes: tuple[Mesh, ...], elements: int, shift: float = np.inf) -> Round:
+        """Start on other meshes, from the fastest motion if that is known, or from this one."""
+        task, solution = self.task, self.solution
+        elements, parts, data, nlp = task.lay_out(meshes, elements)
+        allowed = task.duration and task.duration * (1 + min(self.spared, _LONGER))
+        tightening = Tightening.none(data, allowed)
+        if self.fastest is None:
+            old, new = self.data.grid, data.grid
+            start = solution._replace(
+                profile=Elements(old, solution.profile).move(new),
+                multipliers=move_multipliers(self.nlp, nlp, solution.multipliers, old, new),
+            )
         else:
-            meshes = task.place_breaks(found.switches)
-            elements, parts, data, nlp = task.lay_out(meshes, finer * task.elements)
-            start = start_at(nlp, data, units, found)
-        return Round(task, elements, meshes, parts, data, nlp, units, start, found, task.duration)
+            start, corners = start_at(nlp, data, self.units, self.fastest)
+            if task.options.accuracy >= _EARLY:
+                tightening = anticipate(data, start._replace(profile=corners), tightening)
+        known = elements, meshes, parts, data, nlp, self.units, start, tightening
+        return Round(task, *known, self.fastest, allowed, shift)
 
     @cached_property
     def motions(self) -> list[PathMotion]:
@@ -186,14 +209,32 @@ class Round:
         return max(abs(self.solution.cost), 1e-9)
 
     @cached_property
-    def prices(self) -> Array:
-        """What tightening limits would cost in each solid interval, relatively."""
-        price = self.misses.price(self.nlp, self.data, self.units, self.solution)
-        return np.asarray(price / self.value)
+    def due(self) -> Array:
+        """What tightening limits by what they miss would cost at each node, relatively."""
+        missed = self.misses.short, self.misses.speeding
+        short, speeding = (self.data.spread_to_nodes(part) for part in missed)
+        return self._price((short, speeding))
+
+    @cached_property
+    def paid(self) -> Array:
+        """What having tightened them costs at each node, relatively."""
+        return self._price((self.tightening.missed, 1 - self.tightening.speed_share))
+
+    @cached_property
+    def wasted(self) -> Array:
+        """What it costs at each node that limits are tightened more than they need, relatively."""
+        spare = np.minimum(self.tightening.missed, self.misses.find_spare(self.data))
+        return self._price((spare, np.zeros(len(spare))))
+
+    def _price(self, tightened: tuple[Array, Array]) -> Array:
+        found = price(self.nlp, self.data, self.units, self.solution, tightened)
+        return np.asarray(found / self.value)
 
     @property
     def spared(self) -> float:
         """What the NLP takes the duration for, over what it is, less one."""
+        if not self.solution.lasts:
+            return 0.0
         total = sum(motion.duration for motion in self.motions)
         return max(self.solution.lasts / total - 1, 0.0)
 
@@ -207,19 +248,25 @@ class Round:
     @property
     def merit(self) -> float:
         """What the cost is likely to be once limits hold between nodes."""
-        return self.solution.cost + self.value * float(self.prices.sum())
+        return self.solution.cost + self.value * float(self.due.sum())
 
     @property
     def is_split(self) -> bool:
         """Whether elements end where the plan switches."""
         return any(len(mesh.breaks) for mesh in self.meshes)
 
-    def solve(self, tightening: Tightening | None = None) -> Round | str:
+    def solve(self) -> Round | str:
         """Solve on this mesh; in words how the solver ended if there is no solution."""
-        tightening = tightening or Tightening.none(self.data, self.duration)
         weight = self.task.options.time_weight
-        found = _solve(self.nlp, self.data, self.units, tightening, self.solution, weight)
+        given = self.nlp, self.data, self.units, self.tightening, self.solution, weight
+        found = _solve(*given)
         return found if isinstance(found, str) else replace(self, solution=found)
+
+    def tighten(self, ease: bool) -> Round:
+        """The round with limits tightened by what they miss, and to `ease` no more than needed."""
+        tight = self.tightening
+        tight = tight.ease(self.misses.find_spare(self.data)) if ease else tight
+        return replace(self, tightening=self.misses.tighten(self.data, tight, self.solution))
 
     def adapt(self, dearer: bool = False) -> tuple[Round, Round | None]:
         """The round with its shift, and a better one to go on from; None if this one will do.
@@ -230,8 +277,8 @@ class Round:
             Whether tightening limits has turned out to be dearer than it may be.
         """
         task, most = self.task, self.task.options.accuracy
-        prices = self.prices
-        shares = np.split(prices, np.cumsum([len(part.nonempty) for part in self.parts])[:-1])
+        prices = self.due + self.paid - self.wasted
+        shares = np.split(prices, np.cumsum([len(part.grid.s) for part in self.parts])[:-1])
         coarse = self.elements < MOST and task.options.intervals is None
         dear = dearer or bool(prices.sum() > _DEAR[task.options.goal] * most)
         # Once switches have settled they need not be looked for, and where much is missed they are
@@ -253,35 +300,10 @@ class Round:
         if not (moved or dear):
             return replace(self, shift=shift), None
         meshes = tuple(mesh for mesh, _ in found)
-        elements, parts, data, nlp = task.lay_out(meshes, self.elements * (2 if dear else 1))
-        carried = self._carry(data, nlp)
-        allowed = task.duration and task.duration * (1 + min(self.spared, _LONGER))
-        known = (
-            elements,
-            meshes,
-            parts,
-            data,
-            nlp,
-            self.units,
-            carried,
-            self.fastest,
-            allowed,
-            shift,
-        )
-        return self, Round(task, *known)
+        return self, self._restart(meshes, self.elements * (2 if dear else 1), shift)
 
-    def _carry(self, data: PhaseData, nlp: PathNLP) -> PathSolution:
-        """Where to start from on another grid."""
-        old, new, solution = self.data.grid, data.grid, self.solution
-        if self.fastest is not None:
-            return start_at(nlp, data, self.units, self.fastest)
-        return solution._replace(
-            profile=Elements(old, solution.profile).move(new),
-            multipliers=move_multipliers(self.nlp, nlp, solution.multipliers, old, new),
-        )
-
-    def summarise(self, gap: float) -> Plans:
-        """The plan of each phase, given what tightening limits has cost, relatively."""
+    def summarise(self) -> Plans:
+        """The plan of each phase."""
         options = self.task.options
         plans: Plans = []
         for part, motion in zip(self.parts, self.motions, strict=True):
@@ -291,7 +313,7 @@ class Round:
                 Objective.EFFORT: squares + options.time_weight * motion.duration,
                 Objective.MARGIN: self.task.epsilon + self.solution.margin,
             }[options.goal]
-            error = float(abs(gap) + SHIFTED * min(self.shift, 1.0) + self.unspent)
+            error = float(self.paid.sum() + SHIFTED * min(self.shift, 1.0) + self.unspent)
             plans.append(PhasePlan(motion, torque, value, error=error))
         return plans
 

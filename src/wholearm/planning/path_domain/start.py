@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
+from ..lower_bound.rows import Rows
 from ..lower_bound.sweep import Mode
 from ..options import Objective
 from .corners import LimitSides
@@ -34,8 +35,13 @@ _PICARD = 2
 _NODES = DEGREE + 1
 
 
-def start_at(nlp: PathNLP, data: PhaseData, units: Units, found: Fastest) -> PathSolution:
-    """A motion near a fastest one on the grid of `data`, with multipliers near those of a plan."""
+def start_at(
+    nlp: PathNLP, data: PhaseData, units: Units, found: Fastest
+) -> tuple[PathSolution, Profile]:
+    """A motion near a fastest one on the grid of `data`, with multipliers near those of a plan.
+
+    And that in the corners themselves.
+    """
     sides = LimitSides.of(data, data.nodes, found.margin)
     corners = _Corners.at(data.grid, sides, found)
     rows, signs, _ = data.limits.sides
@@ -63,7 +69,8 @@ def start_at(nlp: PathNLP, data: PhaseData, units: Units, found: Fastest) -> Pat
         pulls = on_rows[:, list(nlp.shape.presses)].sum(axis=1)
         blocks["chain"] = -1 - np.cumsum(pulls)[:-1]
     on_g = nlp.columns.g.join(links=on_links, limits=on_rows.ravel(), **blocks)
-    return PathSolution(moved, found.margin, {"lam_x0": on_x[nlp.free], "lam_g0": on_g})
+    multipliers = {"lam_x0": on_x[nlp.free], "lam_g0": on_g}
+    return PathSolution(moved, found.margin, multipliers), corners.profile
 
 
 class _Corners(NamedTuple):
@@ -98,7 +105,7 @@ class _Corners(NamedTuple):
         wanted = np.interp(grid.s, (found.s[1:] + found.s[:-1]) / 2, found.slopes)
         b, rows = np.interp(grid.s, found.s, found.b), sides.eliminate()
         for _ in range(_PICARD):
-            most, least = (sides.pair(rows.extreme(b, largest).row) for largest in (True, False))
+            most, least = (_find_pairs(sides, rows, b, largest) for largest in (True, False))
             (high, press), (low, other) = (sides.meet(b, pair) for pair in (most, least))
             with np.errstate(divide="ignore", invalid="ignore"):
                 share = np.nan_to_num(np.clip((wanted - low) / (high - low), 0.0, 1.0))
@@ -121,6 +128,16 @@ class _Corners(NamedTuple):
         return Profile(
             np.where(self.held, a, inner_a), b, np.where(self.held, squeeze, inner_squeeze)
         )
+
+
+def _find_pairs(sides: LimitSides, rows: Rows, b: Array, largest: bool) -> NDArray[np.int64]:
+    """The sides that meet at the largest or the least s'' of each node, shape (n, 2).
+
+    Where elements meet other sides may take over. There those that meet at the next node inside do.
+    """
+    row = rows.extreme(b, largest).row.reshape(-1, _NODES)
+    row[:, 0], row[:, -1] = row[:, 1], row[:, -2]
+    return sides.pair(row.ravel())
 
 
 def _find_multipliers(
