@@ -8,21 +8,18 @@ import pytest
 from planned import plan
 from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.simulate import simulate
-from wholearm.verification import look_closer
 from wholearm.verification.look_closer import choose_times
 from wholearm.verification.verdict import Allowance
 from wholearm.verification.verify import verify
 
 
-def test_long_pieces_and_both_ends_of_phases_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(look_closer, "PARTS", 4)
-    torque = TorqueProfile(np.array([0.0, 0.1, 0.11, 1.0]), np.zeros((3, 2, 1)))
-    times = choose_times(torque, np.array([0.0, 0.11, 3.67]))
-    np.testing.assert_allclose(times, [0.1 / 4, 0.2 / 4, 0.3 / 4])
-    _, trajectory = plan()
-    times = choose_times(trajectory.torque, trajectory.phase_starts, trajectory)
-    assert np.isin(trajectory.phase_starts[:-1], times).all()
-    assert np.isin(trajectory.t[-1], times)
+def test_rows_of_a_plan_and_both_ends_of_phases_are_looked_at() -> None:
+    problem, trajectory = plan()
+    times = choose_times(problem, trajectory.torque, trajectory)
+    assert np.isin(times, trajectory.t).all()
+    assert np.isin(trajectory.phase_starts[:-1], times).all() and trajectory.t[-1] in times
+    even = choose_times(problem, trajectory.torque, None)
+    np.testing.assert_allclose(even[[0, -1]], trajectory.torque.breaks[[0, -1]])
 
 
 def wiggle(torque: TorqueProfile, piece: int, size: float) -> TorqueProfile:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.arrays import Array
+from ..common.arrays import Array, sort_unique
 from .trajectory import Samples
 
 
@@ -71,10 +71,10 @@ def sample_phases(
     arrays: Mapping[str, Any], contacts: tuple[str, ...]
 ) -> tuple[SampledMotion, ...]:
     """The motion of each phase, from the arrays of a trajectory by name."""
-    return tuple(_sample(arrays, contacts, index) for index in np.unique(arrays["phase"]))
+    return tuple(_sample(arrays, contacts, index) for index in sort_unique(arrays["phase"]))
 
 
-def _sample(arrays: Mapping[str, Any], contacts: tuple[str, ...], index: int) -> SampledMotion:
+def _sample(arrays: Mapping[str, Any], contacts: tuple[str, ...], index: float) -> SampledMotion:
     rows = arrays["phase"] == index
     held = ~np.isnan(arrays["c_n"][rows]).all(axis=0)
     parts = {name: array[rows] for name, array in arrays.items()}

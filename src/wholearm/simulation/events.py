@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
-from ..contacts.elemental import Contact
 from ..mechanics.dynamics import energy
 from ..problem.definition import Phase, Problem
 from ..results.torque import TorqueProfile
@@ -278,6 +277,7 @@ def collect(
     torque: TorqueProfile,
     outcome: Outcome,
     missed_by: float,
+    glimpses: Glimpses,
     counts: tuple[int, int],
 ) -> Simulation:
     """Put the sections of a simulation together; `counts` are steps and rejected steps."""
@@ -309,7 +309,7 @@ def collect(
         contacts=tuple(contact.name for contact in contacts),
         c_n=c_n,
         c_t=c_t,
-        glimpses=_list_glimpses(sections, contacts),
+        glimpses=glimpses,
         problem=problem,
         torque=torque,
         events=tuple(sorted(events, key=lambda event: event.time)),
@@ -321,8 +321,9 @@ def collect(
     )
 
 
-def _list_glimpses(sections: Sequence[Section], contacts: Sequence[Contact]) -> Glimpses:
+def list_glimpses(problem: Problem, sections: Sequence[Section]) -> Glimpses:
     """What the stages of all steps have seen."""
+    contacts = problem.contacts
     nodes = np.array(NODES)[list(GLIMPSES)]
     columns = [(np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, len(contacts))))]
     for section in sections:

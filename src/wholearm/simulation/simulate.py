@@ -30,7 +30,7 @@ from ..common.sharing import exclusive
 from ..problem.check import require_phases
 from ..problem.definition import End, Phase, Problem
 from ..results.narrow import Torques, narrow
-from .events import EventKind, Outcome, OutcomeKind, Simulation, collect
+from .events import EventKind, Glimpses, Outcome, OutcomeKind, Simulation, collect, list_glimpses
 from .jumps import Arrival, Ending, Released, Rested, Switched, is_there
 from .moving import move
 from .replay import Replay
@@ -116,11 +116,12 @@ def _look_closer(
     run: Replay, ended: tuple[Outcome, float], closer: Closer | None
 ) -> tuple[Simulation, list[float]]:
     """What is recorded, and instants within steps at which something showed that they missed."""
-    found, looks = _collect(run, *ended), 0
+    glimpses = list_glimpses(run.problem, run.sections)
+    found, looks = _collect(run, *ended, glimpses), 0
     missed: list[float] = []
     while closer and not missed and len(wanted := _sort_times(closer(found, looks))):
         missed = look_within(run, wanted)
-        found, looks = _collect(run, *ended), looks + 1
+        found, looks = _collect(run, *ended, glimpses), looks + 1
     return found, missed
 
 
@@ -272,10 +273,11 @@ def _collapse(run: Replay, rest: Rest, change: Collapse) -> Released | Switched 
     return run.lose(change.contact, change.c_n)
 
 
-def _collect(run: Replay, outcome: Outcome, missed_by: float) -> Simulation:
+def _collect(run: Replay, outcome: Outcome, missed_by: float, glimpses: Glimpses) -> Simulation:
     """Put everything recorded together."""
     counts = (run.steps, run.rejected)
-    return collect(run.problem, run.sections, run.events, run.torques, outcome, missed_by, counts)
+    given = run.problem, run.sections, run.events, run.torques
+    return collect(*given, outcome, missed_by, glimpses, counts)
 
 
 __all__ = ["simulate"]

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import NamedTuple
+
 import numpy as np
 
 from ..common.arrays import Array
 from ..contacts.links import evaluate_finger_gap
-from ..problem.definition import Problem
+from ..problem.definition import Phase, Problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..simulation.events import Simulation
 from ..simulation.simulate import Closer
 from .margins import SHORTEST, fit_parabolas, list_normal_forces, list_slips
 
-PARTS = 40
-"""Least number of parts of a phase at whose ends it is looked at."""
 ROWS = 20
-"""About how many rows of each phase of a trajectory its replay is compared with."""
+"""About how many rows of each phase of a trajectory its replay is compared with; without one, about
+how many even parts of each phase are looked at."""
 POINTS = 8
 """Instants around what seems to be a dip."""
 LOOKS = 3
@@ -24,29 +26,62 @@ LOOKS = 3
 WORTH = 1e-7
 """How far below all that is known a dip has to seem, relative to the scene's force or length."""
 
+Dips = list[tuple[float, float]]
+"""Where something seems to dip, from start to end [s]."""
 
-def choose_times(torque: TorqueProfile, starts: Array, plan: Trajectory | None = None) -> Array:
-    """Instants to look at first: inside long pieces of torques, and rows of a plan.
 
-    Parameters
+def choose_times(problem: Problem, torque: TorqueProfile, plan: Trajectory | None) -> Array:
+    """Instants to look at first: rows of a plan, or even ones; steps show what is in between."""
+    if plan is None:
+        return np.linspace(torque.breaks[0], torque.breaks[-1], ROWS * len(problem.phases) + 1)
+    owned = (np.flatnonzero(plan.phase == index) for index in range(len(plan.motions)))
+    picked = (own[np.linspace(0, len(own) - 1, ROWS + 1).astype(int)] for own in owned)
+    return np.concatenate([plan.t[rows] for rows in picked])
+
+
+class Series(NamedTuple):
+    """What a replay has shown in a phase of a force, a margin or a gap.
+
+    Attributes
     ----------
-    torque : TorqueProfile
-    starts : ndarray, shape (n_phases + 1,), [s]
-        About when phases start, and when the last one ends.
-    plan : Trajectory, optional
+    name : str
+    t, values : ndarray, shape (n,), [s], [N or m]
+        At recorded instants.
+    more_t, more : ndarray, shape (k,)
+        By glimpses, in any order.
+    breaks : ndarray, [s]
+        Where it may have a kink.
+    shortest : float, [s]
+        Interval below which it may jump.
+    worth : float, [N or m]
+        How far below the least value a dip has to seem.
     """
-    rows = [np.zeros(0)]
-    for index in range(len(plan.motions) if plan is not None else 0):
-        assert plan is not None
-        own = np.flatnonzero(plan.phase == index)
-        rows.append(plan.t[own[np.linspace(0, len(own) - 1, ROWS + 1).astype(int)]])
-    times, breaks, widths = np.concatenate(rows), torque.breaks, np.diff(torque.breaks)
-    owner = np.searchsorted(starts, (breaks[1:] + breaks[:-1]) / 2, side="right") - 1
-    longest = np.diff(starts)[np.clip(owner, 0, len(starts) - 2)] / PARTS
-    counts = np.ceil(widths / longest - 1e-9).astype(int) - 1
-    piece = np.repeat(np.arange(len(counts)), counts)
-    share = np.arange(1, len(piece) + 1) - (np.cumsum(counts) - counts)[piece]
-    return np.append(times, breaks[piece] + widths[piece] * share / (counts + 1)[piece])
+
+    name: str
+    t: Array
+    values: Array
+    more_t: Array
+    more: Array
+    breaks: Array
+    shortest: float
+    worth: float
+
+    def find_dips(self) -> Dips:
+        """Places where it seems to be lower than anywhere recorded, with and without glimpses."""
+        t, values = np.append(self.t, self.more_t), np.append(self.values, self.more)
+        order = np.argsort(t, kind="stable")
+        return [*self._fit(t[order], values[order]), *self._fit(self.t, self.values)]
+
+    def narrow(self, dip: tuple[float, float]) -> Dips:
+        """Places within a dip where it still seems so by what is recorded."""
+        within = slice(*np.searchsorted(self.t, [dip[0], np.nextafter(dip[1], np.inf)]))
+        return self._fit(self.t[within], self.values[within])
+
+    def _fit(self, t: Array, values: Array) -> Dips:
+        found = fit_parabolas(t, values, self.breaks, self.shortest)
+        least = np.nanmin(self.values, initial=np.inf) - self.worth
+        low = np.flatnonzero(found.lowest < least).tolist()
+        return [(float(found.start[k]), float(found.stop[k])) for k in low]
 
 
 def make_closer(problem: Problem, breaks: Array) -> Closer:
@@ -58,36 +93,39 @@ def make_closer(problem: Problem, breaks: Array) -> Closer:
     breaks : ndarray, [s]
         Those of its torques.
     """
-    scales = problem.scene.scales
-    shortest = SHORTEST * scales.time
+    left: dict[tuple[int, str], Dips] = {}
 
     def look(simulation: Simulation, looks: int) -> Array:
-        times, glimpses = [np.zeros(0)], simulation.glimpses
-        for phase in problem.phases[: int(simulation.phase[-1]) + 1] if looks < LOOKS else ():
-            rows = np.flatnonzero(simulation.phase == phase.index)
-            t = simulation.t[rows]
-            for name, values in list_normal_forces(problem, simulation, phase, rows).items():
-                here, c_n = t, values
-                if not looks:
-                    own = glimpses.phase == phase.index
-                    here = np.append(t, glimpses.t[own])
-                    c_n = np.append(c_n, glimpses.c_n[own, simulation.contacts.index(name)])
-                    order = np.argsort(here, kind="stable")
-                    here, c_n = here[order], c_n[order]
-                times += _surround(here, c_n, breaks, shortest, WORTH * scales.force)
-            # These have no jumps, and kinks at most.
-            for values in list_slips(simulation, phase, rows).values():
-                times += _surround(t, values, t[:1], shortest, WORTH * scales.force)
-            if problem.scene.fingers_collide:
-                gaps = evaluate_finger_gap(problem.scene, simulation.z[rows])
-                times += _surround(t, gaps, t[:1], shortest, WORTH * scales.length)
-        return np.concatenate(times)
+        before, phases = left.copy(), problem.phases[: int(simulation.phase[-1]) + 1]
+        left.clear()
+        for phase in phases if looks < LOOKS else ():
+            if looks and not any(index == phase.index for index, _ in before):
+                continue
+            for one in _list_series(problem, simulation, phase, breaks):
+                key = phase.index, one.name
+                known = before.get(key, [])
+                dips = [d for dip in known for d in one.narrow(dip)] if looks else one.find_dips()
+                left.update({key: dips} if dips else {})
+        every = [np.linspace(*dip, POINTS + 2)[1:-1] for dips in left.values() for dip in dips]
+        return np.concatenate([np.zeros(0), *every])
 
     return look
 
 
-def _surround(t: Array, values: Array, breaks: Array, shortest: float, worth: float) -> list[Array]:
-    """Instants around places where a sampled function seems to dip below all of its samples."""
-    found = fit_parabolas(t, values, breaks, shortest)
-    low = np.flatnonzero(found.lowest < np.nanmin(values, initial=np.inf) - worth)
-    return [np.linspace(found.start[k], found.stop[k], POINTS + 2)[1:-1] for k in low]
+def _list_series(
+    problem: Problem, simulation: Simulation, phase: Phase, breaks: Array
+) -> Iterator[Series]:
+    """All that may dip in a phase; margins and gaps have no jumps, and hardly a kink."""
+    scales, rows = problem.scene.scales, np.flatnonzero(simulation.phase == phase.index)
+    t, none, shortest = simulation.t[rows], np.zeros(0), SHORTEST * scales.time
+    glimpses = simulation.glimpses
+    own = np.flatnonzero(glimpses.phase == phase.index)
+    worth = WORTH * scales.force
+    for name, values in list_normal_forces(problem, simulation, phase, rows).items():
+        more = glimpses.c_n[own, simulation.contacts.index(name)]
+        yield Series(name, t, values, glimpses.t[own], more, breaks, shortest, worth)
+    for name, values in list_slips(simulation, phase, rows).items():
+        yield Series(f"{name} rolling", t, values, none, none, t[:1], shortest, worth)
+    if problem.scene.fingers_collide:
+        gaps = evaluate_finger_gap(problem.scene, simulation.z[rows])
+        yield Series("gap", t, gaps, none, none, t[:1], shortest, WORTH * scales.length)

@@ -142,9 +142,7 @@ def observe(
     JammingError, SimulationError
         If the simulation cannot go on.
     """
-    even = np.linspace(torque.breaks[0], torque.breaks[-1], len(problem.phases) + 1)
-    times = choose_times(torque, even if plan is None else plan.phase_starts, plan)
-    closer = make_closer(problem, torque.breaks)
+    times, closer = choose_times(problem, torque, plan), make_closer(problem, torque.breaks)
     simulation = simulate(problem, torque, tolerance=tolerance, times=times, closer=closer)
     phases = tuple(
         _report_phase(problem, simulation, torque, plan, index)
