@@ -9,6 +9,8 @@ from .sharing import exclusive
 
 SIZE = 64
 """Points per call. Larger needs more memory at no gain; smaller, more calls."""
+FEW = 10
+"""Points up to which each is a call of its own: one for all of `SIZE` costs as much as a dozen."""
 
 
 class Batch:
@@ -54,11 +56,12 @@ class Batch:
         """
         count = len(arguments[0])
         outputs = [np.empty((count, *result.shape[1:])) for result in self._results]
-        for start in range(0, count, SIZE):
-            stop = min(start + SIZE, count)
+        size, run = (1, self._run_one) if count <= FEW else (SIZE, self._run_many)
+        for start in range(0, count, size):
+            stop = min(start + size, count)
             for store, argument in zip(self._arguments, arguments, strict=True):
                 store[: stop - start] = argument[start:stop]
-            (self._run_one if stop - start == 1 else self._run_many)()
+            run()
             for output, result in zip(outputs, self._results, strict=True):
                 output[start:stop] = result[: stop - start]
         return [output.transpose(0, 2, 1) for output in outputs]

@@ -248,13 +248,15 @@ class Scene:
         """Gap below which features count as touching [m]: above rounding, below real clearance."""
         return TOUCHING * self.scales.length
 
-    @property
+    @cached_property
     def mass_diagonal(self) -> Array:
         """Diagonal of M5, shape (5,): m, m, I, J_1, J_2 [kg, kg m^2]."""
         body = self.polygon
         assert body.inertia is not None
         joints = [finger.inertia for finger in self.fingers]
-        return np.array([body.mass, body.mass, body.inertia, *joints])
+        diagonal = np.array([body.mass, body.mass, body.inertia, *joints])
+        diagonal.setflags(write=False)
+        return diagonal
 
     @property
     def applied_force(self) -> Array:

@@ -164,7 +164,6 @@ class Simulation:
         Every contact of the problem.
     c_n, c_t : ndarray, shape (n, m), [N]
         NaN where a contact is not in the formation, and at rest, where forces are indeterminate.
-    glimpses : Glimpses
     problem : Problem
     torque : TorqueProfile
         What was simulated.
@@ -187,7 +186,6 @@ class Simulation:
     contacts: tuple[str, ...]
     c_n: Array
     c_t: Array
-    glimpses: Glimpses
     problem: Problem = field(repr=False)
     torque: TorqueProfile = field(repr=False)
     events: tuple[Event, ...]
@@ -277,7 +275,6 @@ def collect(
     torque: TorqueProfile,
     outcome: Outcome,
     missed_by: float,
-    glimpses: Glimpses,
     counts: tuple[int, int],
 ) -> Simulation:
     """Put the sections of a simulation together; `counts` are steps and rejected steps."""
@@ -309,7 +306,6 @@ def collect(
         contacts=tuple(contact.name for contact in contacts),
         c_n=c_n,
         c_t=c_t,
-        glimpses=glimpses,
         problem=problem,
         torque=torque,
         events=tuple(sorted(events, key=lambda event: event.time)),

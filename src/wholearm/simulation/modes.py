@@ -192,6 +192,12 @@ class Mode:
         return np.concatenate([slip, z[[3 + joint for joint in self.grips.joints]]])
 
 
+@lru_cache(maxsize=64)
+def share_mode(formation: Formation, grips: Grips = FREE) -> Mode:
+    """The mode of a formation in which friction holds `grips`, with what is known of it."""
+    return Mode(formation, grips)
+
+
 class Rows(NamedTuple):
     """Constraint rows at one state.
 
@@ -242,24 +248,29 @@ def respond(mode: Mode, signs: Array, rows: Rows, v: Array) -> Response | None:
     formation, scene = mode.formation, mode.formation.scene
     count, rolling = formation.n_contacts, list(mode.rolled.rolling_rows)
     joints = [3 + joint for joint in mode.grips.joints]
-    P = np.vstack([rows.A, rows.A_t[rolling], np.eye(5)[joints]])
-    bend = np.concatenate([rows.A_dot_v, rows.A_t_dot_v[rolling], np.zeros(len(joints))])
+    slip = mode.rolled.sliding_friction * signs[:count]
+    P: Array = rows.A
+    bend: Array = rows.A_dot_v
+    G: Array = rows.A - slip[:, None] * rows.A_t
     inverse_mass = 1 / scene.mass_diagonal
+    if rolling or joints:
+        held = np.vstack([rows.A_t[rolling], np.eye(5)[joints]])
+        P, G = np.vstack([P, held]), np.vstack([G, held])
+        bend = np.concatenate([bend, rows.A_t_dot_v[rolling], np.zeros(len(joints))])
     if mode.grips and not _are_independent(P * np.sqrt(inverse_mass)):
         return None
-    slip = mode.rolled.sliding_friction * signs[:count]
-    G = np.vstack([rows.A - slip[:, None] * rows.A_t, P[count:]])
     applied = np.zeros((5, 3))
     applied[:, 0] = scene.applied_force - scene.viscous * v
     applied[3:, 0] -= scene.dry[3:] * signs[count:]
     applied[3:, 1:] = np.eye(2)
-    K = (P * inverse_mass) @ G.T
-    ratio = float(np.linalg.det(K) / np.linalg.det((P * inverse_mass) @ P.T))
+    drop = P * inverse_mass
+    K = drop @ G.T
+    ratio = float(np.linalg.det(K) / np.linalg.det(drop @ P.T))
     c = np.zeros((len(P), 3))
     if abs(ratio) > 1e-12:
-        right = -(P * inverse_mass) @ applied
+        right = -drop @ applied
         right[:, 0] -= bend
-        c = np.linalg.solve(K, right)
+        c = np.asarray(np.linalg.solve(K, right), dtype=float)
     acceleration = inverse_mass[:, None] * (applied + G.T @ c)
     rates = np.vstack([rows.A_t @ acceleration, acceleration[3:]])
     rates[:count, 0] += rows.A_t_dot_v

@@ -42,7 +42,7 @@ from .within import look_within
 ROUNDS = 8
 """Most simulations, each with more steps that end where something showed within those before."""
 
-Closer = Callable[[Simulation, int], ArrayLike]
+Closer = Callable[[Simulation, Glimpses, int], ArrayLike]
 """Gives, from what is known and the number of looks so far, instants to look at too, or none."""
 
 
@@ -69,9 +69,9 @@ def simulate(
         Instants at which the state is wanted; steps end there. Those outside the torques' time
         are left out.
     closer : callable, optional
-        Takes the simulation and the number of looks so far, from 0, and gives instants within steps
-        that are to be seen, too, shape (n,) [s], until it gives none. That changes no step, unless
-        something shows there that the ends of steps do not show.
+        Takes the simulation, glimpses of forces within its steps and the number of looks so far,
+        from 0, and gives instants within steps that are to be seen, too, shape (n,) [s], until it
+        gives none. That changes no step, unless something shows there that ends of steps do not.
     progress : callable, optional
         Receives a line at the start of each phase.
 
@@ -106,7 +106,9 @@ def simulate(
 
 def _sort_times(given: ArrayLike | None) -> Array:
     """Instants that are asked for, increasing, shape (n,) [s]."""
-    times = np.asarray([] if given is None else given, dtype=float)
+    if given is None:
+        return np.zeros(0)
+    times = np.asarray(given, dtype=float)
     if not np.isfinite(times).all():
         raise InputError("", "times", "holds numbers that are not finite")
     return sort_unique(times)
@@ -116,12 +118,12 @@ def _look_closer(
     run: Replay, ended: tuple[Outcome, float], closer: Closer | None
 ) -> tuple[Simulation, list[float]]:
     """What is recorded, and instants within steps at which something showed that they missed."""
-    glimpses = list_glimpses(run.problem, run.sections)
-    found, looks = _collect(run, *ended, glimpses), 0
+    found, looks = _collect(run, *ended), 0
     missed: list[float] = []
-    while closer and not missed and len(wanted := _sort_times(closer(found, looks))):
+    glimpses = list_glimpses(run.problem, run.sections if closer else ())
+    while closer and not missed and len(wanted := _sort_times(closer(found, glimpses, looks))):
         missed = look_within(run, wanted)
-        found, looks = _collect(run, *ended, glimpses), looks + 1
+        found, looks = _collect(run, *ended), looks + 1
     return found, missed
 
 
@@ -273,11 +275,10 @@ def _collapse(run: Replay, rest: Rest, change: Collapse) -> Released | Switched 
     return run.lose(change.contact, change.c_n)
 
 
-def _collect(run: Replay, outcome: Outcome, missed_by: float, glimpses: Glimpses) -> Simulation:
+def _collect(run: Replay, outcome: Outcome, missed_by: float) -> Simulation:
     """Put everything recorded together."""
     counts = (run.steps, run.rejected)
-    given = run.problem, run.sections, run.events, run.torques
-    return collect(*given, outcome, missed_by, glimpses, counts)
+    return collect(run.problem, run.sections, run.events, run.torques, outcome, missed_by, counts)
 
 
 __all__ = ["simulate"]

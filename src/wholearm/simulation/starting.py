@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..contacts.formation import Formation, Kinematics
 from ..mechanics.dynamics import Directions
-from .modes import Grips, Mode, Response, Rows, find_grips, list_units, respond
+from .modes import Mode, Response, Rows, find_grips, list_units, respond, share_mode
 from .tolerances import ROUNDING_FORCE, Tolerances, find_tolerances, measure_units
 
 _STEP = 3e-5
@@ -274,7 +274,6 @@ def find_patterns(
     touching = Touching(formation, z, near)
     units = list_units(formation)
     choices = [(1.0, -1.0, 0.0) if held and unit.grips else (1.0, -1.0) for unit in units]
-    modes: dict[Grips, Mode] = {}
     for options in sorted(product(*choices), key=lambda options: options.count(0.0)):
         count = options.count(0.0)
         if (count > 0) != held or formation.n_constraints + count > 4:
@@ -283,7 +282,7 @@ def find_patterns(
         for unit, sign in zip(units, options, strict=True):
             signs[list(unit.rows)] = sign
         grips = find_grips(formation, signs)
-        mode = modes.setdefault(grips, Mode(formation, grips))
+        mode = share_mode(formation, grips)
         pattern = _build_pattern(mode, signs, kinematics, touching)
         if pattern is not None:
             yield pattern

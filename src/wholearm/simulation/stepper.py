@@ -211,9 +211,10 @@ def _build_measure(formation: Formation, until: Until, side: float, short: float
     return ca.Function("measure", [z, v], [ca.densify(part) for part in parts])
 
 
-def open_limits(formation: Formation, until: Until) -> list[GapLimit]:
+@lru_cache(maxsize=64)
+def open_limits(formation: Formation, until: Until) -> tuple[GapLimit, ...]:
     """Limits that end a phase early: all but that of the contact to be gained."""
-    return [limit for limit in formation.limits if not limit.gains(until.contact)]
+    return tuple(limit for limit in formation.limits if not limit.gains(until.contact))
 
 
 def _project(mode: Mode, mechanics: Mechanics, y: Expression, kept: Expression) -> Expression:

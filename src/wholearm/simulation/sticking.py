@@ -26,7 +26,7 @@ from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, Kinematics
 from ..mechanics.dynamics import Directions
 from .closing import close_contacts
-from .modes import Mode
+from .modes import Mode, share_mode
 from .starting import Departure, RestDirection, Way, find_patterns, respond_at_rest
 from .statics import balances, find_pulls
 from .tolerances import find_tolerances, measure_units
@@ -257,7 +257,7 @@ def find_rest(formation: Formation, z: Array) -> Rest:
         # What is stationary here has the direction that it takes up just after.
         ahead = [_rates(formation, z, step, sign * heading) for sign in (1, -1)]
         signs = np.where(still, np.where(np.abs(ahead) > 1e-12 * scale, np.sign(ahead), 0.0), signs)
-    mode = Mode(formation)
+    mode = share_mode(formation)
     ways = tuple(
         _build_way(mode, side * heading, Directions(s[:-2], s[-2:]), kinematics, close)
         for side, s, close in zip((1.0, -1.0), signs, closes, strict=True)

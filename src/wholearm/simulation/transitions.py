@@ -16,7 +16,7 @@ from .choosing import measure_rates
 from .closing import close_contacts
 from .events import EventKind, Outcome, OutcomeKind
 from .jumps import Ending, look_again
-from .modes import Mode, find_fixed, find_grips, list_units
+from .modes import find_fixed, find_grips, list_units, share_mode
 from .replay import Replay
 from .starting import Departure
 from .stepper import open_limits
@@ -116,7 +116,7 @@ def set_off(run: Replay, departure: Departure) -> None:
     grips = find_grips(formation, np.concatenate(departure.directions))
     if formation.n_constraints < 4:
         rows = formation.evaluate(run.y[None, :5], run.y[None, 5:10])
-        fixed = find_fixed(Mode(formation, grips), rows.A[0], rows.A_t[0])
+        fixed = find_fixed(share_mode(formation, grips), rows.A[0], rows.A_t[0])
         run.stuck = {row for u in list_units(formation) for row in u.rows if u.grips and fixed[row]}
     if grips != run.stepper.mode.grips:
         run.take(grips)

@@ -12,7 +12,7 @@ from ..contacts.links import evaluate_finger_gap
 from ..problem.definition import Phase, Problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
-from ..simulation.events import Simulation
+from ..simulation.events import Glimpses, Simulation
 from ..simulation.simulate import Closer
 from .margins import SHORTEST, fit_parabolas, list_normal_forces, list_slips
 
@@ -95,13 +95,13 @@ def make_closer(problem: Problem, breaks: Array) -> Closer:
     """
     left: dict[tuple[int, str], Dips] = {}
 
-    def look(simulation: Simulation, looks: int) -> Array:
+    def look(simulation: Simulation, glimpses: Glimpses, looks: int) -> Array:
         before, phases = left.copy(), problem.phases[: int(simulation.phase[-1]) + 1]
         left.clear()
         for phase in phases if looks < LOOKS else ():
             if looks and not any(index == phase.index for index, _ in before):
                 continue
-            for one in _list_series(problem, simulation, phase, breaks):
+            for one in _list_series(problem, simulation, glimpses, phase, breaks):
                 key = phase.index, one.name
                 known = before.get(key, [])
                 dips = [d for dip in known for d in one.narrow(dip)] if looks else one.find_dips()
@@ -113,12 +113,11 @@ def make_closer(problem: Problem, breaks: Array) -> Closer:
 
 
 def _list_series(
-    problem: Problem, simulation: Simulation, phase: Phase, breaks: Array
+    problem: Problem, simulation: Simulation, glimpses: Glimpses, phase: Phase, breaks: Array
 ) -> Iterator[Series]:
     """All that may dip in a phase; margins and gaps have no jumps, and hardly a kink."""
     scales, rows = problem.scene.scales, np.flatnonzero(simulation.phase == phase.index)
     t, none, shortest = simulation.t[rows], np.zeros(0), SHORTEST * scales.time
-    glimpses = simulation.glimpses
     own = np.flatnonzero(glimpses.phase == phase.index)
     worth = WORTH * scales.force
     for name, values in list_normal_forces(problem, simulation, phase, rows).items():
