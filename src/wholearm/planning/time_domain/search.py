@@ -42,7 +42,7 @@ MOST = 64
 """Intervals of each phase from which on none is halved."""
 _PATIENCE = 80
 """Most iterations of one solve on finer intervals, that starts from a solution."""
-_ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 40}
+_ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 90}
 """Most iterations of one solve, if not 150."""
 _CAP = 1.1
 """Largest margin that is looked for, over the one from which on more decides nothing."""
