@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -9,6 +10,7 @@ from shipped import HEPTAGON
 from wholearm.benchmark.kernels import (
     Outcome,
     choose_kernel,
+    compare,
     describe,
     find_kernel,
     plan_and_verify,
@@ -39,6 +41,14 @@ def test_a_problem_without_a_plan_is_a_fault() -> None:
     good = Outcome("time", 0.25, "", 1.0)
     assert describe("a/b.toml", [good]) == "b: time 0.250000; 1.0 s"
     assert "FAILS: objective" in describe("a/b.toml", [good, outcome._replace(objective="effort")])
+
+
+def test_a_least_time_off_its_reference_is_a_fault(tmp_path: Path) -> None:
+    path = str(tmp_path / "a.toml")
+    assert compare(path, "time", 9.0) == []
+    (tmp_path / "a.reference.json").write_text('{"phase_durations": [0.25, 0.75]}')
+    assert compare(path, "time", 1.0004) == compare(path, "effort", 9.0) == []
+    assert compare(path, "time", 0.999) == ["least time is -0.10% off its reference figure"]
 
 
 def test_faults_make_the_exit_status(tmp_path: str) -> None:

@@ -109,7 +109,7 @@ def test_closing_many_agrees_with_closing_one(radius: float) -> None:
     # Joints above the palm, so that they get into the object too.
     scene = make_scene(points, base=0.06, depth=0.01, length=0.1, radius=radius)
     rng = np.random.default_rng(1)
-    x, phi = rng.uniform(-0.2, 0.2, 200), rng.uniform(-4.0, 4.0, 200)
+    x, phi = rng.uniform(-0.2, 0.2, 100), rng.uniform(-4.0, 4.0, 100)
     closed = close_fingers(scene, x, phi)
     seen = set()
     for row in range(len(x)):
@@ -142,7 +142,7 @@ def test_closing_on_many_vertices_finds_the_first_of_them(radius: float) -> None
     for flatness, length in ((1.0, 0.18), (0.3, 0.06), (0.15, 0.1)):
         points = 0.05 * np.column_stack([np.cos(angles), flatness * np.sin(angles)])
         scene = make_scene(points, base=0.06, depth=-0.012, length=length, radius=radius)
-        x, phi = rng.uniform(-0.12, 0.12, 100), rng.uniform(-4.0, 4.0, 100)
+        x, phi = rng.uniform(-0.12, 0.12, 50), rng.uniform(-4.0, 4.0, 50)
         closed = close_fingers(scene, x, phi)
         for row, finger in np.argwhere(closed.obstacle == 0):
             z = closed.z[row]

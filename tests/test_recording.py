@@ -99,7 +99,8 @@ def test_a_replay_that_fails_is_drawn_and_saved(tmp_path: Path) -> None:
         figure = plots.force_margins(report)
         assert "replayed" in figure.texts[0].get_text()
         report.trajectory.save(tmp_path / "a.npz")
-        plots.save(plots.force_margins(load_trajectory(tmp_path / "a.npz")), tmp_path / "a.png")
+        figure = plots.force_margins(load_trajectory(tmp_path / "a.npz"))
+    plots.save(figure, tmp_path / "a.png")
 
 
 def test_a_replay_that_ends_at_once_is_no_trajectory() -> None:

@@ -4,12 +4,14 @@ OpenBLAS has kernels for each processor, which differ in the last bits; ``OPENBL
 one machine stand in for another.
 
 ``python -m wholearm.benchmark.kernels PROBLEM...`` takes a kernel that is not the machine's
-own, prints one line for each problem and exits with 1 if any plan fails.
+own, prints one line for each problem and exits with 1 if any plan fails, or a least time is not
+that of the reference figures beside its problem.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import platform
 import re
@@ -27,6 +29,8 @@ X86 = ("Haswell", "Sandybridge")
 """Kernels to choose from, both for any processor with AVX2."""
 _SAME = {"Zen": "Haswell", "Excavator": "Haswell"}
 """Processors that have the kernels of another."""
+_OFF = 5e-4
+"""Most that a least time may differ from its reference figure, relatively."""
 
 
 class Outcome(NamedTuple):
@@ -87,10 +91,21 @@ def plan_and_verify(path: str, objective: str) -> Outcome:
         problem = load(path)
         plan = solve(problem, objective)
         value = plan.value
-        fault = "; ".join(verify(problem, plan).failures)
+        faults = [*verify(problem, plan).failures, *compare(path, objective, value)]
+        fault = "; ".join(faults)
     except WholearmError as error:
         fault = str(error)
     return Outcome(objective, value, fault, time.perf_counter() - started)
+
+
+def compare(path: str, objective: str, value: float) -> list[str]:
+    """What is wrong with a least time by the reference figures beside its problem, if there are."""
+    stored = Path(path).with_suffix(".reference.json")
+    if objective != "time" or not stored.exists():
+        return []
+    known = sum(json.loads(stored.read_text(encoding="utf-8"))["phase_durations"])
+    off = value / known - 1
+    return [f"least time is {off:+.2%} off its reference figure"] if abs(off) > _OFF else []
 
 
 def run_all(paths: list[str], workers: int) -> int:
