@@ -6,13 +6,14 @@ import pytest
 
 from wholearm.geometry.curve import Curve
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
-from wholearm.planning.options import Objective
+from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.path_domain.data import PhaseData, join, prepare
-from wholearm.planning.path_domain.fastest import Fastest, find_fastest
+from wholearm.planning.path_domain.fastest import Fastest, Narrow, find_fastest
 from wholearm.planning.path_domain.first_guess import guess
 from wholearm.planning.path_domain.mesh import Mesh
 from wholearm.planning.path_domain.motion import PathMotion
 from wholearm.planning.path_domain.nlp import build_path_nlp, pack, parameters
+from wholearm.planning.path_domain.plan import plan_path
 from wholearm.planning.path_domain.start import start_at
 from wholearm.planning.path_domain.terms import LimitShape
 
@@ -26,7 +27,7 @@ def prepare_on(curve: Curve, mesh: Mesh, phase: int = 1) -> PhaseData:
 
 def find(curve: Curve, duration: float | None = None) -> Fastest:
     found = find_fastest(prepare_on(curve, Mesh()), duration)
-    assert found is not None
+    assert isinstance(found, Fastest)
     return found
 
 
@@ -56,6 +57,20 @@ def test_a_margin_takes_the_duration_that_is_allowed(curves: tuple[Curve, ...]) 
     assert find_fastest(prepare_on(curves[0], Mesh()), 0.9 * measure(fastest)) is None
 
 
+def test_a_place_that_limits_the_margin_is_named(curves: tuple[Curve, ...]) -> None:
+    """At the start of this phase no contact can press harder, however long a motion takes."""
+    curve = curves[2]
+    data, least = prepare_on(curve, Mesh()), measure(find(curve))
+    found = find_fastest(data, 2 * least)
+    assert isinstance(found, Narrow)
+    assert 0 < max(place for place, _ in found.switches) < 0.02 * curve.length
+    at_once, at_leisure = (
+        plan_path(curve, EPSILON, PlanOptions(objective=Objective.MARGIN), 3, ratio * least).value
+        for ratio in (2.0, 3.0)
+    )
+    assert at_leisure == pytest.approx(at_once, rel=5e-4)
+
+
 def test_no_motion_is_found_that_is_not_there(curves: tuple[Curve, ...]) -> None:
     assert find_fastest(prepare_on(curves[0], Mesh())._replace(epsilon=EPSILON), None) is not None
     hard = prepare(curves[0], 50.0, Mesh().make_grid(curves[0], ELEMENTS), 1)
@@ -70,7 +85,7 @@ def test_the_start_is_near_a_solution(curves: tuple[Curve, ...], goal: Objective
     least = measure(find(curve))
     duration = 1.5 * least if goal is Objective.MARGIN else None
     found = find_fastest(coarse, duration)
-    assert found is not None
+    assert isinstance(found, Fastest)
     data = prepare_on(curve, Mesh.of(curve, found.switches))
     nlp = build_path_nlp(LimitShape.of(data.limits), len(data.grid.steps), goal)
     units = guess(coarse)[1]
@@ -99,7 +114,7 @@ def test_phases_that_are_joined_switch_within_each(curves: tuple[Curve, ...]) ->
         for curve, rests in ((curves[0], (True, False)), (curves[0], (False, True)))
     ]
     found = find_fastest(join(parts), None)
-    assert found is not None
+    assert isinstance(found, Fastest)
     lengths = curves[0].length
     ends = [lengths, *(k * lengths + part.stop for k in (0, 1) for part in curves[0].segments)]
     for place, _ in found.switches:

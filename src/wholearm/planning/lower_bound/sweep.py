@@ -38,7 +38,17 @@ class Sweep(NamedTuple):
 
 
 class NoMotionError(ValueError):
-    """No motion keeps the limits on this grid."""
+    """No motion keeps the limits on this grid.
+
+    Attributes
+    ----------
+    interval : int
+        Where none does.
+    """
+
+    def __init__(self, interval: int) -> None:
+        super().__init__()
+        self.interval = interval
 
 
 def find_fastest(rows: Rows, steps: Array, part: Array, cap: Array, near: Array | None) -> Sweep:
@@ -67,22 +77,24 @@ def find_fastest(rows: Rows, steps: Array, part: Array, cap: Array, near: Array 
         brakes, pushes = (after >= 0) & (before < 0), after < 0
         brake = np.where(brakes, after / -before, 0), np.where(brakes, one / -before, np.inf)
         push = np.where(pushes, before / -after, 0), np.where(pushes, one / -after, np.inf)
-    count = len(steps)
+    count, least = len(steps), np.minimum.reduce
     largest, braked = np.zeros(count + 1), np.zeros(count, dtype=bool)
     for k in range(count - 1, -1, -1):
         following = largest[k + 1]
-        b = (brake[0][k] * following + brake[1][k]).min()
-        braked[k] = b < cap[k] and (push[0][k] * b + push[1][k]).min() >= following
+        b = least(brake[0][k] * following + brake[1][k])
+        braked[k] = b < cap[k] and least(push[0][k] * b + push[1][k]) >= following
         if not braked[k]:
             b = min(_find_corner(before[k], after[k], one[k], following), cap[k])
+        if not b > 0 and (k or b < 0):
+            raise NoMotionError(k)
         largest[k] = b
     b, reaches = np.zeros(count + 1), np.zeros(count + 1, dtype=bool)
     for k in range(count):
-        pushed = (push[0][k] * b[k] + push[1][k]).min()
+        pushed = least(push[0][k] * b[k] + push[1][k])
         reaches[k + 1] = pushed >= largest[k + 1]
         b[k + 1] = min(pushed, largest[k + 1])
-    if largest[0] < 0 or not (b[1:-1] > 0).all():
-        raise NoMotionError
+        if not b[k + 1] > 0 and k + 1 < count:
+            raise NoMotionError(k)
     found = [~reaches[1:], ~reaches[:-1], braked]
     return Sweep(b, np.select(found, [Mode.PUSH, Mode.SWITCH, Mode.BRAKE], Mode.HELD))
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
+from ..lower_bound.rows import Rows
 from ..lower_bound.sweep import Mode, NoMotionError
 from ..lower_bound.sweep import find_fastest as sweep
 from .data import PhaseData
@@ -23,8 +24,14 @@ _SHARES = {Mode.PUSH: 0.0, Mode.SWITCH: 0.0, Mode.BRAKE: 1.0, Mode.HELD: 0.5}
 """How far s'' is from its largest, over the range that limits allow."""
 _CLOSE = 1e-4
 """Error of the duration that is good enough for a margin, relatively."""
-_TRIES = 20
+_TRIES = 40
 """Most margins that are tried."""
+_SAME = 1e-4
+"""Difference of margins, relatively, with one of which there is a motion and with one none."""
+
+
+_GRADES = (1e-4, 1e-3, 1e-2)
+"""Ends of elements next to an end that limits the margin, over the length of the curve."""
 
 
 class Fastest(NamedTuple):
@@ -62,23 +69,43 @@ class Fastest(NamedTuple):
         return modes
 
 
-def find_fastest(data: PhaseData, duration: float | None) -> Fastest | None:
+class Narrow(NamedTuple):
+    """Where it is no duration that limits the margin but a place, what surrounds that place."""
+
+    switches: list[Switch]
+
+    @staticmethod
+    def about(start: float, stop: float, length: float) -> Narrow:
+        """About an interval of a curve with a length [m]; at an end of it ever more finely."""
+        near = length * np.array(_GRADES)
+        places = np.array([start, stop])
+        if start < near[-1]:
+            places = near
+        elif stop > length - near[-1]:
+            places = length - near
+        return Narrow([Switch(float(place), False) for place in np.sort(places)])
+
+
+def find_fastest(data: PhaseData, duration: float | None) -> Fastest | Narrow | None:
     """The fastest motion, or if a duration [s] is given, the one of that with the largest margin.
 
-    None if there is none, or the duration is not what limits the margin.
+    None if there is no motion.
     """
-    margin = 0.0 if duration is None else _find_margin(data, duration)
+    sights, margin = Sights.of(data, 0.0), 0.0
     try:
-        return None if margin is None else _find_at(data, margin)
+        if duration is not None:
+            found = _find_margin(data, sights, duration)
+            if found is None or isinstance(found, Narrow):
+                return found
+            sights, margin = Sights.of(data, found), found
+        return _find_at(sights, margin)
     except NoMotionError:
         return None
 
 
-def _find_at(data: PhaseData, margin: float) -> Fastest:
-    sights = Sights.of(data, margin)
-    s, b, modes = _sweep(sights)
+def _find_at(sights: Sights, margin: float) -> Fastest:
+    s, b, modes, near = _sweep(sights, sights.rows, 1, None)
     steps, middle = np.diff(s), sights.rows.pick(slice(1, None, 2))
-    near = np.interp(sights.s[1::2], s, b)
     pushed, braked = (middle.extreme(near, largest).a for largest in (True, False))
     # In an interval with a switch s'' is first the largest, then the least.
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -94,48 +121,78 @@ def _find_at(data: PhaseData, margin: float) -> Fastest:
     return Fastest(s, b, modes, sights.find_switches(here, share, index), margin)
 
 
-def _sweep(sights: Sights) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Every other place is in an interval of the sweep."""
-    s = np.append(sights.s[::2], sights.length)
-    rows, steps = sights.rows.pick(slice(1, None, 2)), np.diff(s)
-    part, near = (sights.s[1::2] - s[:-1]) / steps, None
-    cap = np.append(sights.rows.cap[::2], np.inf)
-    for _ in range(_SPEEDS if rows.v.any() else 1):
-        found = sweep(rows, steps, part, cap, near)
+def _sweep(
+    sights: Sights, rows: Rows, stride: int, near: Array | None
+) -> tuple[Array, Array, NDArray[np.int64], Array]:
+    """A sweep with a middle of an interval every `2 stride` places, for limits `rows` there.
+
+    Also returns b at those middles; `near` is what it is about.
+    """
+    places = np.append(sights.s, sights.length)
+    s, middle = places[:: 2 * stride], slice(stride, len(sights.s), 2 * stride)
+    inner, steps = rows.pick(middle), np.diff(s)
+    part = (sights.s[middle] - s[:-1]) / steps
+    cap = np.append(rows.cap[:: 2 * stride], np.inf)
+    for _ in range(_SPEEDS if near is None and inner.v.any() else 1):
+        found = sweep(inner, steps, part, cap, near)
         near = (1 - part) * found.b[:-1] + part * found.b[1:]
-    return s, found.b, found.modes
+    assert near is not None
+    return s, found.b, found.modes, near
 
 
-def _find_margin(data: PhaseData, duration: float) -> float | None:
-    """The margin with which the fastest motion takes so long [N]."""
+class _Margins(NamedTuple):
+    """Sweeps for several margins: limits at `sights`, and by how much they give way per newton."""
 
-    def find_excess(margin: float) -> float:
-        try:
-            s, b, _ = _sweep(Sights.of(data, margin))
-        except NoMotionError:
-            return np.inf
+    sights: Sights
+    rate: Array
+
+    def find_lead(
+        self, margin: float, duration: float, stride: int, near: Array | None
+    ) -> tuple[float, Array]:
+        """How much the fastest motion is ahead of a duration [s], and b in its intervals.
+
+        As squares of mean speeds, over that wanted: about linear in the margin [N].
+        """
+        rows = self.sights.rows
+        rows = rows._replace(one=rows.one + margin * self.rate)
+        s, b, _, near = _sweep(self.sights, rows, stride, near)
         speed = np.sqrt(b)
-        return float((2 * np.diff(s) / (speed[1:] + speed[:-1])).sum()) / duration - 1
+        lasts = float((2 * np.diff(s) / (speed[1:] + speed[:-1])).sum())
+        return (duration / lasts) ** 2 - 1, near
 
-    low, high = 0.0, data.curve.formation.scene.scales.force
-    at_low, at_high = find_excess(low), find_excess(high)
-    if at_low > 0:
+
+def _find_margin(data: PhaseData, sights: Sights, duration: float) -> float | Narrow | None:
+    """The margin with which the fastest motion takes so long [N]: by false position."""
+    force = data.curve.formation.scene.scales.force
+    margins = _Margins(sights, (Sights.of(data, force).rows.one - sights.rows.one) / force)
+    stride = max(len(sights.fractions) // 4, 1)
+    ahead, near = margins.find_lead(0.0, duration, stride, None)
+    if ahead < 0:
         return None
+    low, high, behind, guess, kept = 0.0, np.inf, -1.0, force, 0
+    margin, last, slope = 0.0, ahead, -1.0
+    stuck: int | None = None
     for _ in range(_TRIES):
-        if at_high <= 0:
-            low, high, at_low = high, 2 * high, at_high
-            at_high = find_excess(high)
-            continue
-        # The excess grows ever faster: a secant falls short, so it alternates with halving.
-        middle = (low + high) / 2
-        if np.isfinite(at_high):
-            secant = low - at_low * (high - low) / (at_high - at_low)
-            middle = min(middle, secant + 0.1 * (secant - low))
-        excess = find_excess(middle)
-        if -_CLOSE < excess <= _CLOSE:
-            return middle
-        if excess > 0:
-            high, at_high = middle, excess
+        blocked = None
+        try:
+            lead, near = margins.find_lead(guess, duration, stride, near)
+            slope, margin, last = (lead - last) / (guess - margin), guess, lead
+        except NoMotionError as error:
+            lead, blocked = -1.0, error.interval
+        if abs(lead) < _CLOSE:
+            break
+        # An end that is kept again and again would be near the root for ever.
+        if lead > 0:
+            behind, kept = (behind / 2 if kept > 0 else behind), 1
+            low, ahead = guess, lead
         else:
-            low, at_low = middle, excess
-    return None
+            ahead, kept = (ahead / 2 if kept < 0 else ahead), -1
+            high, behind, stuck = guess, lead, blocked
+        if stuck is not None and high - low < _SAME * high:
+            places = np.append(sights.s, sights.length)[2 * stride * np.arange(stuck, stuck + 2)]
+            return Narrow.about(float(places[0]), float(places[1]), sights.length)
+        guess = low + ahead / (ahead - behind) * (high - low) if np.isfinite(high) else 2 * low
+    else:
+        return None
+    # Coarse intervals err a little.
+    return guess - margins.find_lead(guess, duration, 1, None)[0] / slope

@@ -164,24 +164,30 @@ class Round:
         elements, parts, data, nlp = task.lay_out(meshes, finer * task.elements)
         profile, units = guess(data, task.options.time_weight)
         found = None if task.options.goal is Objective.EFFORT else find_fastest(data, task.duration)
+        fastest = found if isinstance(found, Fastest) else None
         start, none = PathSolution(profile, 0.0, {}), Tightening.none(data, task.duration)
-        known = task, elements, meshes, parts, data, nlp, units, start, none, found, task.duration
-        begun = Round(*known)
+        known = elements, meshes, parts, data, nlp, units, start, none
+        begun = Round(task, *known, fastest, task.duration)
         if found is None:
             return begun
-        return begun._restart(task.place_breaks(found.switches), finer * task.elements)
+        # Where it is not the duration that limits a margin, switches are not looked for.
+        shift = np.inf if fastest else 0.0
+        meshes = task.place_breaks(found.switches)
+        return begun._restart(meshes, finer * task.elements, shift)
 
-    def _restart(self, meshes: tuple[Mesh, ...], elements: int, shift: float = np.inf) -> Round:
+    def _restart(self, meshes: tuple[Mesh, ...], elements: int, shift: float) -> Round:
         """Start on other meshes, from the fastest motion if that is known, or from this one."""
         task, solution = self.task, self.solution
         elements, parts, data, nlp = task.lay_out(meshes, elements)
-        allowed = task.duration and task.duration * (1 + min(self.spared, _LONGER))
+        allowed = self.allowed
         tightening = Tightening.none(data, allowed)
         if self.fastest is None:
             old, new = self.data.grid, data.grid
             start = solution._replace(
                 profile=Elements(old, solution.profile).move(new),
-                multipliers=move_multipliers(self.nlp, nlp, solution.multipliers, old, new),
+                multipliers=move_multipliers(self.nlp, nlp, solution.multipliers, old, new)
+                if solution.multipliers
+                else {},
             )
         else:
             start, corners = start_at(nlp, data, self.units, self.fastest)
@@ -231,19 +237,22 @@ class Round:
         return np.asarray(found / self.value)
 
     @property
-    def spared(self) -> float:
-        """What the NLP takes the duration for, over what it is, less one."""
-        if not self.solution.lasts:
-            return 0.0
+    def allowed(self) -> float | None:
+        """What the NLP may take for the duration so that it is the one that is allowed [s]."""
+        wanted, lasts = self.task.duration, self.solution.lasts
+        if not wanted or not lasts:
+            return wanted
         total = sum(motion.duration for motion in self.motions)
-        return max(self.solution.lasts / total - 1, 0.0)
+        return wanted * (1 + min(max(lasts / total - 1, 0.0), _LONGER))
 
     @property
     def unspent(self) -> float:
-        """What the time that is spared would gain, to first order, relatively."""
-        row = self.nlp.columns.g["duration"]
-        each = float(self.solution.multipliers["lam_g0"][row].sum()) * self.solution.lasts
-        return max(each, 0.0) * self.spared / self.units.time / self.value
+        """What the time that is left would gain, to first order, relatively."""
+        if self.task.duration is None:
+            return 0.0
+        left = self.task.duration - sum(motion.duration for motion in self.motions)
+        each = float(self.solution.multipliers["lam_g0"][self.nlp.columns.g["duration"]].sum())
+        return max(each, 0.0) * max(left, 0.0) / self.units.time / self.value
 
     @property
     def merit(self) -> float:
@@ -293,12 +302,15 @@ class Round:
             )
         ]
         shift = self.shift if settled else max(own for _, own in found)
-        moved = max(SHIFTED * shift, self.unspent) > _SHARE * most
+        moved = SHIFTED * shift > _SHARE * most
         # What is missed where elements do not end at switches yet says little.
         begun = dearer or self.is_split or not np.isinf(shift)
         dear = dear and begun and coarse
         if not (moved or dear):
-            return replace(self, shift=shift), None
+            if self.unspent <= _SHARE * most:
+                return replace(self, shift=shift), None
+            longer = self.tightening._replace(duration=self.allowed)
+            return self, replace(self, tightening=longer, duration=self.allowed, shift=shift)
         meshes = tuple(mesh for mesh, _ in found)
         return self, self._restart(meshes, self.elements * (2 if dear else 1), shift)
 
