@@ -177,7 +177,7 @@ def _stem(path: str) -> str:
 def _verify(options: argparse.Namespace) -> int:
     from ..common.files import require_ending, require_writable
     from ..common.require import require_number
-    from ..geometry.path_guess import load
+    from ..problem.read import read_problem
     from ..verification.verify import verify
 
     if options.output is not None:
@@ -188,8 +188,13 @@ def _verify(options: argparse.Namespace) -> int:
         for key in ("tolerance", "departure", "rest_speed")
         if getattr(options, key) is not None
     }
-    problem = load(options.problem)
+    problem = read_problem(options.problem)
     torques = _read_torques(options.torques)
+    if getattr(torques, "meta", {}).get("problem") != problem.table:
+        # What has been planned or replayed can be carried out.
+        from ..geometry.path_guess import check_phases
+
+        check_phases(problem)
     report = verify(problem, torques, reduced=options.reduced, **given)
     clear_progress()
     print(json.dumps(report.to_dict(), indent=2) if options.json else report.to_text())

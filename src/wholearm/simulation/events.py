@@ -101,8 +101,7 @@ class Outcome(NamedTuple):
         return self.kind is OutcomeKind.GOAL_REACHED
 
 
-@dataclass(frozen=True, eq=False)
-class Energies:
+class Energies(NamedTuple):
     """Energies at n instants, each of shape (n,) [J].
 
     Attributes
@@ -245,8 +244,7 @@ class Step(NamedTuple):
     arrives: bool
 
 
-@dataclass(frozen=True, eq=False)
-class Section:
+class Section(NamedTuple):
     """What is recorded while one phase is simulated, row by row.
 
     Attributes
@@ -262,10 +260,10 @@ class Section:
 
     phase: Phase
     to: Outputs
-    times: list[float] = field(default_factory=list)
-    rows: list[Array] = field(default_factory=list)
-    impacts: list[float] = field(default_factory=list)
-    steps: list[Step] = field(default_factory=list)
+    times: list[float]
+    rows: list[Array]
+    impacts: list[float]
+    steps: list[Step]
 
 
 def collect(

@@ -103,7 +103,7 @@ class Replay:
         degree = self.coefficients.shape[2] - 1
         formation, until = self.phase.formation, self.phase.until
         self.stepper = s = build_stepper(formation, until, self.side, degree, grips)
-        self.sections.append(Section(self.phase, s.to))
+        self.sections.append(Section(self.phase, s.to, [], [], [], []))
         self.steppers.append(s)
         s.inputs[s.at.tolerance] = self.tolerance
         s.inputs[s.at.kept] = s.mode.read_kept(self.y[:5])

@@ -10,7 +10,6 @@ closes further. Choices in which nothing is held are tried first.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple, Protocol
 
@@ -32,8 +31,7 @@ _GRAZE = 1e-3
 motions that graze a link between their nodes do. How far it then closes is looked at on the way."""
 
 
-@dataclass(frozen=True, eq=False)
-class Departure:
+class Departure(NamedTuple):
     """The formation starts to move, or goes on, at `x` in [-1, 1] of a piece of the torques.
 
     Attributes
@@ -80,8 +78,7 @@ class Way(Protocol):
         """Start this way at `x` of a piece, where the torques are `tau`."""
 
 
-@dataclass(frozen=True, eq=False)
-class RestDirection:
+class RestDirection(NamedTuple):
     """One way in which a formation at rest could move.
 
     Attributes
@@ -178,8 +175,7 @@ class Touching:
         return bool((ahead - here >= -closing).all())
 
 
-@dataclass(frozen=True, eq=False)
-class ModeChoice:
+class ModeChoice(NamedTuple):
     """A choice of directions; quantities at rest are rows @ (1, tau_1, tau_2).
 
     Attributes

@@ -6,10 +6,8 @@ from, is one CasADi function of one packed vector, so that a step costs one call
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -25,8 +23,7 @@ from .runge_kutta import GLIMPSES, build_step
 from .tolerances import find_tolerances
 
 
-@dataclass(frozen=True, eq=False)
-class Compiled:
+class Compiled(NamedTuple):
     """What all steppers of a formation share.
 
     Attributes
@@ -50,8 +47,7 @@ class Compiled:
     look: Expression
 
 
-@dataclass(frozen=True, eq=False)
-class Stepper:
+class Stepper(NamedTuple):
     """The compiled steps of one formation, with what sticks and is held in it.
 
     Calling `step` or `look` reads `inputs` and overwrites `outputs`. Each simulation has its own.
@@ -68,6 +64,8 @@ class Stepper:
         How far below zero each event value counts as rounding.
     step, look : callable
         A step of length h; the same outputs at the state given, without a step.
+    buffers : list
+        What has to live as long as these.
     """
 
     mode: Mode
@@ -79,7 +77,7 @@ class Stepper:
     slack: Array
     step: Any
     look: Any
-    _keep: Any
+    buffers: Any
 
     @property
     def formation(self) -> Formation:
@@ -135,13 +133,13 @@ class _Equations:
         self._measure = _build_measure(formation, until, side, self.short)
         self._stage = _build_stage(mode, self.mechanics)
         self.packed = ca.MX.sym("packed", self.mechanics.at.size)
-        self.least: Expression = math.inf
+        self.least: list[Expression] = []
         self.c_n: list[Expression] = []
 
     def rate(self, state: Expression, time: Expression) -> Expression:
         """Rates of the state at the next stage, whose forces are kept."""
         rates, least, c_n = self._stage(state, time, self.packed)
-        self.least = ca.fmin(self.least, least)
+        self.least.append(least)
         self.c_n.append(c_n)
         return rates
 
@@ -178,7 +176,8 @@ def _compile(
     end, fifth, third = build_step(own.rate, y, t, h, MOVING)
     error = mechanics.error(fifth, third, packed)
     glimpses = ca.vertcat(*(own.c_n[stage] for stage in GLIMPSES))
-    seen = own.report(own.project(end), t + h, error, own.least, glimpses)
+    dip = ca.mmin(ca.vertcat(*own.least))
+    seen = own.report(own.project(end), t + h, error, dip, glimpses)
     step = ca.Function("step", [packed], [seen])
     look = ca.Function("look", [packed], [own.report(y, t, 0, 0, ca.DM.zeros(brief))])
     return Compiled(mode, at, to, rows, slack, step, look)
