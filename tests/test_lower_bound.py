@@ -17,7 +17,8 @@ from wholearm.mechanics.dynamics import Directions, inverse
 from wholearm.mechanics.limits import make_limits
 from wholearm.planning.lower_bound.dual import find_least
 from wholearm.planning.lower_bound.lower_bound import LowerBound, bound_least_time
-from wholearm.planning.lower_bound.rows import GIVE, evaluate_rows
+from wholearm.planning.lower_bound.rows import GIVE, Rows, evaluate_rows
+from wholearm.planning.lower_bound.sweep import NoMotionError, find_fastest
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.impact_sequence import make_sequence
 from wholearm.planning.path_domain.misses import MISS
@@ -102,6 +103,19 @@ def test_no_motion_has_no_bound() -> None:
     toy = Toy(constant(1.0, 50.0))
     with toy.in_place():
         assert bound_least_time([toy.curve], toy.epsilon) is None
+
+
+@pytest.mark.parametrize("cap", [3.0, 5.0])
+def test_a_motion_has_to_be_as_fast_as_the_end_asks_for(cap: float) -> None:
+    """At the end s'' is -2, so that rest is reached over 1 m from b = 4, which the cap forbids."""
+    sides, none = np.tile([1.0, -1.0], (2, 1)), np.zeros((2, 2))
+    rows = Rows(sides, none, none, np.array([[10.0, 10.0], [2.0, -2.0]]), np.full(2, cap))
+    given = rows, np.ones(2), np.full(2, 0.5), np.array([np.inf, cap, np.inf]), None
+    if cap < 4.0:
+        with pytest.raises(NoMotionError):
+            find_fastest(*given)
+    else:
+        assert find_fastest(*given).b == pytest.approx([0.0, 4.0, 0.0], abs=1e-12)
 
 
 @pytest.mark.parametrize("phase", [0, 2])

@@ -37,6 +37,10 @@ class Sweep(NamedTuple):
     modes: NDArray[np.int64]
 
 
+_ROUNDING = 1e-12
+"""Largest b below zero at the end that is rounding, over the largest b."""
+
+
 class NoMotionError(ValueError):
     """No motion keeps the limits on this grid.
 
@@ -95,6 +99,9 @@ def find_fastest(rows: Rows, steps: Array, part: Array, cap: Array, near: Array 
         b[k + 1] = min(pushed, largest[k + 1])
         if not b[k + 1] > 0 and k + 1 < count:
             raise NoMotionError(k)
+    if b[-1] < -_ROUNDING * b.max():
+        raise NoMotionError(count - 1)
+    b[-1] = max(b[-1], 0.0)
     found = [~reaches[1:], ~reaches[:-1], braked]
     return Sweep(b, np.select(found, [Mode.PUSH, Mode.SWITCH, Mode.BRAKE], Mode.HELD))
 
