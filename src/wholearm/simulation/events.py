@@ -228,8 +228,8 @@ class Step(NamedTuple):
         Its start and length.
     inputs : ndarray
         Its packed inputs.
-    c_n : ndarray, shape (len(GLIMPSES) n_c,), [N]
-        At some of its stages.
+    row : ndarray
+        Its packed outputs.
     impact : float, [J]
         Energy lost to impacts so far.
     arrives : bool
@@ -239,7 +239,7 @@ class Step(NamedTuple):
     t: float
     h: float
     inputs: Array
-    c_n: Array
+    row: Array
     impact: float
     arrives: bool
 
@@ -327,7 +327,8 @@ def list_glimpses(problem: Problem, sections: Sequence[Section]) -> Glimpses:
         places = np.array([(step.t, step.h) for step in section.steps])
         t = (places[:, :1] + nodes * places[:, 1:]).ravel()
         c_n = np.full((len(t), len(contacts)), np.nan)
-        seen = np.array([step.c_n for step in section.steps]).reshape(len(t), len(own))
-        c_n[:, [contacts.index(contact) for contact in own]] = seen
+        seen = np.array([step.row[section.to.glimpses] for step in section.steps])
+        where = [contacts.index(contact) for contact in own]
+        c_n[:, where] = seen.reshape(len(t), len(own))
         columns.append((t, np.full(len(t), section.phase.index), c_n))
     return Glimpses(*(np.concatenate(column) for column in zip(*columns, strict=True)))

@@ -14,7 +14,11 @@ from .events import EventKind, Outcome
 from .locate import find_first
 from .replay import Replay
 from .stepper import Stepper
-from .tolerances import REACHED, SLOW, is_slower
+from .tolerances import REACHED, SETTLING, SLOW, is_slower, measure_units
+
+_FAR = 100.0
+"""Ratio of speed and its change, in the scene's units, from which on nothing can turn: slopes and
+lever arms make the change of a contact's sliding a few times that of the velocities."""
 
 
 class Arrival(NamedTuple):
@@ -288,6 +292,8 @@ def _bridge(run: Replay) -> bool:
         run.drop()
         run.note(EventKind.TORQUE_STEP, f"the torques step {run.when()}")
         rows: list[int] = []
+    elif _goes_on(run):
+        return False
     else:
         start = s.outputs.copy()
         stretch = min(run.tolerances.settling, run.breaks[run.piece + 1] - run.t)
@@ -301,6 +307,20 @@ def _bridge(run: Replay) -> bool:
     ended = _decide(run, rows)
     run.record()
     return ended
+
+
+def _goes_on(run: Replay) -> bool:
+    """Whether all that slides or turns is far too fast to come to rest in the shortest time."""
+    s, scales = run.stepper, run.problem.scene.scales
+    units, count = measure_units(run.problem.scene)[5:], s.formation.n_contacts
+    rates = s.outputs[s.to.events][s.rows.slide.start : s.rows.joint.stop].copy()
+    rates[:count] /= scales.speed
+    rates[count:] *= scales.time
+    held = np.append(s.inputs[s.at.Xi], s.inputs[s.at.sigma]) == 0
+    fastest = np.abs(s.outputs[s.to.y][5:10] / units).max()
+    strongest = np.abs(s.outputs[s.to.acceleration] / units).max() * scales.time
+    most = _FAR * SETTLING * (strongest + fastest**2)
+    return bool((held | (rates > most)).all())
 
 
 def _cross(run: Replay, stop: float) -> None:

@@ -61,11 +61,10 @@ def _accept(run: Replay, t: float, arrives: bool = False) -> Array:
 
     It is kept, so that more can be seen of what lies within it.
     """
-    s = run.stepper
-    c_n = s.outputs[s.to.glimpses].copy()
-    step = Step(run.t, t - run.t, s.inputs.copy(), c_n, run.impact, arrives)
-    run.sections[-1].steps.append(step)
-    return run.accept(t)
+    begin, inputs = run.t, run.stepper.inputs.copy()
+    row = run.accept(t)
+    run.sections[-1].steps.append(Step(begin, t - begin, inputs, row, run.impact, arrives))
+    return row
 
 
 def _try_step(run: Replay, target: float) -> tuple[float, bool]:

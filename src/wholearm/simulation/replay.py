@@ -77,6 +77,9 @@ class Replay:
         self.breaks = [float(b) for b in torque.breaks]
         self.coefficients = torque.coefficients
         self.steps_at = _find_steps(torque, self.tolerances.torque_step)
+        ends = torque.breaks[:-1], torque.breaks[1:]
+        flat = self.coefficients.reshape(len(self.coefficients), -1)
+        self.pieces = np.column_stack([*ends, flat])
         self.step_times = [b for b, s in zip(self.breaks, self.steps_at, strict=False) if s]
         known = wanted[(wanted >= self.breaks[0]) & (wanted <= self.breaks[-1])]
         self.wanted = [*known.tolist(), math.inf]
@@ -231,9 +234,8 @@ class Replay:
 
     def load_piece(self) -> None:
         """Hand the present piece of the torques to the stepper."""
-        s, k = self.stepper, self.piece
-        s.inputs[s.at.piece] = self.breaks[k], self.breaks[k + 1]
-        s.inputs[s.at.torque] = self.coefficients[k].ravel()
+        s = self.stepper
+        s.inputs[s.at.piece.start : s.at.torque.stop] = self.pieces[self.piece]
 
     def next_piece(self) -> bool:
         """Go on to the next piece, if there is one; whether the torques step there."""
@@ -241,7 +243,7 @@ class Replay:
             return False
         self.piece += 1
         self.load_piece()
-        return bool(self.steps_at[self.piece])
+        return self.steps_at[self.piece]
 
     @property
     def coming_step(self) -> float:
@@ -287,8 +289,8 @@ class Replay:
         return float(0.5 * v**2 @ scene.mass_diagonal + height)
 
 
-def _find_steps(torque: TorqueProfile, least: float) -> Array:
-    """Whether the torques step by more than `least` at the start of each piece, shape (k,)."""
+def _find_steps(torque: TorqueProfile, least: float) -> list[bool]:
+    """Whether the torques step by more than `least` at the start of each of k pieces."""
     alternate = (-1.0) ** np.arange(torque.coefficients.shape[2])
     jump = (torque.coefficients[1:] @ alternate) - torque.coefficients[:-1].sum(axis=2)
-    return np.append(True, np.abs(jump).max(axis=1) > least)
+    return [True, *(np.abs(jump).max(axis=1) > least).tolist()]
