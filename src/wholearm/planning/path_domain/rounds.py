@@ -31,7 +31,7 @@ from .nlp import (
     parameters,
     unpack,
 )
-from .start import start_at
+from .start import balance, start_at
 from .switches import Switch
 from .terms import LimitShape
 
@@ -165,7 +165,8 @@ class Round:
         profile, units = guess(data, task.options.time_weight)
         found = None if task.options.goal is Objective.EFFORT else find_fastest(data, task.duration)
         fastest = found if isinstance(found, Fastest) else None
-        start, none = PathSolution(profile, 0.0, {}), Tightening.none(data, task.duration)
+        multipliers = balance(nlp, data, units, profile)
+        start, none = PathSolution(profile, 0.0, multipliers), Tightening.none(data, task.duration)
         known = elements, meshes, parts, data, nlp, units, start, none
         begun = Round(task, *known, fastest, task.duration)
         if found is None:
@@ -185,9 +186,7 @@ class Round:
             old, new = self.data.grid, data.grid
             start = solution._replace(
                 profile=Elements(old, solution.profile).move(new),
-                multipliers=move_multipliers(self.nlp, nlp, solution.multipliers, old, new)
-                if solution.multipliers
-                else {},
+                multipliers=move_multipliers(self.nlp, nlp, solution.multipliers, old, new),
             )
         else:
             start, corners = start_at(nlp, data, self.units, self.fastest)

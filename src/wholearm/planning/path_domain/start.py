@@ -27,12 +27,21 @@ from .terms import LEAST_B
 _MU = 1e-7
 """Complementarity of the multipliers: the barrier parameter to start from."""
 _INSIDE = 1e-2
-"""Largest slack of a limit that is to be kept with none, in the units of the NLP."""
+"""Largest slack of a limit that is kept with none, in the units of the NLP; others count as it."""
+_FAR_MU, _FAR_INSIDE = 1e-2, 1e-3
+"""The same two where nothing is known of a solution."""
 _PLAIN = 1e-10
 """What is added to the squares of rows that may depend on each other, over the mean of all."""
 _PICARD = 2
 """Rounds in which speeds and corners are made to agree."""
 _NODES = DEGREE + 1
+
+
+def balance(nlp: PathNLP, data: PhaseData, units: Units, profile: Profile) -> dict[str, Array]:
+    """Multipliers with which any motion is near the central path, if it keeps limits at all."""
+    slack = data.slack(data.nodes, profile) / units.of(data.limits)[data.limits.sides[0]]
+    on_b = -_FAR_MU / np.maximum(profile.b / units.profile[0], _FAR_INSIDE)
+    return _join(nlp, data, _FAR_MU / np.maximum(slack, _FAR_INSIDE), on_b)
 
 
 def start_at(
@@ -44,33 +53,49 @@ def start_at(
     """
     sides = LimitSides.of(data, data.nodes, found.margin)
     corners = _Corners.at(data.grid, sides, found)
-    rows, signs, _ = data.limits.sides
+    rows = data.limits.sides[0]
     scale = data.spans / units.of(data.limits)[rows]
     on_links, kept = _find_multipliers(data.grid, sides, corners, scale, units)
-    blocks = {"chain": np.zeros(0), "duration": np.zeros(0)}
+    rate = 1.0
     if nlp.objective is Objective.MARGIN:
         presses = np.isin(rows[corners.sides], nlp.shape.presses) & ~corners.held[:, None]
         # So much does the margin change with the duration.
         rate = 1 / max(float((kept * presses).sum()), _MU)
-        on_links, kept = rate * on_links, rate * kept
-        blocks["duration"] = np.array([rate])
-    kept = np.maximum(kept, _MU / _INSIDE)
+    on_links, kept = rate * on_links, np.maximum(rate * kept, _MU / _INSIDE)
     moved = corners.move_inside(sides, _MU / kept / scale[corners.sides])
     on_sides = _MU / np.maximum(sides.find_slack(moved) * scale, _INSIDE)
     free = np.flatnonzero(~corners.held)
     on_sides[free[:, None], corners.sides[free]] = kept[free]
-    on_rows = np.zeros((len(data.grid.s), nlp.shape.rows))
+    on_b = -_MU / np.maximum(moved.b / units.profile[0], _INSIDE)
+    on_b[corners.held] += kept[corners.held, 0]
+    multipliers = _join(nlp, data, on_sides, on_b, on_links, rate)
+    return PathSolution(moved, found.margin, multipliers), corners.profile
+
+
+def _join(
+    nlp: PathNLP,
+    data: PhaseData,
+    on_sides: Array,
+    on_b: Array,
+    on_links: Array | float = 0.0,
+    rate: float = 0.0,
+) -> dict[str, Array]:
+    """The NLP's multipliers from those of sides, (n, n_sides), of b, of links and the duration."""
+    (rows, signs, _), sizes = data.limits.sides, nlp.columns.g.sizes
+    on_rows = np.zeros((len(on_sides), nlp.shape.rows))
     for side, row in enumerate(rows.tolist()):
         on_rows[:, row] -= signs[side] * on_sides[:, side]
     on_x = np.zeros(nlp.free.shape)
-    on_x[:, 0] = -_MU / np.maximum(moved.b / units.profile[0], _INSIDE)
-    on_x[corners.held, 0] += kept[corners.held, 0]
-    if nlp.objective is Objective.MARGIN:
-        pulls = on_rows[:, list(nlp.shape.presses)].sum(axis=1)
-        blocks["chain"] = -1 - np.cumsum(pulls)[:-1]
-    on_g = nlp.columns.g.join(links=on_links, limits=on_rows.ravel(), **blocks)
-    multipliers = {"lam_x0": on_x[nlp.free], "lam_g0": on_g}
-    return PathSolution(moved, found.margin, multipliers), corners.profile
+    on_x[:, 0] = on_b
+    # The margin at each node is held by what presses from there on.
+    chain = -1 - np.cumsum(on_rows[:, list(nlp.shape.presses)].sum(axis=1))[:-1]
+    on_g = nlp.columns.g.join(
+        links=on_links + np.zeros(sizes["links"]),
+        chain=chain[: sizes["chain"]],
+        limits=on_rows.ravel(),
+        duration=np.full(sizes["duration"], rate),
+    )
+    return {"lam_x0": on_x[nlp.free], "lam_g0": on_g}
 
 
 class _Corners(NamedTuple):
