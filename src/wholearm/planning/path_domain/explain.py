@@ -33,6 +33,7 @@ from ..advice import (
 from ..options import Objective
 from .data import PhaseData, cut, fit_torque, join
 from .elements import Profile
+from .fastest import is_hopeless
 from .motion import PathMotion
 from .nlp import (
     Relaxation,
@@ -198,6 +199,8 @@ def _solve_elastic(data: PhaseData, profile: Profile, units: Units) -> Profile |
 
 def _relax(data: PhaseData, profile: Profile, units: Units, parameter: Parameter) -> float | None:
     """The value at which one parameter just lets all others be kept, if there is one."""
+    if is_hopeless(data, parameter):
+        return None
     step = units.force if parameter.unit == "N" else parameter.value
     short = _find_shortfalls(data, profile).max(axis=0)
     weights = step * data.limits.weigh(parameter)

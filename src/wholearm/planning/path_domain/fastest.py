@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
+from ...common.shortfalls import Parameter
 from ..lower_bound.rows import Rows
 from ..lower_bound.sweep import Mode, NoMotionError
 from ..lower_bound.sweep import find_fastest as sweep
@@ -30,6 +31,10 @@ _SAME = 1e-4
 """Difference of margins, relatively, with one of which there is a motion and with one none."""
 
 
+_WIDER = 5e-3
+"""By how much limits are wider, over what is much for each, where it is sure that they are."""
+_FREE = 1e6
+"""The same for limits that do not count."""
 _GRADES = (1e-4, 1e-3, 1e-2)
 """Ends of elements next to an end that limits the margin, over the length of the curve."""
 
@@ -101,6 +106,29 @@ def find_fastest(data: PhaseData, duration: float | None) -> Fastest | Narrow | 
         return _find_at(sights, margin)
     except NoMotionError:
         return None
+
+
+def is_hopeless(data: PhaseData, spared: Parameter | None = None) -> bool:
+    """Whether no motion keeps the limits, nor would if each were a little wider.
+
+    Without those that a parameter sets, if one is to be `spared`.
+    """
+    sights, free = Sights.of(data, 0.0), np.zeros(len(data.spans), dtype=bool)
+    if spared is not None:
+        free = data.limits.weigh(spared)[data.limits.sides[0]] > 0
+    cap = np.inf if spared is not None and spared.is_speed else 1 + _WIDER
+    rest = np.where(free, _FREE, sights.sides.rest + _WIDER)
+    rows = sights.sides._replace(rest=rest, cap=cap * sights.sides.cap).eliminate()
+    if rows.v.any():
+        # Viscous friction may help by as much as it is at the largest speed.
+        most = np.sqrt(rows.highest())[:, None]
+        helps = np.multiply(np.abs(rows.v), most, out=np.zeros_like(rows.v), where=rows.v != 0)
+        rows = rows._replace(one=rows.one + np.minimum(helps, _FREE), v=np.zeros_like(rows.v))
+    try:
+        _sweep(sights, rows, 1, None)
+    except NoMotionError:
+        return True
+    return False
 
 
 def _find_at(sights: Sights, margin: float) -> Fastest:

@@ -20,6 +20,7 @@ from ..advice import describe_changes, find_changes, name_phases
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
 from .data import PhaseData, StalledError, join
+from .fastest import is_hopeless
 from .first_guess import guess_slowly
 from .misses import MISS, ROUNDS
 from .motion import PathMotion
@@ -178,7 +179,7 @@ def _plan_finer(task: Task, insist: bool = True) -> Plans | _Stuck:
     """
     stuck: _Stuck | None = None
     for finer in _FINER:
-        found = _plan(task, finer)
+        found = _plan(task, finer, insist)
         if isinstance(found, _Stuck):
             if not found.between and (stuck or not insist):
                 return stuck or found
@@ -188,9 +189,14 @@ def _plan_finer(task: Task, insist: bool = True) -> Plans | _Stuck:
     return found
 
 
-def _plan(task: Task, finer: int = 1) -> Plans | _Stuck:
-    """Solve on meshes that suit the plan more and more, and make limits hold between nodes too."""
+def _plan(task: Task, finer: int = 1, insist: bool = True) -> Plans | _Stuck:
+    """Solve on meshes that suit the plan more and more, and make limits hold between nodes too.
+
+    If that is not insisted on, only where a sweep has found a motion.
+    """
     round_ = Round.begin(task, finer)
+    if not round_.is_kept and (not insist or is_hopeless(round_.data)):
+        return _Stuck(round_.parts, f"{task.name}: no motion keeps the limits", between=False)
     found = round_.solve()
     if isinstance(found, str):
         return _Stuck(round_.parts, f"{task.name}: {found}", between=False)

@@ -259,6 +259,13 @@ class Round:
         return self.solution.cost + self.value * float(self.due.sum())
 
     @property
+    def is_kept(self) -> bool:
+        """Whether a motion is known that keeps limits at nodes, or negative margins would do."""
+        if self.fastest is not None or self.task.options.goal is Objective.MARGIN:
+            return True
+        return bool(self.data.slack(self.data.nodes, self.solution.profile).min() >= 0)
+
+    @property
     def is_split(self) -> bool:
         """Whether elements end where the plan switches."""
         return any(len(mesh.breaks) for mesh in self.meshes)
