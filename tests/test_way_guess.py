@@ -10,8 +10,11 @@ import pytest
 from shipped import HEPTAGON
 from wholearm.benchmark.stress.slow_motion import fast_margin
 from wholearm.benchmark.stress.tracing import weights
+from wholearm.common.errors import InfeasibleError
 from wholearm.geometry.path_guess import connect, guess_phase
+from wholearm.mechanics.limits import PRESS, TORQUE
 from wholearm.planning.options import PlanOptions
+from wholearm.planning.time_domain.explain import refuse_ways
 from wholearm.planning.time_domain.plan import plan_phases
 from wholearm.planning.time_domain.way_guess import SURE, list_goals, list_ways, split_way
 from wholearm.planning.time_domain.way_pace import WayForces
@@ -88,6 +91,22 @@ def test_margins_are_those_of_newton_and_euler() -> None:
     # What epsilon takes of all normal forces, it takes of the margin at most.
     more = problem.epsilon + 0.05 * problem.scene.scales.force
     assert own - 0.05 - 1e-9 <= WayForces([part], more).find_margin() <= own + 1e-9
+
+
+@pytest.mark.parametrize("key", ["torque_limit2", "epsilon"])
+def test_ways_that_miss_a_limit_are_refused_with_it(key: str) -> None:
+    problem = tipping()
+    ways = list_ways(problem, problem.phases[0], problem.start, 1)
+    refuse_ways(problem, problem.phases[0], ways)
+    # Fingers too weak to hold the object on its vertex; forces as large as strong ones can have.
+    problem = problem.with_({key: {"torque_limit2": 0.01, "epsilon": 60.0}[key]})
+    ways = list_ways(problem, problem.phases[0], problem.start, 1)
+    with pytest.raises(InfeasibleError, match=r"at any speed: .* short at the best") as caught:
+        refuse_ways(problem, problem.phases[0], ways)
+    (missed,) = caught.value.shortfalls
+    assert missed.share == -ways[0].margin > 0 and missed.limit in str(caught.value)
+    limits = {"torque_limit2": (TORQUE, "finger 2"), "epsilon": (PRESS, missed.part)}
+    assert (missed.kind, missed.part) == limits[key]
 
 
 def test_a_brisk_motion_keeps_half_the_margin_and_ends_at_rest() -> None:

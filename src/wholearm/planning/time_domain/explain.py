@@ -32,7 +32,10 @@ from .motion import TimeMotion, make_motions
 from .own_units import to_si
 from .search import Search
 from .stage import Stage
+from .way_guess import PacedWay
 
+MISSED = 0.02
+"""Least share by which limits are missed along a way that is no way."""
 ADVICE = 1.0
 """Processor time [s] after which no further change of a limit is tried."""
 Replan = Callable[[Problem], object]
@@ -166,6 +169,31 @@ def explain(
     error = _advise(problem, phases[0], text, find_value, replan, ranked)
     error.motion = _make_trajectory(problem, phases, search, elastic)
     return error
+
+
+def refuse_ways(problem: Problem, phase: Phase, ways: Sequence[PacedWay]) -> None:
+    """Raise an error if on every way to the end of a phase a limit is missed at any speed.
+
+    Where no motion with least shortfalls is found either, the way that misses least says why.
+
+    Raises
+    ------
+    InfeasibleError
+        With the limit that is missed there.
+    """
+    if not ways or (best := max(ways, key=lambda way: way.margin)).margin > -MISSED:
+        return
+    critical = best.forces.find_critical()
+    limits = make_limits(phase.formation, problem.epsilon).limits
+    limit = next(own for own in limits if (own.kind, own.part) == critical)
+    place = Place(phase.number, math.nan, "the best of them")
+    given = (*critical, limit.text, -best.margin * limit.scale, limit.unit, place, -best.margin)
+    shortfall = Shortfall(*given)
+    raise InfeasibleError(
+        f"phase {phase.number} is infeasible along all ways to its end that were looked at, "
+        f"straight ones and bent ones, at any speed: {shortfall}",
+        [shortfall],
+    )
 
 
 def _make_trajectory(

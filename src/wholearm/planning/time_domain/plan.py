@@ -94,7 +94,7 @@ def plan_phases(
     begun, name = _begin(search, attempts.first, fastest, pinned)
     if begun.success:
         return _summarise(problem, search, phases, begun, name)
-    from .explain import explain, refuse
+    from .explain import explain, refuse, refuse_ways
 
     def replan(other: Problem) -> object:
         own = [other.phases[phase.index] for phase in phases]
@@ -107,6 +107,8 @@ def plan_phases(
     tried = ", ".join(dict.fromkeys([NEAREST, *(own.name for own in outcomes)]))
     reason = f"none was found, also of least shortfalls, from {tried}"
     short = [own.short for own in outcomes if own.short]
+    if not short:
+        refuse_ways(problem, phases[0], attempts.ways)
     raise explain(search, problem, phases, short, reason, replan if explained else None)
 
 

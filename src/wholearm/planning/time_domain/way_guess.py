@@ -54,11 +54,21 @@ Way = list[PathGuess]
 
 
 class PacedWay(NamedTuple):
-    """Stretches of a way, the largest margin of a motion along it, and a motion that is brisk."""
+    """A way, the largest margin of a motion along it, and a motion that is brisk.
+
+    Attributes
+    ----------
+    stretches : list of PathGuess
+    margin : float
+    pace : Pace or None
+    forces : WayForces
+        What says so.
+    """
 
     stretches: Way
     margin: float
     pace: Pace | None
+    forces: WayForces
 
 
 class _Bent(NamedTuple):
@@ -128,7 +138,7 @@ def list_ways(problem: Problem, phase: Phase, z: Array, most: int) -> list[Paced
         signs = [np.concatenate(part.directions) for part in bent.way]
         best.setdefault(tuple(np.concatenate(signs).tolist()), bent)
     return [
-        PacedWay(bent.way, bent.margin, bent.forces.find_pace(bent.margin))
+        PacedWay(bent.way, bent.margin, bent.forces.find_pace(bent.margin), bent.forces)
         for bent in list(best.values())[:most]
     ]
 

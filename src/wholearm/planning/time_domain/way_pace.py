@@ -15,13 +15,14 @@ is a linear programme over all intervals of the way. Contacts that roll keep wit
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...common.arrays import Array
 from ...geometry.path_guess import PathGuess
 from ...mechanics.dynamics import force_rows
+from ...mechanics.limits import CONE, PRESS, TORQUE
 from ...mechanics.metric import metric_weights
 
 FASTEST = 9.0
@@ -55,7 +56,13 @@ class Pace(NamedTuple):
 
 
 class WayForces:
-    """The linear programme of one way: x = (b at nodes, c in intervals, margin), over scales."""
+    """The linear programme of one way: x = (b at nodes, c in intervals, margin), over scales.
+
+    Attributes
+    ----------
+    kinds : list of (str, str)
+        Kind of the limit that each row belongs to, and the contact or finger.
+    """
 
     def __init__(self, way: Sequence[PathGuess], epsilon: float) -> None:
         formation, scene = way[0].formation, way[0].formation.scene
@@ -97,11 +104,14 @@ class WayForces:
             [torque, -torque, press],
             [1 - dry, 1 + dry, np.full(len(press), -epsilon / force)],
         )
+        self.kinds = [(TORQUE, "finger 1"), (TORQUE, "finger 2")] * (2 * m)
+        self.kinds += [(PRESS, name) for name in formation.names] * m
         for i, row in enumerate(formation.rolling_rows):
             grip, slip = np.eye(self.size)[own[:, row]], np.eye(self.size)[own[:, self.n_c + i]]
             mu = formation.friction[row]
             rows += [slip - mu * grip, -slip - mu * grip]
             most += 2 * [np.full(m, -mu * epsilon / force)]
+            self.kinds += [(CONE, formation.names[row])] * (2 * m)
         self.rows, self.most = np.concatenate(rows), np.concatenate(most)
         self.rows[:, -1] = 1.0
         with np.errstate(divide="ignore"):
@@ -111,16 +121,25 @@ class WayForces:
 
     def find_margin(self) -> float:
         """The largest margin of any motion; -inf if there is none."""
-        x = self._maximise(np.eye(self.size)[-1], -np.inf)
-        return -np.inf if x is None else float(x[-1])
+        answer = self._maximise(np.eye(self.size)[-1], -np.inf)
+        return -np.inf if answer is None else float(answer.x[-1])
+
+    def find_critical(self) -> tuple[str, str]:
+        """Kind of the limit that most keeps the margin from being larger, and what it limits."""
+        answer = self._maximise(np.eye(self.size)[-1], -np.inf)
+        shares = dict.fromkeys(self.kinds, 0.0)
+        for kind, share in zip(self.kinds, np.abs(answer.ineqlin.marginals), strict=True):
+            shares[kind] += float(share)
+        return max(shares, key=lambda kind: shares[kind])
 
     def find_pace(self, margin: float) -> Pace | None:
         """A brisk motion whose margin is not much less than the largest one, `margin`."""
         speed = np.zeros(self.size)
         speed[: len(self.top)] = 1.0
-        x = self._maximise(speed, min(BRISK * margin, margin - GIVES))
-        if x is None:
+        answer = self._maximise(speed, min(BRISK * margin, margin - GIVES))
+        if answer is None:
             return None
+        x = answer.x
         v = np.sqrt(self.square * np.maximum(x[: len(self.top)], 0.0))
         steps = 2 * self.runs / np.maximum(v[1:] + v[:-1], np.sqrt(LEAST * self.square))
         length = np.append(0.0, np.cumsum(self.runs))
@@ -128,7 +147,8 @@ class WayForces:
         t = np.append(0.0, np.cumsum(steps))
         return Pace(t, length / length[-1], v / length[-1], forces)
 
-    def _maximise(self, gain: Array, least: float) -> Array | None:
+    def _maximise(self, gain: Array, least: float) -> Any:
+        """What SciPy finds, None if that is no solution."""
         from scipy.optimize import linprog
 
         forces = self.size - len(self.top) - 1
@@ -137,4 +157,4 @@ class WayForces:
         answer = linprog(
             -gain, self.rows, self.most, self.equal, self.equal_to, bounds, method="highs"
         )
-        return np.asarray(answer.x) if answer.status == 0 else None
+        return answer if answer.status == 0 else None
