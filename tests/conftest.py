@@ -7,10 +7,12 @@ import signal
 import pytest
 
 import alone  # noqa: F401 -- before NumPy
+import shipped
 from once import STORE
 from shipped import HEPTAGON, plan_of, problem_of
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
+from wholearm.mapping.formation_map import FormationMap
 from wholearm.problem.definition import Problem
 from wholearm.results.trajectory import Trajectory
 
@@ -41,6 +43,11 @@ def heptagon() -> Problem:
 @pytest.fixture(scope="session")
 def curves(heptagon: Problem) -> tuple[Curve, ...]:
     return trace_phases(heptagon)
+
+
+@pytest.fixture(scope="session")
+def chart() -> FormationMap:
+    return shipped.chart()
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""The problem files, and their plans with every other option at its default, each planned once."""
+"""The problem files, their plans with every other option at its default, and a map, each once."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 
 from once import once
 from wholearm.geometry.path_guess import load
+from wholearm.mapping.formation_map import FormationMap, build_map
 from wholearm.planning.plan import solve
 from wholearm.planning.result import Plan
 from wholearm.problem.definition import Problem
@@ -34,6 +35,11 @@ def problem_of(path: Path) -> Problem:
 @once
 def solved(path: Path, objective: str = "time") -> Plan:
     return solve(problem_of(path), objective)
+
+
+@once
+def chart() -> FormationMap:
+    return build_map(problem_of(HEPTAGON), 60)
 
 
 def plan_of(path: Path, objective: str = "time") -> Trajectory:

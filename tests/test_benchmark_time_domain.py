@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -11,6 +12,7 @@ from timed import flip
 from wholearm.benchmark import time_domain
 from wholearm.benchmark.report import Row, format_markdown
 from wholearm.benchmark.time_domain import measure_blocks, measure_order
+from wholearm.planning.plan import solve
 
 ORDERS = {("radau", 3): 5, ("legendre", 3): 6}
 
@@ -44,7 +46,10 @@ def test_replays_that_end_early_have_no_error(monkeypatch: pytest.MonkeyPatch) -
     ]  # fmt: skip
 
 
-def test_whole_plans_are_measured_where_phases_need_the_time_domain() -> None:
+def test_whole_plans_are_measured_where_phases_need_the_time_domain(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(time_domain, "solve", partial(solve, time_intervals=4))
     assert measure_blocks(flip()) == []
     rows = measure_blocks(shove()[0])
     assert [row.method for row in rows] == ["time", "effort", "margin"]

@@ -74,11 +74,6 @@ def close_alone(scene: Scene, q: Array, finger: int) -> float:
 
 
 @pytest.fixture(scope="module")
-def chart(heptagon: Problem) -> FormationMap:
-    return build_map(heptagon, resolution=30, window=WINDOW)
-
-
-@pytest.fixture(scope="module")
 def pointed() -> FormationMap:
     """Short pointed fingers: tips reach edges, and much of the plane is out of reach."""
     problem = change(radius=0.0, length=0.12)
@@ -335,8 +330,8 @@ def test_directions_inside_cells_balance(chart: FormationMap) -> None:
 
 
 def test_mirrored_problem_has_the_mirrored_map() -> None:
-    window = Window((-0.16, 0.16), (np.radians(-20.0), np.radians(10.0)))
-    other = Window((-0.16, 0.16), (np.radians(-10.0), np.radians(20.0)))
+    window = Window((-0.09, 0.09), (np.radians(-20.0), np.radians(10.0)))
+    other = Window((-0.09, 0.09), (np.radians(-10.0), np.radians(20.0)))
     corners = TABLE["object"]["vertices"]
     count = len(corners)
     table = copy.deepcopy(TABLE)

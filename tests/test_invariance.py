@@ -26,8 +26,8 @@ PROBLEMS = Path(__file__).parents[1] / "problems"
 CASES = [("heptagon_impact", 2, 20), ("box_rolling", 1, 80)]
 """Problems, how many of their phases are planned, the last of them to rest, and intervals."""
 TELLINGS = [("time", telling) for telling in RETELLINGS]
-TELLINGS += [(goal, RETELLINGS[k]) for goal in ("effort", "margin") for k in (1, 4)]
-"""Of other costs, those in small units and mirrored, which swaps the torques."""
+TELLINGS += [("effort", RETELLINGS[4]), ("margin", RETELLINGS[1])]
+"""Of other costs, the effort mirrored, which swaps the torques, and the margin in small units."""
 
 
 @pytest.fixture(scope="module", params=CASES, ids=[case[0] for case in CASES])

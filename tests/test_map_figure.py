@@ -25,11 +25,6 @@ from wholearm.results.trajectory import Trajectory
 
 
 @pytest.fixture(scope="module")
-def chart(heptagon: Problem) -> FormationMap:
-    return build_map(heptagon, resolution=60)
-
-
-@pytest.fixture(scope="module")
 def figure(chart: FormationMap) -> Figure:
     return draw_map(chart)
 
@@ -121,11 +116,14 @@ def test_command_writes_the_figure(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
+    chart: FormationMap,
     trajectory: Trajectory,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     trajectory.save("plan.npz")
-    assert main(["map", str(HEPTAGON), "--plan", "plan.npz", "--phi", "-4,0"]) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr("wholearm.mapping.formation_map.build_map", lambda *_, **__: chart)
+        assert main(["map", str(HEPTAGON), "--plan", "plan.npz"]) == 0
     assert capsys.readouterr().out == "wrote map_heptagon_four_contacts.png\n"
     data = (tmp_path / "map_heptagon_four_contacts.png").read_bytes()
     assert data[:4] == b"\x89PNG"

@@ -5,10 +5,18 @@ from dataclasses import replace
 import pytest
 
 from shipped import HEPTAGON
+from wholearm.benchmark.stress import refusals
 from wholearm.benchmark.stress.refusals import judge
 from wholearm.common.errors import InfeasibleError, InputError, JammingError
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem, read_problem
+
+
+@pytest.fixture(autouse=True)
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A limit that is short is so at more than one of sixty places."""
+    monkeypatch.setattr(refusals, "PLACES", 15)
+
 
 WEAK = {f"fingers.{k}.torque_limit": 0.01 for k in (1, 2)}
 

@@ -186,7 +186,7 @@ def test_nothing_of_casadi_is_left_to_the_garbage_collector() -> None:
     def run(**changes: Any) -> None:
         problem = replace(wholearm.load(SQUARE), **changes)
         try:
-            wholearm.verify(problem, wholearm.solve(problem, intervals=10))
+            wholearm.verify(problem, wholearm.solve(problem, intervals=10, time_intervals=4))
         except wholearm.InfeasibleError:
             assert changes
 

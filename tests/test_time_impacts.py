@@ -39,7 +39,7 @@ def problem(objective: str) -> Problem:
 @once
 def solved(objective: str) -> Plan:
     """Plans on few intervals, whose replay is a test of its own."""
-    options: dict[str, Any] = {"time_intervals": 6, "replay": False}
+    options: dict[str, Any] = {"time_intervals": 4, "replay": False}
     return solve(problem(objective), objective, transcription="time", **options)
 
 
