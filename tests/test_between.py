@@ -27,6 +27,7 @@ from wholearm.planning.time_domain.between import (
     raise_bounds,
 )
 from wholearm.planning.time_domain.collocation import make_scheme
+from wholearm.planning.time_domain.enforcing import enforce_between
 from wholearm.planning.time_domain.motion import StageMotion, TimeMotion, make_motions
 from wholearm.planning.time_domain.nlp import bound_unknowns
 from wholearm.planning.time_domain.own_units import to_si
@@ -154,7 +155,7 @@ def test_limits_rise_by_more_than_they_are_missed() -> None:
 def test_tightening_holds_limits_that_points_alone_do_not() -> None:
     problem = landing()
     search, loose = Search.of(problem, PlanOptions()), solve_at_points()
-    held = search.enforce_between(loose)
+    held = enforce_between(search, loose)
     assert loose.success and held.success
     worst = []
     for solution in (loose, held):

@@ -16,12 +16,13 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
+from wholearm.planning.time_domain.enforcing import MOST
 from wholearm.planning.time_domain.mode_search import improve
 from wholearm.planning.time_domain.modes import in_mode, link, mode_of, sign_sequence, split
 from wholearm.planning.time_domain.motion import TimeMotion
 from wholearm.planning.time_domain.moves import WORTH
 from wholearm.planning.time_domain.plan import plan_phases
-from wholearm.planning.time_domain.search import MOST, Search, Solution
+from wholearm.planning.time_domain.search import Search, Solution
 from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.staging import guess_stages
 from wholearm.problem.definition import End, Problem, Until

@@ -17,7 +17,6 @@ from wholearm.planning.time_domain.refinement import (
     cap_halvings,
     count_halvings,
     monitor_violated,
-    settle,
 )
 from wholearm.planning.time_domain.stage import Stage
 
@@ -68,15 +67,6 @@ def test_dearer_misses_are_halved_more_often() -> None:
     times = count_halvings(prices, np.zeros((6, 2, 5)), SCHEME)
     assert times[:3].tolist() == [0, 0, 1] and times[-1] == AT_ONCE
     assert (np.diff(times) >= 0).all()
-
-
-def test_halved_intervals_keep_the_shares_that_they_chose(stages: list[Stage]) -> None:
-    loose = [replace(stage, adapts=0.1) for stage in stages]
-    none = [np.zeros(stage.intervals, dtype=int) for stage in stages]
-    for after in (settle(loose), bisect_intervals(loose, SCHEME, none)):
-        assert [stage.adapts for stage in after] == [0.0] * len(stages)
-        shares = zip(after, loose, strict=True)
-        assert all(one.guess is other.guess for one, other in shares)
 
 
 def test_limits_that_are_broken_are_watched_from_then_on(stages: list[Stage]) -> None:

@@ -28,7 +28,6 @@ from wholearm.planning.time_domain.kernels import (
     new_rows,
     opening_kernel,
     point_kernel,
-    stretch_kernel,
 )
 from wholearm.planning.time_domain.plan import plan_phases
 from wholearm.problem.definition import Problem, Until
@@ -228,11 +227,6 @@ def test_collocation_holds_for_what_polynomials_integrate(
     missed = call(kernel, x, N.ravel(order="F")).reshape(-1, freedoms)
     np.testing.assert_allclose(missed[0], N.T @ shift, atol=1e-13)
     np.testing.assert_allclose(missed[1:], 0.0, atol=1e-13)
-
-
-def test_intervals_cost_what_they_change_by() -> None:
-    got = call(stretch_kernel(), [np.array([0.3])], np.array([5.0, 0.2]))
-    np.testing.assert_allclose(got, 5.0 * 0.5**2, rtol=1e-14)
 
 
 def test_effort_is_the_integral_of_squares() -> None:

@@ -159,7 +159,7 @@ class Trajectory:
         owner = np.minimum(owner, len(self.motions) - 1)
         n, m = len(times), len(self.contacts)
         fields = Samples(*(np.full((n, width), np.nan) for width in (5, 5, 5, 2, m, m)))
-        for index in np.unique(owner).tolist():
+        for index in sorted(set(owner.tolist())):
             motion, rows = self.motions[index], np.flatnonzero(owner == index)
             part = motion.evaluate(times[rows] - starts[index])
             own = [self.contacts.index(name) for name in motion.contacts]

@@ -143,7 +143,7 @@ def _find_slack(stage: Stage, limits: LimitSet, samples: Samples, margin: float)
 def _measure_senses(stage: Stage, samples: Samples) -> Array:
     """Rates in a stage's directions, shape (n, n_c + 2); 1 for contacts that do not rub."""
     senses, formation = stage.measure_senses(samples.z, samples.z_dot), stage.formation
-    senses[:, np.setdiff1d(range(formation.n_contacts), formation.rubbing_rows)] = 1.0
+    senses[:, np.delete(np.arange(formation.n_contacts), formation.rubbing_rows)] = 1.0
     return senses
 
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 from ...common.errors import WholearmError
 from ...contacts.elemental import Contact
-from .refinement import settle
 from .search import Price, Search, Solution
 from .stage import Stage
 
@@ -34,7 +33,7 @@ def choose_end(search: Search, solution: Solution) -> tuple[Search, Solution]:
             break
         least, best = total, (search, solution)
         search = replace(search, price=Price(gradient, solution.end))
-        solution = search.solve(settle(solution.stages), solution)
+        solution = search.solve(solution.stages, solution)
         if not solution.success:
             break
     return best

@@ -27,8 +27,6 @@ from .stage import Stage
 SLIDING = 1e-5
 """Least sliding, over the radius of gyration, and least speed of a joint, in the scene's unit of
 time: what does not move at all would have no sense."""
-EVEN = 0.2
-"""Least duration of an interval that chooses its share over that of its neighbour."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,19 +149,13 @@ def _collocate(
 
 
 def _share(rows: Rows, stage: Stage, layout: StageLayout) -> Indices:
-    """Intervals keep their shares of the stage, or are not too uneven."""
-    before, after = layout.h[:-1], layout.h[1:]
-    if not stage.adapts:
-        own = rows.linear(len(before))
-        # In shares of an even interval, rows are of the size of others.
-        shares = stage.intervals * stage.guess.fractions
-        rows.add_entries(own, before, shares[1:])
-        rows.add_entries(own, after, -shares[:-1])
-        return own
-    own = rows.linear(2, len(before), high=np.inf)
-    rows.add_entries(own, [before, after], 1.0)
-    rows.add_entries(own, [after, before], -EVEN)
-    return own.ravel()
+    """Intervals keep their shares of the stage."""
+    own = rows.linear(stage.intervals - 1)
+    # In shares of an even interval, rows are of the size of others.
+    shares = stage.intervals * stage.guess.fractions
+    rows.add_entries(own, layout.h[:-1], shares[1:])
+    rows.add_entries(own, layout.h[1:], -shares[:-1])
+    return own
 
 
 def _balance(
@@ -261,11 +253,7 @@ def join_stages(
 ) -> None:
     """Position and velocity go on from one stage to the next; an impact changes the velocity."""
     last = layout.nodes[-1]
-    same = (
-        np.setdiff1d(np.arange(len(first)), np.arange(5, 10))
-        if stage.ends_in_impact
-        else slice(None)
-    )
+    same = np.delete(np.arange(len(first)), V) if stage.ends_in_impact else slice(None)
     own = rows.linear(len(first[same]))
     rows.add_entries(own, first[same], 1.0)
     rows.add_entries(own, last[same], -1.0)

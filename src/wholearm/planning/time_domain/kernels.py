@@ -201,13 +201,6 @@ def effort_kernel() -> NamedKernel:
     return _name(x, _NOTHING, effort=x.h * squares / 3)
 
 
-@lru_cache(maxsize=1)
-def stretch_kernel() -> NamedKernel:
-    """What it costs to change the duration of an interval."""
-    x, p = Columns(h=1).make_symbols(), Columns(weight=1, before=1).make_symbols()
-    return _name(x, p, cost=p.weight * (x.h / p.before - 1) ** 2)
-
-
 def find_leaving(formation: Formation, following: Formation) -> list[int]:
     """Contacts of a formation that the next one does not have."""
     return [i for i, c in enumerate(formation.contacts) if c not in following.contacts]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from .modes import sign_sequence
 from .moves import WORTH, list_moves
 from .search import Search, Solution
@@ -15,9 +13,6 @@ LOST = 3
 """Sequences that led to nothing since the last gain after which no more are tried."""
 PATIENCE = 60
 """Most iterations of one of them."""
-STRETCH = 1e-3
-"""Price of changing the durations of all intervals by as much as they are, over the cost: of many
-equal choices the nearest is made."""
 
 
 def improve(search: Search, solution: Solution) -> Solution:
@@ -46,18 +41,6 @@ def improve(search: Search, solution: Solution) -> Solution:
             waiting = [*list_neighbours(search, other, leaning=True), *waiting]
     search.tried.complete = all(sign_sequence(moved) in known for moved in waiting)
     return solution
-
-
-def adapt(search: Search, solution: Solution) -> Solution:
-    """Let the intervals choose their shares of the duration: torques then switch between them.
-
-    The stages returned still choose, at a price that solving for finer ones leaves out.
-    """
-    count = sum(stage.intervals for stage in solution.stages)
-    price = STRETCH * abs(solution.cost) / count
-    loose = [replace(stage, adapts=price) for stage in solution.stages]
-    moved = search.solve(loose, solution, most=PATIENCE)
-    return moved if moved.success and moved.cost < solution.cost else solution
 
 
 def list_neighbours(search: Search, solution: Solution, leaning: bool = False) -> list[list[Stage]]:

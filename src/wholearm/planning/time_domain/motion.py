@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,6 +30,25 @@ _FORWARDS = Store(
     lambda formation: Batch(build_forward(formation)), lambda formation: formation.equations
 )
 """Forward dynamics of formations."""
+
+
+class Response(NamedTuple):
+    """A motion at n instants, and how it changes with its torques, by which all is affine.
+
+    Attributes
+    ----------
+    z, v : ndarray, shape (n, 5)
+    y : ndarray, shape (n, m)
+        (c, tau, theta'), of which there are limits.
+    y_by_torque, a_by_torque : ndarray, shapes (n, m, 2) and (n, 5, 2)
+        Slopes of y and z''.
+    """
+
+    z: Array
+    v: Array
+    y: Array
+    y_by_torque: Array
+    a_by_torque: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +166,21 @@ class StageMotion:
         a, c, _ = self._forward(z, v, tau, Xi, sigma)
         c_n, c_t = split_forces(formation, c[..., 0], Xi)
         return Samples(z, v, a[..., 0], tau, c_n, c_t)
+
+    def respond(self, t: Array) -> Response:
+        """State, forces and accelerations at times `t`, and how these change with torques."""
+        at = self.evaluate(t)
+        signs = [np.broadcast_to(part, (len(t), len(part))) for part in self.directions]
+        found = [
+            self._forward(at.z, at.z_dot, at.tau + step, *signs)[:2]
+            for step in (np.zeros(2), *np.eye(2))
+        ]
+        a, c = (np.stack([own[k][..., 0] for own in found], axis=-1) for k in range(2))
+        y = np.hstack([c[..., 0], at.tau, at.z_dot[:, 3:]])
+        by_torque = np.zeros((*y.shape, 2))
+        by_torque[:, : c.shape[1]] = c[..., 1:] - c[..., :1]
+        by_torque[:, c.shape[1] : -2] = np.eye(2)
+        return Response(at.z, at.z_dot, y, by_torque, a[..., 1:] - a[..., :1])
 
 
 def _fit(x: Array, values: Array) -> Array:

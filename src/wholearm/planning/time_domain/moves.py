@@ -201,7 +201,7 @@ def _find_held(stage: Stage, scheme: Scheme) -> list[Run]:
     shape = (stage.intervals, scheme.degree, -1)
     slow = (senses < least + _SLOW * fast).reshape(shape).all(axis=1)
     held = np.repeat(slow & touches.reshape(shape).any(axis=1), scheme.degree, axis=0)
-    held[:, np.setdiff1d(range(formation.n_contacts), formation.rubbing_rows)] = False
+    held[:, np.delete(np.arange(formation.n_contacts), formation.rubbing_rows)] = False
     return _find_runs(held, stage, scheme, np.zeros(held.shape[1]))
 
 

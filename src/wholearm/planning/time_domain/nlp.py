@@ -17,9 +17,9 @@ each interval, the differential equations are collocated:
     N^T (z_j - z_0 - h sum_l a_jl z'_l) = 0,  N^T (z'_j - z'_0 - h sum_l a_jl z''_l) = 0.
 
 Nothing but these rows knows of durations, so that a stage may shrink to nothing. The intervals of a
-stage keep their shares of it, or within bounds choose them. Unknowns and rows are in the order of
-time. What stands still at an instant has no sense of friction there: an inequality that equations
-keep at zero would leave the solver no interior. All quantities are in units that fit the scene.
+stage keep their shares of it. Unknowns and rows are in the order of time. What stands still at an
+instant has no sense of friction there: an inequality that equations keep at zero would leave the
+solver no interior. All quantities are in units that fit the scene.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from ..options import Objective
 from .assembly import Assembled, assemble_nlp
 from .collocation import Scheme
 from .equations import StageRows, add_stage, find_still, join_stages, least_senses
-from .kernels import effort_kernel, stretch_kernel
+from .kernels import effort_kernel
 from .layout import MARGIN, STATE, StageLayout, V, Z, lay_out
 from .limits import Target, bound_by_limits
 from .rows import Rows
@@ -152,11 +152,6 @@ def _add_costs(rows: Rows, cost: Array, stage: Stage, layout: StageLayout, targe
     if target.objective is Objective.EFFORT:
         kernel = effort_kernel()
         rows.add_cost(kernel, kernel.x.join(tau=layout.tau, h=layout.h[:, None]))
-    if stage.adapts:
-        lengths = stage.guess.duration * stage.guess.fractions
-        stretch = stretch_kernel()
-        given = stretch.p.join(weight=[stage.adapts], before=lengths[:, None])
-        rows.add_cost(stretch, stretch.x.join(h=layout.h[:, None]), given)
     of_time = {
         Objective.TIME: 1.0,
         Objective.EFFORT: target.time_weight,

@@ -26,12 +26,13 @@ from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
 from .attempts import NEAREST, Attempt, Attempts
 from .ending import choose_end
+from .enforcing import enforce_between
 from .mesh import resample
-from .mode_search import adapt, improve
+from .mode_search import improve
 from .modes import LEAST_INTERVALS
 from .motion import TimeMotion, make_motions
 from .own_units import to_si, unit_of
-from .refinement import bisect_intervals, settle
+from .refinement import bisect_intervals
 from .search import Search, Solution
 from .stage import Stage
 
@@ -41,6 +42,8 @@ BUDGET = 400
 """Iterations of the solver after which no further guess is begun: of one block."""
 ATTEMPT = 80
 """Most iterations of the first run of the solver from a guess."""
+ROUGH = 1e-2
+"""Least accuracy of plans of which only matters that there are any."""
 ROUNDING = 5e-7
 """Largest shortfall of a margin below epsilon by rounding, over the weight of the object."""
 _EXACT = 3
@@ -98,7 +101,8 @@ def plan_phases(
 
     def replan(other: Problem) -> object:
         own = [other.phases[phase.index] for phase in phases]
-        return plan_phases(other, own, z, options, explained=False, patient=False)
+        rough = replace(options, accuracy=max(options.accuracy, ROUGH))
+        return plan_phases(other, own, z, rough, explained=False, patient=False)
 
     refuse(search, problem, phases, attempts.first.stages, replan if explained else None)
     *_, last = outcomes = _try_all(search, problem, attempts, begun)
@@ -227,14 +231,14 @@ def solve_attempt(search: Search, attempt: Attempt) -> Solution:
         return solution
     plain = not search.options.mode_search or search.has_ample(solution)
     better = solution if plain else improve(search, solution)
-    search, solution = choose_end(search, adapt(search, better))
+    search, solution = choose_end(search, better)
     wanted = 2**attempt.halvings * sum(stage.intervals for stage in attempt.stages)
     for _ in range(max(attempt.halvings, search.scheme.degree > _EXACT)):
         # Modes that were found may have asked for more intervals than the guess has.
         most = sum(stage.intervals for stage in solution.stages)
         if solution.success and (most < wanted or search.scheme.degree > _EXACT):
             solution = search.solve(_halve(search, solution.stages), solution)
-    return search.enforce_between(solution) if solution.success else solution
+    return enforce_between(search, solution) if solution.success else solution
 
 
 def _slow_down(
@@ -253,7 +257,7 @@ def _slow_down(
     whole, first = len({stage.phase for stage in fastest}), attempt.stages
     count = sum(stage.intervals for stage in first) / whole
     coarse = list[Stage]()
-    for stage in settle(fastest):
+    for stage in fastest:
         shares = [own.guess.duration for own in fastest if own.phase == stage.phase]
         own = max(LEAST_INTERVALS, round(count * stage.guess.duration / sum(shares)))
         breaks = np.linspace(0.0, 1.0, own + 1)
@@ -296,6 +300,7 @@ def _summarise(
             Objective.MARGIN: problem.epsilon + unit * margin,
         }[search.goal]
         own = [stage for stage in solution.stages if stage.phase == phase.index]
-        plans.append(PhasePlan(motion, torque, value, attempt=attempt, stages=own))
+        plan = PhasePlan(motion, torque, value, attempt=attempt, stages=own)
+        plans.append(plan._replace(error=solution.error))
     plans[0] = plans[0]._replace(sequences=tried.sequences, complete=tried.complete)
     return plans

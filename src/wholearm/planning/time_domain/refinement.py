@@ -19,6 +19,8 @@ DEAR = 1e-5
 """Largest price of limits that are raised in an interval, over the cost, without halving it."""
 AT_ONCE = 2
 """Most times that an interval is halved at once."""
+_LESS = 4.0
+"""Factor by which a halving makes what better torques would gain less."""
 _CHEAPER = 3
 """Power of two by which a halving makes misses of limits cheaper."""
 _BROKEN = 1e-6
@@ -33,10 +35,10 @@ def adopt(stages: Sequence[Stage], points: Sequence[StagePoints]) -> list[Stage]
 def bisect_intervals(
     stages: Sequence[Stage], scheme: Scheme, times: Sequence[NDArray[np.int64]]
 ) -> list[Stage]:
-    """Stages with intervals halved so many times, each of shape (K,), which keep their shares."""
+    """Stages with intervals halved so many times, each of shape (K,)."""
     return [
         replace(stage, guess=bisect(stage.guess, scheme, mine)) if mine.any() else stage
-        for stage, mine in zip(settle(stages), times, strict=True)
+        for stage, mine in zip(stages, times, strict=True)
     ]
 
 
@@ -60,15 +62,26 @@ def count_halvings(prices: Array, defects: Array, scheme: Scheme) -> NDArray[np.
     return np.asarray(np.clip(np.ceil(times), 0, AT_ONCE), dtype=np.int64)
 
 
+def spread_halvings(shares: Sequence[Array], most: float) -> list[NDArray[np.int64]]:
+    """How often to halve intervals, (K,) each, so that their shares of an error sum up to `most`.
+
+    The largest are halved first, which leaves a quarter of what they have.
+    """
+    left, times = np.concatenate(shares), np.zeros(sum(map(len, shares)), dtype=np.int64)
+    even = most / len(left)
+    while left.sum() > most:
+        worst = int(np.where(times < AT_ONCE, left, 0.0).argmax())
+        if times[worst] == AT_ONCE or left[worst] <= even:
+            break
+        left[worst] /= _LESS
+        times[worst] += 1
+    return np.split(times, np.cumsum([len(own) for own in shares])[:-1])
+
+
 def cap_halvings(times: list[NDArray[np.int64]], most: int) -> list[NDArray[np.int64]]:
     """How often to halve intervals: once at most, if there would be more than `most` of them."""
     wanted = sum(int((2**mine).sum()) for mine in times)
     return times if wanted <= most else [np.minimum(mine, 1) for mine in times]
-
-
-def settle(stages: Sequence[Stage]) -> list[Stage]:
-    """Stages whose intervals keep the shares of the duration that they have."""
-    return [replace(stage, adapts=0.0) if stage.adapts else stage for stage in stages]
 
 
 def monitor_violated(stages: Sequence[Stage]) -> list[Stage] | None:

@@ -1,4 +1,4 @@
-"""Solving for stages: one NLP after another, until limits hold between points too."""
+"""Solving for stages: one NLP after another, until no limit is broken at the points."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...common.arrays import Array
 from ...common.shortfalls import Parameter
@@ -16,40 +15,20 @@ from ...geometry.cost_to_go import CostToGo
 from ...problem.definition import Problem
 from ..options import Objective, PlanOptions
 from ..phase_plan import Tried
-from .between import Limits, check_between, find_misses, monitor_missed, raise_bounds
+from .between import Limits, raise_bounds
 from .collocation import Scheme, make_scheme
 from .layout import MARGIN, pack, unpack
-from .limits import Target, price_sides
-from .motion import StageMotion, make_motions
+from .limits import Target
 from .nlp import TimeNLP, bound_unknowns, build_time_nlp
 from .own_units import in_own_units, scale_options, unit_lengths, unit_of
-from .refinement import (
-    adopt,
-    bisect_intervals,
-    cap_halvings,
-    count_halvings,
-    monitor_violated,
-    settle,
-)
+from .refinement import adopt, monitor_violated
 from .stage import Stage
 from .warm_start import FIRST_SIZE, Multipliers, carry_multipliers, first_multipliers
 
-ROUNDS = 24
-"""Most times that limits are tightened."""
-REFINEMENTS = 8
-"""Most times that intervals are halved because of misses."""
-MOST = 64
-"""Intervals of each phase from which on none is halved."""
-_PATIENCE = 80
-"""Most iterations of one solve on finer intervals, that starts from a solution."""
 _ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 90}
 """Most iterations of one solve, if not 150."""
 _CAP = 1.1
 """Largest margin that is looked for, over the one from which on more decides nothing."""
-_DEARER = 0.2
-"""Largest relative cost increase accepted from tightening."""
-_COARSE = 0.1
-"""Largest relative cost increase accepted from finer intervals."""
 
 
 class Price(NamedTuple):
@@ -76,6 +55,8 @@ class Solution(NamedTuple):
         What was solved.
     multipliers : dict
         What it ended with.
+    error : float
+        Estimate of what better torques would gain, over the cost; not known of all.
     """
 
     stages: list[Stage]
@@ -85,6 +66,7 @@ class Solution(NamedTuple):
     success: bool
     nlp: TimeNLP
     multipliers: Multipliers
+    error: float = math.nan
 
     @property
     def end(self) -> Array:
@@ -276,95 +258,3 @@ class Search:
             nlp,
             {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")},
         )
-
-    def price_misses(self, solution: Solution, misses: Sequence[Limits]) -> list[Array]:
-        """What raising limits by their misses would cost in each interval, over the cost, (K,)."""
-        on_x, on_g = (np.abs(solution.multipliers[key]) for key in ("lam_x0", "lam_g0"))
-        prices = []
-        for k, miss in enumerate(misses):
-            layout, rows = solution.nlp.layouts[k], solution.nlp.rows_of[k].limits
-            price = price_sides(rows, layout, on_x, on_g)
-            spans = rows.limits.scales[rows.limits.sides[0]]
-            cost = (price * miss.held * spans).sum(axis=1)
-            prices.append(np.asarray(cost / max(abs(solution.cost), 1e-300)))
-        return prices
-
-    def _choose_halvings(
-        self, solution: Solution, motions: Sequence[StageMotion], misses: Sequence[Limits]
-    ) -> list[NDArray[np.int64]]:
-        """How often to halve each interval for what its misses cost; none if there are many."""
-        most = MOST * len({stage.phase for stage in solution.stages})
-        if sum(stage.intervals for stage in solution.stages) >= most:
-            return []
-        prices = self.price_misses(solution, misses)
-        times = [
-            count_halvings(price, motion.defects, self.scheme)
-            for price, motion in zip(prices, motions, strict=True)
-        ]
-        return cap_halvings(times, most)
-
-    def enforce_between(self, solution: Solution) -> Solution:
-        """Go on from a solution until limits hold between points too."""
-        refined, first = 0, solution.cost
-        limits = [Limits.none(stage) for stage in solution.stages]
-        for _ in range(ROUNDS):
-            motions = make_motions(solution.stages, self.scheme)
-            checks = [
-                check_between(stage, motion)
-                for stage, motion in zip(solution.stages, motions, strict=True)
-            ]
-            monitoring = monitor_missed(solution.stages, checks)
-            if monitoring is not None:
-                solution = self.solve(monitoring, solution)
-                if not solution.success:
-                    return solution
-                limits = [Limits.none(stage) for stage in solution.stages]
-                continue
-            misses = [
-                find_misses(stage, check, self.problem.epsilon, solution.margin)
-                for stage, check in zip(solution.stages, checks, strict=True)
-            ]
-            worst = max(miss.worst for miss in misses)
-            halved = refined < REFINEMENTS
-            times = self._choose_halvings(solution, motions, misses) if halved else []
-            if any(mine.any() for mine in times):
-                refined += 1
-                finer = self.solve(
-                    bisect_intervals(solution.stages, self.scheme, times), solution, most=_PATIENCE
-                )
-                if finer.success:
-                    if finer.cost - first > _COARSE * abs(first):
-                        status = "a plan on finer intervals is much dearer"
-                        return finer._replace(status=status, success=False)
-                    solution = finer
-                    limits = [Limits.none(stage) for stage in solution.stages]
-                    continue
-                # What finer intervals do not lead to now they will not lead to later.
-                refined = REFINEMENTS
-            if any(stage.adapts for stage in solution.stages):
-                solution = self.solve(settle(solution.stages), solution)
-                if not solution.success:
-                    return solution
-                continue
-            if worst <= 1:
-                return solution
-            limits = [raised.raised(miss) for raised, miss in zip(limits, misses, strict=True)]
-            tighter = self.run(
-                solution.nlp, solution.stages, limits, solution.multipliers, solution.margin
-            )
-            if not tighter.success:
-                tighter = self._halve_missed(solution, misses)
-                limits = [Limits.none(stage) for stage in tighter.stages]
-            if not tighter.success:
-                return tighter
-            if tighter.cost - solution.cost > _DEARER * abs(solution.cost):
-                status = "a plan that keeps limits between points is much dearer"
-                return tighter._replace(status=status, success=False)
-            solution = tighter
-        status = f"limits are still missed {worst:.2g} times what is allowed between points"
-        return solution._replace(status=status, success=False)
-
-    def _halve_missed(self, solution: Solution, misses: Sequence[Limits]) -> Solution:
-        """Go on from a plan with twice the intervals where it misses limits, which then is less."""
-        times = [miss.list_missed().astype(np.int64) for miss in misses]
-        return self.solve(bisect_intervals(solution.stages, self.scheme, times), solution)

@@ -88,8 +88,6 @@ class Stage:
         What these gaps are at least after a third of the first stage, over the radius of gyration.
     apart : tuple of int
         Monitored limits that are as clear at the end: what comes next ends by closing them.
-    adapts : float
-        What it costs to change the duration of an interval; nothing if they keep their shares.
     ahead : (int, float, float) or None
         Row of z, the value that it has where the phase ends, and from which side it comes there:
         reached before, that would be the end.
@@ -114,7 +112,6 @@ class Stage:
     opening: float = OPENING
     clearance: float = CLEARANCE
     apart: tuple[int, ...] = ()
-    adapts: float = 0.0
     ahead: tuple[int, float, float] | None = None
     stop: Array | None = None
     onset: float = 0.0

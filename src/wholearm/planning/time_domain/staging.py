@@ -244,7 +244,7 @@ def _turn_first(outline: PathGuess, before: PathGuess) -> list[PathGuess]:
     Velocities are continuous, so what slides the other way in the outline has to turn on the way.
     """
     # What rolled has no direction to keep.
-    slides = np.setdiff1d(np.arange(before.formation.n_contacts), before.formation.rolling_rows)
+    slides = np.delete(np.arange(before.formation.n_contacts), before.formation.rolling_rows)
     known = {before.formation.names[k]: before.directions.Xi[k] for k in slides}
     own, formation = np.concatenate(outline.directions), outline.formation
     n_c = formation.n_contacts

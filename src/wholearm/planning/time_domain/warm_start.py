@@ -88,4 +88,4 @@ def find_costate(rows: StageRows, on_g: Array, scheme: Scheme) -> Array:
 def _list_once(nlp: TimeNLP) -> Indices:
     """Rows that are there once, and not in each interval."""
     own = [part.ravel() for r in nlp.rows_of for part in (*r.even, r.states, r.shares)]
-    return np.setdiff1d(np.arange(len(nlp.rows.bounds[0])), np.concatenate(own))
+    return np.delete(np.arange(len(nlp.rows.bounds[0])), np.concatenate(own))

@@ -1,0 +1,163 @@
+"""From a solution to a plan: intervals as fine as the accuracy asks for, limits that hold between.
+
+Intervals are halved for what better torques would gain and for what their misses of limits cost,
+both over the cost, until the sum is below the accuracy, and for what collocation misses. What
+limits then still miss between points is added to them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.arrays import Array
+from ...mechanics.limits import make_limits
+from ..options import Objective
+from .between import Limits, check_between, find_misses, monitor_missed
+from .gains import find_gains
+from .limits import price_sides
+from .motion import StageMotion, make_motions
+from .refinement import bisect_intervals, cap_halvings, count_halvings, spread_halvings
+from .search import Search, Solution
+
+ROUNDS = 24
+"""Most times that limits are tightened."""
+REFINEMENTS = 8
+"""Most times that intervals are halved because of misses."""
+MOST = 64
+"""Intervals of each phase from which on none is halved, with the accuracy of the default; they go
+with the root of its inverse."""
+_USUAL = 1e-4
+"""The accuracy of the default."""
+_SPARE = 0.5
+"""Share of the accuracy that halving intervals is to leave."""
+_PATIENCE = 80
+"""Most iterations of one solve on finer intervals, that starts from a solution."""
+_DEARER = 0.2
+"""Largest relative cost increase accepted from tightening."""
+_COARSE = 0.1
+"""Largest relative cost increase accepted from finer intervals."""
+
+
+def enforce_between(search: Search, solution: Solution) -> Solution:
+    """Go on from a solution until it is accurate and limits hold between points too."""
+    refined, first = 0, solution.cost
+    limits = [Limits.none(stage) for stage in solution.stages]
+    for _ in range(ROUNDS):
+        motions = make_motions(solution.stages, search.scheme)
+        checks = [
+            check_between(stage, motion)
+            for stage, motion in zip(solution.stages, motions, strict=True)
+        ]
+        monitoring = monitor_missed(solution.stages, checks)
+        if monitoring is not None:
+            solution = search.solve(monitoring, solution)
+            if not solution.success:
+                return solution
+            limits = [Limits.none(stage) for stage in solution.stages]
+            continue
+        misses = [
+            find_misses(stage, check, search.problem.epsilon, solution.margin)
+            for stage, check in zip(solution.stages, checks, strict=True)
+        ]
+        worst = max(miss.worst for miss in misses)
+        # Limits that are being tightened are looked at for their misses first.
+        decided = worst <= 1 or not any(own.worst for own in limits)
+        gains = list_gains(search, solution, motions) if decided else []
+        halved = decided and refined < REFINEMENTS
+        times = _choose_halvings(search, solution, motions, misses, gains) if halved else []
+        if any(mine.any() for mine in times):
+            refined += 1
+            stages = bisect_intervals(solution.stages, search.scheme, times)
+            finer = search.solve(stages, solution, most=_PATIENCE)
+            if finer.success:
+                if finer.cost - first > _COARSE * abs(first):
+                    status = "a plan on finer intervals is much dearer"
+                    return finer._replace(status=status, success=False)
+                solution = finer
+                limits = [Limits.none(stage) for stage in solution.stages]
+                continue
+            # What finer intervals do not lead to now they will not lead to later.
+            refined = REFINEMENTS
+        if worst <= 1:
+            return solution._replace(error=float(sum(own.sum() for own in gains)))
+        limits = [raised.raised(miss) for raised, miss in zip(limits, misses, strict=True)]
+        tighter = search.run(
+            solution.nlp, solution.stages, limits, solution.multipliers, solution.margin
+        )
+        if not tighter.success:
+            tighter = _halve_missed(search, solution, misses)
+            limits = [Limits.none(stage) for stage in tighter.stages]
+        if not tighter.success:
+            return tighter
+        if tighter.cost - solution.cost > _DEARER * abs(solution.cost):
+            status = "a plan that keeps limits between points is much dearer"
+            return tighter._replace(status=status, success=False)
+        solution = tighter
+    status = f"limits are still missed {worst:.2g} times what is allowed between points"
+    return solution._replace(status=status, success=False)
+
+
+def list_gains(search: Search, solution: Solution, motions: Sequence[StageMotion]) -> list[Array]:
+    """What better torques would gain in each interval, over the objective, shape (K,) each."""
+    epsilon, square = search.problem.epsilon, float(search.goal is Objective.EFFORT)
+    size = abs(solution.cost) + epsilon * (search.goal is Objective.MARGIN)
+    found = []
+    for k, (stage, motion) in enumerate(zip(solution.stages, motions, strict=True)):
+        rows = solution.nlp.rows_of[k]
+        worth = solution.multipliers["lam_g0"][rows.states].sum(axis=2)
+        costate = np.einsum("kdf,ksf->ksd", rows.bases, worth)
+        limits = make_limits(stage.formation, epsilon)
+        found.append(find_gains(stage, motion, costate, limits, solution.margin, square) / size)
+    return found
+
+
+def price_misses(solution: Solution, misses: Sequence[Limits]) -> list[Array]:
+    """What raising limits by their misses would cost in each interval, over the cost, (K,)."""
+    on_x, on_g = (np.abs(solution.multipliers[key]) for key in ("lam_x0", "lam_g0"))
+    prices = []
+    for k, miss in enumerate(misses):
+        layout, rows = solution.nlp.layouts[k], solution.nlp.rows_of[k].limits
+        price = price_sides(rows, layout, on_x, on_g)
+        spans = rows.limits.scales[rows.limits.sides[0]]
+        cost = (price * miss.held * spans).sum(axis=1)
+        prices.append(np.asarray(cost / max(abs(solution.cost), 1e-300)))
+    return prices
+
+
+def _choose_halvings(
+    search: Search,
+    solution: Solution,
+    motions: Sequence[StageMotion],
+    misses: Sequence[Limits],
+    gains: Sequence[Array],
+) -> list[NDArray[np.int64]]:
+    """How often to halve each interval; none if there are many.
+
+    With a number of intervals that was asked for, gains do not count.
+    """
+    options = search.options
+    share = MOST * max(1.0, math.sqrt(_USUAL / options.accuracy))
+    most = math.ceil(share) * len({stage.phase for stage in solution.stages})
+    if sum(stage.intervals for stage in solution.stages) >= most:
+        return []
+    prices = price_misses(solution, misses)
+    times = [
+        count_halvings(price, motion.defects, search.scheme)
+        for price, motion in zip(prices, motions, strict=True)
+    ]
+    shares = [gain + price for gain, price in zip(gains, prices, strict=True)]
+    fixed = options.time_intervals is not None
+    if not fixed and sum(own.sum() for own in shares) > options.accuracy:
+        more = spread_halvings(shares, _SPARE * options.accuracy)
+        times = [np.maximum(*pair) for pair in zip(times, more, strict=True)]
+    return cap_halvings(times, most)
+
+
+def _halve_missed(search: Search, solution: Solution, misses: Sequence[Limits]) -> Solution:
+    """Go on from a plan with twice the intervals where it misses limits, which then is less."""
+    times = [miss.list_missed().astype(np.int64) for miss in misses]
+    return search.solve(bisect_intervals(solution.stages, search.scheme, times), solution)
