@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from wholearm.planning.time_domain.collocation import make_scheme
+from wholearm.planning.time_domain.collocation import blend, fit_controls, make_scheme
 
 NAMES = ["radau", "legendre"]
 DEGREES = [1, 2, 3, 4, 5, 6]
@@ -119,3 +119,18 @@ def test_a_linear_equation_is_integrated_to_the_order(
     # Two step sizes only, so the next term of the error still shows.
     assert slope == pytest.approx(scheme.order, abs=0.3)
     assert errors[1] < 2e-2
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_polynomials_lie_between_their_control_points(count: int) -> None:
+    rng, places = np.random.default_rng(count), np.linspace(0.0, 1.0, 41)
+    controls = rng.uniform(-1.0, 1.0, (count, 2))
+    values = blend(places, count) @ controls
+    assert (values <= controls.max(axis=0) + 1e-14).all()
+    assert (values >= controls.min(axis=0) - 1e-14).all()
+    np.testing.assert_allclose(values[[0, -1]], controls[[0, -1]], atol=1e-15)
+    # Of their degree they are: their control points follow from as many values.
+    at = np.sort(rng.uniform(0.0, 1.0, count))
+    np.testing.assert_allclose(
+        fit_controls(at, blend(at, count) @ controls, count), controls, atol=1e-6
+    )

@@ -16,7 +16,7 @@ from wholearm.mechanics.dynamics import split_forces
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.time_domain import kernels
 from wholearm.planning.time_domain.assembly import Kernel
-from wholearm.planning.time_domain.collocation import make_scheme
+from wholearm.planning.time_domain.collocation import blend, make_scheme
 from wholearm.planning.time_domain.kernels import (
     collocation_kernel,
     effort_kernel,
@@ -94,24 +94,24 @@ def test_points_have_newton_and_euler_and_closed_contacts(formation: Formation) 
     n_c, n_p = formation.n_contacts, formation.n_constraints
     for _ in range(3):
         z, v, a = draw(rng)
-        forces, tau = rng.normal(size=n_p), rng.normal(size=4)
-        place = rng.uniform(0.1, 0.3)
+        forces, tau = rng.normal(size=n_p), rng.normal(size=(3, 2))
+        shares = rng.uniform(0.1, 0.3, 3)
         Xi, sigma = rng.choice([-1.0, 1.0], n_c), rng.choice([-1.0, 1.0], 2)
         first, least = (z + 0.02 * rng.normal(size=5) if formation.rolling else z[:0]), 0.3
-        x = [z, v, a, forces, tau, first]
+        x = [z, v, a, forces, tau.ravel(), first]
         y = call(
-            point_kernel(formation),
+            point_kernel(formation, 3),
             x,
             Xi,
             sigma,
-            np.array([place, *[least] * formation.n_contacts]),
+            np.array([*shares, *[least] * formation.n_contacts]),
         )
         gaps, rates, bends, balance, senses = np.split(y, np.cumsum([n_p, n_p, n_p, 5]))
         np.testing.assert_allclose(gaps[:n_c], measure_gaps(formation, z), atol=1e-15)
         expected = constraints(formation, z, v, a)
         for got, one, size in zip((rates, bends), expected, (1e-7, 1e-5), strict=True):
             np.testing.assert_allclose(got, one, atol=size)
-        now = tau[:2] * (1 - place) + tau[2:] * place
+        now = shares @ tau
         c_n, c_t = split_forces(formation, forces, Xi)
         row = Samples(z, v, a, now, c_n, c_t)
         missing, size_of = unbalance(formation, row, sigma)
@@ -229,13 +229,14 @@ def test_collocation_holds_for_what_polynomials_integrate(
     np.testing.assert_allclose(missed[1:], 0.0, atol=1e-13)
 
 
-def test_effort_is_the_integral_of_squares() -> None:
+@pytest.mark.parametrize("controls", [2, 3, 5])
+def test_effort_is_the_integral_of_squares(controls: int) -> None:
     rng = np.random.default_rng(8)
-    tau, h = rng.normal(size=(2, 2)), 0.02
-    places, weights = np.polynomial.legendre.leggauss(2)
-    values = tau[0] + (places[:, None] + 1) / 2 * (tau[1] - tau[0])
+    tau, h = rng.normal(size=(controls, 2)), 0.02
+    places, weights = np.polynomial.legendre.leggauss(controls)
+    values = blend((places + 1) / 2, controls) @ tau
     expected = h * weights / 2 @ (values**2).sum(axis=1)
-    got = call(effort_kernel(), [tau.ravel(), np.array([h])])
+    got = call(effort_kernel(controls), [tau.ravel(), np.array([h])])
     np.testing.assert_allclose(got, expected, rtol=1e-14)
 
 
@@ -272,14 +273,14 @@ def test_impacts_balance_the_momentum_of_every_body(rolls: tuple[str, ...]) -> N
 @every
 def test_kernels_have_a_row_for_each_condition(formation: Formation) -> None:
     n_p, rolls = formation.n_constraints, formation.n_rolling
-    assert point_kernel(formation).outputs == 3 * n_p + 5 + formation.n_contacts - rolls
+    assert point_kernel(formation, 2).outputs == 3 * n_p + 5 + formation.n_contacts - rolls
     before = make_formation(formation.scene, "v2-palm")
     assert impact_kernel(before, formation).outputs == 5 + n_p + 1 + 2 * rolls
 
 
 def test_kernels_of_a_formation_are_built_once(curves: tuple[Curve, ...]) -> None:
     formation = curves[0].formation
-    assert point_kernel(formation) is point_kernel(formation)
+    assert point_kernel(formation, 2) is point_kernel(formation, 2)
     assert monitor_kernel(formation, (0, 1)) is not monitor_kernel(formation, (1, 0))
 
 
@@ -287,11 +288,11 @@ def test_limits_are_no_part_of_kernels(heptagon: Problem, monkeypatch: pytest.Mo
     """With other torque limits, nothing that has been built is built again."""
     weaker = heptagon.with_(torque_limit=1.9, speed_limit2=20.0)
     before, after = (problem.phases[0].formation for problem in (heptagon, weaker))
-    assert before is not after and point_kernel(before) is point_kernel(after)
+    assert before is not after and point_kernel(before, 2) is point_kernel(after, 2)
     assert before.function is after.function
     stronger = heptagon.with_(torque_limit=2.1)
     other = heptagon.with_(friction_palm=0.11).phases[0].formation
-    assert point_kernel(other) is not point_kernel(before)
+    assert point_kernel(other, 2) is not point_kernel(before, 2)
     options = PlanOptions(time_intervals=6)
     plan_phases(weaker, weaker.phases[:1], weaker.start, options)
 

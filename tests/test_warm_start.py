@@ -34,8 +34,9 @@ def coarse(objective: str) -> Solution:
     """The heptagon's landing on few intervals, from its outlines."""
     problem = landing()
     start = trace_phases(problem)[-1].end
-    stages = guess_stages(problem, problem.phases[4:], start, SCHEME, 8, 2.0)
-    solution = search_for(objective).solve(stages)
+    search = search_for(objective)
+    stages = guess_stages(problem, problem.phases[4:], start, search.scheme, 8, 2.0)
+    solution = search.solve(stages)
     assert solution.success
     return solution
 
@@ -49,7 +50,7 @@ def replace_scene(stages: list[Stage], problem: Problem) -> list[Stage]:
 def test_halved_intervals_start_from_the_multipliers_before(objective: str) -> None:
     solution = coarse(objective)
     every = [np.ones(stage.intervals, dtype=int) for stage in solution.stages]
-    finer = bisect_intervals(solution.stages, SCHEME, every)
+    finer = bisect_intervals(solution.stages, search_for(objective).scheme, every)
     costs = []
     for before in (solution, None):
         answer = search_for(objective).solve(finer, before)

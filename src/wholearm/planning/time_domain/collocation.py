@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from math import comb
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,8 @@ class Scheme(NamedTuple):
         The same from 0 to 1.
     order : int
         Of the error at the end of an interval.
+    controls : int
+        Number of control points of the torques in an interval.
     """
 
     name: str
@@ -31,6 +34,7 @@ class Scheme(NamedTuple):
     integrals: Array
     weights: Array
     order: int
+    controls: int
 
     @property
     def degree(self) -> int:
@@ -54,8 +58,24 @@ class Scheme(NamedTuple):
         return np.asarray(places[:, None] ** powers @ invert)
 
 
+def blend(places: Array, count: int) -> Array:
+    """Bernstein polynomials at `places`, shape (..., count): shares of the control points.
+
+    A polynomial lies between its control points, the first and last of which are its ends.
+    """
+    k, n = np.arange(count), count - 1
+    choices = np.array([comb(n, own) for own in k.tolist()], dtype=float)
+    x = np.asarray(places)[..., None]
+    return np.asarray(choices * x**k * (1 - x) ** (n - k))
+
+
+def fit_controls(places: Array, values: Array, count: int) -> Array:
+    """Control points of the polynomials nearest to values at places, shape (..., count, m)."""
+    return np.asarray(np.linalg.pinv(blend(places, count)) @ values)
+
+
 @lru_cache(maxsize=8)
-def make_scheme(name: str, degree: int) -> Scheme:
+def make_scheme(name: str, degree: int, controls: int = 2) -> Scheme:
     """Radau IIA points, order 2 d - 1, or Gauss-Legendre points, order 2 d.
 
     Radau points are the zeros of P_d - P_d-1, 1 among them, Legendre points those of P_d.
@@ -65,6 +85,8 @@ def make_scheme(name: str, degree: int) -> Scheme:
     name : {"radau", "legendre"}
     degree : int
         Number of points d.
+    controls : int, optional
+        Of torques that are linear by default.
 
     Notes
     -----
@@ -81,4 +103,4 @@ def make_scheme(name: str, degree: int) -> Scheme:
     invert = np.linalg.inv(points[:, None] ** (powers - 1))
     integrals = (points[:, None] ** powers / powers) @ invert
     order = 2 * degree - (name == "radau")
-    return Scheme(name, points, integrals, (1 / powers) @ invert, order)
+    return Scheme(name, points, integrals, (1 / powers) @ invert, order, controls)

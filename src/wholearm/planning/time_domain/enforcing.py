@@ -38,6 +38,8 @@ _PATIENCE = 80
 """Most iterations of one solve on finer intervals, that starts from a solution."""
 _DEARER = 0.2
 """Largest relative cost increase accepted from tightening."""
+_HOPELESS = 1.0
+"""Price of all that limits miss, over the cost, from which on no finer intervals are tried."""
 _COARSE = 0.1
 """Largest relative cost increase accepted from finer intervals."""
 
@@ -64,6 +66,9 @@ def enforce_between(search: Search, solution: Solution) -> Solution:
             for stage, check in zip(solution.stages, checks, strict=True)
         ]
         worst = max(miss.worst for miss in misses)
+        if sum(price.sum() for price in price_misses(solution, misses)) > _HOPELESS:
+            status = "a plan that keeps limits between points is much dearer"
+            return solution._replace(status=status, success=False)
         # Limits that are being tightened are looked at for their misses first.
         decided = worst <= 1 or not any(own.worst for own in limits)
         gains = list_gains(search, solution, motions) if decided else []

@@ -9,7 +9,7 @@ import numpy as np
 from ...common.arrays import Array
 from ...geometry.curve import find_tied, tangent_basis
 from .assembly import Indices
-from .collocation import Scheme
+from .collocation import Scheme, blend
 from .kernels import (
     collocation_kernel,
     end_kernel,
@@ -167,7 +167,7 @@ def _balance(
     """
     formation, shape = stage.formation, layout.z.shape[:2]
     gradual = stage.onset > 0
-    kernel, node = point_kernel(formation, gradual), layout.nodes[:-1, None]
+    kernel, node = point_kernel(formation, scheme.controls, gradual), layout.nodes[:-1, None]
     columns = kernel.x.join(
         z=layout.z,
         v=layout.v,
@@ -180,7 +180,7 @@ def _balance(
     parameters = kernel.p.join(
         Xi=stage.directions.Xi,
         sigma=stage.directions.sigma,
-        place=scheme.points[:, None],
+        shares=blend(scheme.points, scheme.controls),
         least=np.maximum(least, 0.0),
         onset=np.full(1 * gradual, stage.onset),
     )

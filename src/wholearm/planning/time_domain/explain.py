@@ -27,7 +27,7 @@ from ..advice import (
     rank_shortfalls,
 )
 from ..options import Objective
-from .collocation import Scheme
+from .collocation import Scheme, blend
 from .motion import TimeMotion, make_motions
 from .own_units import to_si
 from .search import Search
@@ -272,8 +272,8 @@ def _list_of_stage(
     """Shortfalls at the points, and of torques at both ends of intervals."""
     limits, part = make_limits(stage.formation, problem.epsilon), stage.guess
     pick = np.array([0, *range(scheme.degree), scheme.degree - 1])
-    at = np.concatenate([[0.0], scheme.points, [1.0]])[:, None]
-    tau = part.tau[:, :1] * (1 - at) + part.tau[:, 1:] * at
+    at = np.concatenate([[0.0], scheme.points, [1.0]])
+    tau = blend(at, part.tau.shape[1]) @ part.tau
     y = np.concatenate([part.forces[:, pick], tau, part.v[:, pick, 3:]], axis=2)
     middles = passed + part.duration * (part.breaks[:-1] + part.fractions / 2)
 

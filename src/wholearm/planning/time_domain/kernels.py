@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, wraps
+from math import comb
 from typing import Any, TypeVar
 
 import casadi as ca
@@ -75,19 +76,19 @@ def _name(x: Symbols, p: Symbols, **y: Expression) -> NamedKernel:
 
 
 @share(32)
-def point_kernel(formation: Formation, gradual: bool = False) -> NamedKernel:
+def point_kernel(formation: Formation, controls: int, gradual: bool = False) -> NamedKernel:
     """Equations and inequalities at a collocation point.
 
-    `tau` is that at the start and the end of the interval, `first` z at its start if a contact
-    rolls, `place` the point's place in it and `least` the least rates. The contacts' constraints,
-    in position, velocity and acceleration, and the five equations of motion are zero; the senses of
-    contacts that slide with friction must not be negative. Friction that sets in `gradual`ly, at
-    the rate `onset`, goes against the motion whichever way that is.
+    `tau` is made of the control points of the torques, `shares` of theirs at the point; `first` is
+    z at the start of the interval if a contact rolls, and `least` the least rates. The contacts'
+    constraints, in position, velocity and acceleration, and the five equations of motion are zero;
+    the senses of contacts that slide with friction must not be negative. Friction that sets in
+    `gradual`ly, at the rate `onset`, goes against the motion whichever way that is.
     """
     scene, n_c, rolls = formation.scene, formation.n_contacts, bool(formation.rolling)
-    x = Columns(z=5, v=5, a=5, forces=formation.n_constraints, tau=4, first=5 * rolls)
+    x = Columns(z=5, v=5, a=5, forces=formation.n_constraints, tau=2 * controls, first=5 * rolls)
     s = x.make_symbols()
-    p = Columns(Xi=n_c, sigma=2, place=1, least=n_c, onset=1 * gradual).make_symbols()
+    p = Columns(Xi=n_c, sigma=2, shares=controls, least=n_c, onset=1 * gradual).make_symbols()
     gaps, P, P_dot_v, A_t = formation.build_constraints(s.z, s.v)
     Xi, sigma = p.Xi, p.sigma
     if gradual:
@@ -96,7 +97,7 @@ def point_kernel(formation: Formation, gradual: bool = False) -> NamedKernel:
         gaps[n_c:] -= formation.roll_function(s.first, s.v)[0]
     applied = (
         ca.DM(scene.applied_force)
-        + ca.vertcat(0, 0, 0, s.tau[:2] * (1 - p.place) + s.tau[2:] * p.place)
+        + ca.vertcat(0, 0, 0, ca.reshape(s.tau, 2, controls) @ p.shares)
         - ca.DM(scene.dry) * ca.vertcat(0, 0, 0, sigma)
         + build_force_rows(formation, P, A_t, Xi).T @ s.forces
     )
@@ -192,13 +193,16 @@ def new_rows(formation: Formation, following: Formation) -> list[int]:
     return fresh + [n_c + i for i, c in enumerate(rolling) if c not in formation.rolling]
 
 
-@lru_cache(maxsize=1)
-def effort_kernel() -> NamedKernel:
-    """Integral of tau^T tau over an interval."""
-    x = Columns(tau=4, h=1).make_symbols()
-    first, last = x.tau[:2], x.tau[2:]
-    squares = ca.sumsqr(first) + ca.dot(first, last) + ca.sumsqr(last)
-    return _name(x, _NOTHING, effort=x.h * squares / 3)
+@lru_cache(maxsize=8)
+def effort_kernel(controls: int) -> NamedKernel:
+    """Integral of tau^T tau over an interval, by the control points of tau."""
+    x, n = Columns(tau=2 * controls, h=1).make_symbols(), controls - 1
+    products = [
+        [comb(n, i) * comb(n, j) / comb(2 * n, i + j) / (2 * n + 1) for j in range(controls)]
+        for i in range(controls)
+    ]
+    tau = ca.reshape(x.tau, 2, controls)
+    return _name(x, _NOTHING, effort=x.h * ca.trace(tau @ ca.DM(products) @ tau.T))
 
 
 def find_leaving(formation: Formation, following: Formation) -> list[int]:

@@ -29,8 +29,8 @@ class StageLayout:
         there. With a margin, that follows.
     h : ndarray of int, shape (K,)
         Durations of the intervals.
-    tau : ndarray of int, shape (K, 4)
-        Torques at the start and at the end of each interval.
+    tau : ndarray of int, shape (K, 2 m)
+        Control points of the torques in each interval, one after the other.
     z, v, a : ndarray of int, shape (K, d, 5)
         z, z' and z'' at the collocation points.
     forces : ndarray of int, shape (K, d, n_f)
@@ -78,7 +78,8 @@ def lay_out(
     for k, (stage, coming) in enumerate(zip(stages, [*stages[1:], None], strict=True)):
         point = Columns(z=5, v=5, a=5, forces=stage.formation.n_constraints)
         end, short = (0 if scheme.ends else STATE), shortfalls[k] if shortfalls else 0
-        interval = Columns(h=1, tau=4, points=d * point.count, end=end, short=short, m=with_margin)
+        sizes = {"h": 1, "tau": 2 * scheme.controls, "points": d * point.count}
+        interval = Columns(**sizes, end=end, short=short, m=int(with_margin))
         first = stop + np.arange(STATE + with_margin)
         starts = first[-1] + 1 + interval.count * np.arange(stage.intervals)
         own = {
@@ -111,7 +112,7 @@ def pack(points: Sequence[StagePoints], layouts: Sequence[StageLayout], margin: 
     x = np.zeros(layouts[-1].stop)
     for part, layout in zip(points, layouts, strict=True):
         x[layout.z], x[layout.v], x[layout.a] = part.z, part.v, part.a
-        x[layout.forces], x[layout.tau] = part.forces, part.tau.reshape(-1, 4)
+        x[layout.forces], x[layout.tau] = part.forces, part.tau.reshape(len(part.tau), -1)
         x[layout.h], x[layout.short] = part.duration * part.fractions, 1.0
         x[layout.nodes[:, Z]], x[layout.nodes[:, V]] = part.nodes[:, 0], part.nodes[:, 1]
         x[layout.nodes[:, MARGIN:]] = margin
@@ -133,7 +134,7 @@ def unpack(x: Array, layouts: Sequence[StageLayout]) -> list[StagePoints]:
                 x[layout.v],
                 x[layout.a],
                 x[layout.forces],
-                x[layout.tau].reshape(-1, 2, 2),
+                x[layout.tau].reshape(len(layout.tau), -1, 2),
                 x[layout.impulses],
             )
         )

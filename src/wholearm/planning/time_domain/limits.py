@@ -13,7 +13,7 @@ from ...common.shortfalls import Parameter
 from ...mechanics.limits import PRESS, SPEED, LimitSet, make_limits
 from ..options import Objective
 from .assembly import Indices
-from .collocation import Scheme
+from .collocation import Scheme, blend
 from .layout import MARGIN, StageLayout
 from .rows import Rows
 from .stage import Stage
@@ -217,13 +217,12 @@ def _add_point_row(
         for k in np.flatnonzero(of_them):
             rows.add_entries(own, unknowns[..., k], of_them[k])
     for k in np.flatnonzero(of_tau):
-        first, last = layout.tau[:, None, k], layout.tau[:, None, 2 + k]
-        rows.add_entries(own, first, of_tau[k] * (1 - scheme.points))
-        rows.add_entries(own, last, of_tau[k] * scheme.points)
+        for i, shares in enumerate(blend(scheme.points, scheme.controls).T):
+            rows.add_entries(own, layout.tau[:, None, 2 * i + k], of_tau[k] * shares)
 
 
 def _find_unknowns(layout: StageLayout, n_forces: int, column: int) -> Indices:
-    """The unknowns of one torque or joint speed: at both ends of intervals, or at the points."""
+    """The unknowns of one torque or joint speed: its control points, or those at the points."""
     if column < n_forces + 2:
-        return layout.tau.reshape(-1, 2, 2)[..., column - n_forces]
+        return layout.tau[:, column - n_forces :: 2]
     return layout.v[..., 3 + column - n_forces - 2]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from .collocation import Scheme
+from .collocation import Scheme, blend, fit_controls
 from .stage import StagePoints
 
 _HAIR = 1e-12
@@ -73,10 +73,11 @@ def _interpolate(part: StagePoints, scheme: Scheme, places: Array) -> tuple[Arra
 
 
 def _torques(part: StagePoints, breaks: Array) -> Array:
-    """Torques at both ends of new intervals, each inside one old interval at its middle."""
+    """Control points of torques in new intervals, each inside one old interval at its middle."""
     middles = (breaks[1:] + breaks[:-1]) / 2
-    count = len(part.fractions)
+    count, controls = part.tau.shape[:2]
     k = np.clip(np.searchsorted(part.breaks, middles, side="right") - 1, 0, count - 1)
-    ends = np.stack([breaks[:-1], breaks[1:]], axis=1)
-    x = np.clip((ends - part.breaks[k, None]) / part.fractions[k, None], 0.0, 1.0)[..., None]
-    return np.asarray(part.tau[k, None, 0] * (1 - x) + part.tau[k, None, 1] * x)
+    at = np.linspace(0.0, 1.0, controls)
+    places = breaks[:-1, None] + np.diff(breaks)[:, None] * at
+    x = np.clip((places - part.breaks[k, None]) / part.fractions[k, None], 0.0, 1.0)
+    return fit_controls(at, blend(x, controls) @ part.tau[k], controls)

@@ -19,7 +19,7 @@ from ...mechanics.metric import metric_weights
 from ...results.modes import ROLLS, ModeSpan
 from ...results.torque import TorqueProfile
 from ...results.trajectory import Samples
-from .collocation import Scheme
+from .collocation import Scheme, blend
 from .stage import Stage, StagePoints
 
 _NODES = 8
@@ -55,8 +55,8 @@ class Response(NamedTuple):
 class StageMotion:
     """One stage as a function of time.
 
-    tau is linear in each interval. z is what it leads to from the interval's start, pulled onto
-    the contacts, and z' its derivative; z'' and the forces follow by forward dynamics. So the
+    tau is a polynomial in each interval. z is what it leads to from the interval's start, pulled
+    onto the contacts, and z' its derivative; z'' and the forces follow by forward dynamics. So the
     equations of motion and the contacts hold at any instant.
 
     Attributes
@@ -87,10 +87,11 @@ class StageMotion:
 
     @cached_property
     def torque(self) -> TorqueProfile:
-        """Torque from the start of the stage, linear in each interval."""
-        first, last = self.points.tau[:, 0], self.points.tau[:, 1]
-        coefficients = np.stack([(first + last) / 2, (last - first) / 2], axis=2)
-        return TorqueProfile(self.breaks, coefficients)
+        """Torque from the start of the stage, a polynomial in each interval."""
+        controls = self.points.tau.shape[1]
+        at = np.linspace(0.0, 1.0, controls)
+        values = blend(at, controls) @ self.points.tau
+        return TorqueProfile(self.breaks, _fit(2 * at - 1, values))
 
     @property
     def _forward(self) -> Batch:
@@ -118,7 +119,8 @@ class StageMotion:
         z, v = nodes[:, 0], nodes[:, 1]
         x = -np.cos(np.pi * np.arange(_NODES) / (_NODES - 1))
         powers = x[:, None] ** np.arange(_NODES + 2)
-        tau = np.einsum("kjd,nd->knj", self.torque.coefficients, powers[:, :2])
+        torque = self.torque.coefficients
+        tau = np.einsum("kjd,nd->knj", torque, powers[:, : torque.shape[2]])
         count = len(half)
         signs = [np.broadcast_to(part, (count * _NODES, len(part))) for part in self.directions]
         a = _fit(2 * self.scheme.points - 1, self.points.a)

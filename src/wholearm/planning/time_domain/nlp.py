@@ -150,7 +150,7 @@ def build_time_nlp(
 def _add_costs(rows: Rows, cost: Array, stage: Stage, layout: StageLayout, target: Target) -> None:
     """What a stage costs."""
     if target.objective is Objective.EFFORT:
-        kernel = effort_kernel()
+        kernel = effort_kernel(layout.tau.shape[1] // 2)
         rows.add_cost(kernel, kernel.x.join(tau=layout.tau, h=layout.h[:, None]))
     of_time = {
         Objective.TIME: 1.0,

@@ -145,6 +145,8 @@ class Search:
         """A search for what `plan_phases` is given, in SI units."""
         scales = problem.scene.scales
         lengths, unit = unit_lengths(scales), unit_of(options.goal, scales)
+        # Where the least time leaves torques open for a while, those of a higher degree would ring.
+        controls = options.degree if options.goal is Objective.EFFORT else 2
 
         def expand(z: Array) -> tuple[float, Array]:
             assert to_go is not None
@@ -154,7 +156,7 @@ class Search:
         return Search(
             in_own_units(problem),
             scale_options(options, scales),
-            make_scheme(options.scheme, options.degree),
+            make_scheme(options.scheme, options.degree, controls),
             None if duration is None else duration / scales.time,
             options.goal,
             to_go=expand if to_go else None,

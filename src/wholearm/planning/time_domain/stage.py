@@ -28,8 +28,8 @@ class StagePoints(NamedTuple):
         z, z' and z'' at the collocation points.
     forces : ndarray, shape (K, d, n_c + R), [N]
         c_n of all contacts, then c_t of the rolling ones.
-    tau : ndarray, shape (K, 2, 2), [N m]
-        At the start and at the end of each interval; linear in between.
+    tau : ndarray, shape (K, m, 2), [N m]
+        Control points of each interval: torques are polynomials of degree m - 1 there.
     impulses : ndarray, shape (n_c + R,) of the next stage, or (0,), [N s]
         Of the impact with which the stage ends, if it does.
     """

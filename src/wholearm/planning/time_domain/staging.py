@@ -167,7 +167,7 @@ def _guess(
         passed = clock[0] + at * (clock[1] - clock[0])
         own = np.searchsorted(pace.t / pace.t[-1], passed) - 1
         forces = pace.forces[np.clip(own, 0, len(pace.forces) - 1)]
-    tau = _balance(outline, z, v, a, forces)
+    tau = _balance(outline, scheme, z, v, a, forces)
     return StagePoints(
         total * (clock[1] - clock[0]),
         np.full(count, 1 / count),
@@ -223,13 +223,16 @@ def _press(outline: PathGuess, z: Array, v: Array, a: Array) -> Array:
     return c.reshape(*z.shape[:2], -1)
 
 
-def _balance(outline: PathGuess, z: Array, v: Array, a: Array, forces: Array) -> Array:
-    """Torques of a motion with contact forces, shape (K, 2, 2), within limits."""
+def _balance(
+    outline: PathGuess, scheme: Scheme, z: Array, v: Array, a: Array, forces: Array
+) -> Array:
+    """Control points of the torques of a motion with contact forces, (K, m, 2), within limits."""
     limit, (G, needed) = outline.formation.scene.torque_limit, _lack(outline, z, v, a)
     c = forces.reshape(len(G), -1)
     tau = needed[:, 3:] - np.einsum("nij,ni->nj", G[:, :, 3:], c)
     tau = np.clip(tau, -0.9 * limit, 0.9 * limit).reshape(*z.shape[:2], 2)
-    return np.stack([tau[:, 0], tau[:, -1]], axis=1)
+    chosen = np.linspace(0, scheme.degree - 1, scheme.controls).round().astype(int)
+    return np.asarray(tau[:, chosen])
 
 
 def _go_straight(phase: Phase, nearest: list[PathGuess], before: PathGuess) -> list[PathGuess]:
