@@ -68,8 +68,8 @@ def _isolate(problem: Problem, index: int, z: Array) -> Problem:
 
 def find_end_error(problem: Problem, name: str, degree: int, intervals: int) -> float:
     """Largest difference of any z between simulation and collocation at the end, or NaN."""
-    scheme = make_scheme(name, degree)
     search = Search.of(problem, PlanOptions(Objective.EFFORT, scheme=name, degree=degree))
+    scheme = search.scheme
     stages = guess_stages(problem, problem.phases, problem.start, scheme, intervals, _FALLS)
     found = [to_si(stage, problem) for stage in search.solve(stages).stages]
     torque = TimeMotion(make_motions(found, scheme)).torque
