@@ -312,15 +312,15 @@ def _bridge(run: Replay) -> bool:
 def _goes_on(run: Replay) -> bool:
     """Whether all that slides or turns is far too fast to come to rest in the shortest time."""
     s, scales = run.stepper, run.problem.scene.scales
-    units, count = measure_units(run.problem.scene)[5:], s.formation.n_contacts
-    rates = s.outputs[s.to.events][s.rows.slide.start : s.rows.joint.stop].copy()
-    rates[:count] /= scales.speed
-    rates[count:] *= scales.time
-    held = np.append(s.inputs[s.at.Xi], s.inputs[s.at.sigma]) == 0
-    fastest = np.abs(s.outputs[s.to.y][5:10] / units).max()
-    strongest = np.abs(s.outputs[s.to.acceleration] / units).max() * scales.time
+    units = measure_units(run.problem.scene)[5:]
+    # Lists, as there are few numbers.
+    turning = s.outputs[s.to.events][s.rows.slide.start : s.rows.joint.stop].tolist()
+    signs = [*s.inputs[s.at.Xi].tolist(), *s.inputs[s.at.sigma].tolist()]
+    fastest = max(map(abs, (s.outputs[s.to.y][5:10] / units).tolist()))
+    strongest = max(map(abs, (s.outputs[s.to.acceleration] / units).tolist())) * scales.time
     most = _FAR * SETTLING * (strongest + fastest**2)
-    return bool((held | (rates > most)).all())
+    least = [most * scales.speed] * s.formation.n_contacts + [most / scales.time] * 2
+    return all(not x or rate > low for x, rate, low in zip(signs, turning, least, strict=True))
 
 
 def _cross(run: Replay, stop: float) -> None:
