@@ -25,6 +25,7 @@ def test_small_changes_leave_a_plan(monkeypatch: pytest.MonkeyPatch) -> None:
     assert row.error == 0.0 and row.note == "2 of 2 planned and verified"
 
 
+@pytest.mark.usefixtures("unadvised")
 def test_what_has_no_plan_is_counted_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(changes, "TRIALS", 1)
     monkeypatch.setattr(changes, "CHANGES", (0.05,))

@@ -66,14 +66,14 @@ def test_axes_are_logarithmic_with_names_and_units() -> None:
 
 def test_work_is_as_large_as_is_asked() -> None:
     table = dict(read_problem(str(HEPTAGON)).table)
-    # Five nodes for each element of four intervals.
-    for size, nodes in ((12, 15), (20, 25)):
+    # Five nodes for each element of four intervals, of which there are more than switches.
+    for size, nodes in ((40, 50), (80, 100)):
         with record_runs() as runs:
             run_work(table, "intervals", "least time", size)
         assert runs[0].unknowns == 3 * nodes - 2
     with record_runs() as runs:
-        run_work(table, "intervals", "margin", 20)
-    assert max(run.unknowns for run in runs) > 3 * 25 - 2
+        run_work(table, "intervals", "margin", 40)
+    assert max(run.unknowns for run in runs) > 3 * 50 - 2
     for size in (5, 6):
         run_work(table, "vertices", "reading", size)
 

@@ -30,7 +30,7 @@ def test_rates_are_those_of_the_formations_own_rows(grips: Grips) -> None:
         packed[at.Xi], packed[at.sigma] = signs[:-2], signs[-2:]
         packed[at.piece], packed[at.torque] = (0.0, 2.0), [tau[0], 0.0, tau[1], 0.0]
         _, P, bend, A_t = mode.build_constraints(state[:5], state[5:10])
-        rates, least = shared[0].stage(state[:10], 0.7, packed, P, bend, A_t)
+        rates, least, c_n = shared[0].stage(state[:10], 0.7, packed, P, bend, A_t)
         v = state[5:10]
         known = formation.evaluate(state[None, :5], v[None])
         turn = 1e-7 * v
@@ -42,5 +42,6 @@ def test_rates_are_those_of_the_formations_own_rows(grips: Grips) -> None:
         load = np.array([1.0, *tau])
         expected = response.acceleration @ load
         assert np.asarray(rates)[5:10, 0] == pytest.approx(expected, rel=1e-6)
-        held = (response.force_limits @ load / mode.force_limit_units).min()
-        assert float(least) == pytest.approx(held, rel=1e-6)
+        held = response.force_limits @ load
+        assert float(least) == pytest.approx((held / mode.force_limit_units).min(), rel=1e-6)
+        assert np.asarray(c_n)[:, 0] == pytest.approx(held[: formation.n_contacts], rel=1e-6)

@@ -11,14 +11,15 @@ import pytest
 from crossing import hexagon, measure_fingers
 from planned import CosineMotion, change, plan
 from pushed import forward
-from shipped import HEXAGON, plan_of
+from shipped import HEXAGON, problem_of
 from wholearm.benchmark.baseline_simulation import simulate_with_scipy, solve_motion
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, JammingError, SimulationError
 from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
 from wholearm.mechanics.dynamics import Directions
-from wholearm.problem.definition import Phase, Problem, Until
+from wholearm.planning.plan import solve
+from wholearm.problem.definition import End, Phase, Problem, Until
 from wholearm.results.torque import TorqueProfile
 from wholearm.scene.model import Finger, Friction, Scene
 from wholearm.simulation import within
@@ -425,8 +426,11 @@ def test_another_limit_ends_the_motion() -> None:
 @pytest.mark.parametrize("solid", [True, False])
 def test_fingers_that_touch_end_the_motion(solid: bool) -> None:
     """The hexagon's plan replayed by a hand with a longer left finger."""
-    problem = hexagon(solid=solid)
-    simulation = simulate(problem, plan_of(HEXAGON).torque)
+    whole, problem = problem_of(HEXAGON), hexagon(solid=solid)
+    *moving, last = whole.phases[:3]
+    slide = dataclasses.replace(whole, phases=(*moving, dataclasses.replace(last, end=End.REST)))
+    torque = solve(slide, intervals=20, replay=False).trajectory.torque
+    simulation = simulate(dataclasses.replace(problem, phases=problem.phases[:3]), torque)
     gaps = measure_fingers(problem.scene, simulation.z)
     if not solid:
         assert simulation.outcome.reached and gaps.min() < -1e-4
