@@ -19,8 +19,6 @@ from ..lower_bound.sweep import find_fastest as sweep
 from .data import PhaseData
 from .switches import Sights, Switch
 
-_SPEEDS = 2
-"""Sweeps until viscous friction is linearised about the right speed."""
 _SHARES = {Mode.PUSH: 0.0, Mode.SWITCH: 0.0, Mode.BRAKE: 1.0, Mode.HELD: 0.5}
 """How far s'' is from its largest, over the range that limits allow."""
 _CLOSE = 1e-4
@@ -161,11 +159,13 @@ def _sweep(
     inner, steps = rows.pick(middle), np.diff(s)
     part = (sights.s[middle] - s[:-1]) / steps
     cap = np.append(rows.cap[:: 2 * stride], np.inf)
-    for _ in range(_SPEEDS if near is None and inner.v.any() else 1):
-        found = sweep(inner, steps, part, cap, near)
-        near = (1 - part) * found.b[:-1] + part * found.b[1:]
-    assert near is not None
-    return s, found.b, found.modes, near
+    if near is None and inner.v.any():
+        # Viscous friction is linearised about a motion without it, for which few places will do.
+        wide = max(len(sights.fractions) // 2, stride)
+        ends, b, *_ = _sweep(sights, rows._replace(v=np.zeros_like(rows.v)), wide, None)
+        near = np.interp(sights.s[middle], ends, b)
+    found = sweep(inner, steps, part, cap, near)
+    return s, found.b, found.modes, (1 - part) * found.b[:-1] + part * found.b[1:]
 
 
 class _Margins(NamedTuple):

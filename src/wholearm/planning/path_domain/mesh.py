@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...common.arrays import Array, sort_unique
 from ...geometry.curve import Curve
@@ -19,8 +20,8 @@ from .data import PhaseData
 from .elements import Grid, Profile, lay_out
 from .switches import Switch, find_switches
 
-START = {Objective.EFFORT: 20}
-"""Elements of a phase to begin with, if not 10: a plan of least effort switches more softly."""
+START, SOFT = 10, 20
+"""Elements of a phase to begin with, and where plans switch more softly, for least effort."""
 MOST = 80
 """Elements of a phase from which on they are not doubled."""
 SHIFTED = 0.02
@@ -62,11 +63,7 @@ class Mesh(NamedTuple):
         ends = find_ends(curve, self.breaks)
         angles = np.arccos(1 - 2 * np.clip(ends / curve.length, 0.0, 1.0))
         weights = np.diff(angles) if self.weights is None else self.weights
-        # Halves go up whatever their last bit is.
-        wanted = weights / weights.sum() * elements + 0.5 + 1e-6
-        counts = np.maximum(1, np.floor(wanted).astype(int))
-        while counts.sum() != elements:
-            counts[np.argmax(counts)] += np.sign(elements - counts.sum())
+        counts = _share_out(elements, weights)
         places = np.repeat(np.arange(len(counts)), counts)
         done = np.concatenate([np.arange(count) / count for count in counts])
         starts = angles[places] + done * np.diff(angles)[places]
@@ -77,9 +74,37 @@ class Mesh(NamedTuple):
         return lay_out(pairs, np.searchsorted(stops[:-1], pairs.mean(axis=1)), rests)
 
 
+def _share_out(elements: int, weights: Array) -> NDArray[np.int64]:
+    """Share out elements by weights, at least one each."""
+    # Halves go up whatever their last bit is.
+    wanted = weights / weights.sum() * elements + 0.5 + 1e-6
+    counts = np.maximum(1, np.floor(wanted).astype(int))
+    while counts.sum() != elements:
+        counts[np.argmax(counts)] += np.sign(elements - counts.sum())
+    return np.asarray(counts)
+
+
 def find_ends(curve: Curve, breaks: Array) -> Array:
     """Ends of the stretches between breaks and reversals of a curve [m]."""
     return sort_unique(np.array([0.0, *(segment.stop for segment in curve.segments), *breaks]))
+
+
+class Better(NamedTuple):
+    """A mesh that suits what has been found on another.
+
+    Attributes
+    ----------
+    mesh : Mesh
+    shift : float
+        How far breaks are from where they were, over the curve's length; infinite if there is one
+        where s'' jumps from one extreme to the other and none was.
+    price : float
+        What tightening is likely to cost on it with as many elements.
+    """
+
+    mesh: Mesh
+    shift: float
+    price: float
 
 
 def adapt(
@@ -89,8 +114,8 @@ def adapt(
     margin: float,
     prices: Array,
     before: Mesh,
-) -> tuple[Mesh, float]:
-    """A mesh for what has been found on another, and how far breaks have shifted.
+) -> Better:
+    """A mesh for what has been found on another.
 
     Parameters
     ----------
@@ -104,27 +129,22 @@ def adapt(
         Of each node.
     before : Mesh
         The other one.
-
-    Returns
-    -------
-    tuple
-        The mesh, and how far breaks are from where they were, over the curve's length; infinite if
-        there is one where s'' jumps from one extreme to the other and none was.
     """
     breaks, shift = before.breaks, 0.0
     if goal in (Objective.TIME, Objective.MARGIN):
         switches = find_switches(part, profile, margin)
         breaks, shift = _match(before.breaks, switches, part.curve)
     if len(breaks) != len(before.breaks):
-        return Mesh(breaks), shift
+        return Better(Mesh(breaks), shift, float(prices.sum()))
     ends = find_ends(part.curve, before.breaks)
     middles = part.grid.edges.mean(axis=1)
     owner = np.searchsorted(ends, middles) - 1
     per_element = prices.reshape(len(middles), -1).sum(axis=1)
     counts = np.bincount(owner, minlength=len(ends) - 1)
     price = np.bincount(owner, per_element, len(ends) - 1)
-    price = np.maximum(price, _CHEAP * price.sum() + 1e-300)
-    return Mesh(breaks, counts * (price / counts) ** (1 / _ORDER)), shift
+    weights = counts * (np.maximum(price, _CHEAP * price.sum() + 1e-300) / counts) ** (1 / _ORDER)
+    finer = counts / _share_out(len(middles), weights)
+    return Better(Mesh(breaks, weights), shift, float((price * finer**_ORDER).sum()))
 
 
 def _match(known: Array, switches: Sequence[Switch], curve: Curve) -> tuple[Array, float]:

@@ -17,7 +17,7 @@ from .data import PhaseData, cut, fit_torque, join, prepare
 from .elements import DEGREE, Elements
 from .fastest import Fastest, find_fastest
 from .first_guess import guess
-from .mesh import MOST, SHIFTED, START, Mesh, adapt, find_ends
+from .mesh import MOST, SHIFTED, SOFT, START, Mesh, adapt, find_ends
 from .misses import MISS, Misses, PathSolution, anticipate, price
 from .motion import PathMotion
 from .nlp import (
@@ -39,10 +39,12 @@ _SHARE = 0.5
 """Share of the accuracy that is allowed for shifted switches."""
 _DEAR = {Objective.TIME: 1.0, Objective.MARGIN: 1.0, Objective.EFFORT: 0.2}
 """Share of the accuracy that missed limits may cost by first order: efforts have other errors."""
+_LIKELY = 0.2
+"""Share of that which as many elements, placed better, may be likely to cost."""
 _LONGER = 0.2
 """Most that the NLP's duration may be allowed to be longer, relatively."""
 _EARLY = 1e-5
-"""Accuracy from which on limits are tightened before anything is solved."""
+"""Accuracy from which on few elements will do, and limits are tightened before all solves."""
 _SETTLED = 0.1
 """Share of the accuracy below which switches are not looked for again."""
 
@@ -74,7 +76,8 @@ class Task:
         """Elements of each phase to begin with."""
         intervals = self.options.intervals
         if intervals is None:
-            return START.get(self.options.goal, 10)
+            few = START if self.options.accuracy >= _EARLY else 2 * START
+            return max(few, SOFT) if self.options.goal is Objective.EFFORT else few
         return max(-(-intervals // DEGREE), 3)
 
     def lay_out(
@@ -295,7 +298,8 @@ class Round:
         prices = self.due + self.paid - self.wasted
         shares = np.split(prices, np.cumsum([len(part.grid.s) for part in self.parts])[:-1])
         coarse = self.elements < MOST and task.options.intervals is None
-        dear = dearer or bool(prices.sum() > _DEAR[task.options.goal] * most)
+        enough = _DEAR[task.options.goal] * most
+        dear = dearer or bool(prices.sum() > enough)
         # Once switches have settled they need not be looked for, and where much is missed they are
         # not better known than by a sweep.
         settled = SHIFTED * self.shift < _SETTLED * most
@@ -307,7 +311,7 @@ class Round:
                 self.parts, self.motions, shares, self.meshes, strict=True
             )
         ]
-        shift = self.shift if settled else max(own for _, own in found)
+        shift = self.shift if settled else max(better.shift for better in found)
         moved = SHIFTED * shift > _SHARE * most
         # What is missed where elements do not end at switches yet says little.
         begun = dearer or self.is_split or not np.isinf(shift)
@@ -317,8 +321,9 @@ class Round:
                 return replace(self, shift=shift), None
             longer = self.tightening._replace(duration=self.allowed)
             return self, replace(self, tightening=longer, duration=self.allowed, shift=shift)
-        meshes = tuple(mesh for mesh, _ in found)
-        return self, self._restart(meshes, self.elements * (2 if dear else 1), shift)
+        more = dearer or (dear and sum(better.price for better in found) > _LIKELY * enough)
+        meshes = tuple(better.mesh for better in found)
+        return self, self._restart(meshes, self.elements * (2 if more else 1), shift)
 
     def summarise(self) -> Plans:
         """The plan of each phase."""
