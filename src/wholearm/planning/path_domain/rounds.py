@@ -96,20 +96,21 @@ class Task:
         return elements, parts, data, nlp
 
     def place_breaks(self, switches: Sequence[Switch]) -> tuple[Mesh, ...]:
-        """Meshes with elements that end at switches, which are at places along all curves."""
+        """Meshes with elements that end at switches, which are at places along all curves.
+
+        Where a fixed number of elements is too few for that, they do not.
+        """
         starts = np.cumsum([0.0, *(curve.length for curve in self.curves)])
         of_curve = np.searchsorted(starts[1:-1], [place for place, _ in switches])
-        return tuple(
-            Mesh.of(
-                curve,
-                [
-                    own._replace(place=own.place - start)
-                    for own, owner in zip(switches, of_curve, strict=True)
-                    if owner == k
-                ],
-            )
-            for k, (curve, start) in enumerate(zip(self.curves, starts, strict=False))
-        )
+        meshes = list[Mesh]()
+        for k, curve in enumerate(self.curves):
+            pairs = zip(switches, of_curve, strict=True)
+            own = [Switch(place - starts[k], jumps) for (place, jumps), at in pairs if at == k]
+            meshes.append(Mesh.of(curve, own))
+            ends = find_ends(curve, meshes[-1].breaks)
+            if self.options.intervals and len(ends) > self.elements:
+                meshes[-1] = Mesh()
+        return tuple(meshes)
 
     def prepare(self, meshes: Sequence[Mesh], elements: int) -> list[PhaseData]:
         """What each phase gives the NLP on its grid."""
