@@ -64,8 +64,9 @@ class Misses(NamedTuple):
         duration: float | None,
     ) -> Misses:
         """Misses of a solution, which is one motion for each phase."""
-        total = sum(motion.duration for motion in motions)
-        late = max(0.0, total / duration - 1) if duration else 0.0
+        late = 0.0
+        if duration:
+            late = max(0.0, sum(motion.duration for motion in motions) / duration - 1)
         return Misses(*data.misses(solution.profile, solution.margin), late)
 
     def find_worst(self, data: PhaseData) -> float:
