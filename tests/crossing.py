@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from once import once
 from plane import cross, point_to_segment
-from shipped import HEXAGON
+from shipped import HEXAGON, problem_of
 from wholearm.common.arrays import Array
-from wholearm.problem.definition import Problem
+from wholearm.planning.plan import solve
+from wholearm.planning.result import Plan
+from wholearm.problem.definition import End, Problem
 from wholearm.problem.read import build_problem
 from wholearm.scene.model import Scene
 
@@ -24,6 +28,20 @@ def hexagon(
         table["fingers"][key]["length"] = length
     table["fingers"]["2"]["base"][0] = base
     return build_problem(table | {"fingers_collide": solid})
+
+
+@once
+def slid() -> Plan:
+    """The hexagon's phases before it tips, the last of them to rest."""
+    whole = problem_of(HEXAGON)
+    *moving, last = whole.phases[:3]
+    phases = (*moving, replace(last, end=End.REST))
+    return solve(replace(whole, phases=phases), intervals=20, replay=False)
+
+
+def shorten(problem: Problem) -> Problem:
+    """A problem like the hexagon's with the same phases only."""
+    return replace(problem, phases=problem.phases[:3])
 
 
 def make_way(solid: bool) -> Problem:

@@ -8,18 +8,16 @@ import sys
 import numpy as np
 import pytest
 
-from crossing import hexagon, measure_fingers
+from crossing import hexagon, measure_fingers, shorten, slid
 from planned import CosineMotion, change, plan
 from pushed import forward
-from shipped import HEXAGON, problem_of
 from wholearm.benchmark.baseline_simulation import simulate_with_scipy, solve_motion
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, JammingError, SimulationError
 from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
 from wholearm.mechanics.dynamics import Directions
-from wholearm.planning.plan import solve
-from wholearm.problem.definition import End, Phase, Problem, Until
+from wholearm.problem.definition import Phase, Problem, Until
 from wholearm.results.torque import TorqueProfile
 from wholearm.scene.model import Finger, Friction, Scene
 from wholearm.simulation import within
@@ -426,11 +424,8 @@ def test_another_limit_ends_the_motion() -> None:
 @pytest.mark.parametrize("solid", [True, False])
 def test_fingers_that_touch_end_the_motion(solid: bool) -> None:
     """The hexagon's plan replayed by a hand with a longer left finger."""
-    whole, problem = problem_of(HEXAGON), hexagon(solid=solid)
-    *moving, last = whole.phases[:3]
-    slide = dataclasses.replace(whole, phases=(*moving, dataclasses.replace(last, end=End.REST)))
-    torque = solve(slide, intervals=20, replay=False).trajectory.torque
-    simulation = simulate(dataclasses.replace(problem, phases=problem.phases[:3]), torque)
+    problem = shorten(hexagon(solid=solid))
+    simulation = simulate(problem, slid().trajectory.torque)
     gaps = measure_fingers(problem.scene, simulation.z)
     if not solid:
         assert simulation.outcome.reached and gaps.min() < -1e-4

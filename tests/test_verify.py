@@ -10,9 +10,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from crossing import hexagon, measure_fingers
+from crossing import hexagon, measure_fingers, shorten, slid
 from planned import change, plan
-from shipped import HEXAGON, plan_of, problem_of
 from tipping import box, scale, tipped
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
@@ -280,7 +279,7 @@ def test_a_slip_fails(later: float) -> None:
 
 
 def test_the_least_gap_of_the_fingers_is_reported() -> None:
-    problem, plan_ = problem_of(HEXAGON), plan_of(HEXAGON)
+    problem, plan_ = slid().problem, slid().trajectory
     report = verify(problem, plan_)
     assert report.ok and report.finger_gap is not None
     motions = zip(plan_.motions, plan_.phase_starts, strict=False)
@@ -297,10 +296,10 @@ def test_the_least_gap_of_the_fingers_is_reported() -> None:
 
 
 def test_fingers_that_touch_fail() -> None:
-    report = verify(hexagon(), plan_of(HEXAGON))
+    report = verify(shorten(hexagon()), slid().trajectory)
     assert not report.ok and report.finger_gap is not None
     assert report.failures[0].startswith("finger 1 touches finger 2 at t = ")
     assert report.finger_gap.least < 1e-6
-    passing = verify(hexagon(solid=False), plan_of(HEXAGON))
+    passing = verify(shorten(hexagon(solid=False)), slid().trajectory)
     assert passing.ok and passing.finger_gap is None
     assert "gap of the fingers" not in passing.to_text()
