@@ -154,7 +154,7 @@ def test_limits_rise_by_more_than_they_are_missed() -> None:
 
 def test_tightening_holds_limits_that_points_alone_do_not() -> None:
     problem = landing()
-    search, loose = Search.of(problem, PlanOptions()), solve_at_points()
+    search, loose = Search.of(problem, PlanOptions(time_intervals=6)), solve_at_points()
     held = enforce_between(search, loose)
     assert loose.success and held.success
     worst = []
@@ -174,7 +174,7 @@ def solve_at_points() -> Solution:
     problem = landing()
     start = plan_landing(time_intervals=6)[0].motion.stages[0].points.nodes[0, 0]
     stages = guess_stages(problem, problem.phases[4:], start, SCHEME, 6, 2.0)
-    solution = Search.of(problem, PlanOptions()).solve(stages)
+    solution = Search.of(problem, PlanOptions(time_intervals=6)).solve(stages)
     assert solution.success
     return solution
 

@@ -300,7 +300,9 @@ def test_a_block_that_starts_elsewhere_gets_another_share() -> None:
     whole = problem_of(TWICE)
     phases = tuple(replace(phase, index=k) for k, phase in enumerate(whole.phases[4:8]))
     problem = replace(whole, start=trace_phases(whole)[-1].end, phases=phases)
-    options = PlanOptions("margin", duration=0.258, time_intervals=4, intervals=20)
+    options = PlanOptions(
+        "margin", duration=0.258, time_intervals=4, intervals=20, mode_search=False
+    )
     planning = plan_blocks(problem, trace_phases(problem), options, lambda _: None)
     times = np.array([plan.motion.duration for plan in planning.least])
     more = 0.258 / times.sum()
