@@ -67,12 +67,14 @@ def find_fastest(rows: Rows, steps: Array, part: Array, cap: Array, near: Array 
     cap : ndarray, shape (N + 1,)
         Largest b at the nodes.
     near : ndarray, shape (N,), optional
-        What b at the places is about: there the speed is linearised; without it, left out.
+        What b at the places is about: there the speed is linearised; without it or at rest, left
+        out.
     """
     of_b, one = rows.b, rows.one
     if near is not None:
-        speed = np.sqrt(near)[:, None]
-        of_b, one = of_b + rows.v / (2 * speed), one + rows.v * speed / 2
+        speed = np.sqrt(np.maximum(near, 0.0))[:, None]
+        drag = np.divide(rows.v, 2 * speed, out=np.zeros_like(rows.v), where=speed > 0)
+        of_b, one = of_b + drag, one + rows.v * speed / 2
     of_a = rows.a / (2 * steps)[:, None]
     before = (1 - part)[:, None] * of_b - of_a
     after = part[:, None] * of_b + of_a
