@@ -38,7 +38,7 @@ from wholearm.planning.time_domain.staging import guess_stages
 from wholearm.results.trajectory import Trajectory
 
 EPSILON = 0.05
-SCHEME = make_scheme("radau", 3)
+SCHEME = make_scheme("radau", 3, 3)
 
 
 def as_stage(motion: StageMotion, **fields: object) -> Stage:

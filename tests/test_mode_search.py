@@ -83,10 +83,10 @@ def test_plans_are_the_same_whichever_way_a_joint_is_guessed(
 
 def test_rolling_for_a_while_is_found_where_it_is_the_best_of_all_sequences() -> None:
     # The box turns over one vertex one way, so that only its own mode is in question.
-    search, (stage,) = outlined(tilting(), 8)
+    search, (stage,) = outlined(tilting(), 16)
     modes = [mode_of(stage).changed((0,), sign) for sign in (-1.0, 0.0)]
     guesses = [[in_mode(stage, mode)] for mode in modes]
-    guesses.append(split(in_mode(stage, modes[1]), search.scheme, 4, 8, modes[0]))
+    guesses.append(split(in_mode(stage, modes[1]), search.scheme, 8, 16, modes[0]))
     slides, rolls, both = (search.solve(link(guess)) for guess in guesses)
     # Sliding throughout and rolling throughout are possible; doing both in turn is quicker.
     assert slides.success and rolls.success and both.success

@@ -33,7 +33,7 @@ from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.staging import guess_stages
 from wholearm.problem.definition import Problem
 
-SCHEME = make_scheme("radau", 3)
+SCHEME = make_scheme("radau", 3, 3)
 TORQUE = "fingers.1.torque_limit"
 COARSE = PlanOptions(time_intervals=4)
 LEAST = 0.35 * 0.2 * 9.81

@@ -18,6 +18,7 @@ from wholearm.planning.time_domain import kernels
 from wholearm.planning.time_domain.assembly import Kernel
 from wholearm.planning.time_domain.collocation import blend, make_scheme
 from wholearm.planning.time_domain.kernels import (
+    bend_kernel,
     collocation_kernel,
     effort_kernel,
     end_kernel,
@@ -227,6 +228,15 @@ def test_collocation_holds_for_what_polynomials_integrate(
     missed = call(kernel, x, N.ravel(order="F")).reshape(-1, freedoms)
     np.testing.assert_allclose(missed[0], N.T @ shift, atol=1e-13)
     np.testing.assert_allclose(missed[1:], 0.0, atol=1e-13)
+
+
+def test_only_what_bends_within_an_interval_costs() -> None:
+    straight, weight = np.linspace([1.0, 2.0], [3.0, -1.0], 4), np.array([0.5, 2.0])
+    bent = straight + np.array([0.0, 0.0, 0.3, 0.0])[:, None] * [1.0, 0.0]
+    got = [call(bend_kernel(4), [own.ravel(), np.array([0.1])], weight) for own in (straight, bent)]
+    np.testing.assert_allclose(got[0], 0.0, atol=1e-15)
+    # Second differences of 0.3 and -0.6 of the first torque.
+    np.testing.assert_allclose(got[1], 0.1 * 0.5 * (0.3**2 + 0.6**2), rtol=1e-12)
 
 
 @pytest.mark.parametrize("controls", [2, 3, 5])

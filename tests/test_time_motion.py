@@ -68,16 +68,17 @@ def test_velocities_are_derivatives(stages: list[StageMotion]) -> None:
         assert np.abs(z_ddot - samples.z_ddot).max() < 1e-3 * np.abs(samples.z_ddot).max()
 
 
-def test_torques_are_linear_between_the_nodes(stages: list[StageMotion]) -> None:
+def test_torques_are_polynomials_between_the_nodes(stages: list[StageMotion]) -> None:
     for stage in stages:
         part = stage.points
         x = np.array([0.1, 0.5, 0.9])
         t = (stage.duration * part.places(x)).ravel()
-        expected = part.tau[:, None, 0] * (1 - x[:, None]) + part.tau[:, None, 1] * x[:, None]
+        shares = np.stack([(1 - x) ** 2, 2 * x * (1 - x), x**2], axis=1)
+        expected = shares @ part.tau
         np.testing.assert_allclose(stage.torque.at(t), expected.reshape(-1, 2), atol=1e-11)
         np.testing.assert_array_equal(stage.evaluate(t).tau, stage.torque.at(t))
         assert stage.torque.duration == pytest.approx(stage.duration, rel=1e-14)
-        assert stage.torque.coefficients.shape == (len(part.fractions), 2, 2)
+        assert stage.torque.coefficients.shape == (len(part.fractions), 2, 3)
 
 
 def test_motions_pass_through_their_nodes(stages: list[StageMotion]) -> None:

@@ -368,14 +368,6 @@ def test_a_margin_below_epsilon_is_planned_again_from_the_least_time(
     assert goals[:2] == [Objective.MARGIN, Objective.TIME] and usual.value > problem.epsilon
 
 
-def test_torques_switch_as_often_where_collocation_is_more_exact() -> None:
-    problem, _ = shove()
-    options = PlanOptions(time_intervals=COARSE, degree=4)
-    plans = plan_phases(problem, problem.phases, problem.start, options)
-    for plan in plans:
-        assert sum(stage.points.tau.shape[0] for stage in plan.motion.stages) >= 2 * COARSE
-
-
 def test_plans_are_the_same_every_time() -> None:
     """Nothing is left of what was planned before, nor of what was planned in between."""
     (problem, _), (other, _) = shove(), heave()

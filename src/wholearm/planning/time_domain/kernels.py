@@ -205,6 +205,15 @@ def effort_kernel(controls: int) -> NamedKernel:
     return _name(x, _NOTHING, effort=x.h * ca.trace(tau @ ca.DM(products) @ tau.T))
 
 
+@lru_cache(maxsize=8)
+def bend_kernel(controls: int) -> NamedKernel:
+    """What bends of torques within an interval cost, by second differences of control points."""
+    x, p = Columns(tau=2 * controls, h=1).make_symbols(), Columns(weight=2).make_symbols()
+    tau = ca.reshape(x.tau, 2, controls)
+    bends = tau[:, 2:] - 2 * tau[:, 1:-1] + tau[:, :-2]
+    return _name(x, p, cost=x.h * ca.dot(p.weight, ca.sum2(bends**2)))
+
+
 def find_leaving(formation: Formation, following: Formation) -> list[int]:
     """Contacts of a formation that the next one does not have."""
     return [i for i, c in enumerate(formation.contacts) if c not in following.contacts]

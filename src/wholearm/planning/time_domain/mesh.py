@@ -72,6 +72,13 @@ def _interpolate(part: StagePoints, scheme: Scheme, places: Array) -> tuple[Arra
     return z, v, a, forces
 
 
+def with_controls(part: StagePoints, count: int) -> StagePoints:
+    """A stage's points with another number of control points of torques."""
+    known = part.tau.shape[1]
+    at = np.linspace(0.0, 1.0, max(count, known))
+    return part._replace(tau=fit_controls(at, blend(at, known) @ part.tau, count))
+
+
 def _torques(part: StagePoints, breaks: Array) -> Array:
     """Control points of torques in new intervals, each inside one old interval at its middle."""
     middles = (breaks[1:] + breaks[:-1]) / 2

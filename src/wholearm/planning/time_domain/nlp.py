@@ -39,7 +39,7 @@ from ..options import Objective
 from .assembly import Assembled, assemble_nlp
 from .collocation import Scheme
 from .equations import StageRows, add_stage, find_still, join_stages, least_senses
-from .kernels import effort_kernel
+from .kernels import bend_kernel, effort_kernel
 from .layout import MARGIN, STATE, StageLayout, V, Z, lay_out
 from .limits import Target, bound_by_limits
 from .rows import Rows
@@ -47,6 +47,9 @@ from .stage import Stage
 
 SHORTEST = 1e-6
 """Least duration of an interval, in the scene's unit: next to nothing, and not nothing."""
+_BEND = 1e-2
+"""Weight of the bends of torques within intervals, over their limits, against time or the margin:
+where those leave torques open for a while, they would ring between the points."""
 _HURRY = 3e-4
 """Weight of time against shortfalls: keeps a motion that is short of something brisk."""
 CLEAR = 1e-3
@@ -130,7 +133,7 @@ def build_time_nlp(
         rows_of.append(add_stage(rows, stage, layout, scheme, stage is stages[-1], target))
         if k + 1 < len(stages):
             join_stages(rows, stage, stages[k + 1], layout, layouts[k + 1].nodes[0])
-        _add_costs(rows, cost, stage, layout, target)
+        _add_costs(rows, cost, stage, layout, scheme, target)
     duration_row, last, end = -1, stages[-1], layouts[-1].nodes[-1]
     if target.chained:
         cost[end[MARGIN]] = -1.0 if target.objective is Objective.MARGIN else 1.0
@@ -147,11 +150,17 @@ def build_time_nlp(
     return TimeNLP(built, max_iter, layouts, rows, rows_of, duration_row)
 
 
-def _add_costs(rows: Rows, cost: Array, stage: Stage, layout: StageLayout, target: Target) -> None:
+def _add_costs(
+    rows: Rows, cost: Array, stage: Stage, layout: StageLayout, scheme: Scheme, target: Target
+) -> None:
     """What a stage costs."""
     if target.objective is Objective.EFFORT:
-        kernel = effort_kernel(layout.tau.shape[1] // 2)
+        kernel = effort_kernel(scheme.controls)
         rows.add_cost(kernel, kernel.x.join(tau=layout.tau, h=layout.h[:, None]))
+    elif scheme.controls > 2:
+        kernel, weight = bend_kernel(scheme.controls), stage.formation.scene.torque_limit**-2.0
+        given = np.tile(_BEND * weight, (stage.intervals, 1))
+        rows.add_cost(kernel, kernel.x.join(tau=layout.tau, h=layout.h[:, None]), given)
     of_time = {
         Objective.TIME: 1.0,
         Objective.EFFORT: target.time_weight,

@@ -46,9 +46,6 @@ ROUGH = 1e-2
 """Least accuracy of plans of which only matters that there are any."""
 ROUNDING = 5e-7
 """Largest shortfall of a margin below epsilon by rounding, over the weight of the object."""
-_EXACT = 3
-"""Points of an interval beyond which collocation is so exact that intervals would stay as they are,
-too long for torques that are linear in each."""
 
 
 def plan_phases(
@@ -233,10 +230,9 @@ def solve_attempt(search: Search, attempt: Attempt) -> Solution:
     better = solution if plain else improve(search, solution)
     search, solution = choose_end(search, better)
     wanted = 2**attempt.halvings * sum(stage.intervals for stage in attempt.stages)
-    for _ in range(max(attempt.halvings, search.scheme.degree > _EXACT)):
+    for _ in range(attempt.halvings):
         # Modes that were found may have asked for more intervals than the guess has.
-        most = sum(stage.intervals for stage in solution.stages)
-        if solution.success and (most < wanted or search.scheme.degree > _EXACT):
+        if solution.success and sum(stage.intervals for stage in solution.stages) < wanted:
             solution = search.solve(_halve(search, solution.stages), solution)
     return enforce_between(search, solution) if solution.success else solution
 

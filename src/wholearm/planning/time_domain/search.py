@@ -19,6 +19,7 @@ from .between import Limits, raise_bounds
 from .collocation import Scheme, make_scheme
 from .layout import MARGIN, pack, unpack
 from .limits import Target
+from .mesh import with_controls
 from .nlp import TimeNLP, bound_unknowns, build_time_nlp
 from .own_units import in_own_units, scale_options, unit_lengths, unit_of
 from .refinement import adopt, monitor_violated
@@ -145,8 +146,6 @@ class Search:
         """A search for what `plan_phases` is given, in SI units."""
         scales = problem.scene.scales
         lengths, unit = unit_lengths(scales), unit_of(options.goal, scales)
-        # Where the least time leaves torques open for a while, those of a higher degree would ring.
-        controls = options.degree if options.goal is Objective.EFFORT else 2
 
         def expand(z: Array) -> tuple[float, Array]:
             assert to_go is not None
@@ -156,7 +155,7 @@ class Search:
         return Search(
             in_own_units(problem),
             scale_options(options, scales),
-            make_scheme(options.scheme, options.degree, controls),
+            make_scheme(options.scheme, options.degree, options.degree),
             None if duration is None else duration / scales.time,
             options.goal,
             to_go=expand if to_go else None,
@@ -164,10 +163,15 @@ class Search:
         )
 
     def aiming(self, goal: Objective, relaxation: Parameter | None = None) -> Search:
-        """The same search with another objective."""
-        return replace(
-            self, goal=goal, relaxation=relaxation, duration=None, to_go=None, price=None
-        )
+        """The same search with another objective.
+
+        Where limits give way torques are linear: others might keep them at the points alone.
+        """
+        name, degree = self.scheme.name, self.scheme.degree
+        straight = goal in (Objective.ELASTIC, Objective.RELAX)
+        scheme = make_scheme(name, degree, 2 if straight else degree)
+        own = replace(self, goal=goal, relaxation=relaxation, scheme=scheme)
+        return replace(own, duration=None, to_go=None, price=None)
 
     def charge(self, z: Array) -> float:
         """What it costs to end at `z`, shape (5,)."""
@@ -195,6 +199,9 @@ class Search:
         most : int
             Most iterations.
         """
+        controls = self.scheme.controls
+        if stages[0].guess.tau.shape[1] != controls:
+            stages = [replace(own, guess=with_controls(own.guess, controls)) for own in stages]
         while True:
             nlp = self.build(stages, most)
             multipliers = None
