@@ -40,8 +40,8 @@ def is_feasible(limits: dict[str, float], phase: int, friction: float = 0.1) -> 
         (1, {"epsilon": 1.0}, ["epsilon"]),
         (
             3,
-            {"epsilon": 0.6, "speed limit of finger 1": 0.3},
-            ["speed limit of finger 1", "epsilon"],
+            {"epsilon": 0.6, "torque limit of finger 1": 0.3},
+            ["torque limit of finger 1", "epsilon"],
         ),
     ],
 )
