@@ -21,7 +21,7 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import inverse
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
 from wholearm.planning.options import Objective, PlanOptions
-from wholearm.planning.path_domain import rounds
+from wholearm.planning.path_domain import task
 from wholearm.planning.path_domain.impact_sequence import ImpactSequence, make_sequence
 from wholearm.planning.path_domain.motion import PathMotion, directions_of
 from wholearm.planning.path_domain.nlp import PathNLP, build_path_nlp
@@ -369,6 +369,6 @@ def test_a_stuck_solver_does_not_blame_the_limits(monkeypatch: pytest.MonkeyPatc
         nlp = build_path_nlp(shape, intervals, goal)
         return replace(nlp, solver=Stopped()) if goal is Objective.TIME else nlp
 
-    monkeypatch.setattr(rounds, "build_path_nlp", build)
+    monkeypatch.setattr(task, "build_path_nlp", build)
     with pytest.raises(SolverError, match=r"Ipopt stopped with Max.* although limits can be kept"):
         Toy(constant(1.0, 0.0, 3.0)).plan(intervals=20)

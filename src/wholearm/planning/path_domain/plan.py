@@ -24,7 +24,8 @@ from .fastest import is_hopeless
 from .first_guess import guess_slowly
 from .misses import MISS, ROUNDS
 from .motion import PathMotion
-from .rounds import Plans, Round, Task
+from .rounds import Plans, Round
+from .task import Task
 
 _MESHES = 6
 """Most times that the mesh is changed before limits are tightened."""

@@ -14,11 +14,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ...common.arrays import Array
+from ...common.errors import InfeasibleError, SolverError
 from ...geometry.cost_to_go import CostToGo
 from ...problem.definition import Phase, Problem
 from ...results.trajectory import Motion
@@ -35,6 +36,9 @@ from .own_units import to_si, unit_of
 from .refinement import bisect_intervals
 from .search import Search, Solution
 from .stage import Stage
+
+if TYPE_CHECKING:
+    from .explain import Replan
 
 CONVINCING = 2
 """Motions that miss limits least, from different guesses, after which there seems to be no plan."""
@@ -94,7 +98,7 @@ def plan_phases(
     begun, name = _begin(search, attempts.first, fastest, pinned)
     if begun.success:
         return _summarise(problem, search, phases, begun, name)
-    from .explain import explain, refuse, refuse_ways
+    from .explain import refuse
 
     def replan(other: Problem) -> object:
         own = [other.phases[phase.index] for phase in phases]
@@ -105,12 +109,7 @@ def plan_phases(
     *_, last = outcomes = _try_all(search, problem, attempts, begun)
     if last.solution.success:
         return _summarise(problem, search, phases, last.solution, last.name)
-    tried = ", ".join(dict.fromkeys([NEAREST, *(own.name for own in outcomes)]))
-    reason = f"none was found, also of least shortfalls, from {tried}"
-    short = [own.short for own in outcomes if own.short]
-    if not short:
-        refuse_ways(problem, phases[0], attempts.ways)
-    raise explain(search, problem, phases, short, reason, replan if explained else None)
+    raise _explain(search, problem, attempts, outcomes, replan if explained else None)
 
 
 def _begin(
@@ -208,6 +207,24 @@ def _find_short(
     if elastic is None or not list_shortfalls(problem, elastic, search.scheme):
         return elastic, []
     return elastic, elastic
+
+
+def _explain(
+    search: Search,
+    problem: Problem,
+    attempts: Attempts,
+    outcomes: Sequence[_Outcome],
+    replan: Replan | None,
+) -> InfeasibleError | SolverError:
+    """Why none of the attempts has led to a plan; `replan` as for `explain`."""
+    from .explain import explain, refuse_ways
+
+    tried = ", ".join(dict.fromkeys([NEAREST, *(own.name for own in outcomes)]))
+    reason = f"none was found, also of least shortfalls, from {tried}"
+    short = [own.short for own in outcomes if own.short]
+    if not short:
+        refuse_ways(problem, attempts.phases[0], attempts.ways)
+    return explain(search, problem, attempts.phases, short, reason, replan)
 
 
 def solve_attempt(search: Search, attempt: Attempt) -> Solution:

@@ -1,0 +1,92 @@
+"""What is planned along curves, and how it is laid out on meshes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...geometry.curve import Curve
+from ..advice import name_phases
+from ..options import Objective, PlanOptions
+from .data import PhaseData, join, prepare
+from .elements import DEGREE
+from .mesh import SOFT, START, Mesh, find_ends
+from .misses import MISS
+from .nlp import PathNLP, build_path_nlp
+from .switches import Switch
+from .terms import LimitShape
+
+EARLY = 1e-5
+"""Accuracy from which on few elements will do, and limits are tightened before all solves."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is planned: see `plan_curves`."""
+
+    curves: Sequence[Curve]
+    epsilon: float
+    options: PlanOptions
+    phases: Sequence[int]
+    duration: float | None
+
+    @property
+    def name(self) -> str:
+        """The phases, for messages."""
+        return name_phases(self.phases)
+
+    @property
+    def lost(self) -> float:
+        """Least normal force below which a margin is none [N]."""
+        return self.epsilon - MISS * self.curves[0].formation.scene.scales.force
+
+    @property
+    def elements(self) -> int:
+        """Elements of each phase to begin with."""
+        intervals = self.options.intervals
+        if intervals is None:
+            few = START if self.options.accuracy >= EARLY else 2 * START
+            return max(few, SOFT) if self.options.goal is Objective.EFFORT else few
+        return max(-(-intervals // DEGREE), 3)
+
+    def lay_out(
+        self, meshes: Sequence[Mesh], wanted: int
+    ) -> tuple[int, list[PhaseData], PhaseData, PathNLP]:
+        """Each phase on its mesh, all as one, and the NLP for that.
+
+        Each has as many elements, also returned, as are wanted if that is enough for its ends.
+        """
+        pairs = zip(self.curves, meshes, strict=True)
+        elements = max(wanted, *(len(find_ends(curve, mesh.breaks)) for curve, mesh in pairs))
+        parts = self.prepare(meshes, elements)
+        data = join(parts)
+        shape = LimitShape.of(data.limits)
+        nlp = build_path_nlp(shape, len(data.grid.steps), self.options.goal)
+        return elements, parts, data, nlp
+
+    def place_breaks(self, switches: Sequence[Switch]) -> tuple[Mesh, ...]:
+        """Meshes with elements that end at switches, which are at places along all curves.
+
+        Where a fixed number of elements is too few for that, they do not.
+        """
+        starts = np.cumsum([0.0, *(curve.length for curve in self.curves)])
+        of_curve = np.searchsorted(starts[1:-1], [place for place, _ in switches])
+        meshes = list[Mesh]()
+        for k, curve in enumerate(self.curves):
+            pairs = zip(switches, of_curve, strict=True)
+            own = [Switch(place - starts[k], jumps) for (place, jumps), at in pairs if at == k]
+            meshes.append(Mesh.of(curve, own))
+            ends = find_ends(curve, meshes[-1].breaks)
+            if self.options.intervals and len(ends) > self.elements:
+                meshes[-1] = Mesh()
+        return tuple(meshes)
+
+    def prepare(self, meshes: Sequence[Mesh], elements: int) -> list[PhaseData]:
+        """What each phase gives the NLP on its grid."""
+        found, last = [], len(meshes) - 1
+        for k, (curve, mesh) in enumerate(zip(self.curves, meshes, strict=True)):
+            grid = mesh.make_grid(curve, elements, (k == 0, k == last))
+            found.append(prepare(curve, self.epsilon, grid, self.phases[k]))
+        return found
