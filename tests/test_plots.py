@@ -345,24 +345,23 @@ def test_scale_shows_zero_and_the_largest_margin(
     assert all(re.fullmatch("\u2212?[0-9.]+", label) for label in labels)
 
 
-@pytest.mark.parametrize(("ending", "magic"), [(".png", b"\x89PNG\r\n"), (".PDF", b"%PDF-")])
 def test_save_writes_the_format_of_the_ending_and_the_same_bytes(
-    planned: Trajectory, tmp_path: Path, ending: str, magic: bytes
+    planned: Trajectory, tmp_path: Path
 ) -> None:
-    first, second = (tmp_path / f"{name}{ending}" for name in "ab")
     short = repeat(planned, [0])
-    figure = plots.force_margins(short)
-    check_layout(figure)
+    figure, other = plots.force_margins(short), plots.force_margins(short)
     # Whether a figure is new or has been drawn before.
-    plots.save(figure, first)
-    plots.save(plots.force_margins(short), str(second))
-    assert first.read_bytes().startswith(magic)
-    assert first.read_bytes() == second.read_bytes()
-    assert b"Date" not in first.read_bytes() and b"dc:date" not in first.read_bytes()
-    assert len(first.read_bytes()) < 1_000_000
-    if ending == ".png":
-        # At least 150 dots per inch.
-        assert int.from_bytes(first.read_bytes()[16:20], "big") >= 150 * SIZE[0]
+    check_layout(figure)
+    for ending, magic in ((".png", b"\x89PNG\r\n"), (".PDF", b"%PDF-")):
+        first, second = (tmp_path / f"{name}{ending}" for name in "ab")
+        plots.save(figure, first)
+        plots.save(other, str(second))
+        written = first.read_bytes()
+        assert written.startswith(magic) and written == second.read_bytes()
+        assert b"Date" not in written and b"dc:date" not in written and len(written) < 1_000_000
+        if ending == ".png":
+            # At least 150 dots per inch.
+            assert int.from_bytes(written[16:20], "big") >= 150 * SIZE[0]
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a", "png", "a.png.txt"])
