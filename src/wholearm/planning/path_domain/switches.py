@@ -107,7 +107,7 @@ class Sights(NamedTuple):
         # Across a reversal limits are others, and an element ends there anyway.
         span, found = high.a - low.a, list[Switch]()
         choice = np.isfinite(span) & (span > _THIN * np.abs(high.a))
-        for segment in np.unique(self.segment).tolist():
+        for segment in sorted(set(self.segment.tolist())):
             own = np.flatnonzero(choice & (self.segment == segment))
             looks = _Looks(
                 self.s[own],

@@ -209,10 +209,7 @@ def _assemble_hessian(
         places.append((ends.max(axis=1) * size + ends.min(axis=1)).ravel())
         entries.append(ca.vec(block.kernel.hessian.map(count)(here, p, lam)))
     place = np.concatenate(places)
-    order = np.argsort(place, kind="stable")
-    first = np.diff(place[order], prepend=-1) > 0
-    unique, owner = place[order][first], np.empty_like(place)
-    owner[order] = np.cumsum(first) - 1
+    unique, owner = np.unique(place, return_inverse=True)
     gather = ca.DM.triplet(
         owner.tolist(),
         np.arange(len(place)).tolist(),
