@@ -72,7 +72,9 @@ def add_verify(parser: argparse.ArgumentParser) -> None:
 
 def add_plot(parser: argparse.ArgumentParser) -> None:
     """Add what `plot` takes."""
-    parser.add_argument("trajectory", help="trajectory file (.npz)")
+    text = "trajectory file (.npz), or torques to replay (.csv)"
+    parser.add_argument("trajectory", help=text)
+    parser.add_argument("--problem", metavar="FILE", help="problem file (TOML) for torques")
     parser.add_argument("-o", "--output", required=True, help="figure to write (.png, .pdf, .svg)")
     parser.add_argument("--simulate", action="store_true", help="overlay the simulated forces")
 

@@ -217,11 +217,15 @@ def _read_torques(path: str) -> Trajectory | TorqueProfile:
 def _plot(options: argparse.Namespace) -> int:
     from ..common.files import require_writable
     from ..figures import plots
-    from ..results.trajectory_file import load_trajectory
+    from ..results.trajectory import Trajectory
 
     plots.require_format(options.output)
     require_writable(options.output)
-    trajectory = load_trajectory(options.trajectory)
+    trajectory = _read_torques(options.trajectory)
+    if not isinstance(trajectory, Trajectory):
+        trajectory = _replay(options, trajectory)
+    elif options.problem is not None:
+        raise InputError("", "--problem", "is for torques (.csv); trajectories bring their own")
     with name_source(options.trajectory):
         simulation = None
         if options.simulate:
@@ -235,6 +239,16 @@ def _plot(options: argparse.Namespace) -> int:
     clear_progress()
     print(f"wrote {options.output}")
     return 0
+
+
+def _replay(options: argparse.Namespace, torques: TorqueProfile) -> Trajectory:
+    """The motion that torques alone lead to."""
+    if options.problem is None:
+        raise InputError(options.trajectory, "--problem", "is needed to replay torques")
+    from ..geometry.path_guess import load
+    from ..simulation.simulate import simulate
+
+    return simulate(load(options.problem), torques, progress=show_progress()).trajectory
 
 
 def _map(options: argparse.Namespace) -> int:

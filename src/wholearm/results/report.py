@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from .narrow import Moved
 from .trajectory import Trajectory
+from .tuning import TuningHelp
 
 
 class ContactMargin(NamedTuple):
@@ -249,6 +250,8 @@ class Report:
         In the order of time.
     reduced : tuple of ReducedState
         The paper's scalar equation along the replay, if that was asked for.
+    help : TuningHelp
+        What helps to tune the torques.
     replay : Simulation or None
         What is reported on.
     """
@@ -268,6 +271,7 @@ class Report:
     steps: int
     changes: tuple[ModeChange, ...] = ()
     reduced: tuple[ReducedState, ...] = ()
+    help: TuningHelp = field(default_factory=TuningHelp)
     replay: Moved | None = field(default=None, repr=False, compare=False)
 
     @property

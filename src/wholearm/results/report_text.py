@@ -16,11 +16,14 @@ def write(report: Report) -> str:
     if report.outcome not in (*report.failures, report.reason):
         parts.append(f"end of the replay: {report.outcome}")
     parts += [f"warning: {text}" for text in report.warnings]
+    help = report.help
+    parts += [f"help: {loss.to_text()}" for loss in help.losses]
+    parts += [f"help: {help.approach.to_text()}"] if help.approach is not None else []
     if report.finger_gap is not None:
         gap = report.finger_gap
         parts.append(f"least gap of the fingers: {gap.least:.5g} m at t = {gap.time:.5g} s")
-    tables = [_contact_table, _rolling_table, _phase_table, _change_table, _reduced_table]
-    tables.append(_energy_table)
+    tables = [_loss_table, _contact_table, _rolling_table, _phase_table, _change_table]
+    tables += [_reduced_table, _energy_table]
     parts += [line for table in tables for line in _after_blank(table(report))]
     return "\n".join(parts)
 
@@ -33,6 +36,25 @@ def _contact_table(report: Report) -> list[str]:
         for c in p.contacts
     ]  # fmt: skip
     return _table(["phase", "contact", "least c_n [N]", "margin [N]", "at t [s]"], rows, {1})
+
+
+def _loss_table(report: Report) -> list[str]:
+    """Forces where contacts are lost or slip, and what torques change of them."""
+    rows = []
+    for loss in report.help.losses:
+        if loss.kind == "thin":
+            continue
+        when = _show(loss.time, ".5f")
+        for own in loss.forces:
+            figures = [_show(value, "+.4f") for value in (own.c_n, own.c_t)]
+            figures += [_show(value, "+.3f") for value in own.per_tau]
+            rows.append([when, f"c_n of {own.contact}", *figures])
+        if loss.closing:
+            value, *per_tau = (_show(value, "+.3f") for value in loss.closing)
+            until = report.phases[loss.phase - 1].until
+            rows.append([when, f"acceleration to {until}", value, "", *per_tau])
+    header = ["at t [s]", "where lost", "c_n [N]", "c_t [N]", "per N m of tau_1", "of tau_2"]
+    return _table(header, rows, {1}) if rows else []
 
 
 def _rolling_table(report: Report) -> list[str]:

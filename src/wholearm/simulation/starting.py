@@ -51,6 +51,10 @@ class Way(Protocol):
     """One way in which a formation at rest could start to move."""
 
     @property
+    def directions(self) -> Directions:
+        """Directions of contacts and joints, zero for what friction holds."""
+
+    @property
     def force_limits(self) -> Array:
         """Rows with H c = force_limits @ (1, tau_1, tau_2), positive where the contacts hold.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -120,7 +121,17 @@ def verify(
     if plan is not None and set(plan.contacts) != names:
         odd = ", ".join(sorted(set(plan.contacts) ^ names))
         raise InputError("", "contacts", f"trajectory and problem differ in {odd}")
-    return judge(observe(problem, torque, plan, tolerance), allowance, reduced)
+    seen = observe(problem, torque, plan, tolerance)
+    report = judge(seen, allowance, reduced)
+    return report if report.ok and not report.warnings else _help(seen, report, allowance)
+
+
+def _help(seen: Observation, report: Report, allowance: Allowance) -> Report:
+    """The report with what helps to tune the torques."""
+    from .tuning import find_help
+
+    found = find_help(seen.problem, seen.simulation, seen.phases, allowance)
+    return replace(report, help=found)
 
 
 def observe(
