@@ -46,7 +46,7 @@ def find_first(run: Replay, start: Array, h: float, among: range | None = None) 
 
         near = 1e-2 * run.tolerances.shortest_step
         flat = 1e-3 * float(s.slack[k])
-        h = _find_root(value, h, float(before[k]), float(after[k]), near, flat)
+        h = find_root(value, h, float(before[k]), float(after[k]), near, flat)
         done.append(k)
         if h != s.inputs[s.at.h]:
             run.step_to(h)
@@ -59,22 +59,22 @@ def find_first(run: Replay, start: Array, h: float, among: range | None = None) 
                 run.step_to(h)
 
 
-def _find_root(
+def find_root(
     function: Callable[[float], float],
     high: float,
     f_low: float,
     f_high: float,
     near: float,
     flat: float,
+    low: float = 0.0,
 ) -> float:
-    """Root in [0, high] of a function that falls from f_low >= 0 to f_high < 0.
+    """Root in [low, high] of a function that falls from f_low >= 0 to f_high < 0.
 
     Regula falsi as of Anderson and Bjorck, which converges like secants on the smooth functions
     here, until it moves by `near` at most or the function is within `flat` of zero.
     """
     if f_low <= 0:
-        return 0.0
-    low = 0.0
+        return low
     for _ in range(60):
         middle = high - f_high * (high - low) / (f_high - f_low)
         if not low < middle < high and not high < middle < low:

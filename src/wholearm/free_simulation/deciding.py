@@ -1,0 +1,324 @@
+"""Which contacts press, slide and stick from now on.
+
+Contact modes are judged a moment later, by what accelerations now lead to until then. The last
+answer is tried first; where it no longer holds Lemke's method finds another, and where there are
+several the one that changes the fewest modes is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..common.arrays import Array
+from .contact_problem import (
+    APART,
+    BACK,
+    FORTH,
+    SAME,
+    STICKS,
+    Answer,
+    ContactProblem,
+    list_answers,
+    solve,
+    try_modes,
+)
+from .events import FreeEventKind
+from .state import AHEAD, CHATTER, CLOSED, STANDING, STILL, Run
+from .stepper import Modes
+from .system import Rows, System
+
+DEPENDENT = 1e-7
+"""Share of a row that others leave, below which it is no constraint of its own."""
+
+
+def find_closed(run: Run) -> tuple[int, ...]:
+    """Pairs that touch and do not part, each constraint once."""
+    system, scales = run.system, run.system.scales
+    ahead = run.z + AHEAD * scales.time * run.v
+    gaps, ranges = system.measure(np.array([run.z, ahead]))
+    near = CLOSED * scales.length
+    faces = (ranges[0] > near) | ((ranges[0] > -near) & (ranges[1] >= ranges[0]))
+    # A gap that is smaller by far than the features themselves; others are behind one another.
+    touching = np.flatnonzero((np.abs(gaps[0]) < near) & faces)
+    if not len(touching):
+        return ()
+    found = sorted(touching.tolist(), key=lambda pair: pair not in run.modes.kept)
+    rows = system.evaluate(run.z, run.v, found)
+    slow = rows.A @ run.v < CHATTER * scales.speed
+    unit = rows.A / np.sqrt((rows.A**2 / system.mass).sum(axis=1))[:, None] / np.sqrt(system.mass)
+    chosen: list[int] = []
+    for k in np.flatnonzero(slow):
+        if all(np.abs(unit[k] - unit[j]).max() > DEPENDENT for j in chosen):
+            chosen.append(int(k))
+    return tuple(sorted(found[k] for k in chosen))
+
+
+class Pattern:
+    """What of closed pairs and coordinates stands still, and which way the rest slides."""
+
+    def __init__(self, run: Run, closed: Sequence[int]) -> None:
+        system = run.system
+        self.system, self.closed = system, tuple(closed)
+        rows = system.evaluate(run.z, run.v, closed)
+        v_t = rows.A_t @ run.v
+        self.mu = system.friction[list(closed)]
+        rubs = self.mu > 0
+        slow = np.abs(v_t) < STANDING * system.scales.speed
+        self.Xi = np.where(rubs & ~slow, np.sign(v_t), 0.0)
+        self.standing = np.flatnonzero(rubs & slow)
+        slow = np.abs(run.v) < STANDING * system.units[system.n :]
+        self.sigma = np.where((system.dry > 0) & ~slow, np.sign(run.v), 0.0)
+        self.joints = np.flatnonzero((system.dry > 0) & slow)
+
+    def pose(self, z: Array, v: Array, tau: Array) -> ContactProblem:
+        """The contact problem of accelerations at a state."""
+        system, rows = self.system, self.system.evaluate(z, v, self.closed)
+        lift = 1 / system.mass
+        free = lift * system.push(v, tau, self.sigma)
+        joints = np.eye(system.n)[self.joints]
+        return ContactProblem(
+            lift,
+            rows.A,
+            rows.A - (self.mu * self.Xi)[:, None] * rows.A_t,
+            rows.A @ free + rows.bend,
+            np.vstack([rows.A_t[self.standing], joints]),
+            np.concatenate([rows.A_t[self.standing] @ free + rows.bend_t[self.standing],
+                            free[self.joints]]),
+            np.concatenate([self.standing, np.full(len(joints), -1)]).astype(int),
+            np.concatenate([self.mu[self.standing], np.zeros(len(joints))]),
+            np.concatenate([np.zeros(len(self.standing)), system.dry[self.joints]]),
+        )  # fmt: skip
+
+    def recall(self, modes: Modes) -> list[int]:
+        """Modes as `try_modes` has them."""
+        choice = []
+        for k, pair in enumerate(self.closed):
+            if pair not in modes.kept:
+                choice.append(APART)
+                continue
+            Xi = modes.Xi[modes.kept.index(pair)] if k in self.standing else 0.0
+            choice.append(FORTH if Xi > 0 else BACK if Xi < 0 else STICKS)
+        for joint in self.joints:
+            sigma = modes.sigma[joint]
+            choice.append(FORTH if sigma > 0 else BACK if sigma < 0 else STICKS)
+        return choice
+
+    def describe(self, answer: Answer) -> list[int]:
+        """Modes of an answer as `try_modes` has them."""
+        ways = {0.0: STICKS, 1.0: FORTH, -1.0: BACK}
+        choice = [STICKS if c > 0 else APART for c in answer.c_n]
+        count = len(self.standing)
+        for k, way in zip(self.standing, answer.way, strict=False):
+            if choice[k] != APART:
+                choice[k] = ways[float(way)]
+        return choice + [ways[float(way)] for way in answer.way[count:]]
+
+
+def decide(run: Run) -> bool | None:
+    """Take the modes that the laws of contact ask for.
+
+    Returns
+    -------
+    bool or None
+        Whether everything rests; None where no modes obey them.
+    """
+    system, scales = run.system, run.system.scales
+    pattern = Pattern(run, find_closed(run))
+    later = AHEAD * scales.time
+    now = pattern.pose(run.z, run.v, run.tau(run.t))
+    first = try_modes(now, pattern.recall(run.modes)) or _solve(run, now)
+    if first is None:
+        return None
+    free = now.lift * system.push(run.v, run.tau(run.t), pattern.sigma)
+    acceleration = free + first.change
+    v = run.v + later * acceleration
+    z = run.z + later * (run.v + v) / 2
+    then = pattern.pose(z, v, run.tau(run.t + later))
+    answer = _choose(run, pattern, then)
+    if answer is None:
+        return None
+    still = STILL * system.units[system.n :] / scales.time
+    coming = then.lift * system.push(v, run.tau(run.t + later), pattern.sigma) + answer.change
+    rests = bool(
+        stands(run) and (np.abs(acceleration) < still).all() and (np.abs(coming) < still).all()
+    )
+    modes = _make_modes(run, pattern, answer, system.evaluate(z, v, pattern.closed))
+    _tell(run, pattern, modes, rests)
+    run.modes = modes
+    _snap(run, pattern)
+    return rests
+
+
+def stands(run: Run) -> bool:
+    """Whether nothing moves."""
+    return bool((np.abs(run.v) < STANDING * run.system.units[run.system.n :]).all())
+
+
+def _solve(run: Run, problem: ContactProblem) -> Answer | None:
+    answer = solve(problem)
+    if answer is not None:
+        run.residual = max(run.residual, answer.residual)
+    return answer
+
+
+def _choose(run: Run, pattern: Pattern, problem: ContactProblem) -> Answer | None:
+    """The answer that is nearest to the last one."""
+    last = pattern.recall(run.modes)
+    found = list_answers(problem) or []
+    if len(found) > 1:
+        modes = [pattern.describe(answer) for answer in found]
+        if run.modes.kept or len(problem.b_n):
+            _tell_ambiguity(run, pattern, modes)
+        away = [sum(a != b for a, b in zip(own, last, strict=True)) for own in modes]
+        return found[int(np.argmin(away))]
+    return try_modes(problem, last) or _solve(run, problem) or (found[0] if found else None)
+
+
+def _make_modes(run: Run, pattern: Pattern, answer: Answer, rows: Rows) -> Modes:
+    """Independent constraints that give the answer's motion."""
+    system, closed = run.system, pattern.closed
+    still = SAME * max(float(np.abs(answer.r_n).max(initial=0.0)), system.scales.acceleration)
+    still *= 1e-3
+    presses = answer.c_n > 0
+    order = sorted(range(len(closed)), key=lambda k: -answer.c_n[k])
+    root = np.sqrt(system.mass)
+    basis: list[Array] = []
+
+    def adds(row: Array) -> bool:
+        """Whether a row is a constraint of its own; it counts from then on."""
+        row = row / root
+        size, rest = float(np.linalg.norm(row)), row.copy()
+        for _ in range(2):
+            for other in basis:
+                rest = rest - (other @ rest) * other
+        left = float(np.linalg.norm(rest))
+        if left <= DEPENDENT * size:
+            return False
+        basis.append(rest / left)
+        return True
+
+    kept = {k for k in order if presses[k] and adds(rows.A[k])}
+    count = len(pattern.standing)
+    stuck, Xi = [], pattern.Xi.copy()
+    # Of contacts that stick as one, those of a flush edge, the one that has to hold comes first.
+    for j in np.argsort(-np.abs(answer.f[:count]), kind="stable"):
+        k, way = pattern.standing[j], answer.way[j]
+        if k in kept:
+            Xi[k] = way
+            if way == 0 and adds(rows.A_t[k]):
+                stuck.append(k)
+    held, sigma = [], pattern.sigma.copy()
+    for joint, way in zip(pattern.joints, answer.way[count:], strict=True):
+        sigma[joint] = way
+        if way == 0 and adds(np.eye(system.n)[joint]):
+            held.append(int(joint))
+    # What touches without a force stays, for as long as it needs none.
+    kept |= {k for k in order if not presses[k] and answer.r_n[k] <= still and adds(rows.A[k])}
+    kept_pairs = sorted(kept)
+    return Modes(
+        tuple(closed[k] for k in kept_pairs),
+        tuple(sorted(closed[k] for k in stuck)),
+        tuple(held),
+        tuple(float(Xi[k]) for k in kept_pairs),
+        tuple(sigma.tolist()),
+    )
+
+
+def _snap(run: Run, pattern: Pattern) -> None:
+    """Take away what rounding leaves of speeds that are zero."""
+    system, modes = run.system, run.modes
+    chosen = (*modes.kept, *(pattern.closed[k] for k in pattern.standing))
+    rows = system.evaluate(run.z, run.v, chosen)
+    count = len(modes.kept)
+    gradients = np.vstack([rows.A[:count], rows.A_t[count:], np.eye(system.n)[pattern.joints]])
+    if not len(gradients):
+        return
+    root = np.sqrt(system.mass)
+    scaled = gradients / root
+    scaled /= np.linalg.norm(scaled, axis=1)[:, None]
+    change = np.linalg.lstsq(scaled, scaled @ (root * run.v), rcond=1e-9)[0]
+    run.take_impulse(run.v - change / root)
+
+
+def _name(system: System, joint: int) -> str:
+    known = joint in system.driven
+    return f"joint {system.driven.index(joint) + 1}" if known else f"coordinate {joint + 1}"
+
+
+def _tell(run: Run, pattern: Pattern, modes: Modes, rests: bool) -> None:
+    """Record what changes."""
+    system, before = run.system, run.modes
+    names = system.names
+    gone = [pair for pair in before.kept if pair not in modes.kept]
+    new = [pair for pair in modes.kept if pair not in before.kept]
+    gaps, ranges = (part[0] for part in system.measure(run.z[None]))
+    near = CLOSED * system.scales.length
+    for pair in gone:
+        # What still touches, at the end of its range, is a neighbour's from there on.
+        heirs = [p for p in new if names[p][-1:] == names[pair][-1:]]
+        if heirs and abs(gaps[pair]) < near and ranges[pair] < near:
+            text = f"{names[pair]} goes on as {names[heirs[0]]}"
+            run.note(FreeEventKind.PASS, text, names[heirs[0]])
+            new.remove(heirs[0])
+        elif pair not in pattern.closed or run.records:
+            run.note(FreeEventKind.PART, f"{names[pair]} is lost", names[pair])
+    for pair in new if run.records else ():
+        run.note(FreeEventKind.TOUCH, f"{names[pair]} presses", names[pair])
+    for pair in modes.kept:
+        if pair not in before.kept or not run.records:
+            continue
+        old = before.Xi[before.kept.index(pair)]
+        now = modes.Xi[modes.kept.index(pair)]
+        _tell_change(run, names[pair], old, now, "slides", system.friction[pair] > 0)
+    for joint in np.flatnonzero(system.dry > 0) if run.records else ():
+        old, now = before.sigma[joint], modes.sigma[joint]
+        moves = not (run.resting and rests)
+        _tell_change(run, _name(system, int(joint)), old, now, "turns", moves)
+    if rests and not run.resting:
+        run.note(FreeEventKind.REST, "everything rests")
+    elif run.resting and not rests:
+        run.note(FreeEventKind.START, "the motion begins")
+
+
+def _tell_change(run: Run, name: str, old: float, now: float, verb: str, rubs: bool) -> None:
+    if old == now or not rubs:
+        return
+    contact = verb == "slides"
+    if now == 0:
+        text = f"{name} sticks" if contact else f"friction holds {name}"
+        run.note(FreeEventKind.STICK, text, name)
+    elif old == 0:
+        text = f"{name} slips" if contact else f"{name} starts to turn"
+        run.note(FreeEventKind.SLIP, text, name)
+    else:
+        run.note(FreeEventKind.REVERSAL, f"{name} {verb} the other way", name)
+
+
+def _tell_ambiguity(run: Run, pattern: Pattern, answers: Sequence[Sequence[int]]) -> None:
+    """Record that there are several answers, once for each set of contacts."""
+    names = [run.system.names[pair] for pair in pattern.closed]
+    words = {APART: "parts", STICKS: "presses", FORTH: "slides +", BACK: "slides -"}
+    standing = set(pattern.standing.tolist())
+    texts = []
+    for answer in answers:
+        parts = [
+            f"{name} {'sticks' if mode == STICKS and k in standing else words[mode]}"
+            for k, (name, mode) in enumerate(zip(names, answer, strict=False))
+            if any(other[k] != mode for other in answers)
+        ]
+        parts += [
+            f"{_name(run.system, int(joint))} "
+            f"{ {STICKS: 'is held', FORTH: 'turns +', BACK: 'turns -'}[mode] }"
+            for joint, mode in zip(pattern.joints, answer[len(names) :], strict=True)
+        ]
+        texts.append(", ".join(parts) or "the rest accelerates otherwise")
+    text = f"{len(answers)} motions are possible with {', '.join(names) or 'no contact'} closed ("
+    text += "; or ".join(texts) + ")"
+    last = [event for event in run.events if event.kind is FreeEventKind.AMBIGUOUS]
+    if not last or last[-1].text.split(" at t =")[0] != text:
+        run.note(FreeEventKind.AMBIGUOUS, text, " ".join(names))
+
+
+__all__ = ["Pattern", "decide", "find_closed"]

@@ -1,0 +1,181 @@
+"""A free simulation under way: the state, the torques, and what is recorded."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..results.torque import TorqueProfile
+from .events import FreeEvent, FreeEventKind
+from .stepper import LOSSES, Modes, Stepper, build_stepper
+from .system import System
+
+CLOSED = 1e-10
+"""Gap that counts as closed at an event, relative to the scene's length."""
+ARMED = 1e-13
+"""Gap from which on a pair has been apart, relative to the scene's length."""
+STANDING = 1e-9
+"""Speed that counts as none, relative to the scene's."""
+CHATTER = 1e-6
+"""Speed of impacts below which they count as the last one, relative to the scene's: what is closed
+and parts more slowly is pressed together again before it is apart by more than rounding."""
+STILL = 1e-10
+"""Acceleration that counts as none, relative to the scene's."""
+AHEAD = 2e-5
+"""How much later contact modes are judged, relative to the scene's time: forces that leave their
+range are told from those that come back into it."""
+TORQUE_STEP = 2e-8
+"""Jump of the torques that counts as one, relative to the scene's torque."""
+NO_PROGRESS = 60
+"""Most decisions in a row without any time passing."""
+
+
+class Record(NamedTuple):
+    """One instant: time, state with losses, z'', tau, pairs that press, their c_n and c_t, impacts.
+
+    The last one is the energy lost to impacts so far [J].
+    """
+
+    t: float
+    y: Array
+    acceleration: Array
+    tau: Array
+    kept: tuple[int, ...]
+    c_n: Array
+    c_t: Array
+    impact: float
+
+
+class Run:
+    """A free simulation under way.
+
+    Attributes
+    ----------
+    t : float, [s]
+    y : ndarray, shape (2 n + LOSSES,)
+    modes : Modes
+        What keeps which contacts at present.
+    armed : ndarray of bool, shape (N,)
+        Pairs that have been apart, so that their closing is an event.
+    impact : float, [J]
+        Energy lost to impacts so far.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        torque: TorqueProfile,
+        z: Array,
+        v: Array,
+        restitution: float = 0.0,
+        tolerance: float = 1e-9,
+        hint: Modes | None = None,
+    ) -> None:
+        self.system, self.torque = system, torque
+        self.restitution, self.tolerance = restitution, tolerance
+        self.t, self.piece = float(torque.breaks[0]), 0
+        self.y = np.concatenate([z, v, np.zeros(LOSSES)])
+        self.modes = hint or Modes(sigma=(0.0,) * system.n)
+        self.armed = np.zeros(len(system.pairs), dtype=bool)
+        self.h = 0.02 * system.scales.time
+        self.impact = 0.0
+        self.decisions, self.decided_at = 0, -math.inf
+        self.steps = self.rejected = 0
+        self.resting = False
+        self.residual = 0.0
+        self.records: list[Record] = []
+        self.events: list[FreeEvent] = []
+
+    @property
+    def z(self) -> Array:
+        """Coordinates, shape (n,)."""
+        return self.y[: self.system.n]
+
+    @property
+    def v(self) -> Array:
+        """Velocities, shape (n,)."""
+        return self.y[self.system.n : 2 * self.system.n]
+
+    @property
+    def end(self) -> float:
+        """When the torques end [s]."""
+        return float(self.torque.breaks[-1])
+
+    @property
+    def stop(self) -> float:
+        """When the present piece of the torques ends [s]."""
+        return float(self.torque.breaks[self.piece + 1])
+
+    def next_piece(self) -> bool:
+        """Go on to the next piece of the torques, if there is one."""
+        more = self.piece + 2 < len(self.torque.breaks)
+        self.piece += more
+        return more
+
+    def tau(self, t: float) -> Array:
+        """Torques of the present piece at `t`, also beyond its end, shape (2,) [N m]."""
+        start, stop = self.torque.breaks[self.piece : self.piece + 2]
+        coefficients = self.torque.coefficients[self.piece]
+        x = (2 * t - start - stop) / (stop - start)
+        return np.asarray(coefficients @ x ** np.arange(coefficients.shape[1]))
+
+    def torque_steps(self) -> bool:
+        """Whether the torques step at the end of the present piece, or end there."""
+        if self.piece + 2 >= len(self.torque.breaks):
+            return True
+        before, after = self.torque.coefficients[self.piece : self.piece + 2]
+        jump = after @ (-1.0) ** np.arange(after.shape[1]) - before.sum(axis=1)
+        return bool(np.abs(jump).max() > TORQUE_STEP * self.system.scales.torque)
+
+    def take_impulse(self, v: Array) -> None:
+        """Change the velocity; what energy that costs is lost to impacts."""
+        before = self.system.stored(self.z, self.v)
+        self.y[self.system.n : 2 * self.system.n] = v
+        self.impact += float(before - self.system.stored(self.z, self.v))
+
+    def load(self) -> Stepper:
+        """The steps of the present modes, with their inputs set to the present state."""
+        system, modes = self.system, self.modes
+        degree = self.torque.coefficients.shape[2] - 1
+        s = build_stepper(system, modes.kept, modes.stuck, modes.held, degree)
+        s.inputs[s.at.tolerance] = self.tolerance
+        s.inputs[s.at.Xi], s.inputs[s.at.sigma] = modes.Xi, modes.sigma
+        self.feed(s)
+        return s
+
+    def feed(self, s: Stepper) -> None:
+        """Hand the present state and torques to the steps."""
+        inputs, at = s.inputs, s.at
+        inputs[at.y], inputs[at.t] = self.y, self.t
+        inputs[at.piece] = self.torque.breaks[self.piece : self.piece + 2]
+        inputs[at.torque] = self.torque.coefficients[self.piece].ravel()
+
+    def stay(self, s: Stepper) -> None:
+        """Keep from here on what sticks and is held."""
+        stuck = self.system.evaluate_slip(self.z, self.modes.stuck)
+        s.inputs[s.at.stay] = np.concatenate([stuck, self.z[list(self.modes.held)]])
+
+    def note(
+        self, kind: FreeEventKind, text: str, contact: str = "", value: float = math.nan
+    ) -> None:
+        """Record an event."""
+        self.events.append(FreeEvent(self.t, kind, f"{text} at t = {self.t:.6g} s", contact, value))
+
+    def record(self, s: Stepper | None) -> None:
+        """Record the present instant, with the forces in a stepper's outputs; None at rest."""
+        system, n = self.system, self.system.n
+        if s is None:
+            none = np.full(len(self.modes.kept), np.nan)
+            row = (np.zeros(n), self.tau(self.t), self.modes.kept, none, none)
+        else:
+            out, to = s.outputs, s.to
+            c_n = out[to.c_n].copy()
+            mu = system.friction[list(self.modes.kept)]
+            c_t = -mu * np.array(self.modes.Xi) * c_n
+            stuck = [self.modes.kept.index(pair) for pair in self.modes.stuck]
+            c_t[stuck] = out[to.f][: len(stuck)]
+            row = (out[to.acceleration].copy(), out[to.tau].copy(), self.modes.kept, c_n, c_t)
+        self.records.append(Record(self.t, self.y.copy(), *row, self.impact))

@@ -1,0 +1,172 @@
+"""Rigid bodies with pairs of features that may touch, as expressions of their coordinates.
+
+The motion is M z'' = f + S tau - B z' - friction + A^T c_n + A_t^T c_t with a constant diagonal M.
+A pair of features has a gap C(z), whose gradient is its row of A, and a slip coordinate s(z), whose
+gradient is its row of A_t: how far the features have slid over each other while they touch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from ..common.arrays import Array, Expression
+from ..common.batch import Batch
+from ..common.sharing import Keeper, kept_property
+from ..scene.model import Scales
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two features that may touch.
+
+    Attributes
+    ----------
+    name : str
+    gap : scalar expression of z, [m]
+        Positive when apart.
+    slip : scalar expression of z, [m]
+        Its rate is the sliding velocity v_t while they touch.
+    friction : float
+        Coulomb's coefficient.
+    ranges : tuple of scalar expressions, [m]
+        All positive where the two face each other; the gap means nothing elsewhere.
+    text : str
+        What has happened when the gap closes, in words.
+    """
+
+    name: str
+    gap: Expression
+    slip: Expression
+    friction: float
+    ranges: tuple[Expression, ...] = ()
+    text: str = ""
+
+
+class Rows(NamedTuple):
+    """Pairs at one state: A z' = 0 and A_t z' = 0 keep them closed and stuck.
+
+    Attributes
+    ----------
+    A, A_t : ndarray, shape (m, n)
+    bend, bend_t : ndarray, shape (m,)
+        A' z' and A_t' z'.
+    """
+
+    A: Array
+    A_t: Array
+    bend: Array
+    bend_t: Array
+
+
+@dataclass(frozen=True, eq=False)
+class System(Keeper):
+    """Coordinates, what moves them and what may touch.
+
+    Attributes
+    ----------
+    z : SX symbol, shape (n,)
+    mass : ndarray, shape (n,)
+        Diagonal of M.
+    applied : ndarray, shape (n,)
+        Gravity as a force on z.
+    viscous, dry : ndarray, shape (n,)
+        Friction of the coordinates themselves: B, and the largest dry one.
+    driven : tuple of int
+        Coordinates that the two torques act on; empty where there are none.
+    pairs : tuple of Pair
+    turns : tuple of bool, length n
+        Which coordinates are angles.
+    scales : Scales
+        Units that tolerances count in.
+    """
+
+    z: Expression
+    mass: Array
+    applied: Array
+    viscous: Array
+    dry: Array
+    driven: tuple[int, ...]
+    pairs: tuple[Pair, ...]
+    turns: tuple[bool, ...]
+    scales: Scales
+
+    @property
+    def n(self) -> int:
+        """Number of coordinates."""
+        return len(self.mass)
+
+    @cached_property
+    def units(self) -> Array:
+        """Units of z, then of z', shape (2 n,)."""
+        place = np.where(self.turns, 1.0, self.scales.length)
+        return np.concatenate([place, place / self.scales.time])
+
+    @cached_property
+    def friction(self) -> Array:
+        """Coefficients of all pairs, shape (N,)."""
+        return np.array([pair.friction for pair in self.pairs])
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of all pairs."""
+        return tuple(pair.name for pair in self.pairs)
+
+    def build_rows(self, chosen: Sequence[int], v: Expression) -> tuple[Expression, ...]:
+        """Gaps, slips, A, A_t, A' v and A_t' v of some pairs, as expressions of z and v."""
+        parts: list[Expression] = []
+        for values in ([self.pairs[k].gap for k in chosen], [self.pairs[k].slip for k in chosen]):
+            column = ca.vertcat(ca.SX(0, 1), *values)
+            rows = ca.jacobian(column, self.z)
+            parts.append((column, rows, ca.jtimes(rows @ v, self.z, v)))
+        (gap, A, bend), (slip, A_t, bend_t) = parts
+        return gap, slip, A, A_t, bend, bend_t
+
+    @kept_property
+    def _rows(self) -> Batch:
+        v = ca.SX.sym("v", self.n)
+        _, slip, *rows = self.build_rows(range(len(self.pairs)), v)
+        outputs = [ca.densify(part) for part in (slip, *rows)]
+        return Batch(ca.Function("rows", [self.z, v], outputs))
+
+    @kept_property
+    def _gaps(self) -> Batch:
+        far = 1e3 * self.scales.length
+        gaps = ca.vertcat(ca.SX(0, 1), *(pair.gap for pair in self.pairs))
+        least = [ca.mmin(ca.vertcat(far, *pair.ranges)) for pair in self.pairs]
+        both = ca.densify(ca.horzcat(gaps, ca.vertcat(ca.SX(0, 1), *least)))
+        return Batch(ca.Function("gaps", [self.z], [both]))
+
+    def evaluate(self, z: Array, v: Array, chosen: Sequence[int]) -> Rows:
+        """Rows of some pairs at one state."""
+        _, A, A_t, bend, bend_t = (part[0, list(chosen)] for part in self._rows(z[None], v[None]))
+        return Rows(A, A_t, bend[:, 0], bend_t[:, 0])
+
+    def evaluate_slip(self, z: Array, chosen: Sequence[int]) -> Array:
+        """Slip coordinates of some pairs, shape (m,) [m]."""
+        return np.asarray(self._rows(z[None], z[None])[0][0, list(chosen), 0])
+
+    def measure(self, z: Array) -> tuple[Array, Array]:
+        """Gaps of all pairs and how far inside their ranges they are, shape (m, N) each [m].
+
+        Parameters
+        ----------
+        z : ndarray, shape (m, n)
+        """
+        both = self._gaps(z)[0]
+        return both[:, :, 0], both[:, :, 1]
+
+    def stored(self, z: Array, v: Array) -> Array:
+        """Kinetic energy less the work of the applied force, shape (...) [J]."""
+        return np.asarray(0.5 * (v**2) @ self.mass - z @ self.applied)
+
+    def push(self, v: Array, tau: Array, sigma: Array) -> Array:
+        """Forces on z but those of contacts, with dry friction in the directions `sigma`, (n,)."""
+        force = self.applied - self.viscous * v - self.dry * sigma
+        force[list(self.driven)] += tau[: len(self.driven)]
+        return force
