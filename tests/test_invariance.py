@@ -23,9 +23,9 @@ from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem
 
 PROBLEMS = Path(__file__).parents[1] / "problems"
-CASES = [("heptagon_impact", 2, 20), ("box_rolling", 1, 80)]
+CASES = [("heptagon_impact", 2, 20), ("box_rolling", 1, 40)]
 """Problems, how many of their phases are planned, the last of them to rest, and intervals."""
-TELLINGS = [("time", telling) for telling in RETELLINGS]
+TELLINGS = [("time", telling) for telling in RETELLINGS[1:]]
 TELLINGS += [("effort", RETELLINGS[4]), ("margin", RETELLINGS[1])]
 """Of other costs, the effort mirrored, which swaps the torques, and the margin in small units."""
 
@@ -48,7 +48,7 @@ def problem(case: tuple[str, int, int]) -> Problem:
 @pytest.fixture(scope="module")
 def answers(case: tuple[str, int, int], problem: Problem) -> dict[str, Answer]:
     goals = ("time", "effort", "margin")
-    return {goal: answer(problem, goal, intervals=case[2]) for goal in goals}
+    return {goal: answer(problem, goal, intervals=case[2], replay=False) for goal in goals}
 
 
 @pytest.mark.parametrize("objective, telling", TELLINGS, ids=lambda p: getattr(p, "name", p))
@@ -59,7 +59,7 @@ def test_answers_do_not_depend_on_how_a_problem_is_told(
     telling: Retelling,
     objective: str,
 ) -> None:
-    other = answer(telling.apply(problem), objective, telling, intervals=case[2])
+    other = answer(telling.apply(problem), objective, telling, intervals=case[2], replay=False)
     difference = compare(answers[objective], other)
     assert difference.value < 1e-8 and difference.torques < 1e-7
 

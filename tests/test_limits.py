@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from plane import SQUARE, make_formation, make_scene
-from refused import ask, edited, plan, read_advice
+from refused import advising, edited, plan, read_advice
 from tipping import roll
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError
@@ -236,9 +236,13 @@ def test_speed_limits_hold_between_collocation_points(
 
 def test_a_speed_limit_gives_way_over_time_as_along_a_curve() -> None:
     limits = {"epsilon": 0.6, "speed limit of finger 1": 0.3}
-    problem, advised = edited(limits), read_advice(ask(3, **limits))["speed limit of finger 1"]
+    problem, name = edited(limits), "speed limit of finger 1"
+    only = advising(lambda own: own.name == name)
+    with only, pytest.raises(InfeasibleError, match=r"^phase 3 is infeasible: ") as caught:
+        plan(problem, 3)
+    advised = read_advice(str(caught.value))[name]
     # With the advised one there is a plan.
-    plan(edited(limits | {"speed limit of finger 1": advised}), 3, explained=False)
+    plan(edited(limits | {name: advised}), 3, explained=False)
     curves = trace_phases(problem)
     search = Search.of(problem, COARSE)
     stages = guess_stages(problem, problem.phases[2:3], curves[1].end, search.scheme, 6, 2.0)

@@ -156,7 +156,7 @@ def test_a_contact_slides_in_one_phase_and_rolls_in_the_next() -> None:
     first = replace(phase, until=Until(), end=End.SMOOTH)
     last = replace(phase, index=1, formation=rolling)
     problem = replace(sliding, phases=(first, last))
-    plan = solve(problem, time_intervals=10, replay=False).trajectory
+    plan = solve(problem, time_intervals=5, replay=False).trajectory
     report = verify(problem, plan)
     assert report.ok, report.to_text()
     assert report.phases[0].until == "change of v1-palm"

@@ -72,10 +72,10 @@ def test_a_free_link_and_the_object_overlap_where_a_limit_says_so(
     rng = np.random.default_rng([finger, int(1e3 * radius)])
     broken: set[str] = set()
     seen = {True: 0, False: 0}
-    for _ in range(5):
+    for _ in range(3):
         scene = random_scene(rng, radius, int(rng.integers(3, 9)))
         formation = make_formation(scene, "v0-palm")
-        z = np.array([approach(rng, scene, finger) for _ in range(150)])
+        z = np.array([approach(rng, scene, finger) for _ in range(250)])
         values = formation.evaluate_limits(z)
         for gap, row in zip(link_gaps(scene, finger, z), values, strict=True):
             limits = limits_of(formation, finger, row)
@@ -119,10 +119,10 @@ def test_a_link_that_touches_overlaps_elsewhere_where_a_limit_says_so(
     finger = int(name[-1]) - 1
     rng = np.random.default_rng([finger, int(1e3 * radius), len(name)])
     seen = {True: 0, False: 0}
-    for _ in range(6):
+    for _ in range(3):
         scene = random_scene(rng, radius, int(rng.integers(3, 9)))
         formation = make_formation(scene, name)
-        z = np.array([hold(rng, scene, name) for _ in range(42)])
+        z = np.array([hold(rng, scene, name) for _ in range(84)])
         assert np.abs(formation.evaluate(z, z).C).max() < 1e-14
         # A little smaller, the object touches nothing where it only touched.
         body = replace(scene.polygon, points=(1 - 1e-6) * scene.polygon.vertices)

@@ -97,7 +97,7 @@ def test_velocities_and_accelerations_are_derivatives() -> None:
 def test_least_time_comes_near_its_lower_bound() -> None:
     bound = bound_least_time([tip_on(0.5)], EPSILON)
     assert bound is not None
-    assert 0 <= plan("time", 0.5, 320).value / bound.value - 1 < 2e-4
+    assert 0 <= plan("time", 0.5, 160).value / bound.value - 1 < 2e-4
     assert 0 <= plan().value / bound.value - 1 < 1e-3
 
 
@@ -106,9 +106,9 @@ def test_the_cone_is_what_holds_the_fastest_motion_back() -> None:
     samples = sample(plan(), 4000)
     near = margin(samples, 0.5) < 0.5 * EPSILON + 1e-3
     assert (near & (samples.c_t[:, 0] > 0)).any() and (near & (samples.c_t[:, 0] < 0)).any()
-    times = [plan("time", mu).value for mu in (0.45, 0.5, 0.6, 0.8)]
+    times = [plan("time", mu, 20).value for mu in (0.45, 0.5, 0.6, 0.8)]
     assert (np.diff(times) < -1e-3).all()
-    assert (margin(sample(plan("time", 0.8), 4000), 0.5) < 0).any()
+    assert (margin(sample(plan("time", 0.8, 20), 4000), 0.5) < 0).any()
 
 
 @pytest.mark.usefixtures("unadvised")
@@ -128,7 +128,7 @@ def test_an_epsilon_that_cones_allow_is_advised() -> None:
     _, found, advised = str(caught.value).rpartition("epsilon = ")
     assert found and advised.endswith(f" N instead of {epsilon:g}")
     value = float(advised.split()[0])
-    assert plan_path(tip_on(mu), value, options, 2).value > plan("time", mu).value
+    assert plan_path(tip_on(mu), value, options, 2).value > plan("time", mu, 20).value
     with pytest.raises(SolverError):
         plan_curves((tip_on(mu),), 1.03 * value, options, (2,), explained=False)
 

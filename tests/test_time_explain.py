@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from once import once
+from refused import advising
 from thrown import shove
 from tipping import box
 from wholearm.common.errors import InfeasibleError, SolverError
@@ -120,16 +121,16 @@ def test_advice_is_that_along_the_curve(heptagon: Problem, curves: tuple[Curve, 
     """Two formulations with different unknowns, one of them convex but for viscous friction."""
     problem, phase = change_limit(heptagon, EPSILON, 1.0), heptagon.phases[1]
     start = curves[0].end
-    options, coarse = PlanOptions(time_intervals=6), PlanOptions(intervals=20)
-    texts = [
-        why_not(lambda: plan_phases(problem, (problem.phases[1],), start, options)),
-        why_not(lambda: plan_path(curves[1], problem.epsilon, coarse, phase.number)),
-    ]
+    options, coarse = PlanOptions(time_intervals=4), PlanOptions(intervals=20)
+    with advising(lambda own: own.key == EPSILON):
+        texts = [
+            why_not(lambda: plan_phases(problem, (problem.phases[1],), start, options)),
+            why_not(lambda: plan_path(curves[1], problem.epsilon, coarse, phase.number)),
+        ]
     shape = r"phase 2 is infeasible: .*c_n of v1-palm >= epsilon = 1 N is \S+ N short at "
     assert all(re.match(shape, text) for text in texts), texts
     within, along = (float(text.split("epsilon = ")[-1].split()[0]) for text in texts)
     assert within == pytest.approx(along, rel=0.02)
-    assert [text.count("instead of") for text in texts] == [1, 1]
 
 
 def test_shortfalls_are_measured_where_they_are_worst() -> None:

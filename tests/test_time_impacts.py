@@ -49,7 +49,7 @@ def planned(objective: str) -> Trajectory:
 
 @cache
 def along(objective: str) -> Trajectory:
-    return solve(problem(objective), objective, intervals=80).trajectory
+    return solve(problem(objective), objective, intervals=80, replay=False).trajectory
 
 
 def ends_of(trajectory: Trajectory, phase: int) -> tuple[Samples, Samples]:
