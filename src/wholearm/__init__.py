@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from .planning.saved import load_plan
     from .problem.definition import End, Phase, Problem, Until
     from .problem.read import place_start, read_formation, read_until
+    from .quasistatic.predict import predict
     from .results.narrow import save
     from .results.report import Report
     from .results.torque import TorqueProfile, read_torque_csv
@@ -79,6 +80,7 @@ _HOMES = {
     "load_plan": "planning.saved",
     "load_trajectory": "results.trajectory_file",
     "place_start": "problem.read",
+    "predict": "quasistatic.predict",
     "read_formation": "problem.read",
     "read_torque_csv": "results.torque",
     "read_until": "problem.read",
@@ -122,6 +124,7 @@ __all__ = [
     "load_trajectory",
     "place_start",
     "plots",
+    "predict",
     "read_formation",
     "read_torque_csv",
     "read_until",

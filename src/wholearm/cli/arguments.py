@@ -79,6 +79,20 @@ def add_plot(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--simulate", action="store_true", help="overlay the simulated forces")
 
 
+def add_predict(parser: argparse.ArgumentParser) -> None:
+    """Add what `predict` takes."""
+    parser.add_argument("problem", help="problem file (TOML)")
+    text = "figure to write (.png, .pdf, .svg) of the least normal force over speed"
+    parser.add_argument("-o", "--output", metavar="FILE", help=text)
+    text = "how hard quasistatic torques squeeze: 0 as little as needed, 1 as hard as helps (0.5)"
+    parser.add_argument("--squeeze", type=float, default=0.5, help=text)
+    text = "write the quasistatic torques as CSV, which hand tuning starts from"
+    parser.add_argument("--torques", metavar="FILE", help=text)
+    text = "mean speed along the phases for these [m/s], over which they are spread in time (0.05)"
+    parser.add_argument("--speed", metavar="V", type=float, help=text)
+    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+
+
 def add_map(parser: argparse.ArgumentParser) -> None:
     """Add what `map` takes."""
     parser.add_argument("problem", help="problem file (TOML)")

@@ -1,4 +1,4 @@
-"""The command line: ``wholearm solve|verify|plot|map|bench``.
+"""The command line: ``wholearm solve|verify|plot|predict|map|bench``.
 
 Exit status 0 means done and all contacts held, 1 infeasible or a contact lost or a goal missed,
 2 bad input, 130 interrupted, 143 terminated. Each command imports what it needs and nothing else.
@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, NoReturn
 
 from ..common.errors import InputError, WholearmError, name_source
 from ..common.interrupts import guard
-from .arguments import add_map, add_plot, add_solve, add_verify
+from .arguments import add_map, add_plot, add_predict, add_solve, add_verify
 from .bench import add_bench, name_study
+from .foresee import predict
 from .progress import clear_progress, show_progress
 
 if TYPE_CHECKING:
@@ -82,6 +83,7 @@ def build_parser() -> argparse.ArgumentParser:
         ("solve", add_solve, _solve, "plan joint torques for a problem file"),
         ("verify", add_verify, _verify, "replay torques open loop and check the motion"),
         ("plot", add_plot, _plot, "draw force margins, torques and snapshots"),
+        ("predict", add_predict, predict, "see up to which speed slow motions keep every contact"),
         ("map", add_map, _map, "draw the contact formations over (x, phi)"),
         ("bench", add_bench, None, "measure run time against error, or run the stress study"),
     ):

@@ -44,11 +44,11 @@ def draw_margins(
         values = np.insert(margins[:, index], steps, np.nan)
         lines += axes.plot(t, values, zorder=3 + rank, label=name, **look)
     axes.axhline(0.0, color="black", linewidth=1.3, zorder=2.5)
-    _scale_margins(axes, np.vstack([margins, *([] if covered is None else [covered])]), epsilon)
+    scale_margins(axes, np.vstack([margins, *([] if covered is None else [covered])]), epsilon)
     return lines
 
 
-def _scale_margins(axes: Axes, margins: Array, epsilon: float) -> None:
+def scale_margins(axes: Axes, margins: Array, epsilon: float) -> None:
     """Set a scale that is linear within a hundredth of the largest margin, ticks and limits."""
     # Where everything is at rest no force is known.
     largest, smallest = (float(f.reduce(margins, None, initial=0.0)) for f in (np.fmax, np.fmin))

@@ -15,6 +15,7 @@ from ..contacts.closing import Flags, Numbers, contact_table, evaluate_contacts
 from ..contacts.formation import Formation, Kinematics
 from ..mechanics.dynamics import Directions, force_rows, inverse, reduced_inertia
 from ..mechanics.metric import metric_weights
+from ..quasistatic.squeeze import Squeezing
 from ..scene.model import Scene
 
 WAYS = ("+x", "-x", "+phi", "-phi")
@@ -96,17 +97,10 @@ def _check_path(
 ) -> Flags:
     directions = _directions(kinematics, z_s)
     forces = inverse(formation, z, z_s, np.zeros_like(z_s), directions, kinematics)
-    limit = formation.scene.torque_limit
-    # Every limit is offset + slope * squeeze >= 0.
-    offset = np.hstack([forces.C0 - epsilon, limit - forces.T0, limit + forces.T0])
-    slope = np.hstack([forces.Cl, -forces.Tl, forces.Tl])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        edge = -offset / slope
-    low = np.where(slope > 0, edge, -np.inf).max(axis=1)
-    high = np.where(slope < 0, edge, np.inf).min(axis=1)
-    stuck = ((slope == 0) & (offset < 0)).any(axis=1)
+    squeezing, still = Squeezing.of(formation, forces, z_s[:, 3:]), np.zeros(len(z))
+    low, high = squeezing.find_span(still, still, epsilon)
     moving = reduced_inertia(formation, kinematics, directions) > 0
-    return np.asarray((low <= high) & ~stuck & moving)
+    return np.asarray((low <= high) & moving)
 
 
 def _check_balance(

@@ -143,8 +143,8 @@ def inverse(
 ) -> PathForces:
     """Forces that carry a formation along a curve, at n places.
 
-    The object's rows M q'' = g + [W_n - W_t U Xi, W_t(rolling)] c leave the four numbers c one that
-    is free: the squeeze lambda, the component of c along a unit null vector.
+    The object's rows M q'' = g + [W_n - W_t U Xi, W_t(rolling)] c leave four numbers c one that is
+    free: the squeeze lambda, the component of c along a unit null vector. Three leave none.
 
     Parameters
     ----------
@@ -159,14 +159,15 @@ def inverse(
     kinematics = kinematics or formation.evaluate(z, z_s)
     G = force_rows(formation, kinematics, directions)
     wrench = G[:, :, :3].transpose(0, 2, 1)
-    null = _null_vector(wrench)
-    mass = scene.mass_diagonal
-    # Bordering by the null vector makes each solution the shortest one.
-    right = np.zeros((len(z), 4, 3))
+    mass, count = scene.mass_diagonal, wrench.shape[2]
+    null = np.zeros((len(z), count)) if count == 3 else _null_vector(wrench)
+    right = np.zeros((len(z), count, 3))
     right[:, :3, 0] = -scene.applied_force[:3]
     right[:, :3, 1] = mass[:3] * z_s[:, :3]
     right[:, :3, 2] = mass[:3] * z_ss[:, :3]
-    solution = np.linalg.solve(np.concatenate([wrench, null[:, None, :]], axis=1), right)
+    # Bordering by the null vector makes each solution the shortest one.
+    matrix = wrench if count == 3 else np.concatenate([wrench, null[:, None, :]], axis=1)
+    solution = np.linalg.solve(matrix, right)
     C0, Ca, Cb = (solution[..., k] for k in range(3))
     joint = G[:, :, 3:]
 

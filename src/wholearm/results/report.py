@@ -297,10 +297,10 @@ class Report:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain values for JSON, with None where there is no number."""
-        plain = _plain(asdict(replace(self, replay=None)))
-        del plain["replay"]
+        values = plain(asdict(replace(self, replay=None)))
+        del values["replay"]
         verdict = {"ok": self.ok, "exit_status": self.exit_status, "reason": self.reason}
-        return {**verdict, **plain}
+        return {**verdict, **values}
 
     def to_text(self) -> str:
         """The verdict with its reason, then everything else as aligned tables."""
@@ -309,14 +309,14 @@ class Report:
         return write(self)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """`value` with None for NaN and infinity and plain containers."""
     if hasattr(value, "_asdict"):
         value = value._asdict()
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     return value

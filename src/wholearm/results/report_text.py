@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -30,12 +31,12 @@ def write(report: Report) -> str:
 
 def _contact_table(report: Report) -> list[str]:
     rows = [
-        [str(p.number), c.contact, _show(c.least, ".4f"), _show(c.margin, "+.4f"),
-         _show(c.time, ".5f")]
+        [str(p.number), c.contact, show(c.least, ".4f"), show(c.margin, "+.4f"),
+         show(c.time, ".5f")]
         for p in report.phases
         for c in p.contacts
     ]  # fmt: skip
-    return _table(["phase", "contact", "least c_n [N]", "margin [N]", "at t [s]"], rows, {1})
+    return align(["phase", "contact", "least c_n [N]", "margin [N]", "at t [s]"], rows, {1})
 
 
 def _loss_table(report: Report) -> list[str]:
@@ -44,28 +45,28 @@ def _loss_table(report: Report) -> list[str]:
     for loss in report.help.losses:
         if loss.kind == "thin":
             continue
-        when = _show(loss.time, ".5f")
+        when = show(loss.time, ".5f")
         for own in loss.forces:
-            figures = [_show(value, "+.4f") for value in (own.c_n, own.c_t)]
-            figures += [_show(value, "+.3f") for value in own.per_tau]
+            figures = [show(value, "+.4f") for value in (own.c_n, own.c_t)]
+            figures += [show(value, "+.3f") for value in own.per_tau]
             rows.append([when, f"c_n of {own.contact}", *figures])
         if loss.closing:
-            value, *per_tau = (_show(value, "+.3f") for value in loss.closing)
+            value, *per_tau = (show(value, "+.3f") for value in loss.closing)
             until = report.phases[loss.phase - 1].until
             rows.append([when, f"acceleration to {until}", value, "", *per_tau])
     header = ["at t [s]", "where lost", "c_n [N]", "c_t [N]", "per N m of tau_1", "of tau_2"]
-    return _table(header, rows, {1}) if rows else []
+    return align(header, rows, {1}) if rows else []
 
 
 def _rolling_table(report: Report) -> list[str]:
     """Margins to slipping; nothing if no contact rolls."""
     rows = [
-        [str(p.number), r.contact, _show(r.least, "+.4f"), _show(r.time, ".5f")]
+        [str(p.number), r.contact, show(r.least, "+.4f"), show(r.time, ".5f")]
         for p in report.phases
         for r in p.rolling
     ]
     header = ["phase", "rolling", "least mu c_n - |c_t| [N]", "at t [s]"]
-    return _table(header, rows, {1}) if rows else []
+    return align(header, rows, {1}) if rows else []
 
 
 def _phase_table(report: Report) -> list[str]:
@@ -80,23 +81,23 @@ def _phase_table(report: Report) -> list[str]:
             str(p.number),
             p.until,
             p.end,
-            _show(p.arrival, ".5f"),
-            _show(p.arrival_rate, ".1e"),
-            _show(p.end_speed, ".1e"),
+            show(p.arrival, ".5f"),
+            show(p.arrival_rate, ".1e"),
+            show(p.end_speed, ".1e"),
         ]
         if impacts:
-            row += [_show(p.impact.impulse, ".4f"), p.impact.contact] if p.impact else ["-", "-"]
+            row += [show(p.impact.impulse, ".4f"), p.impact.contact] if p.impact else ["-", "-"]
         for deviation in (p.end_deviation, p.deviation) if planned else ():
             pair = (deviation.position, deviation.angle) if deviation else (None, None)
-            row += [_show(value, ".1e") for value in pair]
+            row += [show(value, ".1e") for value in pair]
         rows.append(row)
-    return _table(header, rows, {1, 2, 7} if impacts else {1, 2})
+    return align(header, rows, {1, 2, 7} if impacts else {1, 2})
 
 
 def _change_table(report: Report) -> list[str]:
     """Changes of mode; nothing if there are none."""
-    rows = [[str(c.phase), c.what, c.kind, _show(c.time, ".5f")] for c in report.changes]
-    return _table(["phase", "mode of", "", "at t [s]"], rows, {1, 2}) if rows else []
+    rows = [[str(c.phase), c.what, c.kind, show(c.time, ".5f")] for c in report.changes]
+    return align(["phase", "mode of", "", "at t [s]"], rows, {1, 2}) if rows else []
 
 
 def _reduced_table(report: Report) -> list[str]:
@@ -106,9 +107,9 @@ def _reduced_table(report: Report) -> list[str]:
     rows = []
     for r in report.reduced:
         figures = r.Phi_1, r.Phi_2, r.Phi_3, r.theta_1_dot, r.theta_1_ddot
-        texts = [_show(value, ".6g") for value in figures]
-        rows.append([str(r.phase), _show(r.time, ".5f"), *texts, _show(r.residual, ".1e")])
-    return _table(header, rows, set()) if rows else []
+        texts = [show(value, ".6g") for value in figures]
+        rows.append([str(r.phase), show(r.time, ".5f"), *texts, show(r.residual, ".1e")])
+    return align(header, rows, set()) if rows else []
 
 
 def _energy_table(report: Report) -> list[str]:
@@ -123,18 +124,19 @@ def _energy_table(report: Report) -> list[str]:
         ["contacts gained", energy.impact],
         ["residual", energy.residual],
     ]
-    return _table(["energy", "[J]"], [[str(n), f"{v: .6e}"] for n, v in rows], {0})
+    return align(["energy", "[J]"], [[str(n), f"{v: .6e}"] for n, v in rows], {0})
 
 
 def _after_blank(lines: list[str]) -> list[str]:
     return ["", *lines] if lines else []
 
 
-def _show(value: float | None, form: str) -> str:
+def show(value: float | None, form: str) -> str:
+    """A number in some format; a dash where there is none."""
     return "-" if value is None or math.isnan(value) else format(value, form)
 
 
-def _table(header: list[str], rows: list[list[str]], left: set[int]) -> list[str]:
+def align(header: Sequence[str], rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:
     """Lines of a table with aligned columns; those in `left` are flush left."""
     widths = [max(len(cell) for cell in column) for column in zip(header, *rows, strict=True)]
     return [

@@ -16,6 +16,7 @@ from ...common.arrays import Array
 from ...geometry.curve import Curve
 from ...mechanics.dynamics import Directions, inverse
 from ...mechanics.limits import SPEED, make_limits
+from ...mechanics.sides import SideTerms
 
 GIVE = 2.5e-7
 """By how much limits give way, over what is much for each: a plan may miss as much of them."""
@@ -93,27 +94,13 @@ def evaluate_rows(curve: Curve, epsilon: float, s: Array, segment: NDArray[np.in
     forces = inverse(curve.formation, *point[:3], directions, point.kinematics)
     every = make_limits(curve.formation, epsilon)
     limits = every.without(SPEED)
-    of_c, of_tau, _ = (part.T for part in limits.columns)
-    rows, sides, bounds = limits.sides
-    scale = sides / limits.scales[rows]
-
-    def measure(of_forces: Array, of_torques: Array) -> Array:
-        return np.asarray((of_forces @ of_c + of_torques @ of_tau)[:, rows] * scale)
-
-    constant = measure(forces.C0, forces.T0) - bounds * scale + GIVE
+    terms = SideTerms.of(limits, forces, point.z_s[:, 3:])
     cap = np.full(len(s), np.inf)
     for limit in every.only(SPEED).limits:
         rates = np.abs(point.z_s[:, 3:] @ limit.rows[0, -2:])
         with np.errstate(divide="ignore"):
             cap = np.minimum(cap, (limit.high[0] / rates) ** 2 * (1 + GIVE))
-    return eliminate(
-        measure(forces.Cl, forces.Tl),
-        measure(forces.Ca, forces.Ta),
-        measure(forces.Cb, forces.Tb),
-        measure(0 * forces.C0, forces.Tv),
-        constant,
-        cap,
-    )
+    return eliminate(terms.press, terms.rate, terms.bend, terms.drag, terms.rest + GIVE, cap)
 
 
 def eliminate(squeeze: Array, a: Array, b: Array, v: Array, one: Array, cap: Array) -> Rows:

@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
+from ...mechanics.limits import PRESS
+from ...mechanics.sides import SideTerms
 from ..lower_bound.rows import Rows, eliminate
 from .data import PhaseData, Places
 from .elements import Profile
@@ -34,18 +36,11 @@ class LimitSides(NamedTuple):
     @staticmethod
     def of(data: PhaseData, places: Places, margin: float) -> LimitSides:
         """The sides of the limits of phases, for a margin of normal forces over epsilon [N]."""
-        of_c, of_tau, of_rates = (part.T for part in data.limits.columns)
-        rows, signs, _ = data.limits.sides
-        forces, scale = places.forces, signs / data.spans
-        zero = np.zeros(len(places.rates))
-        return LimitSides(
-            data.slack(places, Profile(zero, zero, zero), margin) / data.spans,
-            (forces.Cb @ of_c + forces.Tb @ of_tau)[:, rows] * scale,
-            (forces.Tv @ of_tau + places.rates @ of_rates)[:, rows] * scale,
-            (forces.Ca @ of_c + forces.Ta @ of_tau)[:, rows] * scale,
-            (forces.Cl @ of_c + forces.Tl @ of_tau)[:, rows] * scale,
-            data.largest_b(places),
-        )
+        terms = SideTerms.of(data.limits, places.forces, places.rates)
+        rows = data.limits.sides[0]
+        pressing = np.isin(rows, data.limits.of(PRESS))
+        rest = terms.rest - margin * pressing / data.spans
+        return LimitSides(rest, *terms[1:], data.largest_b(places))
 
     def pick(self, rows: Any) -> LimitSides:
         """Some of the places."""

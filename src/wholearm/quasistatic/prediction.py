@@ -1,0 +1,221 @@
+"""What is predicted of quasistatic motions at speed: numbers, text and plain values."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+from ..common.arrays import Array
+from ..results.report import plain
+from ..results.report_text import align, show
+
+
+class Place(NamedTuple):
+    """Where along a phase: arc length [m], x [m] and phi [rad]."""
+
+    s: float
+    x: float
+    phi: float
+
+    def to_text(self) -> str:
+        """The pose in mm and degrees."""
+        x, phi = round(1e3 * self.x, 6) + 0.0, round(math.degrees(self.phi), 6) + 0.0
+        return f"x = {x:.4g} mm, phi = {phi:.4g} deg"
+
+
+class Weakest(NamedTuple):
+    """What gives way first.
+
+    Attributes
+    ----------
+    contacts : tuple of str
+        One, or two of which either does with another squeeze; none where it is no contact.
+    others : tuple of str
+        Torques or speeds of fingers that keep it from pressing more.
+    place : Place
+    force : float or None, [N]
+        The least normal force there; None where other limits than those of forces are missed.
+    """
+
+    contacts: tuple[str, ...]
+    others: tuple[str, ...]
+    place: Place
+    force: float | None
+
+    @property
+    def name(self) -> str:
+        """What gives way, in words."""
+        parts = [" or ".join(self.contacts), " and ".join(self.others)]
+        return ", by ".join(filter(None, parts)) or "jams"
+
+
+class Survival(NamedTuple):
+    """Up to which speed one kind of motion keeps every contact.
+
+    Attributes
+    ----------
+    motion : str
+        "steady": at one speed throughout, with the best squeeze at each place; "rest to rest",
+        "from rest", "to rest": as a cosine of time, or with constant acceleration, likewise; "own
+        torques": at one speed, under the torques of the quasistatic motion.
+    speed : float or None, [m/s]
+        Along the phase, its largest, from which on a contact presses with less than epsilon. Zero
+        where one does near rest, None where none does.
+    duration : float or None, [s]
+        Of the phase at that speed.
+    lost : float or None, [m/s]
+        Likewise, from which on a contact is lost.
+    again : float or None, [m/s]
+        Where that is zero, the speed from which on contacts are kept after all.
+    first : Weakest
+        What gives way at `speed`.
+    """
+
+    motion: str
+    speed: float | None
+    duration: float | None
+    lost: float | None
+    again: float | None
+    first: Weakest
+
+
+class QuasistaticTorques(NamedTuple):
+    """Torques that balance a quasistatic motion, at n places of a phase.
+
+    Attributes
+    ----------
+    s : ndarray, shape (n,), [m]
+    z : ndarray, shape (n, 5)
+    tau : ndarray, shape (n, 2), [N m]
+    c_n : ndarray, shape (n, n_c), [N]
+    """
+
+    s: Array
+    z: Array
+    tau: Array
+    c_n: Array
+
+
+class Curves(NamedTuple):
+    """The least normal force over speed.
+
+    Attributes
+    ----------
+    speed : ndarray, shape (n,), [m/s]
+    force : dict of ndarray, shape (n,), [N]
+        By the names of motions; minus infinity where other limits are missed.
+    """
+
+    speed: Array
+    force: dict[str, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class PhasePrediction:
+    """One phase.
+
+    Attributes
+    ----------
+    number : int
+    contacts : tuple of str
+    until : str
+    path : {"curve", "line", "left out"}
+        Whether it is looked at along its curve, or along a straight line in (x, phi).
+    length : float, [m]
+    slow : Weakest or None
+        What presses least in the quasistatic motion with the best squeeze; None if left out.
+    kept : tuple of (Place, Place)
+        Stretches where the quasistatic motion keeps every contact.
+    survivals : tuple of Survival
+    torques : QuasistaticTorques or None
+        None where torques do not balance everywhere.
+    curves : Curves or None
+    """
+
+    number: int
+    contacts: tuple[str, ...]
+    until: str
+    path: str
+    length: float
+    slow: Weakest | None = None
+    kept: tuple[tuple[Place, Place], ...] = ()
+    survivals: tuple[Survival, ...] = ()
+    torques: QuasistaticTorques | None = None
+    curves: Curves | None = None
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether the quasistatic motion keeps every contact all along."""
+        return len(self.kept) == 1 and self.kept[0][1].s - self.kept[0][0].s >= self.length
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain values for JSON."""
+        own = {**asdict(self), "is_kept": self.is_kept}
+        if self.torques is not None:
+            own["torques"] = {key: own.tolist() for key, own in self.torques._asdict().items()}
+        if self.curves is not None:
+            forces = {name: force.tolist() for name, force in self.curves.force.items()}
+            own["curves"] = {"speed": self.curves.speed.tolist(), "force": forces}
+        found: dict[str, Any] = plain(own)
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What is predicted of a problem.
+
+    Attributes
+    ----------
+    name : str
+    epsilon : float, [N]
+    phases : tuple of PhasePrediction
+    """
+
+    name: str
+    epsilon: float
+    phases: tuple[PhasePrediction, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain values for JSON, with None where there is no number."""
+        phases = [phase.to_dict() for phase in self.phases]
+        return {"name": self.name, "epsilon": self.epsilon, "phases": phases}
+
+    def to_text(self) -> str:
+        """Tables of quasistatic motions, and of the speeds at which they break."""
+        slow = [phase.number for phase in self.phases if phase.path != "left out"]
+        bad = [phase.number for phase in self.phases if phase.slow and not phase.is_kept]
+        verdict = "keeps every contact"
+        if bad:
+            verdict += f" but in phase{'s' * (len(bad) > 1)} {', '.join(map(str, bad))}"
+        head = f"{self.name}: a quasistatic motion, epsilon = {self.epsilon:g} N, {verdict}"
+        if not slow:
+            head = f"{self.name}: no phase has one or two freedoms"
+        return "\n".join([head, "", *self._list_slow(), "", *self._list_speeds()])
+
+    def _list_slow(self) -> list[str]:
+        rows = []
+        for phase in self.phases:
+            row = [str(phase.number), phase.until, phase.path]
+            if phase.slow is None:
+                rows.append([*row, "-", "-", "-", "-", "has not one or two freedoms"])
+                continue
+            parts = "; ".join(f"{a.to_text()} to {b.to_text()}" for a, b in phase.kept)
+            kept = "all along" if phase.is_kept else parts or "nowhere"
+            figures = [show(phase.length, ".4f"), show(phase.slow.force, "+.4f")]
+            rows.append([*row, *figures, phase.slow.name, phase.slow.place.to_text(), kept])
+        header = ["phase", "until", "along", "length [m]", "least c_n [N]", "of", "at", "kept"]
+        return align(header, rows, {1, 2, 5, 6, 7})
+
+    def _list_speeds(self) -> list[str]:
+        rows = []
+        for phase in self.phases:
+            for own in phase.survivals:
+                first = f"{own.first.name} at {own.first.place.to_text()}"
+                speed, lost = ("any" if v is None else f"{v:.4f}" for v in (own.speed, own.lost))
+                if own.again is not None:
+                    speed = f"0; from {own.again:.4f} on"
+                row = [str(phase.number), own.motion, speed, show(own.duration, ".4f"), lost]
+                rows.append([*row, first if own.speed is not None else "-"])
+        header = ["phase", "motion", "keeps epsilon to [m/s]", "lasting [s]", "contacts to [m/s]"]
+        return align([*header, "first"], rows, {1, 5})

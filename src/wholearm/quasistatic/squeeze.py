@@ -1,0 +1,120 @@
+"""How hard contacts can press at once: the largest least normal force over the squeeze.
+
+At a place of a curve with a speed and an acceleration, every limit is affine in the squeeze. Those
+that epsilon sets, c_n >= epsilon and the cones of rolling contacts, can be kept up to some largest
+epsilon, while torques stay within their limits.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.arrays import Array
+from ..contacts.formation import Formation
+from ..mechanics.dynamics import PathForces
+from ..mechanics.limits import CONE, PRESS, LimitSet, make_limits
+from ..mechanics.sides import SideTerms
+
+_FAR = 1e6
+"""Squeeze that stands for an infinite one, over the scene's force."""
+_LEVEL = 1e-12
+"""Slope over the squeeze below which a limit does not depend on it, over what is much for it."""
+_TIED = 1e-9
+"""Slack of a limit that counts as none, over what is much for it."""
+
+
+class Grasp(NamedTuple):
+    """What presses least at n places, with the best squeeze.
+
+    Attributes
+    ----------
+    least : ndarray, shape (n,), [N]
+        The largest epsilon that all contacts keep; minus infinity where other limits are missed
+        whatever the squeeze.
+    squeeze : ndarray, shape (n,), [N]
+    owners : ndarray of int, shape (n, 2)
+        Limits, as indices into the set, that keep it from being larger, those of contacts first.
+    """
+
+    least: Array
+    squeeze: Array
+    owners: NDArray[np.int64]
+
+
+class Squeezing(NamedTuple):
+    """Limits at n places of a curve as functions of the squeeze.
+
+    Attributes
+    ----------
+    limits : LimitSet
+        For an epsilon of zero.
+    terms : SideTerms
+    """
+
+    limits: LimitSet
+    terms: SideTerms
+
+    @staticmethod
+    def of(formation: Formation, forces: PathForces, rates: Array) -> Squeezing:
+        """Those of a formation; see `SideTerms.of`."""
+        limits = make_limits(formation, 0.0)
+        return Squeezing(limits, SideTerms.of(limits, forces, rates))
+
+    @property
+    def force(self) -> float:
+        """What is much for a normal force [N]."""
+        return float(self.limits.scales[self.limits.of(PRESS)[0]])
+
+    def _split(self) -> tuple[NDArray[np.bool_], Array, NDArray[np.int64]]:
+        """Which sides give way to epsilon, by how much per newton, and the limits they are of."""
+        rows = self.limits.sides[0]
+        weights = np.concatenate([limit.weight for limit in self.limits.limits])[rows]
+        soft = np.isin(rows, self.limits.of(PRESS, CONE)) & (weights > 0)
+        weights = np.where(soft, weights, 0.0) / self.limits.scales[rows]
+        return soft, weights, self.limits.owners[rows]
+
+    def find_span(self, a: Array, b: Array, epsilon: Array | float) -> tuple[Array, Array]:
+        """Least and largest squeeze with which all limits are kept, shape (n,) [N].
+
+        The least is above the largest where there is none.
+        """
+        _, weights, _ = self._split()
+        offset = self.terms.at(a, b) - np.multiply.outer(np.broadcast_to(epsilon, a.shape), weights)
+        return _intersect(offset, self.terms.press, _FAR * self.force)
+
+    def find_best(self, a: Array, b: Array) -> Grasp:
+        """The squeeze with which every contact presses most, at places with a = s'', b = s'^2."""
+        soft, weights, owners = self._split()
+        offset, slope = self.terms.at(a, b), self.terms.press
+        low, high = _intersect(offset[:, ~soft], slope[:, ~soft], _FAR * self.force)
+        # In newtons of epsilon.
+        rest, rise = offset[:, soft] / weights[soft], slope[:, soft] / weights[soft]
+        i, j = np.triu_indices(soft.sum(), 1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            corners = (rest[:, j] - rest[:, i]) / (rise[:, i] - rise[:, j])
+        corners = np.where(np.isfinite(corners), corners, low[:, None])
+        tried = np.clip(np.column_stack([low, high, corners]), low[:, None], high[:, None])
+        least = (rest[:, None] + rise[:, None] * tried[..., None]).min(axis=2)
+        k, best = np.arange(len(a)), least.argmax(axis=1)
+        squeeze, value = tried[k, best], np.where(low <= high, least[k, best], -np.inf)
+        slack = offset + slope * squeeze[:, None]
+        found = np.isfinite(value)
+        slack[:, soft] -= np.where(found, value, 0.0)[:, None] * weights[soft]
+        # Where other limits cannot be kept it is these that are to blame.
+        slack[np.ix_(~found, soft)] = np.inf
+        pair = np.argsort(np.where(found[:, None], np.abs(slack), slack), axis=1)[:, :2]
+        rank = np.sort(owners[pair] + len(self.limits.limits) * ~soft[pair], axis=1)
+        return Grasp(value, squeeze, rank % len(self.limits.limits))
+
+
+def _intersect(offset: Array, slope: Array, far: float) -> tuple[Array, Array]:
+    """Ends of where offset + slope x >= 0 for all columns, shape (n,); crossed if nowhere."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        edge = -offset / slope
+    low = np.where(slope > _LEVEL, edge, -far).max(axis=1, initial=-far)
+    high = np.where(slope < -_LEVEL, edge, far).min(axis=1, initial=far)
+    stuck = ((np.abs(slope) <= _LEVEL) & (offset < -_TIED)).any(axis=1)
+    return np.where(stuck, far, low), np.where(stuck, -far, high)
