@@ -1,4 +1,4 @@
-"""The command line: ``wholearm solve|verify|plot|predict|map|bench``.
+"""The command line: ``wholearm solve|verify|plot|predict|map|export|replay|bench``.
 
 Exit status 0 means done and all contacts held, 1 infeasible or a contact lost or a goal missed,
 2 bad input, 130 interrupted, 143 terminated. Each command imports what it needs and nothing else.
@@ -18,6 +18,7 @@ from ..common.errors import InputError, WholearmError, name_source
 from ..common.interrupts import guard
 from .arguments import add_map, add_plot, add_predict, add_solve, add_verify
 from .bench import add_bench, name_study
+from .engines import add_export, add_replay
 from .foresee import predict
 from .progress import clear_progress, show_progress
 
@@ -85,6 +86,13 @@ def build_parser() -> argparse.ArgumentParser:
         ("plot", add_plot, _plot, "draw force margins, torques and snapshots"),
         ("predict", add_predict, predict, "see up to which speed slow motions keep every contact"),
         ("map", add_map, _map, "draw the contact formations over (x, phi)"),
+        ("export", add_export, None, "write scene and plan for a physics engine"),
+        (
+            "replay",
+            add_replay,
+            None,
+            "replay a plan in MuJoCo or Drake and compare it with the plan",
+        ),
         ("bench", add_bench, None, "measure run time against error, or run the stress study"),
     ):
         own = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")

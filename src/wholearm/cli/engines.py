@@ -1,0 +1,114 @@
+"""The commands ``export`` and ``replay``: files for physics engines, and replays in them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import TYPE_CHECKING
+
+from ..common.errors import InputError, name_source
+from .progress import clear_progress, show_progress
+
+if TYPE_CHECKING:
+    from ..problem.definition import Problem
+    from ..results.trajectory import Trajectory
+
+
+def add_export(parser: argparse.ArgumentParser) -> None:
+    """Add what `export` takes."""
+    parser.add_argument("problem", help="problem file (TOML)")
+    parser.add_argument("plan", nargs="?", help="trajectory file (.npz) that the model plays")
+    text = "file to write (.xml): the scene in MuJoCo's format"
+    parser.add_argument("--mjcf", metavar="FILE", required=True, help=text)
+    parser.add_argument("--step", type=float, help="time step of the model [s]")
+    parser.set_defaults(run=_export)
+
+
+def add_replay(parser: argparse.ArgumentParser) -> None:
+    """Add what `replay` takes."""
+    parser.add_argument("problem", help="problem file (TOML)")
+    parser.add_argument("plan", help="trajectory file (.npz)")
+    text = "mujoco or drake, installed with the extra of that name"
+    parser.add_argument("--engine", required=True, help=text)
+    text = "from start to end, instead of phase by phase from each planned start"
+    parser.add_argument("--whole", action="store_true", help=text)
+    parser.add_argument("--step", type=float, help="longest time step [s]")
+    text = "softness of contacts, over the engine's default (1)"
+    parser.add_argument("--softness", type=float, help=text)
+    text = "how far a replay may be from the plan, over the object's radius of gyration, and in rad"
+    words = "3e-3 for mujoco, 1.5e-3 for drake"
+    parser.add_argument("--departure", type=float, help=f"{text} ({words})")
+    text = "also replay with steps, and then contacts, of a half, a quarter, ... to N halvings"
+    parser.add_argument("--refine", type=int, metavar="N", default=0, help=text)
+    parser.add_argument("--json", action="store_true", help="print the report as JSON")
+    parser.set_defaults(run=_replay)
+
+
+def _export(options: argparse.Namespace) -> int:
+    from ..common.files import require_ending, require_writable, write_text
+    from ..engines.mjcf import write_mjcf
+    from ..problem.read import read_problem
+
+    require_writable(options.mjcf)
+    require_ending(options.mjcf, ".xml")
+    step = _read_positive(options, "step")
+    problem = read_problem(options.problem)
+    plan = None if options.plan is None else _load_plan(options.plan, problem)
+    with name_source(options.problem):
+        write_text(options.mjcf, write_mjcf(problem, plan, step=step))
+    print(f"wrote {options.mjcf}")
+    return 0
+
+
+def _replay(options: argparse.Namespace) -> int:
+    from ..engines.replay import ENGINES, replay_in, require_engine
+    from ..engines.report_text import to_dict, write
+    from ..problem.read import read_problem
+
+    require_engine(options.engine)
+    given = {key: _read_positive(options, key) for key in ("step", "softness", "departure")}
+    if not 0 <= options.refine <= 10:
+        raise InputError("", "--refine", f"{options.refine} given; allowed are 0 to 10")
+    problem = read_problem(options.problem)
+    plan = _load_plan(options.plan, problem)
+    setting = ENGINES[options.engine].setting
+    if given["step"] is not None:
+        setting = setting._replace(step=given["step"] / problem.scene.scales.time)
+    if given["softness"] is not None:
+        setting = setting._replace(softness=given["softness"])
+    with name_source(options.problem):
+        report = replay_in(
+            options.engine,
+            problem,
+            plan,
+            whole=options.whole,
+            setting=setting,
+            allowed=given["departure"],
+            halvings=options.refine,
+            progress=show_progress(),
+        )
+    clear_progress()
+    print(json.dumps(to_dict(report), indent=2) if options.json else write(report))
+    return report.exit_status
+
+
+def _read_positive(options: argparse.Namespace, key: str) -> float | None:
+    from ..common.require import require_number
+
+    value = getattr(options, key)
+    return None if value is None else require_number(value, f"--{key}", positive=True)
+
+
+def _load_plan(path: str, problem: Problem) -> Trajectory:
+    """A plan of the problem's phases."""
+    from ..common.files import require_ending
+    from ..engines.stretch import require_same_phases
+    from ..results.trajectory_file import load_trajectory
+
+    if require_ending(path, ".npz", ".csv") == ".csv":
+        text = "torques alone have no motion to compare with; verify -o FILE.npz writes one"
+        raise InputError(path, "", text)
+    plan = load_trajectory(path)
+    with name_source(path):
+        require_same_phases(problem, plan)
+    return plan

@@ -1,0 +1,224 @@
+"""Replays in Drake."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..problem.definition import Problem
+from ..results.torque import TorqueProfile
+from ..scene.model import Scene
+from .shapes import LINKS, OBJECT, PALM, Pair, Shape, find_rounding, list_pairs, list_shapes
+from .stretch import Run, Setting, Steps, Stretch, list_steps
+
+SINKING = 1e-6
+"""How far the scene's force presses a contact in, over the scene's length."""
+STICTION = 1e-5
+"""Sliding speed up to which friction grows, over the scene's speed."""
+DISSIPATION = 1000.0
+"""Damping of contacts by Hunt and Crossley, times the scene's speed."""
+_ROUGH = 1e12
+"""Friction of vertices and edges, which makes that of a pair twice the other shape's."""
+
+
+def play(problem: Problem, stretch: Stretch, torque: TorqueProfile, setting: Setting) -> Run:
+    """Replay a stretch in Drake; an `Engine`.
+
+    Raises
+    ------
+    ImportError
+        If Drake is not installed.
+    """
+    from pydrake.systems.analysis import Simulator
+
+    steps = list_steps(problem, stretch, torque, setting.step)
+    with _quiet():
+        diagram, plant, pairs = _build(problem.scene, steps, setting)
+    simulator = Simulator(diagram)
+    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    plant.SetPositions(context, _press(problem, stretch, setting))
+    plant.SetVelocities(context, steps.v)
+    simulator.Initialize()
+    results = plant.get_contact_results_output_port()
+    states, press, start = [(stretch.z, stretch.z_dot)], [], 0
+    for end in steps.ends:
+        total = np.zeros(len(list_pairs(problem.scene)))
+        for step in range(start + 1, end + 1):
+            # Half a step late: the step at that time is done then, whatever its rounding.
+            simulator.AdvanceTo((step - 0.5) * steps.h)
+            found = results.Eval(context)
+            for k in range(found.num_point_pair_contacts()):
+                info = found.point_pair_contact_info(k)
+                both = info.point_pair()
+                number = pairs[frozenset((both.id_A, both.id_B))]
+                total[number] += abs(info.contact_force() @ both.nhat_BA_W)
+        press.append(total / (end - start))
+        states.append((plant.GetPositions(context), plant.GetVelocities(context)))
+        start = end
+    z, z_dot = (np.array(part) for part in zip(*states, strict=True))
+    t = stretch.start + steps.h * np.array([0, *steps.ends])
+    names = tuple(pair.name for pair in list_pairs(problem.scene))
+    return Run(t, z, z_dot, names, np.array(press))
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Hold back a warning that half spaces touch nothing deformable."""
+    log = logging.getLogger("drake")
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
+
+
+def _build(scene: Scene, steps: Steps, setting: Setting) -> tuple[Any, Any, dict[Any, int]]:
+    """Diagram, plant, and the numbers of pairs by the identities of their shapes."""
+    from pydrake.multibody.plant import (
+        AddMultibodyPlantSceneGraph,
+        ContactModel,
+        DiscreteContactApproximation,
+    )
+    from pydrake.systems.framework import DiagramBuilder
+    from pydrake.systems.primitives import TrajectorySource
+    from pydrake.trajectories import PiecewisePolynomial
+
+    builder = DiagramBuilder()
+    plant, graph = AddMultibodyPlantSceneGraph(builder, steps.h)
+    # The default approximation, lagged, is wrong by millimetres here; TAMSI converges.
+    plant.set_discrete_contact_approximation(DiscreteContactApproximation.kTamsi)
+    plant.set_contact_model(ContactModel.kPoint)
+    _add_bodies(plant, scene)
+    pairs = _add_shapes(plant, graph, scene, setting)
+    plant.Finalize()
+    plant.set_stiction_tolerance(STICTION * scene.scales.speed)
+    # Held from half a step before each step on, so that rounding of times does not matter.
+    breaks = steps.h * (np.arange(len(steps.tau) + 1) - 0.5)
+    rows = np.vstack([steps.tau, steps.tau[-1:]]).T
+    source = builder.AddSystem(TrajectorySource(PiecewisePolynomial.ZeroOrderHold(breaks, rows)))
+    builder.Connect(source.get_output_port(), plant.get_actuation_input_port())
+    return builder.Build(), plant, pairs
+
+
+def _add_bodies(plant: Any, scene: Scene) -> None:
+    """Object and links, whose weight is no part of the model, on their joints."""
+    from pydrake.math import RigidTransform
+    from pydrake.multibody.tree import (
+        FixedOffsetFrame,
+        PlanarJoint,
+        RevoluteJoint,
+        SpatialInertia,
+        UnitInertia,
+    )
+
+    def add(name: str, mass: float, inertia: float) -> Any:
+        unit = UnitInertia(*3 * [inertia / mass])
+        return plant.AddRigidBody(name, SpatialInertia(mass, np.zeros(3), unit))
+
+    polygon = scene.polygon
+    assert polygon.inertia is not None
+    body = add(OBJECT, polygon.mass, polygon.inertia)
+    plant.AddJoint(PlanarJoint(OBJECT, plant.world_frame(), body.body_frame()))
+    for name, link in zip(LINKS, scene.fingers, strict=True):
+        own = add(name, link.inertia / link.length**2, link.inertia)
+        place = RigidTransform([*np.asarray(link.base), 0.0])
+        base = plant.AddFrame(FixedOffsetFrame(f"{name} base", plant.world_frame(), place))
+        turn = RevoluteJoint(name, base, own.body_frame(), [0.0, 0.0, 1.0], link.viscous)
+        plant.AddJointActuator(name, plant.AddJoint(turn))
+    plant.mutable_gravity_field().set_gravity_vector([0.0, -scene.gravity, 0.0])
+
+
+def _add_shapes(plant: Any, graph: Any, scene: Scene, setting: Setting) -> dict[Any, int]:
+    """Add balls, capsules and the palm; only pairs that may touch are looked at."""
+    from pydrake.geometry import CollisionFilterDeclaration, GeometrySet, HalfSpace
+    from pydrake.math import RigidTransform, RotationMatrix
+
+    shapes = {shape.name: shape for shape in list_shapes(scene)}
+    known: dict[tuple[str, float], Any] = {}
+
+    def register(name: str, friction: float) -> Any:
+        key = (name, friction)
+        if key not in known:
+            material = _make_material(scene, setting, friction)
+            label = f"{name} {friction:g}"
+            if name == PALM:
+                low = [0.0, -find_rounding(scene), 0.0]
+                place = RigidTransform(RotationMatrix.MakeXRotation(-np.pi / 2), low)
+                known[key] = plant.RegisterCollisionGeometry(
+                    plant.world_body(), place, HalfSpace(), label, material
+                )
+            else:
+                place, form = _place(shapes[name])
+                body = plant.GetBodyByName(shapes[name].body)
+                known[key] = plant.RegisterCollisionGeometry(body, place, form, label, material)
+        return known[key]
+
+    numbers = {}
+    for number, pair in enumerate(list_pairs(scene)):
+        ids = [register(name, friction) for name, friction in _share_friction(pair)]
+        numbers[frozenset(ids)] = number
+    manager = graph.collision_filter_manager()
+    manager.Apply(CollisionFilterDeclaration().ExcludeWithin(GeometrySet(list(known.values()))))
+    allowed = CollisionFilterDeclaration()
+    for first, second in numbers:
+        allowed.AllowBetween(GeometrySet(first), GeometrySet(second))
+    manager.Apply(allowed)
+    return numbers
+
+
+def _share_friction(pair: Pair) -> tuple[tuple[str, float], tuple[str, float]]:
+    """Both shapes of a pair with frictions that Drake makes that of the pair of."""
+    if pair.friction == 0.0:
+        return (pair.first, 0.0), (pair.second, 0.0)
+    return (pair.first, _ROUGH), (pair.second, pair.friction / 2)
+
+
+def _press(problem: Problem, stretch: Stretch, setting: Setting) -> Array:
+    """The planned start, with the contacts pressed in as far as the planned forces press them."""
+    formation = problem.phases[stretch.phases[0]].formation
+    A = formation.evaluate(stretch.z[None], stretch.z_dot[None]).A[0]
+    depth = np.array([stretch.c_n[name] for name in formation.names])
+    depth /= _find_stiffness(problem.scene, setting)
+    # The nearest such place by the kinetic energy of getting there.
+    weight = 1 / np.sqrt(problem.scene.mass_diagonal)
+    return np.asarray(stretch.z - weight * (np.linalg.pinv(A * weight) @ depth))
+
+
+def _find_stiffness(scene: Scene, setting: Setting) -> float:
+    """That of a pair [N/m]."""
+    return scene.scales.force / (SINKING * setting.softness * scene.scales.length)
+
+
+def _make_material(scene: Scene, setting: Setting, friction: float) -> Any:
+    """Twice the stiffness of a pair, for both of its shapes."""
+    from pydrake.geometry import AddContactMaterial, ProximityProperties
+    from pydrake.multibody.plant import CoulombFriction
+
+    material = ProximityProperties()
+    AddContactMaterial(
+        material,
+        dissipation=DISSIPATION / scene.scales.speed,
+        point_stiffness=2 * _find_stiffness(scene, setting),
+        friction=CoulombFriction(friction, friction),
+    )
+    return material
+
+
+def _place(shape: Shape) -> tuple[Any, Any]:
+    """A ball or a capsule, and where it is on its body."""
+    from pydrake.geometry import Capsule, Sphere
+    from pydrake.math import RigidTransform, RotationMatrix
+
+    middle = [*shape.points.mean(axis=0), 0.0]
+    if len(shape.points) == 1:
+        return RigidTransform(middle), Sphere(shape.radius)
+    run = shape.points[1] - shape.points[0]
+    length = float(np.hypot(*run))
+    turn = RotationMatrix.MakeFromOneVector([*(run / length), 0.0], 2)
+    return RigidTransform(turn, middle), Capsule(shape.radius, length)

@@ -1,0 +1,175 @@
+"""A scene, and a plan's torques, as an MJCF file: MuJoCo's format, written without MuJoCo.
+
+Positions are z = (x, y, phi, theta_1, theta_2), with the start of the motion as the model's own
+position and as the keyframe ``home``. What else a plan adds is described in `clock`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..problem.definition import Problem
+from ..results.trajectory import Trajectory
+from ..scene.model import Scene
+from .clock import add_clock
+from .elements import add
+from .shapes import LINKS, OBJECT, PALM, find_rounding, list_pairs, list_shapes
+
+STEP = 1.6e-4
+"""Time step, over the scene's time: 1e-5 s in the scenes of `problems/`."""
+
+
+class Softness(NamedTuple):
+    """How soft contacts are.
+
+    Sliding in a convex model of contact parts the surfaces at a rate that falls with the time
+    constant of friction and with the impedance; where they part for long, forces come too late.
+
+    Attributes
+    ----------
+    press, rub : float
+        Time constants of gap and sliding speed, as of critically damped springs, in time steps.
+    impedance : float
+        Share of the unconstrained motion that a contact takes away.
+    ratio : float
+        Impedance of friction over that of the gap.
+    """
+
+    press: float = 10.0
+    rub: float = 400.0
+    impedance: float = 0.01
+    ratio: float = 100.0
+
+    def scale(self, factor: float) -> Softness:
+        """The same with other time constants."""
+        return self._replace(press=factor * self.press, rub=factor * self.rub)
+
+
+def write_mjcf(
+    problem: Problem,
+    plan: Trajectory | None = None,
+    *,
+    step: float | None = None,
+    softness: Softness | None = None,
+) -> str:
+    """The scene as the text of an MJCF file.
+
+    Parameters
+    ----------
+    problem : Problem
+    plan : Trajectory, optional
+        Its torques are part of the model, and each of its phases has a keyframe at its start.
+    step : float, optional, [s]
+        `STEP` of the scene's time when left out.
+    softness : Softness, optional
+
+    Raises
+    ------
+    InputError
+        If a link has no thickness.
+    """
+    scene = problem.scene
+    home = problem.start if plan is None else plan.z[0]
+    root = Element("mujoco", model=problem.name)
+    step = STEP * scene.scales.time if step is None else step
+    softness = Softness() if softness is None else softness
+    _add_options(root, scene, step, softness)
+    world = add(root, "worldbody")
+    _add_palm(world, scene)
+    _add_object(world, scene, home[:3])
+    _add_links(world, scene, home[3:])
+    _add_pairs(add(root, "contact"), scene, step, softness)
+    motors = add(root, "actuator")
+    for number, link in enumerate(scene.fingers, 1):
+        # Controls contain the dry friction of the joint.
+        limit = np.array([-1, 1]) * (link.torque_limit + link.dry)
+        add(motors, "motor", name=f"motor{number}", joint=f"theta{number}", ctrlrange=limit)
+    keys = add(root, "keyframe")
+    if plan is None:
+        add(keys, "key", name="home", qpos=home)
+    else:
+        add_clock(root, scene, plan, step)
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _add_options(root: Element, scene: Scene, step: float, softness: Softness) -> None:
+    """Units and solver, and how a viewer shows the scene."""
+    size, depth = scene.polygon.size, scene.polygon.size / 20
+    add(root, "compiler", angle="radian", autolimits="true")
+    # MuJoCo 4.0.0 factorises sparse Hessians wrongly; its midphase drops shapes this thin.
+    known = {"solver": "Newton", "jacobian": "dense", "integrator": "implicitfast"}
+    gravity = [0.0, -scene.gravity, 0.0]
+    tight = {"tolerance": 1e-12, "cone": "elliptic", "impratio": softness.ratio}
+    option = add(root, "option", timestep=step, gravity=gravity, **tight, **known)
+    add(option, "flag", midphase="disable")
+    add(root, "statistic", center=[0.0, size, 0.0], extent=3 * size)
+    add(add(root, "visual"), "global", azimuth="90", elevation="-89.9")
+    points = [(*corner, side) for side in (-depth, depth) for corner in scene.polygon.vertices]
+    add(add(root, "asset"), "mesh", name=OBJECT, inertia="convex", vertex=points)
+
+
+def _add_geom(body: Element, name: str, kind: str, **attributes: object) -> None:
+    """A shape that touches only what pairs say."""
+    add(body, "geom", name=name, type=kind, contype="0", conaffinity="0", **attributes)
+
+
+def _add_palm(world: Element, scene: Scene) -> None:
+    reach = 10 * max(scene.polygon.size, *(link.length for link in scene.fingers))
+    place = [0.0, -find_rounding(scene), 0.0]
+    size = [reach, reach, reach / 100]
+    _add_geom(world, PALM, "plane", pos=place, zaxis=[0, 1, 0], size=size, rgba=".6 .6 .6 1")
+
+
+def _add_object(world: Element, scene: Scene, q: Array) -> None:
+    polygon = scene.polygon
+    body = add(world, "body", name=OBJECT, pos=[*q[:2], 0.0])
+    add(body, "inertial", pos=[0, 0, 0], mass=polygon.mass, diaginertia=[polygon.inertia] * 3)
+    for axis, (name, kind) in enumerate((("x", "slide"), ("y", "slide"), ("phi", "hinge"))):
+        add(body, "joint", name=name, type=kind, axis=np.eye(3)[axis], ref=q[axis])
+    turned = [0.0, 0.0, q[2]]
+    _add_geom(body, OBJECT, "mesh", mesh=OBJECT, euler=turned, rgba=".9 .7 .3 1")
+    _add_shapes(body, scene, q[2])
+
+
+def _add_links(world: Element, scene: Scene, theta: Array) -> None:
+    for k, link in enumerate(scene.fingers):
+        body = add(world, "body", name=LINKS[k], pos=[*np.asarray(link.base), 0.0])
+        # The weight of links is no part of the model, so their mass is at the joint.
+        mass = link.inertia / link.length**2
+        add(body, "inertial", pos=[0, 0, 0], mass=mass, diaginertia=[link.inertia] * 3)
+        turn = {"axis": [0, 0, 1], "ref": theta[k], "damping": link.viscous}
+        add(body, "joint", name=f"theta{k + 1}", type="hinge", **turn)
+        _add_shapes(body, scene, theta[k])
+
+
+def _add_shapes(body: Element, scene: Scene, angle: float) -> None:
+    """Balls and capsules, turned so that they are in place at the model's own position."""
+    c, s = np.cos(angle), np.sin(angle)
+    for shape in list_shapes(scene):
+        if shape.body == body.get("name"):
+            ends = np.pad(shape.points @ np.array([[c, s], [-s, c]]), ((0, 0), (0, 1)))
+            kind, key = ("sphere", "pos") if len(ends) == 1 else ("capsule", "fromto")
+            _add_geom(body, shape.name, kind, size=shape.radius, **{key: ends})
+
+
+def _add_pairs(contact: Element, scene: Scene, step: float, softness: Softness) -> None:
+    for pair in list_pairs(scene):
+        rough = pair.friction > 0
+        add(
+            contact,
+            "pair",
+            name=pair.name,
+            geom1=pair.first,
+            geom2=pair.second,
+            condim="3" if rough else "1",
+            friction=[pair.friction, pair.friction, 0, 0, 0] if rough else [1, 1, 0, 0, 0],
+            solref=[softness.press * step, 1.0],
+            solreffriction=[softness.rub * step, 1.0],
+            solimp=[softness.impedance, softness.impedance, 1.0],
+        )
