@@ -219,7 +219,7 @@ def test_raised_rates_are_bounds_of_contacts_and_joints() -> None:
 @lru_cache(maxsize=1)
 def make_way_twice() -> tuple[Trajectory, Trajectory]:
     """Plans of least effort with fingers that pass each other, and with solid ones."""
-    options: dict[str, Any] = {"time_intervals": 12, "replay": False}
+    options: dict[str, Any] = {"time_intervals": 8, "replay": False}
     passing, solid = (
         solve(make_way(solid), "effort", **options).trajectory for solid in (False, True)
     )

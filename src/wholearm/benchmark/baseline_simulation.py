@@ -1,121 +1,21 @@
-"""The simulation an ordinary user would write, to measure `simulation.simulate` against.
+"""The equations of motion as an ordinary user would write them, to measure the package against.
 
 The Newton-Euler equations of object and fingers are written out in NumPy, contact by contact, and
-solved together with the contact conditions as one linear system in every call of
-`scipy.integrate.solve_ivp`. Nothing is shared with the package's own contacts and dynamics, so this
-is an independent second formulation too. Friction keeps the directions it is given: no sticking,
-no reversals, no change of formation.
+solved together with the contact conditions as one linear system. Nothing is shared with the
+package's own contacts and dynamics, so this is an independent second formulation. Friction keeps
+the directions it is given.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ..common.arrays import Array
 from ..contacts.elemental import Contact
-from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..scene.model import Scene
-
-
-class BaselineRun(NamedTuple):
-    """What the baseline returns.
-
-    Attributes
-    ----------
-    t : ndarray, shape (n,), [s]
-        Ends of the steps.
-    z, z_dot : ndarray, shape (n, 5)
-    c_n : ndarray, shape (n, n_c), [N]
-    evaluations : int
-        Calls of the right-hand side.
-    lost : int or None
-        Index of the contact whose c_n fell to zero and ended the run at t[-1].
-    """
-
-    t: Array
-    z: Array
-    z_dot: Array
-    c_n: Array
-    evaluations: int
-    lost: int | None
-
-
-def simulate_with_scipy(
-    problem: Problem,
-    phase_index: int,
-    torque: TorqueProfile,
-    z0: Array,
-    z_dot0: Array,
-    Xi: Array,
-    sigma: Array,
-    t_span: tuple[float, float],
-    *,
-    rtol: float = 1e-9,
-    atol: float = 1e-9,
-    method: str = "DOP853",
-    watch_forces: bool = False,
-) -> BaselineRun:
-    """Integrate one phase's formation with SciPy, piece by piece of the torques.
-
-    Parameters
-    ----------
-    problem : Problem
-    phase_index : int
-    torque : TorqueProfile
-    z0, z_dot0 : ndarray, shape (5,)
-        State at t_span[0].
-    Xi, sigma : ndarray, shape (n_c,) and (2,)
-        Directions of sliding and of the joints, kept throughout.
-    t_span : tuple of float, [s]
-    rtol, atol, method
-        Of `solve_ivp`.
-    watch_forces : bool
-        Stop where a c_n falls to zero.
-    """
-    from scipy.integrate import solve_ivp
-
-    contacts, piece = problem.phases[phase_index].formation.contacts, 0
-
-    def forces(t: float, state: Array) -> tuple[Array, Array]:
-        tau = evaluate_piece(torque, piece, t)
-        return solve_motion(problem.scene, contacts, state[:5], state[5:], tau, Xi, sigma)
-
-    def derivative(t: float, state: Array) -> Array:
-        return np.concatenate([state[5:], forces(t, state)[0]])
-
-    events = [_fall(forces, k) for k in range(len(contacts))] if watch_forces else None
-    inner = torque.breaks[(torque.breaks > t_span[0]) & (torque.breaks < t_span[1])]
-    parts, normal, lost = [], [], None
-    state = np.concatenate([z0, z_dot0])
-    for start, stop in pairwise([t_span[0], *inner.tolist(), t_span[1]]):
-        piece = find_piece(torque, (start + stop) / 2)
-        given = {"method": method, "rtol": rtol, "atol": atol, "events": events}
-        parts.append(found := solve_ivp(derivative, (start, stop), state, **given))
-        state = found.y[:, -1]
-        if watch_forces:
-            normal += [forces(t, y)[1] for t, y in zip(found.t, found.y.T, strict=True)]
-        if found.status == 1:
-            lost = next(k for k, times in enumerate(found.t_events) if len(times))
-            break
-    z, z_dot = np.split(np.concatenate([part.y.T for part in parts]), 2, axis=1)
-    c_n, times = np.array(normal).reshape(-1, len(contacts)), np.concatenate([p.t for p in parts])
-    return BaselineRun(times, z, z_dot, c_n, sum(part.nfev for part in parts), lost)
-
-
-def _fall(forces: Callable[[float, Array], tuple[Array, Array]], index: int) -> object:
-    """The event that a c_n falls to zero."""
-
-    def event(t: float, state: Array) -> float:
-        return float(forces(t, state)[1][index])
-
-    event.terminal = True  # type: ignore[attr-defined]
-    event.direction = -1  # type: ignore[attr-defined]
-    return event
 
 
 def find_piece(torque: TorqueProfile, t: float) -> int:
