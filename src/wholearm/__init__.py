@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         WholearmError,
     )
     from .common.shortfalls import Change, Shortfall
+    from .comparison.compare import compare
     from .contacts.elemental import Contact
     from .contacts.formation import Formation
     from .figures import plots
@@ -76,6 +77,7 @@ _HOMES = {
     "Trajectory": "results.trajectory",
     "Until": "problem.definition",
     "WholearmError": "common.errors",
+    "compare": "comparison.compare",
     "load": "geometry.path_guess",
     "load_plan": "planning.saved",
     "load_trajectory": "results.trajectory_file",
@@ -119,6 +121,7 @@ __all__ = [
     "Until",
     "WholearmError",
     "__version__",
+    "compare",
     "load",
     "load_plan",
     "load_trajectory",

@@ -93,6 +93,16 @@ def add_predict(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
 
 
+def add_compare(parser: argparse.ArgumentParser) -> None:
+    """Add what `compare` takes."""
+    parser.add_argument("problem", help="problem file (TOML)")
+    text = "trajectory files (.npz) or torques (.csv) for that problem"
+    parser.add_argument("files", nargs="+", metavar="FILE", help=text)
+    text = "figure to write (.png, .pdf, .svg) of the force margins of all"
+    parser.add_argument("-o", "--output", metavar="FILE", help=text)
+    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+
+
 def add_map(parser: argparse.ArgumentParser) -> None:
     """Add what `map` takes."""
     parser.add_argument("problem", help="problem file (TOML)")

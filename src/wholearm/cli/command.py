@@ -1,4 +1,4 @@
-"""The command line: ``wholearm solve|verify|plot|predict|map|export|replay|bench``.
+"""The command line: ``wholearm solve|verify|plot|predict|compare|map|export|replay|bench``.
 
 Exit status 0 means done and all contacts held, 1 infeasible or a contact lost or a goal missed,
 2 bad input, 130 interrupted, 143 terminated. Each command imports what it needs and nothing else.
@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, NoReturn
 
 from ..common.errors import InputError, WholearmError, name_source
 from ..common.interrupts import guard
-from .arguments import add_map, add_plot, add_predict, add_solve, add_verify
+from .arguments import add_compare, add_map, add_plot, add_predict, add_solve, add_verify
 from .bench import add_bench, name_study
+from .compare import compare
 from .engines import add_export, add_replay
-from .foresee import predict
+from .predict import predict
 from .progress import clear_progress, show_progress
 
 if TYPE_CHECKING:
@@ -85,6 +86,7 @@ def build_parser() -> argparse.ArgumentParser:
         ("verify", add_verify, _verify, "replay torques open loop and check the motion"),
         ("plot", add_plot, _plot, "draw force margins, torques and snapshots"),
         ("predict", add_predict, predict, "see up to which speed slow motions keep every contact"),
+        ("compare", add_compare, compare, "put plans and torques for a problem side by side"),
         ("map", add_map, _map, "draw the contact formations over (x, phi)"),
         ("export", add_export, None, "write scene and plan for a physics engine"),
         (

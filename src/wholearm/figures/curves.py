@@ -31,7 +31,7 @@ def draw_margins(
     """Draw c_n - epsilon [N] of every contact over time, on a scale that is linear near zero.
 
     Returns one line per contact, labelled with its name and broken where forces step. The scale
-    covers further margins `covered`, shape (n, m) [N], too.
+    covers further margins `covered` [N], of any shape, too.
     """
     steps, margins = find_steps(trajectory), trajectory.c_n - epsilon
     t = np.insert(trajectory.t, steps, np.nan)
@@ -44,7 +44,8 @@ def draw_margins(
         values = np.insert(margins[:, index], steps, np.nan)
         lines += axes.plot(t, values, zorder=3 + rank, label=name, **look)
     axes.axhline(0.0, color="black", linewidth=1.3, zorder=2.5)
-    scale_margins(axes, np.vstack([margins, *([] if covered is None else [covered])]), epsilon)
+    every = margins.ravel() if covered is None else np.append(margins, covered)
+    scale_margins(axes, every, epsilon)
     return lines
 
 
@@ -144,14 +145,17 @@ def draw_simulation(
     return lines
 
 
-def draw_phases(axes: Axes, starts: Array, *, labels: bool = True) -> list[Artist]:
+def draw_phases(
+    axes: Axes, starts: Array, *, labels: bool = True, span: float | None = None
+) -> list[Artist]:
     """Shade every other phase and write each one's number above it, where there is room.
 
     `starts` holds when each phase starts and the last one ends, shape (n_phases + 1,) [s]. The axes
-    must be at their final place, which decides what there is room for.
+    must be at their final place, which decides what there is room for; they cover `span` [s], or
+    just the phases.
     """
     artists: list[Artist] = []
-    points = axes.bbox.width / axes.figure.dpi * 72 / (starts[-1] - starts[0])
+    points = axes.bbox.width / axes.figure.dpi * 72 / (span or starts[-1] - starts[0])
     for index, (start, end) in enumerate(pairwise(starts)):
         colour = "white" if index % 2 else BAND
         artists.append(axes.axvspan(start, end, facecolor=colour, linewidth=0, zorder=0.5))

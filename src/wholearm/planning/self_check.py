@@ -137,7 +137,9 @@ def replay_plan(
     """
     problem = planning.problem
     usual, strict = Allowance(), Allowance().scale(STRICT)
+    simulations = 0
     while True:
+        simulations += 1
         report("replaying the plan")
         check, accepted = check_plan(problem, trajectory, strict, usual)
         if check.failure is None:
@@ -152,7 +154,7 @@ def replay_plan(
             block = planning.blocks[planning.find_block(number)]
             raise ReplayError(_describe(block, number, accepted))
         planning, trajectory = better, build(better)
-    return planning, trajectory, _collect_figures(planning, check)
+    return planning, trajectory, _collect_figures(planning, check, simulations)
 
 
 def _improve(
@@ -237,7 +239,7 @@ def _describe(block: BlockPlan, number: int, check: Check) -> str:
     )
 
 
-def _collect_figures(planning: Planning, check: Check) -> ReplayFigures:
+def _collect_figures(planning: Planning, check: Check, simulations: int) -> ReplayFigures:
     """What a plan keeps of its replay."""
     assert isinstance(check.report, Report)
     found = [(find_least_force(phase), phase.number) for phase in check.report.phases]
@@ -252,4 +254,5 @@ def _collect_figures(planning: Planning, check: Check) -> ReplayFigures:
         check.residual.size,
         tuple(block.finer for block in planning.blocks for _ in block.phases),
         check.report.steps,
+        simulations,
     )

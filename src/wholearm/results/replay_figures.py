@@ -51,6 +51,9 @@ class ReplayFigures(NamedTuple):
         without a search for contact modes.
     steps : int
         Of the simulation.
+    simulations : int or None
+        How many replays were made before one held, that one included; None where a file of an
+        earlier version does not say.
     """
 
     least_c_n: LeastForce
@@ -58,6 +61,7 @@ class ReplayFigures(NamedTuple):
     residual: float
     refinements: tuple[int, ...]
     steps: int
+    simulations: int | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -87,6 +91,7 @@ class ReplayFigures(NamedTuple):
             float(given["residual"]),
             tuple(given["refinements"]),
             int(given["steps"]),
+            given.get("simulations"),
         )
 
 

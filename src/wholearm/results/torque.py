@@ -105,7 +105,8 @@ class TorqueProfile:
 def read_torque_csv(path: str) -> TorqueProfile:
     """Read torques from a CSV file with the columns ``t,tau1,tau2`` (s, N m, N m).
 
-    Torques are linear between rows; a repeated time is a step.
+    Torques are linear between rows; a repeated time is a step. Lines that begin with ``#`` are
+    comments; see `read_notes`.
 
     Raises
     ------
@@ -116,7 +117,11 @@ def read_torque_csv(path: str) -> TorqueProfile:
     try:
         with open(path, newline="", encoding="utf-8-sig") as stream:
             reader = csv.reader(stream)
-            numbered = [(reader.line_num, row) for row in reader if any(map(str.strip, row))]
+            numbered = [
+                (reader.line_num, row)
+                for row in reader
+                if any(map(str.strip, row)) and not row[0].lstrip().startswith("#")
+            ]
     except OSError as error:
         raise InputError(str(path), "", f"cannot be read: {error.strerror}") from None
     except (UnicodeDecodeError, csv.Error) as error:
@@ -144,6 +149,22 @@ def read_torque_csv(path: str) -> TorqueProfile:
     if t[-1] == 0.0:
         raise InputError(str(path), "t", "every time is 0; the torques must last")
     return TorqueProfile.join_rows(t, values[:, 1:])
+
+
+def read_notes(path: str) -> dict[str, str]:
+    """What comments ``# key = value`` of a CSV file say, by their keys.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    try:
+        with open(path, encoding="utf-8-sig") as stream:
+            comments = [line[1:].split("=", 1) for line in stream if line.startswith("#")]
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(str(path), "", f"cannot be read: {error}") from None
+    return {pair[0].strip(): pair[1].strip() for pair in comments if len(pair) == 2}
 
 
 def _read_row(path: str, line: int, row: list[str], where: list[int]) -> list[float]:

@@ -1,0 +1,1 @@
+"""Plans and torques for one problem, side by side."""
