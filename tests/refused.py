@@ -1,7 +1,8 @@
-"""Why there is no plan for the heptagon with other limits, each of them asked for once."""
+"""Why problems with other limits have no plan, each of them asked for once."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ import pytest
 
 from once import once
 from shipped import HEPTAGON, problem_of
+from thrown import shove
 from wholearm.common.errors import InfeasibleError
 from wholearm.common.shortfalls import Parameter
 from wholearm.geometry.tracing import trace_phases
@@ -17,6 +19,9 @@ from wholearm.planning import advice
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.explain import FRICTION
 from wholearm.planning.path_domain.plan import plan_curves
+from wholearm.planning.time_domain import explain
+from wholearm.planning.time_domain.explain import change_limit
+from wholearm.planning.time_domain.plan import plan_phases
 from wholearm.problem.definition import Problem
 
 INTERVALS = 15
@@ -59,6 +64,16 @@ def ask(phase: int, friction: float = 0.1, viscous: float = 0.01, **limits: floa
     message = str(caught.value)
     assert message.startswith(f"phase {phase} is infeasible: ") and "\n" not in message
     return message
+
+
+@once
+def ask_shoved(key: str, value: float) -> InfeasibleError:
+    """Why the square is not shoved with another value of a limit, however long advice takes."""
+    problem = change_limit(shove()[0], key, value)
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(InfeasibleError) as caught:
+        patch.setattr(explain, "ADVICE", math.inf)
+        plan_phases(problem, problem.phases, problem.start, PlanOptions(time_intervals=4))
+    return caught.value
 
 
 def read_advice(message: str) -> dict[str, float]:

@@ -519,14 +519,11 @@ def test_bad_trajectory_files(
     assert not Path("a.png").exists()
 
 
-@pytest.mark.parametrize("name, start", [("a.png", b"\x89PNG"), ("a.svg", b"<?xml")])
-def test_plot(
-    folder: Path, planned: Path, capsys: pytest.CaptureFixture[str], name: str, start: bytes
-) -> None:
-    assert main(["plot", str(planned / "plan.npz"), "-o", name]) == 0
-    assert capsys.readouterr().out == f"wrote {name}\n"
-    assert Path(name).read_bytes().startswith(start)
-    assert [path.name for path in folder.iterdir()] == [name]
+def test_plot(folder: Path, planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plot", str(planned / "plan.npz"), "-o", "a.png"]) == 0
+    assert capsys.readouterr().out == "wrote a.png\n"
+    assert Path("a.png").read_bytes().startswith(b"\x89PNG")
+    assert [path.name for path in folder.iterdir()] == ["a.png"]
 
 
 @pytest.mark.parametrize("output, words", [("a.doc", "doc"), ("absent/a.png", "cannot be written")])

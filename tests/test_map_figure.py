@@ -124,12 +124,11 @@ def test_command_writes_the_figure(
     with monkeypatch.context() as patch:
         patch.setattr("wholearm.mapping.formation_map.build_map", lambda *_, **__: chart)
         assert main(["map", str(HEPTAGON), "--plan", "plan.npz"]) == 0
-    assert capsys.readouterr().out == "wrote map_heptagon_four_contacts.png\n"
-    data = (tmp_path / "map_heptagon_four_contacts.png").read_bytes()
-    assert data[:4] == b"\x89PNG"
-    box = str(HEPTAGON.with_name("box_rolling.toml"))
-    arguments = ["map", box, "--phi", "-2,0", "-o", "m.svg"]
-    assert main([*arguments, "--list", "0.03,-2", "0.02,-2"]) == 0
+        assert capsys.readouterr().out == "wrote map_heptagon_four_contacts.png\n"
+        data = (tmp_path / "map_heptagon_four_contacts.png").read_bytes()
+        assert data[:4] == b"\x89PNG"
+        listing = ["--list", "0.045,-1.98", "0.03,-1.98"]
+        assert main(["map", str(HEPTAGON), "-o", "m.svg", *listing]) == 0
     captured = capsys.readouterr()
     assert "contacts = [" in captured.out and captured.err == "wrote m.svg\n"
     assert (tmp_path / "m.svg").read_bytes()[:5] == b"<?xml"

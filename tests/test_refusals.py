@@ -15,7 +15,7 @@ from wholearm.problem.read import build_problem, read_problem
 @pytest.fixture(autouse=True)
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """A limit that is short is so at more than one of sixty places."""
-    monkeypatch.setattr(refusals, "PLACES", 15)
+    monkeypatch.setattr(refusals, "PLACES", 8)
 
 
 WEAK = {f"fingers.{k}.torque_limit": 0.01 for k in (1, 2)}

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from refused import ask_shoved
 from shipped import HEPTAGON, problem_of
-from thrown import shove
 from wholearm.common.errors import InfeasibleError
 from wholearm.figures import plots
+from wholearm.mechanics.limits import EPSILON
 from wholearm.planning.plan import solve
 from wholearm.problem.definition import Problem
 from wholearm.results.trajectory_file import load_trajectory
@@ -38,7 +39,7 @@ def along() -> InfeasibleError:
 @pytest.fixture(scope="module")
 def within() -> InfeasibleError:
     """In the time domain, from where a motion may begin."""
-    return refuse(replace(shove()[0], epsilon=1.2), time_intervals=4)
+    return ask_shoved(EPSILON, 1.0)
 
 
 @pytest.mark.parametrize("which", ["along", "within"])

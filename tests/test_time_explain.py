@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from once import once
-from refused import advising
+from refused import advising, ask_shoved
 from thrown import shove
 from tipping import box
 from wholearm.common.errors import InfeasibleError, SolverError
@@ -45,12 +44,6 @@ def plan_all(problem: Problem, **options: Any) -> list[PhasePlan[TimeMotion]]:
     return plan_phases(problem, problem.phases, problem.start, COARSE, **options)
 
 
-@once
-def why_not_shoved(key: str, value: float) -> str:
-    """Why the square is not shoved with another value of a limit, and what is advised."""
-    return why_not(lambda: plan_all(change_limit(shove()[0], key, value)))
-
-
 def why_not(plan: Callable[[], object]) -> str:
     with pytest.raises(InfeasibleError) as caught:
         plan()
@@ -78,7 +71,7 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_force_that_weight_limits_has_its_closed_form() -> None:
-    text = why_not_shoved(EPSILON, 1.0)
+    text = str(ask_shoved(EPSILON, 1.0))
     found = re.fullmatch(
         r"phases 1 and 2 are infeasible: c_n of v1-palm >= epsilon = 1 N is (\S+) N short at "
         r"t = \S+ s, phase 2; feasible with epsilon = (\S+) N instead of 1",
@@ -99,7 +92,7 @@ def test_a_force_that_weight_limits_has_its_closed_form() -> None:
 def test_there_is_a_plan_with_what_is_advised_and_none_with_less(
     key: str, value: float, name: str
 ) -> None:
-    problem, text = shove()[0], why_not_shoved(key, value)
+    problem, text = shove()[0], str(ask_shoved(key, value))
     advised = re.search(rf"; feasible with {name} = (\S+) N( m)? instead of {value:g}$", text)
     assert advised, text
     enough = float(advised[1])
