@@ -106,6 +106,10 @@ class Squeezing(NamedTuple):
         # Where other limits cannot be kept it is these that are to blame.
         slack[np.ix_(~found, soft)] = np.inf
         pair = np.argsort(np.where(found[:, None], np.abs(slack), slack), axis=1)[:, :2]
+        # Without a squeeze, only those that are missed.
+        bent = np.abs(np.take_along_axis(slope, pair, axis=1)) > _LEVEL
+        free = np.take_along_axis(slack, pair, axis=1)[:, 1] > _TIED
+        pair[:, 1] = np.where(free & ~bent.any(axis=1), pair[:, 0], pair[:, 1])
         rank = np.sort(owners[pair] + len(self.limits.limits) * ~soft[pair], axis=1)
         return Grasp(value, squeeze, rank % len(self.limits.limits))
 

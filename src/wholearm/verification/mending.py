@@ -8,6 +8,7 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..mechanics.limits import LimitSet
@@ -21,9 +22,9 @@ for each."""
 
 
 def find_changes(
-    limits: LimitSet, sides: Array, part: str, kind: str, tau: Array, much: float
+    limits: LimitSet, sides: Array, missed: NDArray[np.bool_], tau: Array, much: float
 ) -> tuple[TorqueChange, ...]:
-    """Least changes of each torque alone that mend one limit, and of both where those spoil others.
+    """Least changes of each torque alone that mend some limits, and of both where those spoil some.
 
     Other limits have to be kept; what they miss already they must not miss by more.
 
@@ -32,17 +33,16 @@ def find_changes(
     limits : LimitSet
     sides : ndarray, shape (n_sides, 3)
         Slack of its one-sided limits is sides @ (1, tau_1, tau_2).
-    part, kind : str
-        Those of the limit to mend.
+    missed : ndarray of bool, shape (n_sides,)
+        Which sides are to be mended.
     tau : ndarray, shape (2,), [N m]
     much : float, [N m]
         What is much for a torque.
     """
     owners = limits.owners[limits.sides[0]]
-    own = np.array([(limit.part, limit.kind) == (part, kind) for limit in limits.limits])[owners]
     scale = limits.scales[limits.sides[0]]
     slack, slope = normalise(sides, scale, tau, much)
-    slack = np.where(own, slack, np.maximum(slack, 0.0))
+    slack = np.where(missed, slack, np.maximum(slack, 0.0))
 
     def describe(change: Array) -> TorqueChange:
         short = -(slack + slope @ change)

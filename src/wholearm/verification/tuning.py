@@ -21,7 +21,7 @@ from ..simulation.events import EventKind, Simulation
 from .holding import find_resting_changes, find_worst, list_ways
 from .instants import Instant, find_moving
 from .margins import find_lowest
-from .mending import find_changes
+from .mending import KEPT, find_changes
 from .verdict import Allowance
 
 _KINDS = {EventKind.CONTACT_LOST: "lost", EventKind.SLIP: "slips"}
@@ -79,7 +79,7 @@ def _look_at(
         changes = find_resting_changes(formation, ways, epsilon, z, tau, gradient)
     else:
         instant = find_moving(formation, z, v, tau, simulation.z_ddot[row])
-        changes = () if instant is None else list_changes(instant, epsilon, contact, kind, tau)
+        changes = () if instant is None else list_changes(instant, epsilon, contact, tau)
     load = np.array([1.0, *tau])
     forces: tuple[ForceAt, ...] = ()
     closing: tuple[float, ...] = ()
@@ -96,13 +96,18 @@ def _look_at(
 
 
 def list_changes(
-    instant: Instant, epsilon: float, contact: str, kind: str, tau: Array
+    instant: Instant, epsilon: float, contact: str, tau: Array
 ) -> tuple[TorqueChange, ...]:
-    """Changes of the torques of a motion that mend the loss of a contact."""
+    """Changes of the torques of a motion that mend a contact, and what else lets go with it."""
     formation = instant.formation
-    limits = make_limits(formation, epsilon)
-    sides, wanted = instant.find_sides(limits), CONE if kind == "slips" else PRESS
-    return find_changes(limits, sides, contact, wanted, tau, formation.scene.scales.torque)
+    much, load = formation.scene.scales.torque, np.array([1.0, *tau])
+    limits, bare = make_limits(formation, epsilon), make_limits(formation, 0.0)
+    forces = (PRESS, CONE)
+    own = [limit.part == contact and limit.kind in forces for limit in limits.limits]
+    missed = np.array(own)[limits.owners][limits.sides[0]]
+    gone = instant.find_sides(bare) @ load < -KEPT * limits.scales[limits.sides[0]]
+    missed |= gone & np.isin(limits.sides[0], limits.of(*forces))
+    return find_changes(limits, instant.find_sides(limits), missed, tau, much)
 
 
 def _find_row(simulation: Simulation, index: int, contact: str, kind: str, time: float) -> int:
