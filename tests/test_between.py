@@ -21,6 +21,7 @@ from wholearm.planning.time_domain.between import (
     GRAZE,
     MISS,
     Limits,
+    Raised,
     check_between,
     find_misses,
     monitor_missed,
@@ -147,9 +148,18 @@ def test_limits_rise_by_more_than_they_are_missed() -> None:
     plain = Limits.none(stage)
     assert [table.shape[1] for table in plain] == [8, 2, 4] and plain.worst == 0.0
     missed = Limits(*(table + k * 1e-3 for k, table in enumerate(plain)))
-    raised = missed.raised(missed)
-    for before, after in zip(missed, raised, strict=True):
-        assert (after >= 2 * before).all() and (after <= 3 * before).all()
+    once = Raised.none(stage).further(missed)
+    for miss, added in zip(missed, once.limits, strict=True):
+        assert (added >= miss).all() and (added <= 2 * miss).all()
+    # Where a third of what was added has been of use, three times as much is needed; forces have
+    # a price, so that they go on as before.
+    left = Limits(*(miss - added / 3 for miss, added in zip(missed, once.added, strict=True)))
+    twice = once.further(left)
+    assert twice.added.held == pytest.approx(1.5 * left.held)
+    assert twice.added.gap == pytest.approx(3 * left.gap)
+    assert twice.added.sense == pytest.approx(3 * left.sense)
+    for first, then, whole in zip(once.limits, twice.added, twice.limits, strict=True):
+        assert whole == pytest.approx(first + then)
 
 
 def test_tightening_holds_limits_that_points_alone_do_not() -> None:

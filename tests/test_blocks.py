@@ -7,9 +7,12 @@ from typing import Any
 import pytest
 
 from shipped import HEPTAGON, TWICE, problem_of
+from wholearm.common.errors import InfeasibleError
+from wholearm.common.shortfalls import Place, Shortfall
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning import blocks
-from wholearm.planning.blocks import Planning, plan_alone
+from wholearm.planning.block_plan import Planning
+from wholearm.planning.blocks import plan_alone
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.time_domain import impacts
 
@@ -45,10 +48,10 @@ def test_no_phase_has_to_press_much_more_than_those_before_it(
     curves, options = trace_phases(problem), PlanOptions("margin", intervals=20)
     known = blocks.plan_blocks(problem, curves, options, lambda _: None).plans
 
-    def plan_with_impacts(*of: Any, **_: Any) -> Any:
+    def plan_with_impacts(*of: Any, **others: Any) -> Any:
         plan = known[of[1][0].index]
         if of[3].goal is Objective.MARGIN:
-            given.append((of[6], plan.value))
+            given.append((others["ample"], plan.value))
         return [plan]
 
     monkeypatch.setattr(impacts, "plan_with_impacts", plan_with_impacts)
@@ -58,3 +61,33 @@ def test_no_phase_has_to_press_much_more_than_those_before_it(
     for index in range(1, len(given)):
         before = min(value for _, value in given[:index])
         assert given[index][0] == pytest.approx(blocks.AMPLE * before)
+
+
+@pytest.mark.parametrize("share", [2.0, 0.1])
+def test_what_is_far_from_possible_later_stops_planning_before(
+    monkeypatch: pytest.MonkeyPatch, share: float
+) -> None:
+    """What is near to being possible may be so from where a better plan ends."""
+    problem, begun = problem_of(HEPTAGON), list[tuple[int, bool, bool]]()
+    curves, options = trace_phases(problem), PlanOptions(intervals=20)
+    known = blocks.plan_blocks(problem, curves, options, lambda _: None).plans
+    place = Place(3, 0.0, "there")
+    short = Shortfall("press", "v1-palm", "c_n", 1.0, "N", place, share * blocks.CLEAR)
+
+    def plan_with_impacts(*of: Any, **others: Any) -> Any:
+        number = of[1][0].number
+        begun.append((number, others["only_begin"], bool(others["begun"])))
+        if number == 3 and others["only_begin"]:
+            raise InfeasibleError("phase 3 is infeasible", [short])
+        return [known[number - 1]]
+
+    monkeypatch.setattr(impacts, "plan_with_impacts", plan_with_impacts)
+    over_time = replace(options, transcription="time")
+    if share > 1:
+        with pytest.raises(InfeasibleError, match="phase 3"):
+            blocks.plan_blocks(problem, curves, over_time, lambda _: None)
+    else:
+        blocks.plan_blocks(problem, curves, over_time, lambda _: None)
+    whole = [(number, False, number < 3) for number in range(1, len(known) + 1)]
+    first = [(number, True, False) for number in (1, 2, 3)]
+    assert begun == (first if share > 1 else [*first, *whole])

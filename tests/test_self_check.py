@@ -12,7 +12,8 @@ from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, JammingError, ReplayError, SolverError
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning import self_check
-from wholearm.planning.blocks import Planning, plan_blocks
+from wholearm.planning.block_plan import Planning
+from wholearm.planning.blocks import plan_blocks
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
@@ -118,6 +119,24 @@ class Spoiled:
 def slide(heptagon: Problem) -> Problem:
     """The heptagon's first three phases."""
     return replace(heptagon, phases=heptagon.phases[:3])
+
+
+def test_a_contact_that_falls_a_little_short_is_pressed_more(slide: Problem) -> None:
+    """The plan is one for a smaller epsilon, and on as many intervals as there may be."""
+    from wholearm.planning.plan import assemble_plan
+
+    short, options = 1e-3, PlanOptions(intervals=10)
+    slide = replace(slide, phases=slide.phases[:1])
+    easy = replace(slide, epsilon=slide.epsilon - short)
+    planning = plan_blocks(easy, trace_phases(easy), options, lambda _: None)
+    finest = tuple(replace(own, finer=self_check.REFINEMENTS) for own in planning.blocks)
+    planning = replace(planning, problem=slide, blocks=finest)
+    held, trajectory, figures = replay_plan(
+        planning, assemble_plan(planning), assemble_plan, lambda _: None
+    )
+    assert figures.least_c_n.least > slide.epsilon
+    assert held.more == {0: pytest.approx(self_check.SPARE * short, rel=0.05)}
+    assert np.nanmin(trajectory.c_n) == pytest.approx(slide.epsilon + held.more[0], abs=1e-5)
 
 
 @pytest.mark.parametrize("cured", [0, 2])

@@ -19,7 +19,8 @@ import numpy as np
 from ..common.files import write_text
 from ..geometry.path_guess import load
 from ..geometry.tracing import trace_phases
-from ..planning.blocks import BlockPlan, plan_blocks
+from ..planning.block_plan import BlockPlan
+from ..planning.blocks import plan_blocks
 from ..planning.options import PlanOptions
 from ..planning.time_domain.enforcing import enforce_between
 from ..planning.time_domain.own_units import unit_of

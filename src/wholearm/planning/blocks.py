@@ -8,12 +8,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InfeasibleError, InputError, SolverError, name_source
+from ..common.errors import (
+    InfeasibleError,
+    InputError,
+    SolverError,
+    WholearmError,
+    name_source,
+)
 from ..geometry.cost_to_go import CostToGo
 from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phase
@@ -22,20 +29,19 @@ from ..problem.definition import Phase, Problem
 from ..results.trajectory import Motion
 from ..scene.model import Scene
 from ..solvers.statistics import charge
+from .block_plan import BEGUN, FINEST, PLAIN, BlockPlan, Planning
 from .durations import share_again, share_duration
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence
 from .path_domain.sequence_plan import plan_sequence
 from .phase_plan import add_up
 from .splitting import leads_on, runs_along_curves, split_blocks
-from .stops import Plans, end_of
+from .stops import Plans
 
-PLAIN = -1
-"""Number of doublings that stands for as many intervals as at first, and no search for modes."""
+CLEAR = 0.05
+"""Least shortfall, over what is much for a limit, that no better plan of phases before mends."""
 COARSE = 80
 """Intervals along a curve that refining doubles where none are asked for."""
-FINEST = 64
-"""Most intervals of a phase in the time domain that refining asks for."""
 AMPLE = 1.1
 """Ratio to the least normal force of other phases from which on more decides nothing."""
 MOVED = 1e-9
@@ -44,102 +50,6 @@ APART = 1e-6
 """The same, from which on its plans of least duration are others."""
 SHORT = 5e-7
 """Largest shortfall of a margin below epsilon by rounding, over the scene's force."""
-
-
-@dataclass(frozen=True, eq=False)
-class BlockPlan:
-    """A block as it is planned.
-
-    Attributes
-    ----------
-    phases : tuple of Phase
-    start : ndarray, shape (5,)
-        Where it starts.
-    finer : int
-        How often its intervals are doubled, or `PLAIN`.
-    duration : float or None, [s]
-        Its longest duration, for the objective `margin`.
-    fastest : list of PhasePlan
-        Plans of least duration from this start, if they were made for it.
-    plans : list of PhasePlan
-        One for each of its phases.
-    chain : ImpactSequence or None
-        Its curves; None if it is planned in the time domain.
-    """
-
-    phases: tuple[Phase, ...]
-    start: Array
-    finer: int
-    duration: float | None
-    fastest: Plans
-    plans: Plans
-    chain: ImpactSequence | None
-
-    @property
-    def end(self) -> Array:
-        """Where the block ends, shape (5,)."""
-        if self.chain is not None:
-            return self.chain.curves[-1].end
-        return end_of(self.plans[-1])[0]
-
-    @property
-    def intervals(self) -> int:
-        """Most intervals of a phase in the time domain: each is a piece of the torques."""
-        return max(len(plan.torque.coefficients) for plan in self.plans)
-
-    @property
-    def has_searched(self) -> bool:
-        """Whether more than one sequence of contact modes was tried."""
-        return any(plan.sequences > 1 for plan in self.plans)
-
-    @property
-    def is_finest(self) -> bool:
-        """Whether it is planned in the time domain with all the intervals that it may have."""
-        return self.chain is None and self.intervals >= FINEST
-
-
-@dataclass(frozen=True, eq=False)
-class Planning:
-    """The plans of all phases of a problem.
-
-    Attributes
-    ----------
-    problem : Problem
-    curves : tuple of Curve
-        Those of the first phases: as far as geometry alone says where phases end.
-    options : PlanOptions
-    blocks : tuple of BlockPlan
-    shares, allowed : list of float or None, [s]
-        The longest duration of each phase, for the objective `margin`: in proportion to plans of
-        least duration, and as used, where a block turned out to start from somewhere else.
-    least : list of PhasePlan
-        Those plans of least duration; empty for other objectives.
-    pinned : bool
-        Whether blocks end where those plans do.
-    ahead : bool
-        Whether blocks end with regard to what follows them. Plans that durations are shared out
-        by do not, as blocks for the objective `margin` cannot.
-    """
-
-    problem: Problem
-    curves: tuple[Curve, ...]
-    options: PlanOptions
-    blocks: tuple[BlockPlan, ...]
-    shares: list[float | None]
-    allowed: list[float | None]
-    least: Plans = field(default_factory=list)
-    pinned: bool = False
-    ahead: bool = True
-
-    @property
-    def plans(self) -> Plans:
-        """One for each phase."""
-        return [plan for block in self.blocks for plan in block.plans]
-
-    def find_block(self, number: int) -> int:
-        """Index of the block with the phase of a number, counted from 1."""
-        ends = [block.phases[-1].number for block in self.blocks]
-        return next(k for k, end in enumerate(ends) if number <= end)
 
 
 def plan_blocks(
@@ -168,14 +78,15 @@ def plan_blocks(
     planning = Planning(problem, curves, options, (), none, none)
     if options.goal is Objective.MARGIN:
         first = replace(planning, options=_for_time(options), ahead=False)
-        least = plan_each(first, finer, report).plans
+        least = plan_each(_begin_each(first, report), finer, report).plans
         planning = replace(planning, shares=share_duration(least, options.duration), least=least)
         try:
             return _require_margin(plan_each(planning, finer, report))
         except (InfeasibleError, InputError, SolverError):
             # From where blocks of the largest margin end the next ones need not go on.
             planning = replace(planning, pinned=True)
-    return _require_margin(plan_each(planning, finer, report))
+        return _require_margin(plan_each(planning, finer, report))
+    return plan_each(_begin_each(planning, report), finer, report)
 
 
 def plan_alone(planning: Planning, report: Callable[[str], None]) -> Planning | None:
@@ -200,39 +111,111 @@ def refine_block(
     return _require_margin(plan_each(planning, finer, report))
 
 
+def press_more(
+    planning: Planning, index: int, force: float, report: Callable[[str], None]
+) -> Planning:
+    """Plan one block anew with normal forces that are larger than asked for by `force` [N] more."""
+    more = planning.more | {index: planning.more.get(index, 0.0) + force}
+    finer, known = [own.finer for own in planning.blocks], dict(enumerate(planning.blocks))
+    known[index] = replace(known[index], finer=BEGUN)
+    return _require_margin(_plan_others(replace(planning, more=more), finer, known, report))
+
+
 def plan_each(planning: Planning, finer: Sequence[int], report: Callable[[str], None]) -> Planning:
     """Plan block after block, but for those that are planned as wanted.
 
     Where a block starts from somewhere else than in the plans of least duration, the allowed
     durations are shared out again.
     """
+    return _plan_others(planning, finer, dict(enumerate(planning.blocks)), report)
+
+
+def _plan_others(
+    planning: Planning,
+    finer: Sequence[int],
+    known: dict[int, BlockPlan],
+    report: Callable[[str], None],
+) -> Planning:
+    """Plan each block that is not `known`, by its index, as wanted."""
+    made = replace(planning, blocks=(), allowed=list(planning.shares))
+    for index, wanted in enumerate(finer):
+        made = _plan_next(made, wanted, known.get(index), report)
+    return made
+
+
+def _begin_each(planning: Planning, report: Callable[[str], None]) -> Planning:
+    """Begin to plan each block, as far as that succeeds: what is impossible later shows at once.
+
+    Only where something follows a block in the time domain.
+
+    Raises
+    ------
+    InfeasibleError
+        If a block surely has no plan, wherever exactly the one before it ends.
+    """
+    blocks, begun = split_blocks(planning.problem), planning
+    over_time = [not runs_along_curves(own, planning.options) for own in blocks]
+    if not any(over_time[:-1]):
+        return planning
+    for index in range(len(blocks)):
+        try:
+            begun = _plan_next(begun, BEGUN, None, report)
+        except WholearmError as error:
+            if not any(over_time[:index]) or _is_clear(error):
+                raise
+            break
+    return begun
+
+
+def _is_clear(error: WholearmError) -> bool:
+    """Whether what has no plan is far from having one."""
+    shortfalls = error.shortfalls if isinstance(error, InfeasibleError) else ()
+    return max((own.share for own in shortfalls), default=0.0) > CLEAR
+
+
+def _plan_next(
+    planning: Planning, finer: int, known: BlockPlan | None, report: Callable[[str], None]
+) -> Planning:
+    """Plan the block after those that are planned, unless it is `known` as wanted.
+
+    Where it starts from somewhere else than in the plans of least duration, the allowed durations
+    are shared out again.
+    """
     problem, options, least = planning.problem, planning.options, planning.least
-    allowed = list(planning.shares)
-    blocks: list[BlockPlan] = []
-    z = problem.start
-    for index, phases in enumerate(split_blocks(problem)):
-        known = planning.blocks[index] if planning.blocks else None
-        moved = known is None or _distance(problem.scene, known.start, z) > MOVED
-        fastest: Plans = [] if moved or known is None else known.fastest
-        if moved and least and _starts_off(problem.scene, least[phases[0].index].motion, z):
-            fastest = _plan_block(planning, phases, z, _for_time(options), None)[0]
-        if fastest:
-            share_again(allowed, phases, least, fastest)
-        duration = add_up(phases, allowed)
-        wanted = finer[index], duration
-        if known is None or moved or (known.finer, known.duration) != wanted:
-            numbers = "-".join(str(phase.number) for phase in phases)
-            report(f"phase {numbers} of {len(problem.phases)}: {options.goal.value}")
-            own = _refine(options, known, finer[index])
-            to_go = _look_ahead(planning, phases, own) if planning.ahead else None
-            with name_source(problem.source):
-                quick = fastest or [least[phase.index] for phase in phases if least]
-                ample = find_ample(blocks)
-                made = _plan_block(planning, phases, z, own, allowed, to_go, ample, quick)
-            known = BlockPlan(phases, z, *wanted, fastest, *made)
-        blocks.append(known)
-        z = known.end
-    return replace(planning, blocks=tuple(blocks), allowed=allowed)
+    phases = split_blocks(problem)[len(planning.blocks)]
+    z = planning.blocks[-1].end if planning.blocks else problem.start
+    if finer == BEGUN and runs_along_curves(phases, options):
+        finer = 0
+    allowed = list(planning.allowed)
+    moved = known is None or _distance(problem.scene, known.start, z) > MOVED
+    fastest: Plans = [] if moved or known is None else known.fastest
+    if moved and least and _starts_off(problem.scene, least[phases[0].index].motion, z):
+        fastest = _plan_block(planning, phases, z, _for_time(options))[0]
+    if fastest:
+        share_again(allowed, phases, least, fastest)
+    duration = add_up(phases, allowed)
+    wanted = finer, duration
+    if known is None or moved or (known.finer, known.duration) != wanted:
+        numbers = "-".join(str(phase.number) for phase in phases)
+        report(f"phase {numbers} of {len(problem.phases)}: {options.goal.value}")
+        own = _refine(options, known, finer)
+        with name_source(problem.source):
+            more = planning.more.get(len(planning.blocks), 0.0)
+            pressed = replace(problem, epsilon=problem.epsilon + more) if more else problem
+            made = _plan_block(
+                replace(planning, problem=pressed),
+                phases,
+                z,
+                own,
+                allowed,
+                to_go=_look_ahead(planning, phases, own) if planning.ahead else None,
+                ample=find_ample(planning.blocks),
+                fastest=fastest or [least[phase.index] for phase in phases if least],
+                begun=known.plans if known and known.finer == BEGUN else (),
+                only_begin=finer == BEGUN,
+            )
+        known = BlockPlan(phases, z, *wanted, fastest, *made)
+    return replace(planning, blocks=(*planning.blocks, known), allowed=allowed)
 
 
 def find_ample(blocks: Sequence[BlockPlan]) -> float:
@@ -242,13 +225,14 @@ def find_ample(blocks: Sequence[BlockPlan]) -> float:
 
 def _refine(options: PlanOptions, known: BlockPlan | None, finer: int) -> PlanOptions:
     """Options for a block whose intervals are doubled `finer` times."""
-    if finer == 0:
+    if finer in (0, BEGUN):
         return options
     if finer == PLAIN:
         return replace(options, mode_search=False)
     wanted = options.time_intervals
     if known is not None and known.chain is None:
-        wanted = min(known.intervals * 2 ** (finer - known.finer), FINEST)
+        doublings = 0 if known.finer == BEGUN else finer - known.finer
+        wanted = min(known.intervals * 2**doublings, FINEST)
     along = (options.intervals or COARSE) * 2**finer
     return replace(options, intervals=along, time_intervals=wanted)
 
@@ -258,12 +242,13 @@ def _plan_block(
     block: Sequence[Phase],
     z: Array,
     options: PlanOptions,
-    allowed: Sequence[float | None] | None,
-    to_go: CostToGo | None = None,
-    ample: float = math.inf,
-    fastest: Plans | None = None,
+    allowed: Sequence[float | None] | None = None,
+    **over_time: Any,
 ) -> tuple[Plans, ImpactSequence | None]:
-    """Plan a block from `z`, along its curves or in the time domain; also its curves."""
+    """Plan a block from `z`, along its curves or in the time domain; also its curves.
+
+    What is `over_time` is given to `plan_with_impacts` alone.
+    """
     plans: Plans = []
     problem, known = planning.problem, planning.curves
     allowed = [None] * len(problem.phases) if allowed is None else allowed
@@ -271,10 +256,9 @@ def _plan_block(
         from .time_domain.impacts import plan_with_impacts
 
         with charge(block[0].number):
-            duration = add_up(block, allowed)
-            given = (problem, block, z, options, duration, to_go, ample, fastest)
             pinned = planning.pinned or leads_on(problem, block, options)
-            plans += plan_with_impacts(*given, pinned=pinned)
+            given = (problem, block, z, options, add_up(block, allowed))
+            plans += plan_with_impacts(*given, pinned=pinned, **over_time)
         return plans, None
     curves = []
     for phase in block:
@@ -309,7 +293,7 @@ def _look_ahead(
         return None
 
     def value(z: Array) -> float:
-        return sum(plan.value for plan in _plan_block(planning, following, z, options, None)[0])
+        return sum(plan.value for plan in _plan_block(planning, following, z, options)[0])
 
     return CostToGo(phase, value)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from ..results.certificate import Certificate, TimeBound
-from .blocks import BlockPlan, Planning
+from .block_plan import BlockPlan, Planning
 from .lower_bound.lower_bound import bound_least_time
 
 OVER_TIME = "planned over time"

@@ -36,6 +36,8 @@ class PhasePlan(NamedTuple, Generic[M_co]):
         The stages that it was solved on, in the scene's own units; none along curves.
     error : float
         Estimate of how far the value of all phases in one NLP is from their best, relative to it.
+    solution : object
+        What the solver has found, of the first of the phases in one NLP that are only begun.
     """
 
     motion: M_co
@@ -46,6 +48,7 @@ class PhasePlan(NamedTuple, Generic[M_co]):
     attempt: str = ""
     stages: Sequence[object] = ()
     error: float = math.nan
+    solution: object = None
 
 
 @dataclass

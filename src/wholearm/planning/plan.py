@@ -22,7 +22,8 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory, assemble
 from ..results.transition import Transition
 from ..solvers.statistics import Ledger, open_ledger
-from .blocks import Planning, plan_blocks
+from .block_plan import Planning
+from .blocks import plan_blocks
 from .impacts import assess_impacts
 from .options import PlanOptions
 from .path_domain import sequence_plan

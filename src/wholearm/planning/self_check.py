@@ -27,7 +27,8 @@ from ..scene.model import Scales
 from ..verification.newton_euler import balance
 from ..verification.verdict import Allowance, find_least_force, measure_departure
 from ..verification.verify import judge, observe
-from .blocks import PLAIN, BlockPlan, Planning, plan_alone, refine_block
+from .block_plan import PLAIN, BlockPlan, Planning
+from .blocks import plan_alone, press_more, refine_block
 
 REFINEMENTS = 3
 """Most doublings of the intervals of a block."""
@@ -36,6 +37,10 @@ ROUGH = 2
 on a contact that comes to rest need not hold, however fine it is."""
 STRICT = 0.5
 """Share of what `verify` allows that a plan may use, if another plan is to be had."""
+DIP = 2e-3
+"""Largest shortfall of a normal force, over the scene's force, that pressing more is to mend."""
+SPARE = 2.0
+"""How much more a plan is then to press, over that shortfall."""
 RESIDUAL = 1e-8
 """Largest residual of the equations of motion, relative to the scene's force or torque, length or
 speed: rounding leaves 1e-13."""
@@ -147,6 +152,8 @@ def replay_plan(
         durations = np.diff(trajectory.phase_starts)
         number = check.find_culprit(problem.scene.scales, strict, durations)
         better = _improve(planning, number, accepted.failure is not None, report)
+        if better is None and accepted.failure is not None:
+            better = _press_more(planning, number, accepted, report)
         if better is None and accepted.failure is None:
             check = accepted
             break
@@ -173,6 +180,29 @@ def _improve(
     if refined is None and fails and block.has_searched and block.finer != PLAIN:
         refined = _refine(planning, index, report, plain=True)
     return refined
+
+
+def _press_more(
+    planning: Planning, number: int, check: Check, report: Callable[[str], None]
+) -> Planning | None:
+    """A plan of the block with phase `number` in whose replay c_n may fall by what it does now.
+
+    Where a contact slides the other way a replay may stick for an instant, with another force.
+    """
+    index, problem = planning.find_block(number), planning.problem
+    if not isinstance(check.report, Report) or index in planning.more:
+        return None
+    block, force = planning.blocks[index], problem.scene.scales.force
+    own = [
+        phase for phase in check.report.phases if problem.phases[phase.number - 1] in block.phases
+    ]
+    short = -min((c.margin for phase in own for c in phase.contacts), default=0.0)
+    if not 0.0 < short < DIP * force:
+        return None
+    try:
+        return press_more(planning, index, SPARE * short, report)
+    except (InfeasibleError, SolverError):
+        return None
 
 
 def check_plan(problem: Problem, trajectory: Trajectory, *allowances: Allowance) -> list[Check]:

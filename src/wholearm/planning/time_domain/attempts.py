@@ -12,7 +12,7 @@ from ...common.arrays import Array
 from ...geometry.cost_to_go import CostToGo
 from ...problem.definition import Phase, Problem
 from .ending import keep_apart
-from .search import Search
+from .search import Search, Solution
 from .stage import Stage
 from .staging import guess_stages
 from .way_guess import PacedWay, list_ways
@@ -42,12 +42,15 @@ class Attempt(NamedTuple):
     stages : list of Stage
     gradual : bool
         Whether friction first sets in gradually, which shows its modes.
+    before : Solution or None
+        What has led to the stages.
     """
 
     name: str
     halvings: int
     stages: list[Stage]
     gradual: bool = False
+    before: Solution | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +81,14 @@ class Attempts:
     def first(self) -> Attempt:
         """To the nearest end."""
         return Attempt(NEAREST, self._halvings, self._guess(self._halvings, FALLS[0]))
+
+    def resume(self, found: Solution) -> Attempt:
+        """From what was found from nearly the same place."""
+        first = found.stages[0].guess
+        nodes = first.nodes.copy()
+        nodes[0, 0] = self.first.stages[0].guess.nodes[0, 0]
+        moved = replace(found.stages[0], guess=first._replace(nodes=nodes))
+        return Attempt("", self._halvings, [moved, *found.stages[1:]], before=found)
 
     @cached_property
     def ways(self) -> list[PacedWay]:

@@ -29,7 +29,10 @@ might hold in a replay what turns there for an instant."""
 CHECKS = 25
 """Places per interval at which limits are checked."""
 _OVER = 1.5
-"""Factor on the miss by which a limit is tightened."""
+"""Factor on the miss by which a limit is tightened at first."""
+_MOST = (_OVER, 4.0, 4.0)
+"""The same at most, of forces, gaps and senses, where tightening has made the miss little less:
+forces have a price."""
 
 
 class Limits(NamedTuple):
@@ -56,10 +59,6 @@ class Limits(NamedTuple):
         widths = (sides, len(stage.monitored), formation.n_contacts + 2)
         return Limits(*(np.zeros((stage.intervals, width)) for width in widths))
 
-    def raised(self, misses: Limits) -> Limits:
-        """Raised by somewhat more than the misses."""
-        return Limits(*(own + _OVER * miss for own, miss in zip(self, misses, strict=True)))
-
     @property
     def worst(self) -> float:
         """The largest, over what is allowed."""
@@ -75,6 +74,39 @@ class Limits(NamedTuple):
         allowed = (MISS, GRAZE, FALTER * SLIDING)
         parts = (t.max(axis=1, initial=0.0) / a for t, a in zip(self, allowed, strict=True))
         return np.asarray(np.max(list(parts), axis=0))
+
+
+class Raised(NamedTuple):
+    """What limits of one stage are raised by, and what has led to that.
+
+    Attributes
+    ----------
+    limits : Limits
+        By how much they are raised.
+    missed : Limits
+        By how much they were missed before they were raised last.
+    added : Limits
+        By how much they were raised then.
+    """
+
+    limits: Limits
+    missed: Limits
+    added: Limits
+
+    @staticmethod
+    def none(stage: Stage) -> Raised:
+        """Nothing is raised."""
+        return Raised(*(3 * [Limits.none(stage)]))
+
+    def further(self, misses: Limits) -> Raised:
+        """Raised by more than the misses, as much as the last time has shown to be needed."""
+        limits, added = list[Array](), list[Array]()
+        for raised, before, last, miss, most in zip(*self, misses, _MOST, strict=True):
+            # What was raised before has made the miss less by this share of it.
+            share = np.divide(before - miss, last, out=np.ones_like(miss), where=last > 0)
+            added.append(miss * np.clip(1 / np.maximum(share, 1 / most), _OVER, most))
+            limits.append(raised + added[-1])
+        return Raised(Limits(*limits), misses, Limits(*added))
 
 
 class CheckPlaces(NamedTuple):

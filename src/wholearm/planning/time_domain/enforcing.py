@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...common.arrays import Array
 from ...mechanics.limits import make_limits
 from ..options import Objective
-from .between import Limits, check_between, find_misses, monitor_missed
+from .between import CheckPlaces, Limits, Raised, check_between, find_misses, monitor_missed
 from .gains import find_gains
 from .limits import price_sides
 from .motion import StageMotion, make_motions
@@ -38,6 +38,8 @@ _PATIENCE = 80
 """Most iterations of one solve on finer intervals, that starts from a solution."""
 _DEARER = 0.2
 """Largest relative cost increase accepted from tightening."""
+DEARER = "a plan that keeps limits between points is much dearer"
+"""Status of solutions whose limits between points cannot be kept by tightening them."""
 _HOPELESS = 1.0
 """Price of all that limits miss, over the cost, from which on no finer intervals are tried."""
 _COARSE = 0.1
@@ -47,30 +49,23 @@ _COARSE = 0.1
 def enforce_between(search: Search, solution: Solution) -> Solution:
     """Go on from a solution until it is accurate and limits hold between points too."""
     refined, first = 0, solution.cost
-    limits = [Limits.none(stage) for stage in solution.stages]
+    raised = [Raised.none(stage) for stage in solution.stages]
     for _ in range(ROUNDS):
         motions = make_motions(solution.stages, search.scheme)
-        checks = [
-            check_between(stage, motion)
-            for stage, motion in zip(solution.stages, motions, strict=True)
-        ]
+        checks = [check_between(*pair) for pair in zip(solution.stages, motions, strict=True)]
         monitoring = monitor_missed(solution.stages, checks)
         if monitoring is not None:
             solution = search.solve(monitoring, solution)
             if not solution.success:
                 return solution
-            limits = [Limits.none(stage) for stage in solution.stages]
+            raised = [Raised.none(stage) for stage in solution.stages]
             continue
-        misses = [
-            find_misses(stage, check, search.problem.epsilon, solution.margin)
-            for stage, check in zip(solution.stages, checks, strict=True)
-        ]
+        misses = _list_misses(search, solution, checks)
         worst = max(miss.worst for miss in misses)
         if sum(price.sum() for price in price_misses(solution, misses)) > _HOPELESS:
-            status = "a plan that keeps limits between points is much dearer"
-            return solution._replace(status=status, success=False)
+            return solution._replace(status=DEARER, success=False)
         # Limits that are being tightened are looked at for their misses first.
-        decided = worst <= 1 or not any(own.worst for own in limits)
+        decided = worst <= 1 or not any(own.limits.worst for own in raised)
         gains = list_gains(search, solution, motions) if decided else []
         halved = decided and refined < REFINEMENTS
         times = _choose_halvings(search, solution, motions, misses, gains) if halved else []
@@ -83,27 +78,43 @@ def enforce_between(search: Search, solution: Solution) -> Solution:
                     status = "a plan on finer intervals is much dearer"
                     return finer._replace(status=status, success=False)
                 solution = finer
-                limits = [Limits.none(stage) for stage in solution.stages]
+                raised = [Raised.none(stage) for stage in solution.stages]
                 continue
             # What finer intervals do not lead to now they will not lead to later.
             refined = REFINEMENTS
         if worst <= 1:
             return solution._replace(error=float(sum(own.sum() for own in gains)))
-        limits = [raised.raised(miss) for raised, miss in zip(limits, misses, strict=True)]
+        raised = [own.further(miss) for own, miss in zip(raised, misses, strict=True)]
+        limits = [own.limits for own in raised]
         tighter = search.run(
             solution.nlp, solution.stages, limits, solution.multipliers, solution.margin
         )
         if not tighter.success:
             tighter = _halve_missed(search, solution, misses)
-            limits = [Limits.none(stage) for stage in tighter.stages]
+            raised = [Raised.none(stage) for stage in tighter.stages]
         if not tighter.success:
             return tighter
         if tighter.cost - solution.cost > _DEARER * abs(solution.cost):
-            status = "a plan that keeps limits between points is much dearer"
-            return tighter._replace(status=status, success=False)
+            return tighter._replace(status=DEARER, success=False)
         solution = tighter
     status = f"limits are still missed {worst:.2g} times what is allowed between points"
     return solution._replace(status=status, success=False)
+
+
+def is_hopeless(search: Search, solution: Solution) -> bool:
+    """Whether limits are missed between points by so much that finer intervals are of no use."""
+    motions = make_motions(solution.stages, search.scheme)
+    checks = [check_between(*pair) for pair in zip(solution.stages, motions, strict=True)]
+    prices = price_misses(solution, _list_misses(search, solution, checks))
+    return bool(sum(price.sum() for price in prices) > _HOPELESS)
+
+
+def _list_misses(search: Search, solution: Solution, checks: Sequence[CheckPlaces]) -> list[Limits]:
+    """What each stage misses between its points."""
+    return [
+        find_misses(stage, check, search.problem.epsilon, solution.margin)
+        for stage, check in zip(solution.stages, checks, strict=True)
+    ]
 
 
 def list_gains(search: Search, solution: Solution, motions: Sequence[StageMotion]) -> list[Array]:

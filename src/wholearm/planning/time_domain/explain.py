@@ -36,7 +36,7 @@ from .way_guess import PacedWay
 
 MISSED = 0.02
 """Least share by which limits are missed along a way that is no way."""
-ADVICE = 1.0
+ADVICE = 0.6
 """Processor time [s] after which no further change of a limit is tried."""
 Replan = Callable[[Problem], object]
 """Plans the same phases of another problem; raises if there is no plan."""

@@ -25,8 +25,10 @@ from .stage import Stage
 
 ONSETS = (0.1, 0.03)
 """Rates at which friction sets in, one after the other, in the scene's unit."""
-PATIENCE = 60
+PATIENCE = 50
 """Most iterations of the solver for each of them."""
+MOST = 9
+"""Turns beyond which modes are those of a motion that trembles."""
 SLOW = 1e-5
 """Rate over the largest one at the same instant below which its sign says nothing."""
 STILL = 1e-4
@@ -50,7 +52,11 @@ def find_modes(search: Search, stages: Sequence[Stage]) -> Solution:
         before = solution
     settled = [replace(stage, onset=0.0) for stage in solution.stages]
     pieces = [piece for stage in settled for piece in split_by_senses(stage, search.scheme)]
-    return solution._replace(stages=link(merge(pieces)))
+    stages = link(merge(pieces))
+    if len(stages) > MOST + len(settled):
+        status = "with friction that sets in gradually things turn too often"
+        return solution._replace(status=status, success=False)
+    return solution._replace(stages=stages)
 
 
 class _Turn(NamedTuple):

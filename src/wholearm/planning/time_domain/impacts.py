@@ -40,6 +40,8 @@ def plan_with_impacts(
     ample: float = math.inf,
     fastest: Plans | None = None,
     pinned: bool = False,
+    begun: Plans | None = None,
+    only_begin: bool = False,
 ) -> Plans:
     """Plan a block with the impacts that are possible, or else with stops.
 
@@ -53,8 +55,8 @@ def plan_with_impacts(
         Longest duration of the block, for the objective `margin`.
     to_go : CostToGo, optional
         What follows a block without impacts.
-    ample, fastest, pinned
-        As of `plan_phases`; a block with impacts makes its own.
+    ample, fastest, pinned, begun, only_begin
+        As of `plan_phases`; a block with impacts makes its own, and plans as a whole.
 
     Raises
     ------
@@ -64,7 +66,8 @@ def plan_with_impacts(
     ends = _find_impacts(block)
     if not ends:
         own = partial(plan_phases, problem, block, z, options, duration, to_go=to_go, ample=ample)
-        return [*own(fastest=fastest or (), pinned=pinned)]
+        going_on = partial(own, begun=begun or (), only_begin=only_begin)
+        return [*going_on(fastest=fastest or (), pinned=pinned)]
     explained = plan_parts_of(problem, block, ample, explained=True)
     # A duration that is too short for stops need not be so without them.
     probe = (

@@ -11,7 +11,7 @@ MOST = 12
 """Most sequences of modes to try from one start."""
 LOST = 3
 """Sequences that led to nothing since the last gain after which no more are tried."""
-PATIENCE = 60
+PATIENCE = 50
 """Most iterations of one of them."""
 
 

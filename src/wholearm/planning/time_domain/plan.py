@@ -27,7 +27,7 @@ from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
 from .attempts import NEAREST, Attempt, Attempts
 from .ending import choose_end
-from .enforcing import enforce_between
+from .enforcing import DEARER, enforce_between, is_hopeless
 from .mesh import resample
 from .mode_search import improve
 from .modes import LEAST_INTERVALS
@@ -44,8 +44,13 @@ CONVINCING = 2
 """Motions that miss limits least, from different guesses, after which there seems to be no plan."""
 BUDGET = 400
 """Iterations of the solver after which no further guess is begun: of one block."""
-ATTEMPT = 80
-"""Most iterations of the first run of the solver from a guess."""
+ATTEMPT = 50
+"""Most iterations of the first run of the solver from a guess: where it leads to a plan it takes 25
+or less in one phase."""
+SPLIT = 80
+"""The same in modes that friction has shown which sets in gradually, with many stages."""
+MUCH_DEARER = 3.0
+"""Cost of a plan, over that with friction that sets in gradually, with which it is none."""
 ROUGH = 1e-2
 """Least accuracy of plans of which only matters that there are any."""
 ROUNDING = 5e-7
@@ -63,6 +68,8 @@ def plan_phases(
     ample: float = math.inf,
     fastest: Sequence[PhasePlan[Motion]] = (),
     pinned: bool = False,
+    begun: Sequence[PhasePlan[Motion]] = (),
+    only_begin: bool = False,
     explained: bool = True,
     patient: bool = True,
 ) -> list[PhasePlan[TimeMotion]]:
@@ -83,6 +90,10 @@ def plan_phases(
         Plans of least time from `z`, for `margin`: it starts from them, or is them.
     pinned : bool
         Whether it ends there.
+    begun : sequence of PhasePlan
+        What has come of them when they were only begun, from nearly the same `z`.
+    only_begin : bool
+        Whether to find modes on few intervals alone: limits may be missed between points.
     explained : bool
         Whether to look for a change that would make a plan possible, where there is none.
     patient : bool
@@ -93,11 +104,14 @@ def plan_phases(
     InputError, InfeasibleError, SolverError
         If a phase's contacts do not touch, its end cannot be reached, or there is no plan.
     """
-    search = Search.of(problem, options, duration, to_go, ample)
+    search = Search.of(problem, options, duration, to_go, ample, only_begin)
     attempts = Attempts(problem, phases, z, search, to_go, patient)
-    begun, name = _begin(search, attempts.first, fastest, pinned)
-    if begun.success:
-        return _summarise(problem, search, phases, begun, name)
+    known = _go_on(search, attempts, begun[0]) if begun else None
+    if known is not None:
+        return _summarise(problem, search, phases, known, begun[0].attempt)
+    first, name = _begin(search, attempts.first, fastest, pinned)
+    if first.success:
+        return _summarise(problem, search, phases, first, name)
     from .explain import refuse
 
     def replan(other: Problem) -> object:
@@ -106,7 +120,7 @@ def plan_phases(
         return plan_phases(other, own, z, rough, explained=False, patient=False)
 
     refuse(search, problem, phases, attempts.first.stages, replan if explained else None)
-    *_, last = outcomes = _try_all(search, problem, attempts, begun)
+    *_, last = outcomes = _try_all(search, problem, attempts, first)
     if last.solution.success:
         return _summarise(problem, search, phases, last.solution, last.name)
     raise _explain(search, problem, attempts, outcomes, replan if explained else None)
@@ -129,6 +143,16 @@ def _begin(
         if quick.success:
             begun = _slow_down(search, quick.stages, first, False, pinned) or begun
     return begun, first.name
+
+
+def _go_on(search: Search, attempts: Attempts, begun: PhasePlan[Motion]) -> Solution | None:
+    """Go on from plans that were only begun, in their modes; None if that leads to nothing."""
+    if not isinstance(begun.solution, Solution):
+        return None
+    search.tried.sequences, search.tried.complete = begun.sequences, begun.complete
+    settled = replace(search, options=replace(search.options, mode_search=False))
+    solution = solve_attempt(settled, attempts.resume(begun.solution))
+    return solution if solution.success else None
 
 
 class _Outcome(NamedTuple):
@@ -229,22 +253,26 @@ def _explain(
 
 def solve_attempt(search: Search, attempt: Attempt) -> Solution:
     """Solve, find modes and intervals, halve these, and make limits hold in between."""
-    stages = attempt.stages
+    stages, least = attempt.stages, math.nan
     if attempt.gradual:
         from .gradual import find_modes
 
         found = find_modes(search, stages)
         if not found.success:
             return found
-        stages = found.stages
-    solution = search.solve(stages, most=ATTEMPT)
+        stages, least = found.stages, found.cost
+    solution = search.solve(stages, attempt.before, SPLIT if attempt.gradual else ATTEMPT)
     if solution.success and solution.margin < -ROUNDING:
         # A way that presses too little may be far from one that presses enough.
         return solution._replace(success=False, status="the largest c_n is below epsilon")
     if not solution.success:
         return solution
+    if 0 < MUCH_DEARER * least < solution.cost or is_hopeless(search, solution):
+        return solution._replace(success=False, status=DEARER)
     plain = not search.options.mode_search or search.has_ample(solution)
     better = solution if plain else improve(search, solution)
+    if search.only_begins:
+        return better
     search, solution = choose_end(search, better)
     wanted = 2**attempt.halvings * sum(stage.intervals for stage in attempt.stages)
     for _ in range(attempt.halvings):
@@ -316,4 +344,6 @@ def _summarise(
         plan = PhasePlan(motion, torque, value, attempt=attempt, stages=own)
         plans.append(plan._replace(error=solution.error))
     plans[0] = plans[0]._replace(sequences=tried.sequences, complete=tried.complete)
+    if search.only_begins:
+        plans[0] = plans[0]._replace(solution=solution)
     return plans

@@ -26,7 +26,7 @@ from .refinement import adopt, monitor_violated
 from .stage import Stage
 from .warm_start import FIRST_SIZE, Multipliers, carry_multipliers, first_multipliers
 
-_ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 90}
+_ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 50}
 """Most iterations of one solve, if not 150."""
 _CAP = 1.1
 """Largest margin that is looked for, over the one from which on more decides nothing."""
@@ -120,6 +120,8 @@ class Search:
     price : Price or None
     ample : float
         Least normal force from which on more decides nothing, for the objective `margin`.
+    only_begins : bool
+        Whether plans may miss limits between points.
     tried : Tried
         Shared by all searches for one plan.
     """
@@ -133,6 +135,7 @@ class Search:
     to_go: Callable[[Array], tuple[float, Array]] | None = None
     price: Price | None = None
     ample: float = math.inf
+    only_begins: bool = False
     tried: Tried = field(default_factory=Tried)
 
     @staticmethod
@@ -142,6 +145,7 @@ class Search:
         duration: float | None = None,
         to_go: CostToGo | None = None,
         ample: float = math.inf,
+        only_begins: bool = False,
     ) -> Search:
         """A search for what `plan_phases` is given, in SI units."""
         scales = problem.scene.scales
@@ -160,6 +164,7 @@ class Search:
             options.goal,
             to_go=expand if to_go else None,
             ample=ample / scales.force,
+            only_begins=only_begins,
         )
 
     def aiming(self, goal: Objective, relaxation: Parameter | None = None) -> Search:

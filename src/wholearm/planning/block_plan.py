@@ -1,0 +1,118 @@
+"""Blocks of phases as they are planned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from ..common.arrays import Array
+from ..geometry.curve import Curve
+from ..problem.definition import Phase, Problem
+from .options import PlanOptions
+from .path_domain.impact_sequence import ImpactSequence
+from .stops import Plans, end_of
+
+PLAIN = -1
+"""Number of doublings that stands for as many intervals as at first, and no search for modes."""
+BEGUN = -2
+"""The same for plans that are only begun: they may miss limits between points."""
+FINEST = 64
+"""Most intervals of a phase in the time domain that refining asks for."""
+
+
+@dataclass(frozen=True, eq=False)
+class BlockPlan:
+    """A block as it is planned.
+
+    Attributes
+    ----------
+    phases : tuple of Phase
+    start : ndarray, shape (5,)
+        Where it starts.
+    finer : int
+        How often its intervals are doubled, or `PLAIN` or `BEGUN`.
+    duration : float or None, [s]
+        Its longest duration, for the objective `margin`.
+    fastest : list of PhasePlan
+        Plans of least duration from this start, if they were made for it.
+    plans : list of PhasePlan
+        One for each of its phases.
+    chain : ImpactSequence or None
+        Its curves; None if it is planned in the time domain.
+    """
+
+    phases: tuple[Phase, ...]
+    start: Array
+    finer: int
+    duration: float | None
+    fastest: Plans
+    plans: Plans
+    chain: ImpactSequence | None
+
+    @property
+    def end(self) -> Array:
+        """Where the block ends, shape (5,)."""
+        if self.chain is not None:
+            return self.chain.curves[-1].end
+        return end_of(self.plans[-1])[0]
+
+    @property
+    def intervals(self) -> int:
+        """Most intervals of a phase in the time domain: each is a piece of the torques."""
+        return max(len(plan.torque.coefficients) for plan in self.plans)
+
+    @property
+    def has_searched(self) -> bool:
+        """Whether more than one sequence of contact modes was tried."""
+        return any(plan.sequences > 1 for plan in self.plans)
+
+    @property
+    def is_finest(self) -> bool:
+        """Whether it is planned in the time domain with all the intervals that it may have."""
+        return self.chain is None and self.intervals >= FINEST
+
+
+@dataclass(frozen=True, eq=False)
+class Planning:
+    """The plans of all phases of a problem.
+
+    Attributes
+    ----------
+    problem : Problem
+    curves : tuple of Curve
+        Those of the first phases: as far as geometry alone says where phases end.
+    options : PlanOptions
+    blocks : tuple of BlockPlan
+    shares, allowed : list of float or None, [s]
+        The longest duration of each phase, for the objective `margin`: in proportion to plans of
+        least duration, and as used, where a block turned out to start from somewhere else.
+    least : list of PhasePlan
+        Those plans of least duration; empty for other objectives.
+    pinned : bool
+        Whether blocks end where those plans do.
+    ahead : bool
+        Whether blocks end with regard to what follows them. Plans that durations are shared out
+        by do not, as blocks for the objective `margin` cannot.
+    more : dict, [N]
+        By how much normal forces of blocks, by their indices, have to exceed epsilon, if at all.
+    """
+
+    problem: Problem
+    curves: tuple[Curve, ...]
+    options: PlanOptions
+    blocks: tuple[BlockPlan, ...]
+    shares: list[float | None]
+    allowed: list[float | None]
+    least: Plans = field(default_factory=list)
+    pinned: bool = False
+    ahead: bool = True
+    more: dict[int, float] = field(default_factory=dict)
+
+    @property
+    def plans(self) -> Plans:
+        """One for each phase."""
+        return [plan for block in self.blocks for plan in block.plans]
+
+    def find_block(self, number: int) -> int:
+        """Index of the block with the phase of a number, counted from 1."""
+        ends = [block.phases[-1].number for block in self.blocks]
+        return next(k for k, end in enumerate(ends) if number <= end)
