@@ -134,7 +134,7 @@ def test_a_contact_that_falls_a_little_short_is_pressed_more(slide: Problem) -> 
     held, trajectory, figures = replay_plan(
         planning, assemble_plan(planning), assemble_plan, lambda _: None
     )
-    assert figures.least_c_n.least > slide.epsilon
+    assert figures.least_c_n.value > slide.epsilon
     assert held.more == {0: pytest.approx(self_check.SPARE * short, rel=0.05)}
     assert np.nanmin(trajectory.c_n) == pytest.approx(slide.epsilon + held.more[0], abs=1e-5)
 

@@ -28,8 +28,6 @@ from .way_pace import Pace, WayForces
 
 STEP = 0.15
 """How far apart ends are looked at, over the length of the way to the nearest end."""
-LEAST_STEP = 0.02
-"""How far apart they are at least, over the radius of gyration."""
 GROWTH = 1.2
 """By how much more each of these is apart from the one before."""
 STEPS = 12
@@ -165,8 +163,7 @@ def list_goals(phase: Phase, z: Array, nearest: Array) -> list[Array]:
     """Ends of a phase: the nearest, shape (5,), and others on both sides of it."""
     formation, goals = phase.formation, [nearest]
     metric = np.sqrt(metric_weights(formation.scene))
-    size = formation.scene.scales.length
-    step = max(STEP * float(np.linalg.norm((nearest - z) * metric)), LEAST_STEP * size)
+    step = STEP * float(np.linalg.norm((nearest - z) * metric))
     slip, ends = formation.evaluate_slip(z[None])[0], list_ends(phase)
     N = tangent_basis(formation, nearest) * metric[2] / metric[:, None] ** 2
 
