@@ -8,9 +8,9 @@ from scipy.integrate import quad
 
 from bodies import G, make_body, measure_energy, rotate, simulate
 from wholearm.common.arrays import Array
-from wholearm.free_simulation.events import FreeEventKind
 from wholearm.free_simulation.state import Run
 from wholearm.free_simulation.system import System
+from wholearm.simulation.events import EventKind
 
 CLOSE = 1e-8
 
@@ -22,7 +22,7 @@ def make_block(b: float = 0.1, h: float = 0.1, mu: float = 0.3, slope: float = 0
     return make_body(corners, mu=mu, inertia=(b**2 + h**2) / 3, weight=weight)
 
 
-def list_times(run: Run, kind: FreeEventKind) -> Array:
+def list_times(run: Run, kind: EventKind) -> Array:
     return np.array([event.time for event in run.events if event.kind is kind])
 
 
@@ -56,7 +56,7 @@ def test_a_block_on_a_ramp_tips() -> None:
 
 def test_a_sliding_block_comes_to_rest() -> None:
     run = simulate(make_block(mu=0.5), [0, 0.1, 0], [1, 0, 0], 1.0)
-    assert list_times(run, FreeEventKind.REST) == pytest.approx([1 / (0.5 * G)], abs=CLOSE)
+    assert list_times(run, EventKind.REST) == pytest.approx([1 / (0.5 * G)], abs=CLOSE)
     assert run.z[0] == pytest.approx(1 / G, abs=CLOSE) and run.resting
 
 
@@ -66,7 +66,7 @@ def test_a_ladder_leaves_the_wall() -> None:
     rod = make_body([(-a, 0), (a, 0)], lines, inertia=a**2 / 3)
     z = [-a * np.cos(start), a * np.sin(start), start]
     run = simulate(rod, z, [0, 0, 0], 0.7)
-    lost = next(event for event in run.events if event.kind is FreeEventKind.PART)
+    lost = next(event for event in run.events if event.kind is EventKind.CONTACT_LOST)
     last = np.arcsin(2 / 3 * np.sin(start))
     # With elevation e: e'^2 = 3 g / (2 a) (sin e_0 - sin e); s^2 = e_0 - e takes the root away.
     e_0 = np.pi - start
@@ -88,7 +88,7 @@ def test_a_corner_bounces() -> None:
     body = make_body([(0.0, -0.1)], inertia=0.01)
     run = simulate(body, [0, 0.1 + height, 0], [0, 0, 0], 1.5, e)
     fall, speed = np.sqrt(2 * height / G), np.sqrt(2 * height * G)
-    hits = [event for event in run.events if event.kind is FreeEventKind.IMPACT]
+    hits = [event for event in run.events if event.kind is EventKind.IMPACT]
     count = 12
     powers = e ** np.arange(1, count)
     times = fall + np.append(0, 2 * np.cumsum(powers) * speed / G)
@@ -113,7 +113,7 @@ def test_a_corner_that_strikes_off_its_centroid(restitution: float) -> None:
 def test_a_block_falls_flat() -> None:
     mu, drop = 0.3, 0.1
     run = simulate(make_block(mu=mu), [0, 0.1 + drop, 0], [1, 0, 0], 0.15)
-    hits = [event for event in run.events if event.kind is FreeEventKind.IMPACT]
+    hits = [event for event in run.events if event.kind is EventKind.IMPACT]
     assert [hit.contact for hit in hits] == ["v0-line0", "v1-line0"]
     time, speed = np.sqrt(2 * drop / G), np.sqrt(2 * drop * G)
     assert [hit.time for hit in hits] == pytest.approx([time, time], abs=CLOSE)
@@ -128,7 +128,7 @@ def test_a_rocking_block_loses_what_housner_says() -> None:
     b, h, tilt = 0.1, 0.3, -0.1
     corner = rotate(tilt, np.array([[b, -h]]))[0]
     run = simulate(make_block(b, h, 2.0), [b - corner[0], -corner[1], tilt], [0, 0, 0], 3.0)
-    hits = [event for event in run.events if event.kind is FreeEventKind.IMPACT]
+    hits = [event for event in run.events if event.kind is EventKind.IMPACT]
     speeds = np.array([hit.value for hit in hits])
     # A corner comes down with the width times the turning, which its energy gives.
     drop = -corner[1] - h
@@ -136,7 +136,7 @@ def test_a_rocking_block_loses_what_housner_says() -> None:
     assert speeds[0] == pytest.approx(2 * b * np.sqrt(2 * G * drop / inertia), abs=CLOSE)
     ratio = 1 - 1.5 * b**2 / (b**2 + h**2)
     assert speeds[1:10] == pytest.approx(ratio * speeds[:9], abs=CLOSE)
-    assert run.resting and run.events[-1].kind is FreeEventKind.REST
+    assert run.resting and run.events[-1].kind is EventKind.REST
     assert measure_energy(run) == pytest.approx(0, abs=1e-9)
 
 
@@ -165,7 +165,7 @@ def test_a_rod_just_below_the_painleve_limit() -> None:
 
 def test_a_rod_beyond_the_painleve_limit_is_hit_without_a_collision() -> None:
     rod = Rod(1.2)
-    assert [event.kind for event in rod.run.events[:1]] == [FreeEventKind.INCONSISTENT]
+    assert [event.kind for event in rod.run.events[:1]] == [EventKind.INCONSISTENT]
     lift = rod.rows.T / rod.system.mass[:, None]
     stuck = rod.v - lift @ np.linalg.solve(rod.rows @ lift, rod.rows @ rod.v)
     assert rod.run.records[0].y[3:6] == pytest.approx(stuck, abs=CLOSE)
@@ -174,7 +174,7 @@ def test_a_rod_beyond_the_painleve_limit_is_hit_without_a_collision() -> None:
 def test_a_rod_with_two_motions_says_so() -> None:
     rod = Rod(1.2, turn=6.0)
     assert rod.falls > 0 > rod.reduced
-    assert [event.kind for event in rod.run.events] == [FreeEventKind.AMBIGUOUS]
+    assert [event.kind for event in rod.run.events] == [EventKind.AMBIGUOUS]
     assert "v0-line0 parts; or v0-line0 presses" in rod.run.events[0].text
     # Nothing pressed before, so that it goes on apart.
     assert rod.run.v[1] == pytest.approx(rod.v[1] - G * 0.01, abs=CLOSE)

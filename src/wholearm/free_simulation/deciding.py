@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..common.arrays import Array
+from ..simulation.events import EventKind
 from .contact_problem import (
     APART,
     BACK,
@@ -24,7 +25,6 @@ from .contact_problem import (
     solve,
     try_modes,
 )
-from .events import FreeEventKind
 from .state import AHEAD, CHATTER, CLOSED, STANDING, STILL, Run
 from .stepper import Modes
 from .system import Rows, System
@@ -260,12 +260,12 @@ def _tell(run: Run, pattern: Pattern, modes: Modes, rests: bool) -> None:
         heirs = [p for p in new if names[p][-1:] == names[pair][-1:]]
         if heirs and abs(gaps[pair]) < near and ranges[pair] < near:
             text = f"{names[pair]} goes on as {names[heirs[0]]}"
-            run.note(FreeEventKind.PASS, text, names[heirs[0]])
+            run.note(EventKind.PASS, text, names[heirs[0]])
             new.remove(heirs[0])
         elif pair not in pattern.closed or run.records:
-            run.note(FreeEventKind.PART, f"{names[pair]} is lost", names[pair])
+            run.note(EventKind.CONTACT_LOST, f"{names[pair]} is lost", names[pair])
     for pair in new if run.records else ():
-        run.note(FreeEventKind.TOUCH, f"{names[pair]} presses", names[pair])
+        run.note(EventKind.GAINED, f"{names[pair]} presses", names[pair])
     for pair in modes.kept:
         if pair not in before.kept or not run.records:
             continue
@@ -277,9 +277,9 @@ def _tell(run: Run, pattern: Pattern, modes: Modes, rests: bool) -> None:
         moves = not (run.resting and rests)
         _tell_change(run, _name(system, int(joint)), old, now, "turns", moves)
     if rests and not run.resting:
-        run.note(FreeEventKind.REST, "everything rests")
+        run.note(EventKind.REST, "everything rests")
     elif run.resting and not rests:
-        run.note(FreeEventKind.START, "the motion begins")
+        run.note(EventKind.START, "the motion begins")
 
 
 def _tell_change(run: Run, name: str, old: float, now: float, verb: str, rubs: bool) -> None:
@@ -288,12 +288,12 @@ def _tell_change(run: Run, name: str, old: float, now: float, verb: str, rubs: b
     contact = verb == "slides"
     if now == 0:
         text = f"{name} sticks" if contact else f"friction holds {name}"
-        run.note(FreeEventKind.STICK, text, name)
+        run.note(EventKind.STICK, text, name)
     elif old == 0:
         text = f"{name} slips" if contact else f"{name} starts to turn"
-        run.note(FreeEventKind.SLIP, text, name)
+        run.note(EventKind.SLIP, text, name)
     else:
-        run.note(FreeEventKind.REVERSAL, f"{name} {verb} the other way", name)
+        run.note(EventKind.REVERSAL, f"{name} {verb} the other way", name)
 
 
 def _tell_ambiguity(run: Run, pattern: Pattern, answers: Sequence[Sequence[int]]) -> None:
@@ -316,9 +316,9 @@ def _tell_ambiguity(run: Run, pattern: Pattern, answers: Sequence[Sequence[int]]
         texts.append(", ".join(parts) or "the rest accelerates otherwise")
     text = f"{len(answers)} motions are possible with {', '.join(names) or 'no contact'} closed ("
     text += "; or ".join(texts) + ")"
-    last = [event for event in run.events if event.kind is FreeEventKind.AMBIGUOUS]
+    last = [event for event in run.events if event.kind is EventKind.AMBIGUOUS]
     if not last or last[-1].text.split(" at t =")[0] != text:
-        run.note(FreeEventKind.AMBIGUOUS, text, " ".join(names))
+        run.note(EventKind.AMBIGUOUS, text, " ".join(names))
 
 
 __all__ = ["Pattern", "decide", "find_closed"]

@@ -20,10 +20,13 @@ The links slide on each other without friction, as no coefficient is given for t
 from __future__ import annotations
 
 import casadi as ca
+import numpy as np
 
-from ..common.arrays import Expression
-from ..common.sharing import Store
+from ..common.arrays import Array, Expression
+from ..common.sharing import Store, exclusive
 from ..contacts.elemental import build_features, rotate_quarter
+from ..contacts.links import build_finger_gap
+from ..contacts.obstacles import build_apart
 from ..scene.model import Scene
 from .system import Pair, System
 
@@ -31,6 +34,24 @@ from .system import Pair, System
 def build_system(scene: Scene) -> System:
     """The hand and the object as a system with five coordinates, the same for equal scenes."""
     return _SYSTEMS(scene)
+
+
+@exclusive
+def measure_gaps(scene: Scene, z: Array) -> Array:
+    """Least gaps of the bodies at n configurations, shape (n, 4) [m], negative where they overlap.
+
+    Object and palm, object and links 1 and 2, link and link (infinite where they pass each other).
+    They come by another way than those of the pairs: the largest separation in any direction.
+
+    Parameters
+    ----------
+    z : ndarray, shape (n, 5)
+    """
+    features = build_features(scene)
+    gaps = [ca.mmin(features.vertices[1, :]), *(build_apart(scene, k) for k in range(2))]
+    gaps.append(build_finger_gap(scene) if scene.fingers_collide else ca.inf)
+    function = ca.Function("gaps", [features.z], [ca.densify(ca.vertcat(*gaps))])
+    return np.asarray(function(z.T).full().T)
 
 
 def _build(scene: Scene) -> System:

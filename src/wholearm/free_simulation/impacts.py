@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..common.arrays import Array
+from ..simulation.events import EventKind
 from .contact_problem import APART, BACK, FORTH, STICKS, Answer, ContactProblem, solve, try_modes
 from .deciding import Pattern, find_closed
-from .events import FreeEventKind
 from .state import AHEAD, CHATTER, STANDING, Run
 
 ROUNDS = 30
@@ -52,7 +52,7 @@ def _collide(
         if rates[k] >= -STANDING * run.system.scales.speed or answer.c_n[k] <= 0:
             continue
         name, text = run.system.names[pair], run.system.pairs[pair].text
-        kind = FreeEventKind.IMPACT if bouncing else FreeEventKind.CHATTER
+        kind = EventKind.IMPACT if bouncing else EventKind.CHATTER
         after = f"{text or name} at {-rates[k]:.4g} m/s"
         note = after if bouncing else f"the impacts of {name} come ever closer and are over"
         run.note(kind, note, name, float(-rates[k]))
@@ -110,7 +110,7 @@ def jolt(run: Run) -> bool:
     if np.abs(change / system.units[system.n :]).max() < 10 * AHEAD:
         return False
     run.note(
-        FreeEventKind.INCONSISTENT,
+        EventKind.INCONSISTENT,
         f"no finite forces keep {names} closed: an impact without a collision",
         names,
     )

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..simulation.events import EventKind
 from .deciding import decide, stands
-from .events import FreeEventKind
 from .impacts import collide, jolt
 from .motion import StuckError, move
 from .rest import hold
@@ -34,7 +34,7 @@ def play(run: Run, touching: float) -> None:
             return
         if rests is None:
             if not jolt(run):
-                run.note(FreeEventKind.GIVEN_UP, "no motion obeys the laws of contact")
+                run.note(EventKind.GIVEN_UP, "no motion obeys the laws of contact")
                 return
             continue
         run.resting = rests
@@ -45,7 +45,7 @@ def play(run: Run, touching: float) -> None:
         try:
             move(run)
         except StuckError as error:
-            run.note(FreeEventKind.GIVEN_UP, str(error).partition(" at t")[0] + " become too short")
+            run.note(EventKind.GIVEN_UP, str(error).partition(" at t")[0] + " become too short")
             return
 
 
@@ -54,7 +54,7 @@ def _advances(run: Run) -> bool:
     run.decisions = run.decisions + 1 if run.t == run.decided_at else 0
     run.decided_at = run.t
     if run.decisions > NO_PROGRESS:
-        run.note(FreeEventKind.GIVEN_UP, "decisions do not end")
+        run.note(EventKind.GIVEN_UP, "decisions do not end")
         return False
     return True
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..results.torque import TorqueProfile
-from .events import FreeEvent, FreeEventKind
+from ..simulation.events import Event, EventKind
 from .stepper import LOSSES, Modes, Stepper, build_stepper
 from .system import System
 
@@ -87,7 +87,7 @@ class Run:
         self.resting = False
         self.residual = 0.0
         self.records: list[Record] = []
-        self.events: list[FreeEvent] = []
+        self.events: list[Event] = []
 
     @property
     def z(self) -> Array:
@@ -158,11 +158,10 @@ class Run:
         stuck = self.system.evaluate_slip(self.z, self.modes.stuck)
         s.inputs[s.at.stay] = np.concatenate([stuck, self.z[list(self.modes.held)]])
 
-    def note(
-        self, kind: FreeEventKind, text: str, contact: str = "", value: float = math.nan
-    ) -> None:
+    def note(self, kind: EventKind, text: str, contact: str = "", value: float = math.nan) -> None:
         """Record an event."""
-        self.events.append(FreeEvent(self.t, kind, f"{text} at t = {self.t:.6g} s", contact, value))
+        text = f"{text} at t = {self.t:.6g} s"
+        self.events.append(Event(self.t, 0, kind, text, contact, value))
 
     def record(self, s: Stepper | None) -> None:
         """Record the present instant, with the forces in a stepper's outputs; None at rest."""

@@ -47,6 +47,18 @@ class EventKind(Enum):
     """The formation stops being valid in another way."""
     END = "end"
     """The torques end before the goal."""
+    GAINED = "contact gained"
+    """A contact that nothing was said about presses from here on."""
+    PASS = "pass"
+    """A contact goes on as one of a neighbouring feature."""
+    CHATTER = "chatter"
+    """Impacts that come ever faster are over: the contact stays closed."""
+    AMBIGUOUS = "ambiguous"
+    """The laws of contact allow several motions; the one nearest to the last is taken."""
+    INCONSISTENT = "inconsistent"
+    """They allow none with finite forces: an impact without a collision."""
+    GIVEN_UP = "given up"
+    """Events come without time passing, or steps do not get anywhere."""
 
 
 class Event(NamedTuple):
@@ -67,7 +79,8 @@ class Event(NamedTuple):
         and release: the c_n that the contact would need [N]; slip of a contact that the phase lets
         roll: its margin mu c_n - |c_t| [N];
         impact: the least impulse, that of `contact` [N s]; end: the distance to the phase's end [m
-        or rad], NaN if that is a release; NaN otherwise.
+        or rad], NaN if that is a release; NaN otherwise. Where no contacts are told, impact: the
+        speed at which the gap closed [m/s].
     """
 
     time: float
@@ -87,6 +100,9 @@ class OutcomeKind(Enum):
     HELD = "held"
     LIMIT_REACHED = "limit reached"
     GOAL_MISSED = "goal missed"
+    ENDED = "ended"
+    """A simulation that is told no contacts came to its end."""
+    GIVEN_UP = "given up"
 
 
 class Outcome(NamedTuple):

@@ -1,0 +1,151 @@
+"""What a free simulation returns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.arrays import Array
+from ..common.errors import InputError
+from ..contacts.elemental import parse_contact
+from ..problem.definition import Problem
+from ..simulation.events import Energies, EventKind, Outcome, OutcomeKind, Simulation
+from .state import Run
+
+
+class Stretch(NamedTuple):
+    """Some time in which a contact presses.
+
+    Attributes
+    ----------
+    contact : str
+    start, stop : float, [s]
+    least : float, [N]
+        Its least c_n then; NaN where everything rests, as forces are indeterminate there.
+    time : float, [s]
+        When.
+    """
+
+    contact: str
+    start: float
+    stop: float
+    least: float
+    time: float
+
+
+@dataclass(frozen=True, eq=False)
+class FreeSimulation(Simulation):
+    """A simulated motion for which no contact was assumed, at every step.
+
+    As of `Simulation`, with these differences. Phases are those that the clock of a plan is in; for
+    torques without one there is one phase. Beside the problem's, `contacts` has others that
+    pressed; forces are NaN where a contact does not press, and at rest. An event is there twice,
+    as forces may step. `missed_by` is NaN.
+
+    Attributes
+    ----------
+    stretches : tuple of Stretch
+        When each pair of features pressed, by the order of their start.
+    residual : float
+        Largest residual of a contact problem, relative to its largest rate.
+    """
+
+    stretches: tuple[Stretch, ...]
+    residual: float
+
+    def show(self, contacts: Sequence[str]) -> FreeSimulation:
+        """The same with other columns of forces, NaN where a contact never pressed."""
+        forces = np.full((2, len(self.t), len(contacts)), np.nan)
+        for column, name in enumerate(contacts):
+            if name in self.contacts:
+                own = self.contacts.index(name)
+                forces[:, :, column] = self.c_n[:, own], self.c_t[:, own]
+        return replace(self, contacts=tuple(contacts), c_n=forces[0], c_t=forces[1])
+
+
+def collect(run: Run, problem: Problem, starts: Sequence[float]) -> FreeSimulation:
+    """Put together what a run has recorded; `starts` says when phases begin by the clock [s]."""
+    rows, n, names = run.records, run.system.n, run.system.names
+    y, t = np.array([row.y for row in rows]), np.array([row.t for row in rows])
+    planned = [contact.name for contact in problem.contacts]
+    used = dict.fromkeys(names[pair] for row in rows for pair in row.kept)
+    contacts = (
+        *planned,
+        *(name for name in used if name not in planned and _is_named(name, problem)),
+    )
+    columns = {name: column for column, name in enumerate(contacts)}
+    forces = np.full((2, len(rows), len(contacts)), np.nan)
+    for index, row in enumerate(rows):
+        for pair, c_n, c_t in zip(row.kept, row.c_n, row.c_t, strict=True):
+            if names[pair] in columns:
+                forces[:, index, columns[names[pair]]] = c_n, c_t
+    given_up = next((e for e in run.events if e.kind is EventKind.GIVEN_UP), None)
+    outcome = Outcome(OutcomeKind.ENDED, f"the simulation ends at t = {run.t:.5g} s")
+    if given_up is not None:
+        outcome = Outcome(OutcomeKind.GIVEN_UP, given_up.text)
+    clock = np.asarray(starts)
+    owners = np.searchsorted(clock, [event.time for event in run.events], side="right") - 1
+    stored = run.system.stored(y[:, :n], y[:, n : 2 * n])
+    impact = np.array([row.impact for row in rows])
+    return FreeSimulation(
+        t=t,
+        z=y[:, :n],
+        z_dot=y[:, n : 2 * n],
+        z_ddot=np.array([row.acceleration for row in rows]),
+        tau=np.array([row.tau for row in rows]),
+        phase=_find_phases(t, clock),
+        contacts=contacts,
+        c_n=forces[0],
+        c_t=forces[1],
+        problem=problem,
+        torque=run.torque,
+        events=tuple(
+            event._replace(phase=max(int(owner), 0))
+            for event, owner in zip(run.events, owners, strict=True)
+        ),
+        stretches=_list_stretches(run),
+        energies=Energies(stored, y[:, 10], y[:, 11], y[:, 12], y[:, 13], impact),
+        outcome=outcome,
+        missed_by=math.nan,
+        residual=run.residual,
+        steps=run.steps,
+        rejected=run.rejected,
+    )
+
+
+def _find_phases(t: Array, starts: Array) -> NDArray[np.int64]:
+    """Phases by the clock; of two rows at a boundary the first one ends the phase before."""
+    found = np.searchsorted(starts, t, side="right") - 1
+    twice = np.append(np.diff(t) == 0, False) & np.isin(t, starts[1:])
+    return np.asarray(np.maximum(found - twice, 0))
+
+
+def _is_named(name: str, problem: Problem) -> bool:
+    """Whether a pair is a contact that problem files know."""
+    try:
+        parse_contact(name, problem.scene)
+    except InputError:
+        return False
+    return True
+
+
+def _list_stretches(run: Run) -> tuple[Stretch, ...]:
+    """When each pair pressed, without a pause."""
+    found: list[Stretch] = []
+    names, rows = run.system.names, run.records
+    for pair in dict.fromkeys(pair for row in rows for pair in row.kept):
+        here = np.array([pair in row.kept for row in rows])
+        edges = np.flatnonzero(np.diff(here, prepend=False, append=False))
+        for first, after in edges.reshape(-1, 2):
+            own = rows[first:after]
+            c_n = np.array([row.c_n[row.kept.index(pair)] for row in own])
+            known = np.flatnonzero(c_n == c_n)
+            at = int(known[c_n[known].argmin()]) if len(known) else 0
+            least: Any = float(c_n[at])
+            found.append(Stretch(names[pair], own[0].t, own[-1].t, least, own[at].t))
+    return tuple(sorted(found, key=lambda stretch: (stretch.start, stretch.contact)))

@@ -1,0 +1,210 @@
+"""Free simulation of a hand: joint torques in, motion, contacts and events out."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..common.arrays import Array
+from ..common.errors import InputError, SimulationError
+from ..common.require import require_number
+from ..common.sharing import exclusive
+from ..problem.definition import End, Problem
+from ..results.narrow import Torques, narrow
+from ..results.torque import TorqueProfile
+from ..results.trajectory import Trajectory
+from .hand import build_system, measure_gaps
+from .play import play
+from .result import FreeSimulation, collect
+from .state import Run
+from .stepper import Modes
+
+
+class PhaseRun(NamedTuple):
+    """Phases that are simulated from a planned start at rest, to the next one.
+
+    Attributes
+    ----------
+    first, last : int
+        Indices of the phases.
+    simulation : FreeSimulation
+    """
+
+    first: int
+    last: int
+    simulation: FreeSimulation
+
+
+@exclusive
+def simulate_free(
+    problem: Problem,
+    what: Torques,
+    *,
+    start: ArrayLike | None = None,
+    until: float | None = None,
+    restitution: float = 0.0,
+    tolerance: float = 1e-9,
+) -> FreeSimulation:
+    """Simulate torques without being told which contacts hold, also after one is lost.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its phases count only for the clock of a plan.
+    what : Plan, Trajectory, Simulation or TorqueProfile
+    start : array_like, shape (5,) or (10,), optional
+        z, and z' if it is not at rest; the problem's start if left out. What is closer than what
+        counts as touching is moved onto its contact.
+    until : float, optional, [s]
+        The end, if not that of the torques; those of their end hold after it.
+    restitution : float
+        Poisson's coefficient, 0 for plastic impacts to 1.
+    tolerance : float
+        As of `simulate`.
+
+    Raises
+    ------
+    InputError
+        If a number is out of its range.
+    SimulationError
+        If features overlap at the start.
+    """
+    profile, plan = narrow(what)
+    state = _require_start(problem, start)
+    rate = require_number(restitution, "restitution", nonnegative=True)
+    if rate > 1:
+        raise InputError("", "restitution", f"{restitution!r} is not between 0 and 1")
+    if not 1e-14 <= tolerance <= 1e-2:
+        raise InputError("", "tolerance", f"{tolerance!r} is not between 1e-14 and 1e-2")
+    if until is not None:
+        profile = _cut(profile, require_number(until, "until", positive=True))
+    starts = [0.0] if plan is None else plan.phase_starts[:-1].tolist()
+    hint = None if plan is None or start is not None else _recall(problem, plan, 0)
+    return _simulate(problem, profile, state, starts, hint, rate, tolerance)
+
+
+@exclusive
+def simulate_phases(
+    problem: Problem, plan: Trajectory, *, restitution: float = 0.0, tolerance: float = 1e-9
+) -> tuple[PhaseRun, ...]:
+    """Simulate the phases of a plan one by one, each from its planned start.
+
+    Phases that pass into one another in motion are simulated together.
+
+    Parameters
+    ----------
+    problem, restitution, tolerance
+        As of `simulate_free`.
+    plan : Trajectory
+    """
+    starts, found = plan.phase_starts, []
+    first = 0
+    for last, phase in enumerate(problem.phases[: len(starts) - 1]):
+        if phase.end is not End.REST and last + 2 < len(starts):
+            continue
+        profile = _cut(plan.torque, float(starts[last + 1]), float(starts[first]))
+        row = int(np.flatnonzero(plan.phase == first)[0])
+        state = np.concatenate([plan.z[row], plan.z_dot[row]])
+        hint = _recall(problem, plan, row)
+        clock = starts[first : last + 1].tolist()
+        simulation = _simulate(problem, profile, state, clock, hint, restitution, tolerance)
+        found.append(PhaseRun(first, last, simulation))
+        first = last + 1
+    return tuple(found)
+
+
+def _simulate(
+    problem: Problem,
+    profile: TorqueProfile,
+    state: Array,
+    starts: list[float],
+    hint: Modes | None,
+    restitution: float,
+    tolerance: float,
+) -> FreeSimulation:
+    run = Run(
+        build_system(problem.scene), profile, state[:5], state[5:], restitution, tolerance, hint
+    )
+    play(run, problem.scene.touching)
+    return collect(run, problem, starts)
+
+
+def _recall(problem: Problem, plan: Trajectory, row: int) -> Modes:
+    """Contact modes with which a plan begins: the last answer, where there are several."""
+    system = build_system(problem.scene)
+    names = [name for name, c in zip(plan.contacts, plan.c_n[row], strict=True) if c == c]
+    kept = sorted(system.names.index(name) for name in names)
+    z, v, a = plan.z[row], plan.z_dot[row], plan.z_ddot[row]
+    rows = system.evaluate(z, v, kept)
+    ahead = 1e-3 * system.scales.time
+    slides = np.sign(rows.A_t @ v + ahead * (rows.A_t @ a + rows.bend_t))
+    phase = problem.phases[int(plan.phase[row])]
+    rolls = [system.names[pair] in {c.name for c in phase.formation.rolling} for pair in kept]
+    Xi = np.where(rolls, 0.0, slides)
+    turns = np.sign(v + ahead * a) * (system.dry > 0)
+    stuck = tuple(pair for pair, one in zip(kept, rolls, strict=True) if one)
+    return Modes(tuple(kept), stuck, (), tuple(Xi.tolist()), tuple(turns.tolist()))
+
+
+def _require_start(problem: Problem, start: ArrayLike | None) -> Array:
+    if start is None:
+        return np.concatenate([problem.start, np.zeros(5)])
+    try:
+        state = np.asarray(start, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError("", "start", "does not hold numbers") from None
+    if state.shape not in ((5,), (10,)) or not np.isfinite(state).all():
+        raise InputError(
+            "", "start", f"shape {state.shape} given; 5 or 10 finite numbers are needed"
+        )
+    return np.concatenate([state, np.zeros(10 - len(state))])
+
+
+def _require_apart(problem: Problem, z: Array) -> None:
+    """Check that nothing overlaps at the start by more than what counts as touching."""
+    depths = -measure_gaps(problem.scene, z[None])[0]
+    which = int(depths.argmax())
+    if depths[which] > 10 * problem.scene.touching:
+        pair = ("palm and object", "finger 1 and object", "finger 2 and object", "both fingers")
+        raise SimulationError(f"{pair[which]} overlap by {depths[which]:.3g} m at the start")
+
+
+def _cut(profile: TorqueProfile, stop: float, start: float | None = None) -> TorqueProfile:
+    """The torques from `start` to `stop`, those of their end held after it."""
+    breaks, coefficients = profile.breaks, profile.coefficients
+    first = float(breaks[0]) if start is None else start
+    inner = breaks[(breaks > first) & (breaks < stop)]
+    near = 1e-12 * max(abs(first), abs(stop))
+    inner = inner[(inner > first + near) & (inner < stop - near)]
+    new = np.array([first, *inner, stop])
+    pieces = []
+    for a, b in pairwise(new.tolist()):
+        k = int(np.searchsorted(breaks, (a + b) / 2, side="right")) - 1
+        if k >= len(coefficients):
+            held = np.zeros_like(coefficients[0])
+            held[:, 0] = coefficients[-1].sum(axis=1)
+            pieces.append(held)
+            continue
+        pieces.append(_restrict(coefficients[k], breaks[k], breaks[k + 1], a, b))
+    return TorqueProfile(new, np.array(pieces))
+
+
+def _restrict(coefficients: Array, start: float, stop: float, a: float, b: float) -> Array:
+    """The same polynomials over a part [a, b] of [start, stop]."""
+    if a == start and b == stop:
+        return coefficients
+    # x = shift + scale u, where u runs from -1 to 1 over the part.
+    scale, shift = (b - a) / (stop - start), (a + b - start - stop) / (stop - start)
+    result = np.zeros_like(coefficients)
+    power = np.zeros(coefficients.shape[1])
+    power[0] = 1.0
+    for k in range(coefficients.shape[1]):
+        result += coefficients[:, k : k + 1] * power
+        power = shift * power + scale * np.append(0.0, power[:-1])
+    return result
+
+
+__all__ = ["PhaseRun", "SimulationError", "simulate_free", "simulate_phases"]
