@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from .contacts.elemental import Contact
     from .contacts.formation import Formation
     from .figures import plots
+    from .free_simulation.result import FreeSimulation
+    from .free_simulation.simulate import simulate_free
     from .geometry.path_guess import load
     from .planning.options import Objective, PlanOptions
     from .planning.plan import solve
@@ -45,6 +47,8 @@ if TYPE_CHECKING:
     from .scene.polygon import Polygon
     from .simulation.events import Simulation
     from .simulation.simulate import simulate
+    from .verification.free import verify_free
+    from .verification.free_report import FreeReport
     from .verification.verify import verify
 
 __version__ = "0.1.0"
@@ -56,6 +60,8 @@ _HOMES = {
     "Finger": "scene.model",
     "Formation": "contacts.formation",
     "Friction": "scene.model",
+    "FreeReport": "verification.free_report",
+    "FreeSimulation": "free_simulation.result",
     "InfeasibleError": "common.errors",
     "InputError": "common.errors",
     "JammingError": "common.errors",
@@ -88,8 +94,10 @@ _HOMES = {
     "read_until": "problem.read",
     "save": "results.narrow",
     "simulate": "simulation.simulate",
+    "simulate_free": "free_simulation.simulate",
     "solve": "planning.plan",
     "verify": "verification.verify",
+    "verify_free": "verification.free",
 }
 
 __all__ = [
@@ -98,6 +106,8 @@ __all__ = [
     "End",
     "Finger",
     "Formation",
+    "FreeReport",
+    "FreeSimulation",
     "Friction",
     "InfeasibleError",
     "InputError",
@@ -133,8 +143,10 @@ __all__ = [
     "read_until",
     "save",
     "simulate",
+    "simulate_free",
     "solve",
     "verify",
+    "verify_free",
 ]
 
 

@@ -3,6 +3,22 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+
+SIMULATORS = ("told", "free")
+"""What `plot --simulate` takes; the first one if it is left out."""
+
+
+def name_simulator(given: Sequence[str]) -> list[str]:
+    """Give `--simulate` the simulator that it leaves out."""
+    named: list[str] = []
+    for text in given:
+        if named[-1:] == ["--simulate"]:
+            named[-1] += f"={text if text in SIMULATORS else SIMULATORS[0]}"
+            if text in SIMULATORS:
+                continue
+        named.append(text)
+    return [f"{text}={SIMULATORS[0]}" if text == "--simulate" else text for text in named]
 
 
 def add_solve(parser: argparse.ArgumentParser) -> None:
@@ -65,6 +81,10 @@ def add_verify(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rest-speed", type=float, help=f"{text} (2e-2)")
     text = "also list the paper's scalar equation of motion where a phase has four constraints"
     parser.add_argument("--reduced", action="store_true", help=text)
+    text = "simulate without telling which contacts hold: whole, and a plan's phases one by one too"
+    parser.add_argument("--free", action="store_true", help=text)
+    text = "Poisson's coefficient of impacts, 0 to 1, with --free (0: plastic)"
+    parser.add_argument("--restitution", type=float, help=text)
     text = "trajectory file to write (.npz) of the replayed motion, for plot"
     parser.add_argument("-o", "--output", metavar="FILE", help=text)
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
@@ -76,7 +96,8 @@ def add_plot(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("trajectory", help=text)
     parser.add_argument("--problem", metavar="FILE", help="problem file (TOML) for torques")
     parser.add_argument("-o", "--output", required=True, help="figure to write (.png, .pdf, .svg)")
-    parser.add_argument("--simulate", action="store_true", help="overlay the simulated forces")
+    text = "overlay the simulated forces; free: simulated without telling which contacts hold"
+    parser.add_argument("--simulate", choices=SIMULATORS, metavar="[free]", help=text)
 
 
 def add_predict(parser: argparse.ArgumentParser) -> None:

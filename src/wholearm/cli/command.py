@@ -16,7 +16,15 @@ from typing import TYPE_CHECKING, NoReturn
 
 from ..common.errors import InputError, WholearmError, name_source
 from ..common.interrupts import guard
-from .arguments import add_compare, add_map, add_plot, add_predict, add_solve, add_verify
+from .arguments import (
+    add_compare,
+    add_map,
+    add_plot,
+    add_predict,
+    add_solve,
+    add_verify,
+    name_simulator,
+)
 from .bench import add_bench, name_study
 from .compare import compare
 from .engines import add_export, add_replay
@@ -26,8 +34,11 @@ from .progress import clear_progress, show_progress
 if TYPE_CHECKING:
     from ..planning.result import Plan
     from ..planning.table_check import Table
+    from ..results.report import Report
     from ..results.torque import TorqueProfile
     from ..results.trajectory import Trajectory
+    from ..simulation.events import Simulation
+    from ..verification.free_report import FreeReport
 
 
 class _Parser(argparse.ArgumentParser):
@@ -43,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(given: Sequence[str]) -> int:
     try:
-        named = name_study([_protect(text) for text in given])
+        named = name_study([_protect(text) for text in name_simulator(given)])
         options = build_parser().parse_args(named)
         status: int = options.run(options)
         sys.stdout.flush()
@@ -200,6 +211,7 @@ def _verify(options: argparse.Namespace) -> int:
         for key in ("tolerance", "departure", "rest_speed")
         if getattr(options, key) is not None
     }
+    _check_free(options)
     problem = read_problem(options.problem)
     torques = _read_torques(options.torques)
     if getattr(torques, "meta", {}).get("problem") != problem.table:
@@ -207,7 +219,13 @@ def _verify(options: argparse.Namespace) -> int:
         from ..geometry.path_guess import check_phases
 
         check_phases(problem)
-    report = verify(problem, torques, reduced=options.reduced, **given)
+    if options.free:
+        from ..verification.free import verify_free
+
+        rate = {} if options.restitution is None else {"restitution": options.restitution}
+        report: Report | FreeReport = verify_free(problem, torques, **given, **rate)
+    else:
+        report = verify(problem, torques, reduced=options.reduced, **given)
     clear_progress()
     print(json.dumps(report.to_dict(), indent=2) if options.json else report.to_text())
     if options.output is not None:
@@ -215,6 +233,16 @@ def _verify(options: argparse.Namespace) -> int:
         if not options.json:
             print(f"wrote {options.output}")
     return report.exit_status
+
+
+def _check_free(options: argparse.Namespace) -> None:
+    """Check that nothing is asked for that the other simulator does."""
+    others = {"--reduced": options.reduced, "--rest-speed": options.rest_speed}
+    for key, value in others.items() if options.free else ():
+        if value:
+            raise InputError("", key, "does not go with --free")
+    if options.restitution is not None and not options.free:
+        raise InputError("", "--restitution", "needs --free")
 
 
 def _read_torques(path: str) -> Trajectory | TorqueProfile:
@@ -239,18 +267,26 @@ def _plot(options: argparse.Namespace) -> int:
     elif options.problem is not None:
         raise InputError("", "--problem", "is for torques (.csv); trajectories bring their own")
     with name_source(options.trajectory):
-        simulation = None
-        if options.simulate:
-            from ..problem.read import read_own_problem
-            from ..simulation.simulate import simulate
-
-            problem = read_own_problem(trajectory.meta)
-            simulation = simulate(problem, trajectory.torque, progress=show_progress())
+        simulation = _overlay(options.simulate, trajectory) if options.simulate else None
         figure = plots.force_margins(trajectory, simulation=simulation)
     plots.save(figure, options.output)
     clear_progress()
     print(f"wrote {options.output}")
     return 0
+
+
+def _overlay(simulator: str, trajectory: Trajectory) -> Simulation:
+    """The motion of a trajectory simulated, with its contacts."""
+    from ..problem.read import read_own_problem
+
+    problem = read_own_problem(trajectory.meta)
+    if simulator == "free":
+        from ..free_simulation.simulate import simulate_free
+
+        return simulate_free(problem, trajectory).show(trajectory.contacts)
+    from ..simulation.simulate import simulate
+
+    return simulate(problem, trajectory.torque, progress=show_progress())
 
 
 def _replay(options: argparse.Namespace, torques: TorqueProfile) -> Trajectory:

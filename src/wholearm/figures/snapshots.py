@@ -91,7 +91,10 @@ def draw_strip(figure: Figure, trajectory: Trajectory, scene: Scene, styles: Sty
     for row, width, box in zip(rows, scale * widths, boxes, strict=True):
         axes = figure.add_axes(inset(left, bottom, width, height))
         own = trajectory.motions[trajectory.phase[row]].contacts
+        # What does not press at this instant is left out, unless no force is known.
+        known = dict(zip(trajectory.contacts, np.isfinite(trajectory.c_n[row]), strict=True))
         names = [name for name in trajectory.contacts if name in own]
+        names = [name for name in names if known[name]] or names
         draw_snapshot(axes, scene, trajectory.z[row], names, styles)
         axes.set(xlim=box[:, 0], ylim=(low, high))
         place = f"phase {trajectory.phase[row] + 1}" if row < rows[-1] else "end"

@@ -89,12 +89,14 @@ def _list_sides(scene: Scene, finger: int) -> list[Pair]:
     link, part = build_features(scene).links[finger], scene.fingers[finger]
     mu, k = scene.friction.of(finger), finger + 1
     side = 1.0 if finger == 0 else -1.0
+    # What touches a side between its ends has the whole object on that side, by convexity.
+    middle = link.normal.T @ (build_features(scene).z[:2] - link.base)
     pairs = []
     for i in range(scene.polygon.n_vertices):
         run = link.vertex_run[i]
         for name, way, text in (("finger", 1.0, ""), ("back", -1.0, "the far side of ")):
             gap = way * (link.vertex_gap[i] + part.radius) - part.radius
-            ranges = (run, part.length - run)
+            ranges = (run, part.length - run, way * middle)
             text = f"v{i} touches {text}finger {k}"
             pairs.append(Pair(f"v{i}-{name}{k}", gap, way * side * run, mu, ranges, text))
     return pairs
@@ -139,11 +141,12 @@ def _list_link_pairs(scene: Scene) -> list[Pair]:
     for own, other in ((0, 1), (1, 0)):
         mine, theirs, part = links[own], links[other], scene.fingers[other]
         axis = (theirs.tip - theirs.base) / part.length
-        for name, point in (("tip", mine.tip), ("joint", mine.base)):
+        for name, point, rest in (("tip", mine.tip, mine.base), ("joint", mine.base, mine.tip)):
+            behind = theirs.normal.T @ (rest - theirs.base)
             run, level = axis.T @ (point - theirs.base), theirs.normal.T @ (point - theirs.base)
             for side, way in (("finger", 1.0), ("back", -1.0)):
                 title = f"{name}{own + 1}-{side}{other + 1}"
-                ranges = (run, part.length - run)
+                ranges = (run, part.length - run, way * behind)
                 pairs.append(_slide(title, way * level - thick, ranges))
     if thick == 0:
         return pairs
@@ -153,8 +156,8 @@ def _list_link_pairs(scene: Scene) -> list[Pair]:
     for first, second in ((ends[0], ends[1]), (ends[0], joints[1]), (joints[0], ends[1])):
         run = second[1] - first[1]
         gap = ca.sqrt(ca.sumsqr(run)) - thick
-        ranges = (first[2].T @ run, -(second[2].T @ run))
-        pairs.append(_slide(f"{first[0]}1-{second[0]}2", gap, ranges))
+        beyond = (first[2].T @ run, -(second[2].T @ run))
+        pairs.append(_slide(f"{first[0]}1-{second[0]}2", gap, beyond))
     return pairs
 
 

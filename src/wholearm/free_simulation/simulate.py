@@ -125,9 +125,9 @@ def _simulate(
     restitution: float,
     tolerance: float,
 ) -> FreeSimulation:
-    run = Run(
-        build_system(problem.scene), profile, state[:5], state[5:], restitution, tolerance, hint
-    )
+    z, v = np.split(state, 2)
+    _require_apart(problem, z)
+    run = Run(build_system(problem.scene), profile, z, v, restitution, tolerance, hint)
     play(run, problem.scene.touching)
     return collect(run, problem, starts)
 

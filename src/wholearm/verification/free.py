@@ -1,0 +1,203 @@
+"""Check torques by simulating them without being told which contacts hold.
+
+A plan is simulated whole, from the exact start and by the clock, and phase by phase, each from its
+planned start; the verdict is about the phases, as the joints between them are knife edges. Torques
+alone are followed by what happens: a phase ends where its `until` is reached.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..common.errors import InputError
+from ..common.require import require_number
+from ..common.sharing import exclusive
+from ..free_simulation.result import FreeSimulation
+from ..free_simulation.simulate import simulate_free, simulate_phases
+from ..problem.definition import Phase, Problem
+from ..results.narrow import Torques, narrow
+from ..results.report import Deviation
+from ..results.trajectory import Trajectory
+from ..simulation.events import EventKind, OutcomeKind
+from ..simulation.tolerances import REST_WINDOW
+from .free_report import FreePhase, FreeReport, Loss
+from .verdict import DEPARTURE
+
+_TOLD = (EventKind.AMBIGUOUS, EventKind.INCONSISTENT)
+
+
+@exclusive
+def verify_free(
+    problem: Problem,
+    what: Torques,
+    *,
+    tolerance: float = 1e-9,
+    departure: float = DEPARTURE,
+    restitution: float = 0.0,
+) -> FreeReport:
+    """Simulate torques without being told which contacts hold, and report what happens.
+
+    Parameters
+    ----------
+    problem : Problem
+    what : Plan, Trajectory or TorqueProfile
+    tolerance : float
+        Of the simulation.
+    departure : float
+        How far the end of a phase may be from the plan; as of `verify`.
+    restitution : float
+        Poisson's coefficient of impacts.
+
+    Raises
+    ------
+    InputError
+        If the trajectory has other contacts than the problem, or a number is out of its range.
+    SimulationError
+        If bodies overlap at the start.
+    """
+    torque, plan = narrow(what)
+    allowed = require_number(departure, "departure", positive=True)
+    names = {contact.name for contact in problem.contacts}
+    if plan is not None and set(plan.contacts) != names:
+        odd = ", ".join(sorted(set(plan.contacts) ^ names))
+        raise InputError("", "contacts", f"trajectory and problem differ in {odd}")
+    options = {"tolerance": tolerance, "restitution": restitution}
+    whole = simulate_free(problem, torque if plan is None else plan, **options)
+    warnings = _warn("whole", whole)
+    if plan is None:
+        phases, failures = _follow(problem, whole)
+        return FreeReport(problem.name, whole, (), phases, tuple(failures), tuple(warnings))
+    failures, alone = [], []
+    for part in simulate_phases(problem, plan, **options):
+        found = _compare(problem, plan, part.simulation, range(part.first, part.last + 1))
+        alone += found
+        title = f"phases {found[0].number} to {found[-1].number}" if found[1:] else ""
+        warnings += _warn(f"{title or f'phase {found[0].number}'} alone", part.simulation)
+        failures += _fail(problem, part.simulation, found, allowed)
+    by_clock = _compare(problem, plan, whole, range(len(plan.phase_starts) - 1))
+    return FreeReport(
+        problem.name, whole, tuple(alone), tuple(by_clock), tuple(failures), tuple(warnings)
+    )
+
+
+def _fail(
+    problem: Problem, simulation: FreeSimulation, phases: Sequence[FreePhase], allowed: float
+) -> list[str]:
+    """Why phases from rest are not as planned."""
+    texts = [] if simulation.outcome.kind is OutcomeKind.ENDED else [simulation.outcome.text]
+    for phase in phases:
+        texts += [
+            f"phase {phase.number} alone: {loss.contact} is lost at t = {loss.time:.5g} s"
+            for loss in phase.losses
+        ]
+        end = phase.deviation
+        assert end is not None
+        if max(end.position / problem.scene.scales.length, end.angle) > allowed:
+            texts.append(
+                f"phase {phase.number} alone ends {end.position:.3g} m and {end.angle:.3g} rad "
+                "away from the plan"
+            )
+    return texts
+
+
+def _warn(title: str, simulation: FreeSimulation) -> list[str]:
+    """What was not decided by the laws of contact alone."""
+    return [f"{title}: {event.text}" for event in simulation.events if event.kind in _TOLD]
+
+
+def _compare(
+    problem: Problem, plan: Trajectory, simulation: FreeSimulation, indices: range
+) -> list[FreePhase]:
+    """Phases by the clock: where each ends, and which of its contacts are lost meanwhile."""
+    found, starts = [], plan.phase_starts
+    for index in indices:
+        phase = problem.phases[index]
+        start, stop = float(starts[index]), float(starts[index + 1])
+        losses = _find_losses(problem, simulation, phase, start, stop)
+        row = int(np.searchsorted(simulation.t, stop, side="right")) - 1
+        last = int(np.flatnonzero(plan.phase == index)[-1])
+        away = np.abs(simulation.z[row] - plan.z[last])
+        reached = bool(simulation.t[row] == stop)
+        end = Deviation(float(away[:2].max()), float(away[2:].max()), float(simulation.t[row]))
+        found.append(FreePhase(phase.number, start, stop, reached, tuple(losses), end))
+    return found
+
+
+def _follow(
+    problem: Problem, simulation: FreeSimulation
+) -> tuple[tuple[FreePhase, ...], list[str]]:
+    """Phases of torques alone: each until what ends it has happened."""
+    found: list[FreePhase] = []
+    failures: list[str] = []
+    start = float(simulation.t[0])
+    following: Sequence[Phase | None] = [*problem.phases[1:], None]
+    for phase, after in zip(problem.phases, following, strict=True):
+        stop = _find_end(simulation, phase, after, start)
+        last = float(simulation.t[-1]) if stop is None else stop
+        losses = _find_losses(problem, simulation, phase, start, last)
+        found.append(FreePhase(phase.number, start, last, stop is not None, tuple(losses), None))
+        failures += [
+            f"{loss.contact} is lost at t = {loss.time:.5g} s, phase {phase.number}"
+            for loss in losses
+        ]
+        if stop is None:
+            failures.append(f"phase {phase.number} does not end: {phase.until} is not reached")
+            break
+        start = stop
+    return tuple(found), failures
+
+
+def _find_end(
+    simulation: FreeSimulation, phase: Phase, after: Phase | None, start: float
+) -> float | None:
+    """When a phase ends, None if it does not [s]."""
+    until = phase.until
+    later = [event for event in simulation.events if event.time >= start]
+    if until.contact is not None:
+        times = [e.time for e in later if e.contact == until.contact.name]
+        own = [s for s in simulation.stretches if s.contact == until.contact.name]
+        times += [max(s.start, start) for s in own if s.stop > start]
+    elif until.value is not None:
+        values = simulation.z[:, 0 if until.coordinate == "x" else 2] - until.value
+        rows = np.flatnonzero(simulation.t >= start)
+        passed = rows[values[rows] * values[rows[0]] <= 0]
+        times = simulation.t[passed[:1]].tolist()
+    else:
+        kept = set() if after is None else set(after.formation.names)
+        leaving = set(phase.formation.names) - kept
+        lost = [e for e in later if e.kind is EventKind.CONTACT_LOST]
+        times = [e.time for e in lost if e.contact in leaving]
+    return min(times, default=None)
+
+
+def _find_losses(
+    problem: Problem, simulation: FreeSimulation, phase: Phase, start: float, stop: float
+) -> list[Loss]:
+    """When contacts of a phase do not press for longer than a moment, the first time of each.
+
+    The end of a phase, where a rounding decides which contact goes first, does not count.
+    """
+    window = REST_WINDOW * problem.scene.scales.time
+    found = []
+    for name in phase.formation.names:
+        own = [(s.start, s.stop) for s in simulation.stretches if s.contact == name]
+        edges = _list_gaps(own, start, stop)
+        long = [first for first, after in edges if after - first > window]
+        found += [Loss(name, long[0])] if long else []
+    return sorted(found, key=lambda loss: loss.time)
+
+
+def _list_gaps(
+    stretches: Sequence[tuple[float, float]], start: float, stop: float
+) -> list[tuple[float, float]]:
+    """What stretches leave open between two times."""
+    gaps, at = [], start
+    for first, last in sorted(stretches):
+        if first > at:
+            gaps.append((at, min(first, stop)))
+        at = max(at, last)
+        if at >= stop:
+            return gaps
+    return [*gaps, (at, stop)]

@@ -1,0 +1,215 @@
+"""Hand and object without being told which contacts hold."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plane import finger_gap, make_scene
+from planned import change, plan
+from shipped import HEPTAGON
+from wholearm.benchmark.free_runs import draw_run, judge_run, run_draw
+from wholearm.cli.command import main
+from wholearm.common.arrays import Array
+from wholearm.common.errors import InputError, SimulationError
+from wholearm.contacts.elemental import parse_contact
+from wholearm.contacts.formation import Formation
+from wholearm.free_simulation.hand import build_system, measure_gaps
+from wholearm.free_simulation.simulate import simulate_free, simulate_phases
+from wholearm.problem.definition import Problem
+from wholearm.results.torque import TorqueProfile
+from wholearm.results.trajectory import Trajectory, assemble
+from wholearm.scene.model import Finger, Friction, Scene
+from wholearm.scene.polygon import Polygon
+from wholearm.simulation.events import EventKind, OutcomeKind
+from wholearm.verification.free import verify_free
+from wholearm.verification.free_report import FreeReport
+
+NAMES = ("v0-palm", "v1-finger1", "v3-finger2", "e0-tip1", "v2-tip2")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pairs_are_the_contacts_that_problems_name(name: str) -> None:
+    scene = make_scene()
+    system, formation = build_system(scene), Formation(scene, (parse_contact(name, scene),))
+    pair = system.names.index(name)
+    rng = np.random.default_rng(2)
+    v = rng.normal(size=5)
+    for _ in range(3):
+        z = np.append(rng.uniform(-0.05, 0.05, 2), rng.uniform(-1, 1, 3))
+        # Where they touch, rows of sliding are those of slip coordinates.
+        for _ in range(20):
+            row = system.evaluate(z, v, [pair]).A[0]
+            z -= system.measure(z[None])[0][0, pair] * row / (row @ row)
+        rows, known = system.evaluate(z, v, [pair]), formation.evaluate(z[None], v[None])
+        assert system.measure(z[None])[0][0, pair] == pytest.approx(known.C[0, 0], abs=1e-15)
+        assert rows.A == pytest.approx(known.A[0], abs=1e-12)
+        assert rows.A_t == pytest.approx(known.A_t[0], abs=1e-12)
+        assert rows.bend == pytest.approx(known.A_dot_v[0], abs=1e-9)
+
+
+def pinch(torque: float, until: float = 10.0) -> tuple[Problem, TorqueProfile, Array]:
+    """A square between two upright links, pressed by the same torque of both."""
+    link = dict(length=0.18, radius=0.005, inertia=0.005, viscous=0.01, dry=0.0, torque_limit=2.0)
+    square = [[-0.03, -0.03], [0.03, -0.03], [0.03, 0.03], [-0.03, 0.03]]
+    fingers = Finger(base=(0.035, -0.01), **link), Finger(base=(-0.035, -0.01), **link)  # type: ignore[arg-type]
+    scene = Scene(Polygon(square, 0.2), fingers, Friction(0.6, 0.6, 0.6))
+    z = np.array([0, 0.08, 0, np.pi / 2, np.pi / 2])
+    problem = Problem("pinch", scene, 0.05, z, (), checked=True)
+    profile = TorqueProfile(np.array([0, until]), np.array([[[torque], [-torque]]]))
+    return problem, profile, z
+
+
+def test_a_pinched_square_does_not_creep() -> None:
+    problem, torque, z = pinch(0.3)
+    run = simulate_free(problem, torque)
+    assert (run.z == run.z[0]).all() and (run.z_dot == 0).all() and run.t[-1] == 10.0
+    assert run.z[0] == pytest.approx(z, abs=1e-15)
+    assert [event.kind for event in run.events] == [EventKind.REST]
+
+
+def test_a_square_that_is_pinched_too_weakly_falls_to_the_palm() -> None:
+    # Friction needs mu 2 N = m g, and N is at most the torque over the lower corners' height.
+    problem, torque, _ = pinch(0.9 * 0.2 * 9.81 * 0.06 / (2 * 0.6), until=1.0)
+    run = simulate_free(problem, torque)
+    assert run.z[-1, 1] == pytest.approx(0.03, abs=1e-9) and (run.z_dot[-1] == 0).all()
+    assert {event.contact for event in run.find(EventKind.IMPACT)} == {"v0-palm", "v1-palm"}
+    assert run.outcome.kind is OutcomeKind.ENDED
+    assert np.abs(run.energies.residual).max() < 1e-9
+
+
+@pytest.mark.parametrize("seed", [3, 7, 45, 98])
+def test_random_runs_gain_no_energy_and_overlap_nowhere(seed: int) -> None:
+    draw = draw_run(seed)
+    run = run_draw(draw)
+    figures = judge_run(run)
+    assert run.outcome.kind is OutcomeKind.ENDED and run.residual < 1e-9
+    assert figures.gained < 1e-8 and figures.unexplained < 1e-8
+    assert figures.overlap < 1e-7
+    # Other distances, of polygon and segments.
+    scene = draw.problem.scene
+    for finger in range(2):
+        q, theta = run.z[::5, :3], run.z[::5, 3 + finger]
+        assert finger_gap(scene, q, finger, theta).min() > -1e-7 * scene.scales.length
+
+
+@lru_cache
+def begin() -> tuple[Problem, Trajectory]:
+    """The first two phases of a plan."""
+    problem, trajectory = plan(pieces=12)
+    count = int(np.searchsorted(trajectory.torque.breaks, 0.8))
+    torque = TorqueProfile(
+        trajectory.torque.breaks[: count + 1], trajectory.torque.coefficients[:count]
+    )
+    two = dataclasses.replace(problem, phases=problem.phases[:2])
+    meta = {"epsilon": problem.epsilon, "problem": two.table}
+    return two, assemble(list(trajectory.motions[:2]), torque, meta, 201)
+
+
+@lru_cache
+def checked() -> FreeReport:
+    return verify_free(*begin())
+
+
+def test_phases_of_a_plan_are_as_told() -> None:
+    report = checked()
+    assert report.ok and report.exit_status == 0 and len(report.alone) == 2
+    for phase in report.alone:
+        assert phase.reached and phase.losses == () and phase.deviation is not None
+        # The interpolated torques are good to about 1e-11.
+        assert phase.deviation.position < 1e-9 and phase.deviation.angle < 1e-9
+
+
+def test_a_report_says_what_happens_contact_by_contact() -> None:
+    report = checked()
+    text, plain = report.to_text(), json.loads(json.dumps(report.to_dict()))
+    assert text.startswith("heptagon, four contacts: ok: from its planned start each phase keeps")
+    assert plain["ok"] and len(plain["events"]) == len(report.whole.events)
+    assert {row["contact"] for row in plain["contacts"]} >= set(
+        report.whole.problem.phases[0].formation.names
+    )
+    first = report.whole.stretches[0]
+    assert first.start == 0.0 and first.least > 0
+
+
+def test_the_motion_is_a_trajectory() -> None:
+    whole = checked().whole
+    trajectory = whole.trajectory
+    assert trajectory.contacts[: len(begin()[1].contacts)] == begin()[1].contacts
+    assert trajectory.duration == pytest.approx(0.8)
+    shown = whole.show(begin()[1].contacts[::-1])
+    assert shown.c_n[:, -1] == pytest.approx(whole.c_n[:, 0], nan_ok=True)
+
+
+def test_torques_alone_are_followed_by_what_happens() -> None:
+    problem, trajectory = begin()
+
+    def let_go(starts: Array, c: Array) -> Array:
+        c[starts > 0.2] *= -1
+        return c
+
+    report = verify_free(problem, change(trajectory.torque, let_go))
+    assert not report.ok and report.exit_status == 1 and report.alone == ()
+    assert report.phases[0].losses and report.phases[0].losses[0].time > 0.2
+    # The simulation goes on after the first loss.
+    assert report.whole.t[-1] == pytest.approx(0.8)
+    assert report.whole.outcome.kind is OutcomeKind.ENDED
+
+
+def test_the_end_and_the_start_may_be_others() -> None:
+    problem, torque, z = pinch(0.3)
+    run = simulate_free(problem, torque, until=12.5)
+    assert run.t[-1] == 12.5 and run.tau[-1] == pytest.approx([0.3, -0.3])
+    thrown = simulate_free(problem, torque, start=[*z, 0, 1.0, 0, 0, 0], until=0.01)
+    assert thrown.z_dot[-1, 1] < 1.0 - 0.01 * 9.81 and thrown.z[-1, 1] > z[1]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"restitution": 1.5}, "restitution: 1.5 is not between 0 and 1"),
+        ({"until": 0.0}, "until"),
+        ({"start": [1.0, 2.0]}, "5 or 10 finite numbers are needed"),
+        ({"tolerance": 1.0}, "tolerance: 1.0 is not between"),
+    ],
+)
+def test_numbers_out_of_range(options: dict[str, object], message: str) -> None:
+    problem, torque, _ = pinch(0.3)
+    with pytest.raises(InputError, match=message):
+        simulate_free(problem, torque, **options)  # type: ignore[arg-type]
+
+
+def test_an_overlap_at_the_start_is_told() -> None:
+    problem, torque, z = pinch(0.3)
+    with pytest.raises(SimulationError, match=r"finger 1 and object overlap by 0\.01 m at"):
+        simulate_free(problem, torque, start=z + np.array([0.01, 0, 0, 0, 0]))
+    assert measure_gaps(problem.scene, z[None])[0, :3] == pytest.approx([0.05, 0, 0], abs=1e-15)
+
+
+def test_phases_that_pass_into_one_another_run_together() -> None:
+    problem, trajectory = begin()
+    runs = simulate_phases(problem, trajectory, tolerance=1e-6)
+    assert [(run.first, run.last) for run in runs] == [(0, 0), (1, 1)]
+    assert [run.simulation.t[0] for run in runs] == pytest.approx([0.0, 0.4])
+
+
+def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, trajectory = begin()
+    given, written, figure = (str(tmp_path / name) for name in ("a.npz", "b.npz", "c.png"))
+    trajectory.save(given)
+    path = str(tmp_path / "two.toml")
+    parts = HEPTAGON.read_text(encoding="utf-8").split("[[phases]]")
+    Path(path).write_text("[[phases]]".join(parts[:3]), encoding="utf-8")
+    assert main(["verify", path, given, "--free", "-o", written]) == 0
+    out = capsys.readouterr().out
+    assert out.splitlines()[0].startswith("heptagon, four contacts: ok: ")
+    assert f"wrote {written}" in out and "the whole from the start, by the clock" in out
+    assert main(["plot", written, "--simulate", "free", "-o", figure]) == 0
+    assert Path(figure).stat().st_size > 10_000
+    for options in (["--reduced", "--free"], ["--restitution", "0.5"]):
+        assert main(["verify", path, given, *options]) == 2
