@@ -13,6 +13,11 @@ if TYPE_CHECKING:
     from ..problem.definition import Problem
     from ..results.trajectory import Trajectory
 
+STEPS = (1e-6, 1e-1)
+"""Shortest and longest time step that is allowed, over the scene's time."""
+MOST = 6
+"""Most halvings of steps and softness."""
+
 
 def add_export(parser: argparse.ArgumentParser) -> None:
     """Add what `export` takes."""
@@ -33,12 +38,12 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
     text = "from start to end, instead of phase by phase from each planned start"
     parser.add_argument("--whole", action="store_true", help=text)
     parser.add_argument("--step", type=float, help="longest time step [s]")
-    text = "softness of contacts, over the engine's default (1)"
+    text = "softness of contacts, over the default, which is in proportion to the step (1)"
     parser.add_argument("--softness", type=float, help=text)
     text = "how far a replay may be from the plan, over the object's radius of gyration, and in rad"
     words = "3e-3 for mujoco, 1.5e-3 for drake"
     parser.add_argument("--departure", type=float, help=f"{text} ({words})")
-    text = "also replay with steps, and then contacts, of a half, a quarter, ... to N halvings"
+    text = "also replay with steps of a half, a quarter, ... to N halvings"
     parser.add_argument("--refine", type=int, metavar="N", default=0, help=text)
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
     parser.set_defaults(run=_replay)
@@ -53,6 +58,8 @@ def _export(options: argparse.Namespace) -> int:
     require_ending(options.mjcf, ".xml")
     step = _read_positive(options, "step")
     problem = read_problem(options.problem)
+    if step is not None:
+        _read_step(step, problem.scene.scales.time)
     plan = None if options.plan is None else _load_plan(options.plan, problem)
     with name_source(options.problem):
         write_text(options.mjcf, write_mjcf(problem, plan, step=step))
@@ -67,13 +74,13 @@ def _replay(options: argparse.Namespace) -> int:
 
     require_engine(options.engine)
     given = {key: _read_positive(options, key) for key in ("step", "softness", "departure")}
-    if not 0 <= options.refine <= 10:
-        raise InputError("", "--refine", f"{options.refine} given; allowed are 0 to 10")
+    if not 0 <= options.refine <= MOST:
+        raise InputError("", "--refine", f"{options.refine} given; allowed are 0 to {MOST}")
     problem = read_problem(options.problem)
     plan = _load_plan(options.plan, problem)
-    setting = ENGINES[options.engine].setting
+    setting, time = ENGINES[options.engine].setting, problem.scene.scales.time
     if given["step"] is not None:
-        setting = setting._replace(step=given["step"] / problem.scene.scales.time)
+        setting = setting._replace(step=_read_step(given["step"], time))
     if given["softness"] is not None:
         setting = setting._replace(softness=given["softness"])
     with name_source(options.problem):
@@ -90,6 +97,15 @@ def _replay(options: argparse.Namespace) -> int:
     clear_progress()
     print(json.dumps(to_dict(report), indent=2) if options.json else write(report))
     return report.exit_status
+
+
+def _read_step(step: float, time: float) -> float:
+    """A time step over the scene's time, if it is one that engines get along with."""
+    least, most = (share * time for share in STEPS)
+    if not least <= step <= most:
+        text = f"{step:g} s given; allowed are {least:.3g} to {most:.3g} s"
+        raise InputError("", "--step", text)
+    return step / time
 
 
 def _read_positive(options: argparse.Namespace, key: str) -> float | None:

@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 
 from ..common.arrays import Array
+from ..contacts.formation import Formation, find_touching
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..scene.model import Scene
 from .shapes import LINKS, OBJECT, PALM, Pair, Shape, find_rounding, list_pairs, list_shapes
 from .stretch import Run, Setting, Steps, Stretch, list_steps
 
-SINKING = 1e-6
-"""How far the scene's force presses a contact in, over the scene's length."""
+SINKING = 6e-3
+"""How far the scene's force presses a contact in, over the scene's length and the step."""
 STICTION = 1e-5
 """Sliding speed up to which friction grows, over the scene's speed."""
 DISSIPATION = 1000.0
@@ -39,7 +40,7 @@ def play(problem: Problem, stretch: Stretch, torque: TorqueProfile, setting: Set
     steps = list_steps(problem, stretch, torque, setting.step)
     with _quiet():
         diagram, plant, pairs = _build(problem.scene, steps, setting)
-    simulator = Simulator(diagram)
+        simulator = Simulator(diagram)
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     plant.SetPositions(context, _press(problem, stretch, setting))
     plant.SetVelocities(context, steps.v)
@@ -180,19 +181,23 @@ def _share_friction(pair: Pair) -> tuple[tuple[str, float], tuple[str, float]]:
 
 
 def _press(problem: Problem, stretch: Stretch, setting: Setting) -> Array:
-    """The planned start, with the contacts pressed in as far as the planned forces press them."""
-    formation = problem.phases[stretch.phases[0]].formation
-    A = formation.evaluate(stretch.z[None], stretch.z_dot[None]).A[0]
-    depth = np.array([stretch.c_n[name] for name in formation.names])
-    depth /= _find_stiffness(problem.scene, setting)
+    """The planned start, with the contacts pressed in as far as the planned forces press them.
+
+    What touches there without a force, as a contact that has just been let go does, just touches.
+    """
+    scene = problem.scene
+    touching = Formation(scene, find_touching(scene, stretch.z))
+    A = touching.evaluate(stretch.z[None], stretch.z_dot[None]).A[0]
+    depth = np.array([stretch.c_n.get(name, 0.0) for name in touching.names])
+    depth /= _find_stiffness(scene, setting)
     # The nearest such place by the kinetic energy of getting there.
-    weight = 1 / np.sqrt(problem.scene.mass_diagonal)
+    weight = 1 / np.sqrt(scene.mass_diagonal)
     return np.asarray(stretch.z - weight * (np.linalg.pinv(A * weight) @ depth))
 
 
 def _find_stiffness(scene: Scene, setting: Setting) -> float:
     """That of a pair [N/m]."""
-    return scene.scales.force / (SINKING * setting.softness * scene.scales.length)
+    return scene.scales.force / (SINKING * setting.step * setting.softness * scene.scales.length)
 
 
 def _make_material(scene: Scene, setting: Setting, friction: float) -> Any:

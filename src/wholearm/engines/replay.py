@@ -123,7 +123,7 @@ def replay_in(
     allowed : float, optional
         Error of the pose that is allowed, over the scene's length and in rad.
     halvings : int
-        How often the step is halved, and then the softness.
+        How often the step is halved, with harder contacts and with the same.
     progress : callable, optional
 
     Raises
@@ -153,8 +153,8 @@ def replay_in(
 
 
 def list_settings(setting: Setting, halvings: int) -> list[Setting]:
-    """A setting, the same with shorter steps, and with harder contacts."""
+    """A setting, finer ones, and finer steps alone, with contacts as they are at first."""
     finer = [setting._replace(step=setting.step / 2**k) for k in range(halvings + 1)]
     return finer + [
-        setting._replace(softness=setting.softness / 2**k) for k in range(1, halvings + 1)
+        own._replace(softness=setting.softness * 2**k) for k, own in enumerate(finer[1:], 1)
     ]

@@ -53,7 +53,7 @@ class Setting(NamedTuple):
     step : float
         Time step, over the scene's time.
     softness : float
-        Softness of contacts, over the engine's default.
+        Softness of contacts, over the engine's default, which is in proportion to the step.
     """
 
     step: float
