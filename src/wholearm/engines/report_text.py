@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..common.arrays import Array
 from ..results.report_text import align
 from .departure import PRESS, Departure
 
@@ -123,14 +124,20 @@ def to_dict(report: EngineReport) -> dict[str, Any]:
 
 
 def _describe(stretch: Stretch, found: Departure) -> dict[str, Any]:
+    largest = np.array([np.max(found.position), np.max(found.angle)])
     return {
         "phases": [index + 1 for index in stretch.phases],
         "start": stretch.start,
         "stop": stretch.stop,
-        "largest": {"position": float(np.max(found.position)), "angle": float(np.max(found.angle))},
+        "largest": dict(zip(("position", "angle"), _list(largest), strict=True)),
         "departs": None if found.time is None else {"time": found.time, "reason": found.reason},
         "forces": [force._asdict() for force in found.forces],
         "t": found.t.tolist(),
-        "position": found.position.tolist(),
-        "angle": found.angle.tolist(),
+        "position": _list(found.position),
+        "angle": _list(found.angle),
     }
+
+
+def _list(values: Array) -> list[float | None]:
+    """Numbers for JSON, which has nothing but null for those of an engine that fails."""
+    return [value if math.isfinite(value) else None for value in values.tolist()]
