@@ -2,7 +2,7 @@
 
 What makes a replay depart is looked for in its contacts, up to the row at which it is beyond what
 is allowed: one that opens, one that sticks where it should slide or slides where it should roll,
-or one that presses and is not planned. The first of them is the reason.
+or one that presses and is not planned. The reason is the first of those that last until then.
 """
 
 from __future__ import annotations
@@ -67,6 +67,14 @@ class Departure(NamedTuple):
     reason: str
 
 
+class _Change(NamedTuple):
+    """A contact that is not as planned, from when until when [s]."""
+
+    start: float
+    stop: float
+    what: str
+
+
 class _Part(NamedTuple):
     """A phase of a stretch: which rows of the run are its own, and the plan there."""
 
@@ -103,10 +111,20 @@ def compare(
     if not len(beyond):
         return Departure(run.t, position, angle, forces, None, "")
     time = float(run.t[beyond[0]])
-    seen = [each for part in parts for each in _list_changes(problem, part, run, allowed * length)]
-    first = min((each for each in seen if each[0] <= time), default=None)
-    reason = f"{first[1]} at t = {first[0]:.5g} s" if first else "every contact is as planned"
-    return Departure(run.t, position, angle, forces, time, reason)
+    changes = [
+        each for part in parts for each in _list_changes(problem, part, run, allowed * length)
+    ]
+    return Departure(run.t, position, angle, forces, time, _choose_reason(changes, time))
+
+
+def _choose_reason(changes: list[_Change], time: float) -> str:
+    """The first change that lasts until the replay departs, or else the last one before."""
+    before = [each for each in changes if each.start <= time]
+    lasting = [each for each in before if each.stop >= time]
+    if not before:
+        return "every contact is as planned"
+    reason = min(lasting) if lasting else max(before, key=lambda each: each.stop)
+    return f"{reason.what} at t = {reason.start:.5g} s"
 
 
 def _divide(problem: Problem, plan: Trajectory, stretch: Stretch, run: Run) -> list[_Part]:
@@ -159,10 +177,8 @@ def _average(plan: Trajectory, part: _Part, run: Run) -> list[Force]:
     return [Force(part.phase.number, *row) for row in rows]
 
 
-def _list_changes(
-    problem: Problem, part: _Part, run: Run, reach: float
-) -> Iterator[tuple[float, str]]:
-    """When the contacts of a phase first are not as planned, and how."""
+def _list_changes(problem: Problem, part: _Part, run: Run, reach: float) -> Iterator[_Change]:
+    """When the contacts of a phase are not as planned, and how."""
     scales, formation, rows = problem.scene.scales, part.phase.formation, part.rows
     own = formation.evaluate(run.z[rows], run.z_dot[rows])
     planned = formation.evaluate(part.want.z, part.want.z_dot)
@@ -171,21 +187,21 @@ def _list_changes(
     pressing = run.press[rows[rows > 0] - 1].copy()
     for k, name in enumerate(formation.names):
         pressing[:, _find_columns(name, part, run)] = 0.0
-        yield from _first(run.t[rows], own.C[:, k] > OPEN * reach, f"{name} opens")
+        yield from _find_runs(run.t[rows], own.C[:, k] > OPEN * reach, f"{name} opens")
         moves = MOVES * scales.speed
         if k in formation.rolling_rows:
-            yield from _first(run.t[rows], np.abs(slides[:, k]) > moves, f"{name} slips")
+            yield from _find_runs(run.t[rows], np.abs(slides[:, k]) > moves, f"{name} slips")
             continue
         held = (np.abs(meant[:, k]) > moves) & (np.abs(slides[:, k]) < SLOW * np.abs(meant[:, k]))
-        yield from _first(run.t[rows], held, f"{name} sticks")
+        yield from _find_runs(run.t[rows], held, f"{name} sticks")
     for column in np.flatnonzero((pressing > PRESS * scales.force).any(axis=0)):
         hits = pressing[:, column] > PRESS * scales.force
         times = run.t[rows[rows > 0]]
-        yield from _first(times, hits, f"{run.pairs[column]} presses, which is not planned,")
+        yield from _find_runs(times, hits, f"{run.pairs[column]} presses, which is not planned,")
 
 
-def _first(t: Array, happens: NDArray[np.bool_], text: str) -> Iterator[tuple[float, str]]:
-    """The first time at which something happens, if it does."""
-    found = np.flatnonzero(happens)
-    if len(found):
-        yield float(t[found[0]]), text
+def _find_runs(t: Array, happens: NDArray[np.bool_], what: str) -> Iterator[_Change]:
+    """Times from when until when something happens."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], happens, [False]]).astype(int)))
+    for first, last in zip(edges[::2], edges[1::2] - 1, strict=True):
+        yield _Change(float(t[first]), float(t[last]), what)
