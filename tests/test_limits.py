@@ -145,7 +145,7 @@ def strain(motion: PathMotion | TimeMotion, formation: Formation) -> Array:
 
 
 PHASE = 1
-COARSE = PlanOptions(time_intervals=6)
+COARSE = PlanOptions(time_intervals=4)
 
 
 def test_another_limit_binds_along_a_curve(

@@ -59,20 +59,13 @@ def test_advised_values_are_feasible_and_hardly_larger_than_needed(
         assert not is_feasible(limits | {name: back * value}, phase)
 
 
-@pytest.mark.parametrize(
-    "phase, limits",
-    [
-        (1, {"epsilon": 0.05}),
-        (4, {"torque limit of finger 1": 0.3, "torque limit of finger 2": 0.05}),
-    ],
-)
-def test_where_nothing_is_advised_nothing_helps(phase: int, limits: dict[str, float]) -> None:
+def test_where_nothing_is_advised_nothing_helps() -> None:
     """Not even a hundred times the torque, or no force at all."""
-    friction = 0.3 if phase == 1 else 0.1
-    assert read_advice(ask(phase, friction, **limits)) == {}
+    limits = {"epsilon": 0.05}
+    assert read_advice(ask(1, 0.3, **limits)) == {}
     for name in LIMITS:
         generous = 0.0 if name == "epsilon" else 300.0
-        assert not is_feasible(limits | {name: generous}, phase, friction)
+        assert not is_feasible(limits | {name: generous}, 1, 0.3)
 
 
 def relax_by_linear_program(curve: Curve, epsilon: float, name: str) -> float | None:
@@ -173,8 +166,8 @@ def test_phases_that_impacts_join_are_advised_together() -> None:
         plan_sequence(chain, 1.03 * value, OPTIONS, explained=False)
 
 
-@pytest.mark.parametrize("duration", [0.05, 0.1])
-def test_too_short_a_duration_is_named(curves: tuple[Curve, ...], duration: float) -> None:
+def test_too_short_a_duration_is_named(curves: tuple[Curve, ...]) -> None:
+    duration = 0.1
     options = PlanOptions("margin", intervals=INTERVALS)
     least = plan_path(curves[0], 0.05, OPTIONS, 1).value
     with pytest.raises(

@@ -131,11 +131,11 @@ def test_a_chain_is_one_problem(chain: ImpactSequence) -> None:
 @pytest.mark.parametrize("objective", OBJECTIVES)
 def test_two_halves_are_one_whole(objective: str) -> None:
     half, whole = Toy(constant(1.0, 0.5, 0.2)), Toy(constant(1.0, 0.5, 0.2), length=2.0)
-    options = PlanOptions(objective=objective, intervals=80)
+    options = PlanOptions(objective=objective, intervals=40)
     duration = 6.0 if objective == "margin" else None
     with half.in_place():
         parts = plan_curves((half.curve, half.curve), half.epsilon, options, (1, 2), duration)
-    one = whole.plan(duration, objective=objective, intervals=160)
+    one = whole.plan(duration, objective=objective, intervals=80)
     values = [part.value for part in parts]
     value = values[0] if objective == "margin" else sum(values)
     assert value == pytest.approx(one.value, rel=1e-4)

@@ -68,9 +68,10 @@ def test_a_rolling_contact_has_two_rows_more_than_a_sliding_one_along_a_curve(
 def test_phases_that_stop_are_problems_of_their_own(pairs: dict[str, Pair]) -> None:
     pair = pairs["a transition at speed"]
     # Both phases, an interval of no length between them, and no more: without the ends of one.
-    for case in (pair.without, pair.having):
-        assert_bare(spend(case), CONTACTS, 0)
-    assert spend(pair.having).unknowns > spend(pair.without).unknowns
+    stopping, going = (spend(case) for case in (pair.without, pair.having))
+    for cost in (stopping, going):
+        assert_bare(cost, CONTACTS, 0)
+    assert going.unknowns > stopping.unknowns
 
 
 def test_the_table_has_a_row_for_each_part(

@@ -67,7 +67,7 @@ def gentle() -> list[PhasePlan[TimeMotion]]:
 @once
 def in_time() -> Trajectory:
     """The heptagon's last slide and its flip, which curves are for, in the time domain."""
-    return solve(turning(), transcription="time", time_intervals=12, replay=False).trajectory
+    return solve(turning(), transcription="time", time_intervals=8, replay=False).trajectory
 
 
 @cache
@@ -141,7 +141,7 @@ def test_rolling_contacts_are_planned_like_along_the_curve() -> None:
     """The phase in which the box tips over a vertex."""
     phase = replace(box().phases[1], index=0)
     problem = replace(box(), start=tip().start, phases=(phase,))
-    options: dict[str, Any] = {"time_intervals": 8, "mode_search": False, "replay": False}
+    options: dict[str, Any] = {"time_intervals": 6, "mode_search": False, "replay": False}
     within = solve(problem, transcription="time", **options)
     # Measured 0.77 % on 32 intervals, half of that on 64.
     assert -1e-4 < within.duration / tipped().meta["phase_durations"][1] - 1 < 1e-2
@@ -164,7 +164,7 @@ def test_margins_with_rolling_contacts_are_those_along_the_curve() -> None:
     phase, allowed = problem.phases[1], along.meta["phase_durations"][1]
     assert phase.formation.rolling
     start = along.motions[1].evaluate(np.zeros(1)).z[0]
-    options = PlanOptions("margin", time_intervals=8, mode_search=False)
+    options = PlanOptions("margin", time_intervals=6, mode_search=False)
     (within,) = plan_phases(problem, (phase,), start, options, allowed)
     # Forces on an eighth of the phase cannot follow as closely.
     assert within.value == pytest.approx(along.meta["phase_values"][1], rel=2e-2)

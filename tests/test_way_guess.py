@@ -157,7 +157,7 @@ def test_a_way_sets_out_as_it_is_told() -> None:
 def test_a_way_that_slides_while_it_tips_is_planned() -> None:
     problem = tipping()
     (plan,) = plan_phases(
-        problem, problem.phases, problem.start, PlanOptions(time_intervals=5), explained=False
+        problem, problem.phases, problem.start, PlanOptions(time_intervals=4), explained=False
     )
     motion = plan.motion
     samples = motion.evaluate(np.linspace(0.0, motion.duration, 50))
