@@ -108,8 +108,10 @@ def _add_options(root: Element, scene: Scene, step: float, softness: Softness) -
     tight = {"tolerance": 1e-12, "cone": "elliptic", "impratio": softness.ratio}
     option = add(root, "option", timestep=step, gravity=gravity, **tight, **known)
     add(option, "flag", midphase="disable")
-    add(root, "statistic", center=[0.0, size, 0.0], extent=3 * size)
-    add(add(root, "visual"), "global", azimuth="90", elevation="-89.9")
+    add(root, "statistic", center=[0.0, size / 2, 0.0], extent=2 * size)
+    visual = add(root, "visual")
+    add(visual, "global", azimuth="90", elevation="-89.9")
+    add(visual, "headlight", ambient=".5 .5 .5", diffuse=".4 .4 .4")
     points = [(*corner, side) for side in (-depth, depth) for corner in scene.polygon.vertices]
     add(add(root, "asset"), "mesh", name=OBJECT, inertia="convex", vertex=points)
 
@@ -123,7 +125,7 @@ def _add_palm(world: Element, scene: Scene) -> None:
     reach = 10 * max(scene.polygon.size, *(link.length for link in scene.fingers))
     place = [0.0, -find_rounding(scene), 0.0]
     size = [reach, reach, reach / 100]
-    _add_geom(world, PALM, "plane", pos=place, zaxis=[0, 1, 0], size=size, rgba=".6 .6 .6 1")
+    _add_geom(world, PALM, "plane", pos=place, zaxis=[0, 1, 0], size=size, rgba=".6 .6 .6 .3")
 
 
 def _add_object(world: Element, scene: Scene, q: Array) -> None:
