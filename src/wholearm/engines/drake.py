@@ -14,6 +14,7 @@ from ..contacts.formation import Formation, find_touching
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..scene.model import Scene
+from .departure import find_pairs
 from .shapes import LINKS, OBJECT, PALM, Pair, Shape, find_rounding, list_pairs, list_shapes
 from .stretch import Run, Setting, Steps, Stretch, list_steps
 
@@ -23,6 +24,10 @@ STICTION = 1e-5
 """Sliding speed up to which friction grows, over the scene's speed."""
 DISSIPATION = 1000.0
 """Damping of contacts by Hunt and Crossley, times the scene's speed."""
+_EVERY = 4
+"""Steps from one look at the forces to the next: contacts swing ten times as slowly."""
+_APART = 0.1
+"""Share of a contact's row that no other contact has, from which on it is another place."""
 _ROUGH = 1e12
 """Friction of vertices and edges, which makes that of a pair twice the other shape's."""
 
@@ -46,10 +51,12 @@ def play(problem: Problem, stretch: Stretch, torque: TorqueProfile, setting: Set
     plant.SetVelocities(context, steps.v)
     simulator.Initialize()
     results = plant.get_contact_results_output_port()
+    names = tuple(pair.name for pair in list_pairs(problem.scene))
     states, press, start = [(stretch.z, stretch.z_dot)], [], 0
     for end in steps.ends:
-        total = np.zeros(len(list_pairs(problem.scene)))
-        for step in range(start + 1, end + 1):
+        total = np.zeros(len(names))
+        looks = range(end, start, -_EVERY)[::-1]
+        for step in looks:
             # Half a step late: the step at that time is done then, whatever its rounding.
             simulator.AdvanceTo((step - 0.5) * steps.h)
             found = results.Eval(context)
@@ -58,12 +65,11 @@ def play(problem: Problem, stretch: Stretch, torque: TorqueProfile, setting: Set
                 both = info.point_pair()
                 number = pairs[frozenset((both.id_A, both.id_B))]
                 total[number] += abs(info.contact_force() @ both.nhat_BA_W)
-        press.append(total / (end - start))
+        press.append(total / len(looks))
         states.append((plant.GetPositions(context), plant.GetVelocities(context)))
         start = end
     z, z_dot = (np.array(part) for part in zip(*states, strict=True))
     t = stretch.start + steps.h * np.array([0, *steps.ends])
-    names = tuple(pair.name for pair in list_pairs(problem.scene))
     return Run(t, z, z_dot, names, np.array(press))
 
 
@@ -183,16 +189,31 @@ def _share_friction(pair: Pair) -> tuple[tuple[str, float], tuple[str, float]]:
 def _press(problem: Problem, stretch: Stretch, setting: Setting) -> Array:
     """The planned start, with the contacts pressed in as far as the planned forces press them.
 
-    What touches there without a force, as a contact that has just been let go does, just touches.
+    What touches elsewhere without a force, as a contact that has just been let go, just touches.
     """
-    scene = problem.scene
-    touching = Formation(scene, find_touching(scene, stretch.z))
-    A = touching.evaluate(stretch.z[None], stretch.z_dot[None]).A[0]
-    depth = np.array([stretch.c_n.get(name, 0.0) for name in touching.names])
-    depth /= _find_stiffness(scene, setting)
+    scene, formation = problem.scene, problem.phases[stretch.phases[0]].formation
+    touching = find_touching(scene, stretch.z)
+    contacts = formation.contacts + tuple(c for c in touching if c not in formation.contacts)
+    A = Formation(scene, contacts).evaluate(stretch.z[None], stretch.z_dot[None]).A[0]
     # The nearest such place by the kinetic energy of getting there.
     weight = 1 / np.sqrt(scene.mass_diagonal)
-    return np.asarray(stretch.z - weight * (np.linalg.pinv(A * weight) @ depth))
+    rows = _drop_repeated(A * weight, formation.n_contacts)
+    forces = np.array([stretch.c_n.get(c.name, 0.0) for c in contacts])
+    corners = scene.polygon.n_vertices
+    share = np.array([len(find_pairs(c.name, corners)) for c in contacts])
+    depth = forces / share / _find_stiffness(scene, setting)
+    return np.asarray(stretch.z - weight * (np.linalg.pinv((A * weight)[rows]) @ depth[rows]))
+
+
+def _drop_repeated(rows: Array, kept: int) -> list[int]:
+    """The first rows, and of the others those that are not at the place of one before."""
+    unit, chosen = rows / np.linalg.norm(rows, axis=1)[:, None], list(range(kept))
+    for row in range(kept, len(rows)):
+        known = unit[chosen]
+        rest = unit[row] - np.linalg.pinv(known) @ (known @ unit[row])
+        if np.linalg.norm(rest) > _APART:
+            chosen.append(row)
+    return chosen
 
 
 def _find_stiffness(scene: Scene, setting: Setting) -> float:
