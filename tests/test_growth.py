@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from shipped import HEPTAGON
 from wholearm.benchmark import growth
@@ -88,6 +89,7 @@ def test_everything_is_measured_and_written(
         return Cost(None, 1.0, 2.0)
 
     monkeypatch.setattr(growth, "measure_alone", measure)
+    monkeypatch.setattr(growth, "draw_growth", lambda _: Figure())
     paths = run_growth(str(HEPTAGON), str(tmp_path))
     assert given == [(point.grows, point.work, point.size) for point in make_points()]
     assert [Path(path).suffix for path in paths] == [".md", ".csv", ".png"]

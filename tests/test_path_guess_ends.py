@@ -97,7 +97,7 @@ def test_contacts_of_a_flush_edge_turn_as_one(square: Problem) -> None:
 
 
 def test_a_flush_edge_that_turns_is_planned_in_the_time_domain_too(square: Problem) -> None:
-    curves, options = trace_phases(square), PlanOptions()
+    curves, options = trace_phases(square), PlanOptions(time_intervals=6)
     curve = curves[2]
     turning = [part.Xi for part in curve.segments]
     assert len(turning) == 2 and (turning[0] != turning[1]).tolist() == [False, True, True, False]

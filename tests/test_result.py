@@ -46,7 +46,7 @@ def within() -> Plan:
     """A plan in the time domain."""
     whole = two_phases()
     first = replace(whole, phases=whole.phases[:1])
-    return solve(first, transcription="time", time_intervals=8, certify=True)
+    return solve(first, transcription="time", time_intervals=4, certify=True)
 
 
 @pytest.fixture(scope="module")

@@ -175,7 +175,7 @@ def test_a_tipped_box_sticks_slips_and_sticks_again() -> None:
 
 
 @pytest.mark.parametrize("soft", [False, True])
-@pytest.mark.parametrize("off", [0.0, 3e-9, -3e-9])
+@pytest.mark.parametrize("off", [3e-9, -3e-9])
 def test_a_planned_stop_and_start_are_kept_though_rounding_disturbs_them(
     soft: bool, off: float
 ) -> None:

@@ -303,7 +303,7 @@ def test_limits_are_no_part_of_kernels(heptagon: Problem, monkeypatch: pytest.Mo
     stronger = heptagon.with_(torque_limit=2.1)
     other = heptagon.with_(friction_palm=0.11).phases[0].formation
     assert point_kernel(other, 2) is not point_kernel(before, 2)
-    options = PlanOptions(time_intervals=6)
+    options = PlanOptions(time_intervals=4)
     plan_phases(weaker, weaker.phases[:1], weaker.start, options)
 
     def refuse(*_: object) -> Kernel:
