@@ -422,7 +422,7 @@ def test_friction_cones_have_a_panel_of_their_own(figure: Figure) -> None:
     t, shares = data_of(line_of(cones, "v1-palm"))
     known = ~np.isnan(t)
     column = plan.contacts.index("v1-palm")
-    expected = np.where(plan.phase == 1, plan.c_t[:, column] / (0.5 * plan.c_n[:, column]), np.nan)
+    expected = np.where(plan.phase == 1, plan.c_t[:, column] / (tipping.PALM * plan.c_n[:, column]), np.nan)
     np.testing.assert_allclose(shares[known], expected, rtol=1e-12)
     assert np.nanmax(np.abs(shares)) < 1 and levels(cones) == [-1.0, 1.0, 0.0]
     margin_line = line_of(margins, "v1-palm")
@@ -447,7 +447,7 @@ def test_simulation_is_drawn_over_a_plan_that_rolls() -> None:
     ]
     column = plan.contacts.index("v1-palm")
     rows = simulation.phase == 1
-    share = simulation.c_t[rows, column] / (0.5 * simulation.c_n[rows, column])
+    share = simulation.c_t[rows, column] / (tipping.PALM * simulation.c_n[rows, column])
     curves = [data_of(line)[1] for line in dotted if len(data_of(line)[0]) == len(simulation.t)]
     (curve,) = [values for values in curves if not np.isnan(values).all()]
     np.testing.assert_allclose(curve[rows], share, rtol=1e-12)

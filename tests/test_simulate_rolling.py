@@ -8,7 +8,7 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from plane import make_formation, make_scene, measure_slip, place_corners, unbalance
-from tipping import POINTS, box, constant, falling, ramp, roll, tip, tipped
+from tipping import PALM, POINTS, box, constant, falling, ramp, roll, tip, tipped
 from wholearm.common.arrays import Array
 from wholearm.contacts.closing import close_finger, place_flush
 from wholearm.mechanics.dynamics import energy
@@ -222,7 +222,7 @@ def test_a_rolling_contact_may_slide_in_the_next_phase() -> None:
     plan = tipped()
     simulation = simulate(box(), plan.torque, times=plan.t)
     column = simulation.contacts.index("v1-palm")
-    share = np.abs(simulation.c_t[:, column]) / (0.5 * simulation.c_n[:, column])
+    share = np.abs(simulation.c_t[:, column]) / (PALM * simulation.c_n[:, column])
     seen = ~np.isnan(share)
     for phase, slides in ((0, True), (1, False), (2, True)):
         own = share[seen & (simulation.phase == phase)]

@@ -22,7 +22,7 @@ from timed import (
     tables,
     total,
 )
-from tipping import box, tip, tipped
+from tipping import PALM, box, tip, tipped
 from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
@@ -152,7 +152,7 @@ def test_rolling_contacts_are_planned_like_along_the_curve() -> None:
         samples = stage.evaluate(instants(stage, 9))
         for k, contact in enumerate(stage.formation.contacts):
             if contact in rolls:
-                grip = 0.5 * (samples.c_n[:, k] - problem.epsilon) - np.abs(samples.c_t[:, k])
+                grip = PALM * (samples.c_n[:, k] - problem.epsilon) - np.abs(samples.c_t[:, k])
                 assert grip.min() > -SLACK
                 slip = measure_slip(stage.formation, samples.z, samples.z_dot)
                 assert np.abs(slip[:, k]).max() < 1e-12
@@ -167,7 +167,7 @@ def test_margins_with_rolling_contacts_are_those_along_the_curve() -> None:
     options = PlanOptions("margin", time_intervals=6, mode_search=False)
     (within,) = plan_phases(problem, (phase,), start, options, allowed)
     # Forces on an eighth of the phase cannot follow as closely.
-    assert within.value == pytest.approx(along.meta["phase_values"][1], rel=2e-2)
+    assert within.value == pytest.approx(along.meta["phase_values"][1], rel=3e-2)
     assert within.value < along.meta["phase_values"][1] * (1 + 1e-3)
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from crossing import hexagon, measure_fingers, shorten, slid
 from planned import change, plan
-from tipping import box, scale, tipped
+from tipping import PALM, box, scale, tipped
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.results.torque import TorqueProfile
@@ -250,7 +250,7 @@ def test_margins_to_slipping_are_those_of_inverse_dynamics() -> None:
     motion = tipped().motions[1]
     t = np.linspace(0, motion.duration, 20001)
     samples = motion.evaluate(t)
-    expected = 0.5 * samples.c_n[:, 0] - np.abs(samples.c_t[:, 0])
+    expected = PALM * samples.c_n[:, 0] - np.abs(samples.c_t[:, 0])
     assert margin.contact == "v1-palm"
     assert margin.least == pytest.approx(expected.min(), abs=1e-5)
     near = np.abs(t + report.phases[1].start - margin.time).argmin()

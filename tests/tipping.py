@@ -31,6 +31,10 @@ def tipped() -> Trajectory:
     return plan_of(BOX)
 
 
+PALM = box().scene.friction.palm
+"""Friction with the palm."""
+
+
 def tip() -> Curve:
     """The curve of the phase in which the box tips over vertex 1."""
     return trace_phases(box())[1]
@@ -39,7 +43,7 @@ def tip() -> Curve:
 @lru_cache(maxsize=1)
 def tilting() -> Problem:
     """That phase alone, in which the vertex may slide as well."""
-    problem = box()
+    problem = box().with_(friction_palm=0.5)
     formation = replace(problem.phases[1].formation, rolling=())
     phase = Phase(0, formation, problem.phases[1].until)
     return replace(problem, start=trace_phases(problem)[0].end, phases=(phase,))
