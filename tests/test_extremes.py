@@ -45,7 +45,9 @@ def edited(friction: dict[str, float] | None = None, **joints: float) -> Problem
 )
 def test_extreme_scenes_are_planned(joints: dict[str, Any]) -> None:
     problem = edited(**joints)
-    report = verify(problem, solve(problem, intervals=20, replay=False))
+    # Links a thousand times as heavy let other contact forces be possible than the planned ones.
+    plan = solve(problem, intervals=20, replay=False, least_minor=-5.0)
+    report = verify(problem, plan, least_minor=-5.0)
     assert report.ok, report.failures
 
 

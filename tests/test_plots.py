@@ -422,7 +422,9 @@ def test_friction_cones_have_a_panel_of_their_own(figure: Figure) -> None:
     t, shares = data_of(line_of(cones, "v1-palm"))
     known = ~np.isnan(t)
     column = plan.contacts.index("v1-palm")
-    expected = np.where(plan.phase == 1, plan.c_t[:, column] / (tipping.PALM * plan.c_n[:, column]), np.nan)
+    expected = np.where(
+        plan.phase == 1, plan.c_t[:, column] / (tipping.PALM * plan.c_n[:, column]), np.nan
+    )
     np.testing.assert_allclose(shares[known], expected, rtol=1e-12)
     assert np.nanmax(np.abs(shares)) < 1 and levels(cones) == [-1.0, 1.0, 0.0]
     margin_line = line_of(margins, "v1-palm")

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .common.errors import (
+        AmbiguityError,
         InfeasibleError,
         InputError,
         JammingError,
@@ -64,6 +65,7 @@ _HOMES = {
     "FreeSimulation": "free_simulation.result",
     "InfeasibleError": "common.errors",
     "InputError": "common.errors",
+    "AmbiguityError": "common.errors",
     "JammingError": "common.errors",
     "Objective": "planning.options",
     "Phase": "problem.definition",
@@ -101,6 +103,7 @@ _HOMES = {
 }
 
 __all__ = [
+    "AmbiguityError",
     "Change",
     "Contact",
     "End",

@@ -60,6 +60,7 @@ def add_solve(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-replay", dest="replay", action="store_false", help=text)
     text = "bound the least time along curves from below, and print the gap"
     parser.add_argument("--certify", action="store_true", help=text)
+    _add_least_minor(parser)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
 
@@ -79,6 +80,7 @@ def add_verify(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--departure", type=float, help=f"{text} (1e-3)")
     text = "speed that passes for rest, over the root of that radius times gravity"
     parser.add_argument("--rest-speed", type=float, help=f"{text} (2e-2)")
+    _add_least_minor(parser)
     text = "also list the paper's scalar equation of motion where a phase has four constraints"
     parser.add_argument("--reduced", action="store_true", help=text)
     text = "simulate without telling which contacts hold: whole, and a plan's phases one by one too"
@@ -88,6 +90,11 @@ def add_verify(parser: argparse.ArgumentParser) -> None:
     text = "trajectory file to write (.npz) of the replayed motion, for plot"
     parser.add_argument("-o", "--output", metavar="FILE", help=text)
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
+
+
+def _add_least_minor(parser: argparse.ArgumentParser) -> None:
+    text = "least principal minor of the contact problem, over that without friction (0.1)"
+    parser.add_argument("--least-minor", type=float, help=text)
 
 
 def add_plot(parser: argparse.ArgumentParser) -> None:

@@ -212,6 +212,8 @@ def _verify(options: argparse.Namespace) -> int:
         if getattr(options, key) is not None
     }
     _check_free(options)
+    if options.least_minor is not None:
+        given["least_minor"] = options.least_minor
     problem = read_problem(options.problem)
     torques = _read_torques(options.torques)
     if getattr(torques, "meta", {}).get("problem") != problem.table:

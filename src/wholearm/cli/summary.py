@@ -42,6 +42,7 @@ def summarise(plan: Plan, output: str, table: Mapping[str, Any] | None = None) -
     lines += [_describe_replay(plan.replay)]
     lines += [] if plan.certificate is None else _list_bounds(plan.certificate)
     lines += _list_table(table) if table is not None else []
+    lines += _describe_sureness(plan)
     value = f"{plan.status.value}: {plan.options.goal.value} = {plan.value:.6f} {plan.unit}"
     value += "" if math.isnan(plan.error) else f" (to {max(plan.error, _LEAST_ERROR):.0e})"
     return "\n".join([*lines, f"{value}, {plan.duration:.6f} s in all; wrote {output}"])
@@ -59,6 +60,21 @@ def _describe_replay(replay: ReplayFigures | None) -> str:
         f"{max((end.angle for end in ends), default=0.0):.1e} rad at the ends of phases"
     )
     return text + (f", with up to {2**finer} times the intervals" if finer > 0 else "")
+
+
+def _describe_sureness(plan: Plan) -> list[str]:
+    """Whether contact forces are the only ones, and for how long phases may stay wedged."""
+    known = [(own.minor, own.number) for own in plan.phases if own.minor is not None]
+    if not known:
+        return []
+    least, number = min(known)
+    text = f"least minor {least.ratio:.4f}, of {least.contacts} in phase {number}"
+    wedged = [
+        f"; phase {phase.number} may stay wedged for {1e3 * phase.wedged:.3g} ms"
+        for phase in plan.phases
+        if phase.wedged
+    ]
+    return ["".join([text, *wedged])]
 
 
 def _list_bounds(certificate: Certificate) -> list[str]:

@@ -124,5 +124,9 @@ class JammingError(_PhaseError):
     changes: tuple[Change, ...] = ()
 
 
+class AmbiguityError(JammingError):
+    """Friction lets other contact forces than the planned ones be possible, or nearly so."""
+
+
 class SimulationError(_PhaseError):
     """The forward simulation cannot go on (step size underflow, inconsistent start)."""

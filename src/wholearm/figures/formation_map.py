@@ -30,6 +30,7 @@ SIZE = (11.0, 7.9)  # in
 _BOX = (0.75, 1.0, 9.4, 6.2)  # axes: left, bottom, width, height [in]
 _INK, _LINE, _FAINT = "#222222", "#9aa1ab", "#c3c8d0"
 _LOST = ("#ececec", "#b8b8b8", "////")  # face, lines and hatch
+_AMBIGUOUS = "#AA3377"
 _CROSSED = ("#f6e3ee", "#CC79A7", "\\\\\\\\")
 _UNREACHED = {
     "finger 1 too short": -1,
@@ -84,7 +85,7 @@ def draw_map(chart: FormationMap, plan: Trajectory | None = None) -> Figure:
         points = _to_axes(np.array([c.point for c in flush]).reshape(-1, 2))
         axes.plot(*points.T, "o", ms=3.6, mfc=_INK, mec="white", mew=0.5, zorder=6, ls="none")
         _draw_paths(axes, paths)
-        _draw_legend(figure, bool(paths), bool((chart.cell == CROSSED).any()))
+        _draw_legend(figure, bool(paths), bool((chart.cell == CROSSED).any()), _is_ambiguous(chart))
         _name_palm_lines(axes, chart)
         problem = chart.problem
         limits = " and ".join(dict.fromkeys(f"{v:g}" for v in problem.scene.torque_limit))
@@ -161,6 +162,7 @@ def _draw_directions(axes: Axes, chart: FormationMap, boxes: Sequence[Array]) ->
         look |= {"width": 0.95 / 72, "headwidth": 4.2, "headlength": 4.2, "headaxislength": 3.8}
         u, v = np.broadcast_to(way[:, None], (2, len(mine)))
         axes.quiver(*(mine + gap).T, u, v, color=_FREE, **look)
+    axes.plot(*places[chart.ambiguous[free]].T, "x", ms=3.5, color=_AMBIGUOUS, zorder=2)
 
 
 def _draw_borders(axes: Axes, borders: Sequence[Border]) -> None:
@@ -184,6 +186,14 @@ def _draw_borders(axes: Axes, borders: Sequence[Border]) -> None:
                     heads += _place_heads(shifted, way)
         axes.add_collection(LineCollection(strips, colors=colour, linewidths=1.3, zorder=4))
         _draw_heads(axes, heads, colour)
+    runs = [
+        points[run]
+        for border, points in zip(flush, every, strict=True)
+        for run in _find_runs(border.ambiguous)
+        if run.stop - run.start > 1
+    ]
+    dots: Any = {"linestyles": (0, (1.5, 1.5)), "linewidths": 2.2, "zorder": 4}
+    axes.add_collection(LineCollection(runs, colors=_AMBIGUOUS, **dots))
 
 
 def _find_runs(flags: Flags) -> list[slice]:
@@ -304,7 +314,12 @@ def _patch(look: tuple[str, str, str], label: str) -> Patch:
     return Patch(fc=face, ec=edge, hatch=hatch, lw=0, label=label)
 
 
-def _draw_legend(figure: Figure, with_path: bool, crossed: bool) -> None:
+def _is_ambiguous(chart: FormationMap) -> bool:
+    """Whether friction lets other contact forces be possible somewhere."""
+    return bool(chart.ambiguous.any() or any(own.ambiguous.any() for own in chart.borders))
+
+
+def _draw_legend(figure: Figure, with_path: bool, crossed: bool, ambiguous: bool) -> None:
     arrow: Any = {"marker": ">", "ms": 5, "lw": 1.4}
     handles: list[Any] = [
         Line2D([], [], color=_FORTH, label="quasistatic motion possible, +x or +\u03c6", **arrow),
@@ -332,6 +347,11 @@ def _draw_legend(figure: Figure, with_path: bool, crossed: bool) -> None:
     ]
     if crossed:
         handles.append(_patch(_CROSSED, "the fingers would overlap"))
+    if ambiguous:
+        look: Any = {"marker": "x", "ms": 4, "lw": 2.2, "ls": (0, (1.5, 1.5))}
+        handles.append(
+            Line2D([], [], color=_AMBIGUOUS, label="contact forces would not be unique", **look)
+        )
     if with_path:
         handles.insert(6, Line2D([], [], color=_INK, lw=5, alpha=0.42, label="plan, by phase"))
     note = (

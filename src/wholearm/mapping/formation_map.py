@@ -69,6 +69,8 @@ class Border:
     forth, back : ndarray of bool, shape (n,)
         Whether a quasistatic motion is possible with the coordinate increasing, and decreasing;
         all False where nothing is flush.
+    ambiguous : ndarray of bool, shape (n,)
+        Whether it would be, one way or the other, if contact forces were the only ones.
     """
 
     contacts: tuple[Contact, ...]
@@ -78,6 +80,7 @@ class Border:
     z: Array
     forth: Flags
     back: Flags
+    ambiguous: Flags
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -127,6 +130,8 @@ class FormationMap:
     possible : ndarray of bool, shape (m, 4)
         Whether a quasistatic motion is possible there with x increasing, x decreasing, phi
         increasing and phi decreasing while the other stays.
+    ambiguous : ndarray of bool, shape (m,)
+        Whether one more of these would be possible, if contact forces were the only ones.
     """
 
     problem: Problem
@@ -138,6 +143,7 @@ class FormationMap:
     crossings: tuple[Crossing, ...]
     places: Array
     possible: Flags
+    ambiguous: Flags
 
 
 @exclusive
@@ -186,7 +192,7 @@ def build_map(
     for track in list_tracks(scene, window, samples):
         borders += [_build_border(problem, piece) for piece in cut(track, window)]
     report("map: crossings and directions")
-    places, possible = _check_cells(problem, window)
+    directions = _check_cells(problem, window)
     return FormationMap(
         problem,
         x,
@@ -195,8 +201,7 @@ def build_map(
         tuple(name_contacts(table, row) for row in known),
         tuple(borders),
         _find_crossings(scene, borders),
-        places,
-        possible,
+        *directions,
     )
 
 
@@ -273,12 +278,12 @@ def _build_border(problem: Problem, piece: Piece) -> Border:
     flush = piece.track.flush
     along = "x" if flush is not None and flush[0] is None else "phi"
     label = piece.label[piece.label != NOWHERE]
-    forth = back = np.zeros(len(z), dtype=bool)
+    ways = (np.zeros(len(z), dtype=bool),) * 3
     if flush is not None:
         row = 0 if along == "x" else 2
-        forth, back = check_border(scene, problem.epsilon, label, z, row)
+        ways = check_border(scene, problem.epsilon, label, z, row)
     contacts = name_contacts(contact_table(scene), label)
-    return Border(contacts, flush, along, np.column_stack([x, phi]), z, forth, back)
+    return Border(contacts, flush, along, np.column_stack([x, phi]), z, *ways)
 
 
 def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]:
@@ -311,7 +316,7 @@ def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]
     return tuple(crossings)
 
 
-def _check_cells(problem: Problem, window: Window) -> tuple[Array, Flags]:
+def _check_cells(problem: Problem, window: Window) -> tuple[Array, Flags, Flags]:
     """Directions of possible motion at the points of a lattice inside cells."""
     scene = problem.scene
     x, phi = (np.linspace(*ends, ARROWS + 1) for ends in (window.x, window.phi))
@@ -322,10 +327,11 @@ def _check_cells(problem: Problem, window: Window) -> tuple[Array, Flags]:
     z, triples = close_fingers(scene, *places.T).z, labels[:, [0, 2, 4]]
     known, owner = np.unique(triples, axis=0, return_inverse=True)
     possible = np.zeros((len(places), len(WAYS)), dtype=bool)
+    ambiguous = np.zeros(len(places), dtype=bool)
     for index, label in enumerate(known):
         mine = owner.ravel() == index
-        possible[mine] = check_cell(scene, problem.epsilon, label, z[mine])
-    return places, possible
+        possible[mine], ambiguous[mine] = check_cell(scene, problem.epsilon, label, z[mine])
+    return places, possible, ambiguous
 
 
 __all__ = [

@@ -3,7 +3,8 @@
 At vanishing speed and acceleration the object's balance g_obj + (W_n - W_t U Xi) c_n = 0 and the
 joints' tau = D sigma - (J_n - J_t U Xi)^T c_n, in this package's signs the rows of -G^T c_n, hold
 with the friction that the direction of travel gives. Three contacts leave no choice; four leave the
-squeeze free, an interval of which may satisfy c_n >= epsilon and the torque limits.
+squeeze free, an interval of which may satisfy c_n >= epsilon and the torque limits. What could be
+balanced so, but not by these forces alone (`mechanics.uniqueness`), is ambiguous; so is what jams.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ import numpy as np
 from ..common.arrays import Array
 from ..contacts.closing import Flags, Numbers, contact_table, evaluate_contacts
 from ..contacts.formation import Formation, Kinematics
-from ..mechanics.dynamics import Directions, force_rows, inverse, reduced_inertia
+from ..mechanics.dynamics import Directions, force_rows, inverse
 from ..mechanics.metric import metric_weights
+from ..mechanics.uniqueness import LEAST_MINOR, find_minors
 from ..quasistatic.squeeze import Squeezing
 from ..scene.model import Scene
 
@@ -28,7 +30,7 @@ _WAYS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 def check_border(
     scene: Scene, epsilon: float, label: Numbers, z: Array, coordinate: int
-) -> tuple[Flags, Flags]:
+) -> tuple[Flags, Flags, Flags]:
     """Whether a quasistatic motion along a border is possible, each way.
 
     Parameters
@@ -45,8 +47,9 @@ def check_border(
     Returns
     -------
     forth, back : ndarray of bool, shape (n,)
-        For travel with the coordinate increasing, and decreasing. A motion that jams (reduced
-        inertia of zero or less) counts as impossible.
+        For travel with the coordinate increasing, and decreasing.
+    ambiguous : ndarray of bool, shape (n,)
+        Whether it would be, one way or the other, if contact forces were the only ones.
     """
     formation, kinematics = _pick(scene, label, z)
     weights = np.sqrt(metric_weights(scene))
@@ -55,13 +58,14 @@ def check_border(
     z_s *= np.where(z_s[:, [coordinate]] < 0, -1.0, 1.0)
     regular = sizes[:, -1] > REGULAR * sizes[:, 0]
     part = Kinematics(*(array[regular] for array in kinematics))
-    possible = np.zeros((2, len(z)), dtype=bool)
-    for row, way in zip(possible, (z_s[regular], -z_s[regular]), strict=True):
+    held, unique = (np.zeros((2, len(z)), dtype=bool) for _ in range(2))
+    for row, sole, way in zip(held, unique, (z_s[regular], -z_s[regular]), strict=True):
         row[regular] = _check_path(formation, part, epsilon, z[regular], way)
-    return possible[0], possible[1]
+        sole[row] = _are_unique(formation, part, way, row[regular])
+    return held[0] & unique[0], held[1] & unique[1], np.any(held & ~unique, axis=0)
 
 
-def check_cell(scene: Scene, epsilon: float, label: Numbers, z: Array) -> Flags:
+def check_cell(scene: Scene, epsilon: float, label: Numbers, z: Array) -> tuple[Flags, Flags]:
     """Whether a quasistatic motion from inside a cell is possible towards each of `WAYS`.
 
     Parameters
@@ -75,21 +79,24 @@ def check_cell(scene: Scene, epsilon: float, label: Numbers, z: Array) -> Flags:
 
     Returns
     -------
-    ndarray of bool, shape (n, 4)
+    possible : ndarray of bool, shape (n, 4)
+    ambiguous : ndarray of bool, shape (n,)
+        Whether one more of them would be, if contact forces were the only ones.
     """
     formation, kinematics = _pick(scene, label, z)
     rows = np.zeros((2, 5))
     rows[[0, 1], [0, 2]] = 1.0
     matrix = np.concatenate([kinematics.A, np.broadcast_to(rows, (len(z), 2, 5))], axis=1)
-    possible = np.zeros((len(z), len(WAYS)), dtype=bool)
+    held, unique = (np.zeros((len(z), len(WAYS)), dtype=bool) for _ in range(2))
     regular = np.abs(np.linalg.det(matrix)) > REGULAR * scene.scales.length**2
     part = Kinematics(*(array[regular] for array in kinematics))
     for k, way in enumerate(_WAYS):
         right = np.zeros((regular.sum(), 5, 1))
         right[:, 3:, 0] = way
         z_s = np.linalg.solve(matrix[regular], right)[..., 0]
-        possible[regular, k] = _check_balance(formation, part, epsilon, z_s)
-    return possible
+        held[regular, k] = _check_balance(formation, part, epsilon, z_s)
+        unique[held[:, k], k] = _are_unique(formation, part, z_s, held[regular, k])
+    return held & unique, np.any(held & ~unique, axis=1)
 
 
 def _check_path(
@@ -99,8 +106,7 @@ def _check_path(
     forces = inverse(formation, z, z_s, np.zeros_like(z_s), directions, kinematics)
     squeezing, still = Squeezing.of(formation, forces, z_s[:, 3:]), np.zeros(len(z))
     low, high = squeezing.find_span(still, still, epsilon)
-    moving = reduced_inertia(formation, kinematics, directions) > 0
-    return np.asarray((low <= high) & moving)
+    return np.asarray(low <= high)
 
 
 def _check_balance(
@@ -115,7 +121,14 @@ def _check_balance(
     c_n = np.linalg.solve(wrench, right)[..., 0]
     tau = scene.dry[3:] * directions.sigma - np.einsum("nij,ni->nj", G[:, :, 3:], c_n)
     held = (c_n >= epsilon).all(axis=1) & (np.abs(tau) <= scene.torque_limit).all(axis=1)
-    return np.asarray(held & regular & (reduced_inertia(formation, kinematics, directions) > 0))
+    return np.asarray(held & regular)
+
+
+def _are_unique(formation: Formation, kinematics: Kinematics, z_s: Array, rows: Flags) -> Flags:
+    """Whether contact forces of travel along `z_s` are the only ones, at those of the `rows`."""
+    part = Kinematics(*(array[rows] for array in kinematics))
+    Xi = _directions(part, z_s[rows]).Xi
+    return np.asarray(find_minors(formation, part, Xi).ratios >= LEAST_MINOR)
 
 
 def _directions(kinematics: Kinematics, z_s: Array) -> Directions:

@@ -7,6 +7,7 @@ from enum import Enum
 
 from ..common.errors import InputError
 from ..common.require import require_number
+from ..mechanics.uniqueness import LEAST_MINOR, require_minor
 
 
 class Objective(Enum):
@@ -62,6 +63,7 @@ class PlanOptions:
     mode_search: bool = True
     certify: bool = False
     accuracy: float = 1e-4
+    least_minor: float = LEAST_MINOR
 
     def __post_init__(self) -> None:
         given = self.objective
@@ -95,6 +97,7 @@ class PlanOptions:
             allowed = "{:g} to {:g}".format(*ACCURACIES)
             raise InputError("", "accuracy", f"{accuracy:g} given; allowed are {allowed}")
         object.__setattr__(self, "accuracy", accuracy)
+        object.__setattr__(self, "least_minor", require_minor(self.least_minor))
         if self.duration is not None:
             duration = require_number(self.duration, "duration", positive=True)
             object.__setattr__(self, "duration", duration)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -30,6 +30,7 @@ from .path_domain import sequence_plan
 from .phase_plan import combine
 from .result import Plan, PlannedPhase, Status, Timings
 from .saved import write_meta
+from .sureness import Sureness, check_sureness
 
 
 def solve(
@@ -77,6 +78,9 @@ def solve(
         Whether to replay the plan, to refine what does not hold and to return only what does.
     certify : bool, default False
         Whether to bound the least time along curves from below, for `time`.
+    least_minor : float, default 0.1, below 1
+        Least principal minor of the contact problem over that without friction: contact forces are
+        the only ones where all are positive, and at 0.1 still with a tenth more friction.
 
     Returns
     -------
@@ -108,11 +112,15 @@ def solve_with(
         traced = time.perf_counter()
         planning = _plan(problem, curves, options, report)
         trajectory, figures = assemble_plan(planning), None
+        sure = check_sureness(problem, trajectory, options.least_minor)
         planned = time.perf_counter()
         if options.replay:
             from .self_check import replay_plan
 
+            first = trajectory
             planning, trajectory, figures = replay_plan(planning, trajectory, assemble_plan, report)
+            if trajectory is not first:
+                sure = check_sureness(problem, trajectory, options.least_minor)
         replayed = time.perf_counter()
         transitions = _assess(planning, report)
         assessed = time.perf_counter()
@@ -122,7 +130,7 @@ def solve_with(
 
             report("bounding the least time from below")
             certificate = certify(planning)
-    phases = _list_phases(planning, ledger)
+    phases = _list_phases(planning, ledger, sure)
     plan = Plan(
         problem,
         options,
@@ -179,7 +187,9 @@ def assemble_plan(planning: Planning) -> Trajectory:
     return assemble(motions, torque, meta, planning.options.samples)
 
 
-def _list_phases(planning: Planning, ledger: Ledger) -> tuple[PlannedPhase, ...]:
+def _list_phases(
+    planning: Planning, ledger: Ledger, sure: Sequence[Sureness] = ()
+) -> tuple[PlannedPhase, ...]:
     return tuple(
         PlannedPhase(
             phase.number,
@@ -192,6 +202,7 @@ def _list_phases(planning: Planning, ledger: Ledger) -> tuple[PlannedPhase, ...]
             plan.attempt,
             plan.error,
             ledger.of(phase.number),
+            *(sure[phase.index] if sure else (None, None)),
         )
         for phase, plan in zip(planning.problem.phases, planning.plans, strict=True)
     )

@@ -16,6 +16,7 @@ from ..problem.definition import Problem
 from ..results.certificate import Certificate
 from ..results.modes import ModeSpan
 from ..results.replay_figures import ReplayFigures
+from ..results.report import LeastMinor
 from ..results.trajectory import Samples, Trajectory
 from ..results.transition import Transition
 from ..solvers.statistics import SolverStatistics
@@ -68,6 +69,10 @@ class PlannedPhase(NamedTuple):
     statistics : SolverStatistics
         Everything that was solved for this phase, or for phases planned as one from this one on:
         for the plan itself and on the way to it, for its refinement and to assess its impacts.
+    minor : LeastMinor or None
+        The least principal minor over that without friction; None in files of earlier versions.
+    wedged : float or None, [s]
+        For how long friction could hold everything at rest; None if it does not begin so.
     """
 
     number: int
@@ -80,6 +85,8 @@ class PlannedPhase(NamedTuple):
     attempt: str
     error: float
     statistics: SolverStatistics
+    minor: LeastMinor | None = None
+    wedged: float | None = None
 
 
 class Timings(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from math import isnan, nan
 from typing import Any
 
@@ -12,6 +13,7 @@ from ..problem.read import read_own_problem
 from ..results.certificate import Certificate
 from ..results.modes import ModeSpan
 from ..results.replay_figures import ReplayFigures
+from ..results.report import LeastMinor
 from ..results.trajectory import Trajectory
 from ..results.trajectory_file import load_trajectory
 from ..results.transition import Transition
@@ -21,7 +23,7 @@ from .result import Plan, PlannedPhase, Status, Timings
 
 _OPTIONS = (
     "intervals", "transcription", "time_weight", "duration", "time_intervals", "degree", "scheme",
-    "opening", "clearance", "samples", "mode_search", "certify", "accuracy",
+    "opening", "clearance", "samples", "mode_search", "certify", "accuracy", "least_minor",
 )  # fmt: skip
 """Options that stand in `meta` by themselves; `objective` and `replay` do in other ways."""
 
@@ -44,6 +46,8 @@ def write_meta(plan: Plan) -> dict[str, Any]:
         "complete": [phase.complete for phase in phases],
         "attempts": [phase.attempt for phase in phases],
         "phase_errors": [None if isnan(phase.error) else phase.error for phase in phases],
+        "least_minors": [None if own.minor is None else own.minor._asdict() for own in phases],
+        "wedged": [phase.wedged for phase in phases],
         "phase_durations": [phase.duration for phase in phases],
         **{name: getattr(options, name) for name in _OPTIONS},
         "iterations": [phase.statistics.iterations for phase in phases],
@@ -80,6 +84,10 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
         raise InputError(source, "meta", what) from None
     except InputError as error:
         raise InputError(source, f"meta.{error.key}", error.problem) from None
+
+
+def _read_minor(given: Mapping[str, Any] | None) -> LeastMinor | None:
+    return None if given is None else LeastMinor(**given)
 
 
 def _read_error(given: Any) -> float:
@@ -120,6 +128,8 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
             str(column("attempts", "")[k]),
             _read_error(column("phase_errors", None)[k]),
             statistics[k],
+            _read_minor(column("least_minors", None)[k]),
+            column("wedged", None)[k],
         )
         for k in range(count)
     )

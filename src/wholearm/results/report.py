@@ -31,6 +31,24 @@ class ContactMargin(NamedTuple):
     margin: float
 
 
+class LeastMinor(NamedTuple):
+    """The least principal minor of the contact problem in one phase (`mechanics.uniqueness`).
+
+    Attributes
+    ----------
+    ratio : float
+        To that without friction; contact forces are the only ones where it is positive.
+    contacts : str
+        Whose minor it is, with the modes of those that do not slide.
+    time : float, [s]
+        When.
+    """
+
+    ratio: float
+    contacts: str
+    time: float
+
+
 class LeastImpulse(NamedTuple):
     """The contact of the next phase with the least impulse in an impact, and that impulse [N s]."""
 
@@ -114,6 +132,10 @@ class PhaseReport(NamedTuple):
         None if there was no impact; one that is planned for may have been a stop.
     end_deviation, deviation : Deviation or None
         From the plan, at the end of the phase and at worst; None without a plan.
+    minor : LeastMinor or None
+        None if nothing was seen moving.
+    wedged : float or None, [s]
+        For how long friction could have held everything at rest; None if it did not begin so.
     """
 
     number: int
@@ -128,6 +150,8 @@ class PhaseReport(NamedTuple):
     impact: LeastImpulse | None
     end_deviation: Deviation | None
     deviation: Deviation | None
+    minor: LeastMinor | None = None
+    wedged: float | None = None
 
 
 class ModeChange(NamedTuple):

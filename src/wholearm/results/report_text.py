@@ -23,8 +23,8 @@ def write(report: Report) -> str:
     if report.finger_gap is not None:
         gap = report.finger_gap
         parts.append(f"least gap of the fingers: {gap.least:.5g} m at t = {gap.time:.5g} s")
-    tables = [_loss_table, _contact_table, _rolling_table, _phase_table, _change_table]
-    tables += [_reduced_table, _energy_table]
+    tables = [_loss_table, _contact_table, _rolling_table, _phase_table, _sure_table]
+    tables += [_change_table, _reduced_table, _energy_table]
     parts += [line for table in tables for line in _after_blank(table(report))]
     return "\n".join(parts)
 
@@ -92,6 +92,21 @@ def _phase_table(report: Report) -> list[str]:
             row += [show(value, ".1e") for value in pair]
         rows.append(row)
     return align(header, rows, {1, 2, 7} if impacts else {1, 2})
+
+
+def _sure_table(report: Report) -> list[str]:
+    """Whether contact forces are the only ones, and for how long phases may stay at rest."""
+    rows = [
+        [
+            str(p.number),
+            show(p.minor and p.minor.ratio, ".4f"),
+            p.minor.contacts if p.minor else "-",
+            show(p.minor and p.minor.time, ".5f"),
+            show(None if p.wedged is None else 1e3 * p.wedged, ".1f"),
+        ]
+        for p in report.phases
+    ]
+    return align(["phase", "least minor", "of", "at t [s]", "wedged [ms]"], rows, {2})
 
 
 def _change_table(report: Report) -> list[str]:

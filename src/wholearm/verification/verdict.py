@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..common.arrays import Array
 from ..common.require import require_number
 from ..contacts.links import FINGERS_TOUCH
+from ..geometry.curve import describe_pose
+from ..mechanics.uniqueness import LEAST_MINOR, describe_minor, require_minor
 from ..problem.definition import End, Problem
 from ..results.report import ContactMargin, Deviation, Failure, FingerGap, PhaseReport
 from ..scene.model import Scene
@@ -31,6 +33,8 @@ ROUNDING = 5e-7
 GOAL = 3e-4
 """Distance to the end of the last phase that counts as there, relative to the scene's length, and
 in rad."""
+ROUGH_MINOR = 1e-3
+"""By how much minors of a replay may be less than those of its plan."""
 OVERLAP = 3e-5
 """Overlap of the links that passes for touching, relative to the scene's length."""
 
@@ -48,25 +52,29 @@ class Allowance:
         scene's length.
     stray : float
         How far normal forces of a plan may fall below epsilon, over epsilon.
+    least_minor : float
+        Least ratio of a principal minor of the contact problem to that without friction.
 
     Raises
     ------
     InputError
-        If one of the numbers is not positive.
+        If one of the first three is not positive, or the last is 1 or more.
     """
 
     departure: float = DEPARTURE
     rest_speed: float = REST_SPEED
     stray: float = STRAY
+    least_minor: float = LEAST_MINOR
 
     def __post_init__(self) -> None:
         for key in ("departure", "rest_speed", "stray"):
             value = require_number(getattr(self, key), key, positive=True)
             object.__setattr__(self, key, value)
+        object.__setattr__(self, "least_minor", require_minor(self.least_minor))
 
     def scale(self, share: float) -> Allowance:
         """A share of what is allowed from the plan; the speed that passes for rest stays."""
-        return Allowance(share * self.departure, self.rest_speed, share * self.stray)
+        return replace(self, departure=share * self.departure, stray=share * self.stray)
 
     def measure_stray(self, problem: Problem) -> float:
         """How far normal forces of a plan may fall below epsilon [N]."""
@@ -184,6 +192,32 @@ def describe_thin_margins(
         for phase in phases
         for c in phase.contacts
         if c.margin < -allowed and (phase.number, c.contact) not in lost
+    ]
+
+
+def describe_ambiguity(
+    problem: Problem, simulation: Simulation, phases: Sequence[PhaseReport], allowance: Allowance
+) -> list[Failure]:
+    """Sentences on phases whose contact forces are not, or hardly, the only ones."""
+    failures = []
+    for phase in phases:
+        minor = phase.minor
+        if minor is None or minor.ratio >= allowance.least_minor - ROUGH_MINOR:
+            continue
+        place = describe_pose(simulation.z[np.searchsorted(simulation.t, minor.time)])
+        text = describe_minor(minor.ratio, minor.contacts, place, allowance.least_minor)
+        text = f"{text}, at t = {minor.time:.5g} s, phase {phase.number}"
+        failures.append(Failure(phase.number, text))
+    return failures
+
+
+def describe_wedging(phases: Sequence[PhaseReport]) -> list[str]:
+    """Sentences on phases that need not begin as soon as their torques do."""
+    return [
+        f"phase {phase.number} may stay wedged for {1e3 * phase.wedged:.3g} ms: so long friction "
+        "can hold everything at rest under its torques"
+        for phase in phases
+        if phase.wedged
     ]
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import InputError
 from ..common.sharing import exclusive
+from ..mechanics.uniqueness import LEAST_MINOR
 from ..problem.definition import End, Phase, Problem
 from ..results.narrow import Torques, narrow
 from ..results.report import (
@@ -36,14 +37,17 @@ from .margins import (
     list_contact_margins,
     list_slip_margins,
 )
+from .sureness import find_least_minor, find_wedged
 from .verdict import (
     DEPARTURE,
     REST_SPEED,
     Allowance,
+    describe_ambiguity,
     describe_departures,
     describe_overlap,
     describe_stops,
     describe_thin_margins,
+    describe_wedging,
     judge_end,
     measure_speed,
 )
@@ -85,6 +89,7 @@ def verify(
     tolerance: float = 1e-9,
     departure: float = DEPARTURE,
     rest_speed: float = REST_SPEED,
+    least_minor: float = LEAST_MINOR,
     reduced: bool = False,
 ) -> Report:
     """Replay the torques of a plan, or given ones, open loop and report what happens.
@@ -105,6 +110,8 @@ def verify(
     rest_speed : float
         Speed at the end of a phase that passes for rest, relative to the scene's speed (the root
         of length times gravity); angular speeds count times the scene's length.
+    least_minor : float
+        Least ratio of a principal minor of the contact problem to that without friction.
     reduced : bool
         Whether to list the paper's scalar equation of motion along phases with four constraints.
 
@@ -116,7 +123,7 @@ def verify(
         If the simulation cannot go on.
     """
     torque, plan = narrow(what)
-    allowance = Allowance(departure, rest_speed)
+    allowance = Allowance(departure, rest_speed, least_minor=least_minor)
     names = {contact.name for contact in problem.contacts}
     if plan is not None and set(plan.contacts) != names:
         odd = ", ".join(sorted(set(plan.contacts) ^ names))
@@ -170,8 +177,9 @@ def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Rep
     failures = [] if reached else [Failure(len(phases), outcome)]
     failures += describe_stops(problem, simulation, allowance)
     failures += describe_overlap(problem.scene, phases, gap) if reached else []
+    failures += describe_ambiguity(problem, simulation, phases, allowance)
     thin = describe_thin_margins(problem, phases, simulation, allowance)
-    warnings = _describe_torques(problem, seen.torque)
+    warnings = _describe_torques(problem, seen.torque) + describe_wedging(phases)
     for phase in problem.phases[: len(phases)]:
         rows = np.flatnonzero(simulation.phase == phase.index)
         warnings += describe_misses(phase, simulation, rows, seen.torque)
@@ -239,6 +247,8 @@ def _report_phase(
         impact=LeastImpulse(impacts[0].contact, impacts[0].value) if impacts else None,
         end_deviation=end,
         deviation=worst,
+        minor=find_least_minor(phase, simulation, rows),
+        wedged=find_wedged(problem, phase, simulation, rows, REST_SPEED),
     )
 
 

@@ -139,7 +139,7 @@ def explain_jam(curve: Curve, epsilon: float, jam: JammingError, replan: Replan)
         return _replan_with([curve], epsilon, replan, parameter, value)
 
     advice = advise(str(jam), _list_frictions(curve.formation), find_value, change)
-    error = JammingError(advice.text)
+    error = type(jam)(advice.text)
     error.changes = advice.changes
     return error
 

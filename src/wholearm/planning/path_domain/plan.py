@@ -96,7 +96,8 @@ def plan_curves(
     InfeasibleError
         If no motion keeps the limits; names what is short, where, and what would have to change.
     JammingError
-        If friction jams a formation somewhere on its curve.
+        If friction jams a formation somewhere on its curve; an AmbiguityError if it lets other
+        contact forces be possible.
     SolverError
         If the solver stops without an answer.
     """
@@ -178,6 +179,7 @@ def _plan_finer(task: Task, insist: bool = True) -> Plans | _Stuck:
     What so few elements cannot keep at their nodes, twice as many may: they are tried if that is
     insisted on. What is said of why there is no plan is said of the fewer.
     """
+    task.require_unique()
     stuck: _Stuck | None = None
     for finer in _FINER:
         found = _plan(task, finer, insist)

@@ -10,7 +10,7 @@ import numpy as np
 from ...geometry.curve import Curve
 from ..advice import name_phases
 from ..options import Objective, PlanOptions
-from .data import PhaseData, join, prepare
+from .data import PhaseData, join, prepare, require_unique
 from .elements import DEGREE
 from .mesh import SOFT, START, Mesh, find_ends
 from .misses import MISS
@@ -50,6 +50,11 @@ class Task:
             few = START if self.options.accuracy >= EARLY else 2 * START
             return max(few, SOFT) if self.options.goal is Objective.EFFORT else few
         return max(-(-intervals // DEGREE), 3)
+
+    def require_unique(self) -> None:
+        """Require contact forces to be the only ones; see `data.require_unique`."""
+        for curve, phase in zip(self.curves, self.phases, strict=True):
+            require_unique(curve, self.options.least_minor, phase)
 
     def lay_out(
         self, meshes: Sequence[Mesh], wanted: int

@@ -1,0 +1,170 @@
+"""Whether contact forces are the only ones: principal minors of K over those without friction.
+
+Contacts only press, c_n >= 0, and only those that press keep their gaps closed. Which of them do is
+a complementarity problem with the matrix K = A M5^-1 (A - U Xi A_t)^T. It has exactly one solution,
+whatever acts, if and only if every principal minor of K is positive: det K_S > 0 for every set S of
+contacts (Cottle, Pang and Stone, "The linear complementarity problem", theorem 3.3.7). Without
+friction K is symmetric, and its minors are positive wherever the contacts of S are independent; the
+ratio of both says how much of that friction has left.
+
+A contact that does not slide has modes of its own: it sticks, with its tangential row as one more
+constraint and c_t as its force, or it slips either way with c_t = -U c_n or U c_n. Every choice of
+contacts and of their modes then has a minor, and as no more than four modes meet in one place,
+positive ones are again necessary and sufficient (Kuhn and Loewen, "Piecewise affine bijections of
+R^n, and the equation Sx+ - Tx- = y", 1987). Joints that turn have constant friction, which does not
+enter K.
+
+With one contact that slides the ratio falls linearly with its friction: at a ratio r, friction may
+be 1 / (1 - r) times as large before forces cease to be unique.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.arrays import Array
+from ..common.errors import InputError
+from ..common.require import require_number
+from ..contacts.formation import Formation, Kinematics
+
+LEAST_MINOR = 0.1
+"""Least ratio of a minor of a plan: coefficients of friction are not known to better than a
+tenth."""
+_INDEPENDENT = 1e-12
+"""Least Gram determinant of the rows of contacts, each of length one, at which they are
+independent."""
+_SLIDES, _STICKS, _SLIPS = " ", " sticking", (" slipping +", " slipping -")
+
+
+def require_minor(value: float) -> float:
+    """A least ratio of minors that can be asked for: below 1, negative ones too.
+
+    Raises
+    ------
+    InputError
+        If it is not.
+    """
+    given = require_number(value, "least_minor")
+    if given >= 1:
+        raise InputError("", "least_minor", f"{given:g} given; allowed are numbers below 1")
+    return given
+
+
+def describe_minor(ratio: float, contacts: str, place: str, least: float) -> str:
+    """Say that a minor is too small."""
+    return (
+        f"ambiguous: {contacts}, minor {ratio:.2f} at {place}, of that without friction; at least "
+        f"{least:g} is asked for, and other contact forces are possible at 0 and below"
+    )
+
+
+class Minors(NamedTuple):
+    """The least ratio of a principal minor to that without friction, at n places.
+
+    Attributes
+    ----------
+    ratios : ndarray, shape (n,)
+        1 where friction makes no difference; forces are not unique at zero and below.
+    choices : ndarray of int, shape (n,)
+        Whose minor it is, among `names`.
+    names : tuple of str
+        Choices of contacts, with the modes of those that do not slide.
+    """
+
+    ratios: Array
+    choices: NDArray[np.int64]
+    names: tuple[str, ...]
+
+    def find_least(self) -> tuple[float, str, int]:
+        """The least ratio of all places, its contacts, and at which place it is."""
+        row = int(self.ratios.argmin())
+        return float(self.ratios[row]), self.names[self.choices[row]], row
+
+
+class _Choices(NamedTuple):
+    """Choices of contacts and modes with as many constraints each.
+
+    Attributes
+    ----------
+    modes : tuple of tuple of str
+        Mode of each contact, empty for those left out.
+    rows, forces : ndarray of int, shape (m, k)
+        Of each choice the constraints, as rows of [A; A_t], and the forces, as rows of
+        [A - U Xi A_t; A; A_t; A - U A_t; A + U A_t].
+    """
+
+    modes: tuple[tuple[str, ...], ...]
+    rows: NDArray[np.int64]
+    forces: NDArray[np.int64]
+
+
+def find_minors(
+    formation: Formation, kinematics: Kinematics, Xi: Array, sticking: tuple[int, ...] = ()
+) -> Minors:
+    """Find the least ratio of a principal minor to that without friction, at n configurations.
+
+    Parameters
+    ----------
+    formation : Formation
+    kinematics : Kinematics
+    Xi : ndarray, shape (n_c,) or (n, n_c)
+        Sliding directions.
+    sticking : tuple of int
+        Contacts that do not slide there, besides those that the formation lets roll.
+    """
+    held, friction = {*formation.rolling_rows, *sticking}, formation.friction
+    kinds = tuple((k in held, own > 0) for k, own in enumerate(friction.tolist()))
+    A, A_t = kinematics.A, kinematics.A_t
+    slip = friction[:, None] * A_t
+    G = A - np.broadcast_to(Xi, A.shape[:2])[..., None] * slip
+    forces = [G, A, A_t, *([A - slip, A + slip] if held else [])]
+    rows = np.concatenate([A, A_t], axis=1) if held else A
+    K = (rows / formation.scene.mass_diagonal) @ np.concatenate(forces, axis=1).transpose(0, 2, 1)
+    ratios, names = [np.ones((len(A), 1))], ["no contact"]
+    for choices in _list_choices(kinds):
+        of_rows = choices.rows[:, :, None]
+        smooth = K[:, of_rows, choices.rows[:, None, :] + len(kinds)]
+        rubbed = K[:, of_rows, choices.forces[:, None, :]]
+        below = np.asarray(np.linalg.det(smooth), dtype=float)
+        own: Array = np.ones_like(below)
+        least = _INDEPENDENT * np.einsum("...ii->...i", smooth).prod(axis=-1)
+        np.divide(np.linalg.det(rubbed), below, out=own, where=below > least)
+        ratios.append(own)
+        for modes in choices.modes:
+            pairs = zip(formation.names, modes, strict=True)
+            names.append(" with ".join((name + mode).strip() for name, mode in pairs if mode))
+    table = np.concatenate(ratios, axis=1)
+    return Minors(table.min(axis=1), table.argmin(axis=1), tuple(names))
+
+
+@lru_cache(maxsize=64)
+def _list_choices(kinds: tuple[tuple[bool, bool], ...]) -> tuple[_Choices, ...]:
+    """Every choice that friction makes a difference to, by its number of constraints, at most 5.
+
+    Of each contact `kinds` says whether it does not slide, and whether it has friction.
+    """
+    count = len(kinds)
+    found: dict[int, list[tuple[tuple[str, ...], list[int], list[int]]]] = {}
+    options = [("", _STICKS, *_SLIPS) if held else ("", _SLIDES) for held, _ in kinds]
+    block = {_SLIDES: 0, _STICKS: 1, _SLIPS[0]: 3, _SLIPS[1]: 4}
+    for modes in product(*options):
+        normal = [k for k, mode in enumerate(modes) if mode]
+        stuck = [k for k in normal if modes[k] == _STICKS]
+        if len(normal + stuck) > 5 or not any(kinds[k][1] for k in normal if k not in stuck):
+            continue
+        forces = [block[modes[k]] * count + k for k in normal] + [2 * count + k for k in stuck]
+        rows = normal + [count + k for k in stuck]
+        found.setdefault(len(rows), []).append((modes, rows, forces))
+    return tuple(
+        _Choices(
+            tuple(modes for modes, _, _ in chosen),
+            np.array([rows for _, rows, _ in chosen]),
+            np.array([forces for _, _, forces in chosen]),
+        )
+        for chosen in found.values()
+    )

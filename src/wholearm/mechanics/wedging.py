@@ -1,0 +1,130 @@
+"""Torques under which friction can hold a formation at rest.
+
+At rest every contact force within its cone and every joint friction within [-D, D] is possible.
+With the edges of the cones as columns E and their amounts e >= 0, balance is
+
+    g + S (tau - d) + E e = 0,   e >= 0,   |d| <= D.
+
+Projected onto the torques, what this linear programme allows is a convex polygon, perhaps without
+bounds. Its corners come from the basic solutions of the object's three rows, three edges each, its
+unbounded sides from combinations of edges that balance each other, the squeezes. Beyond the
+polygon, by its distance from tau, nothing can be held: a motion begins, whatever the forces are.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.arrays import Array
+from ..contacts.elemental import Contact
+from ..contacts.formation import Formation
+from ..scene.model import Scene
+
+_TINY = 1e-9
+"""What counts as zero of numbers of the order of one."""
+
+
+class StaticTorques(NamedTuple):
+    """The polygon normals @ tau <= bounds, with normals of length one.
+
+    Attributes
+    ----------
+    normals : ndarray, shape (m, 2)
+    bounds : ndarray, shape (m,), [N m]
+        A single one of minus infinity where nothing can be held.
+    """
+
+    normals: Array
+    bounds: Array
+
+    def measure(self, tau: Array) -> Array:
+        """How far torques, shape (n, 2), are beyond the polygon; negative inside, (n,) [N m]."""
+        if not len(self.normals):
+            return np.full(len(tau), -np.inf)
+        return np.asarray((tau @ self.normals.T - self.bounds).max(axis=1))
+
+
+def find_static_torques(scene: Scene, contacts: tuple[Contact, ...], z: Array) -> StaticTorques:
+    """Torques with which contact forces and joint friction can balance gravity at `z`, shape (5,).
+
+    Parameters
+    ----------
+    contacts : tuple of Contact
+        All that touch.
+    """
+    formation, scales = Formation(scene, contacts), scene.scales
+    kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
+    slip = formation.friction[:, None] * kinematics.A_t[0]
+    edges = np.concatenate([kinematics.A[0] - slip, kinematics.A[0] + slip])
+    # Forces count in the scene's force, torques in its torque.
+    edges /= np.array([1.0, 1.0, *[scales.length] * 3])
+    load = scene.applied_force[:3] / (scales.force * np.array([1.0, 1.0, scales.length]))
+    E, joints = edges[:, :3], -edges[:, 3:]
+    corners, rays = _find_corners(E, joints, load), _find_rays(E, joints)
+    if not len(corners):
+        return StaticTorques(np.array([[1.0, 0.0]]), np.array([-np.inf]))
+    hull = _find_hull(corners)
+    sides = np.concatenate([np.roll(hull, -1, axis=0) - hull, rays, np.eye(2)])
+    sides = sides[np.linalg.norm(sides, axis=1) > _TINY]
+    normals = np.stack([sides[:, 1], -sides[:, 0]], axis=1)
+    normals = np.concatenate([normals, -normals])
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    normals = normals[(normals @ rays.T <= _TINY).all(axis=1)]
+    bounds = scales.torque * (normals @ hull.T).max(axis=1) if len(normals) else np.zeros(0)
+    return StaticTorques(normals, bounds + np.abs(normals) @ scene.dry[3:])
+
+
+def _find_corners(E: Array, joints: Array, load: Array) -> Array:
+    """Torques of the basic solutions of E^T e = -load with e >= 0, shape (m, 2)."""
+    chosen = _choose(len(E), 3)
+    matrix = E[chosen].transpose(0, 2, 1)
+    regular = np.abs(np.linalg.det(matrix)) > _TINY
+    matrix, chosen = matrix[regular], chosen[regular]
+    amounts = np.linalg.solve(matrix, np.broadcast_to(-load[:, None], (len(matrix), 3, 1)))[..., 0]
+    held = (amounts >= -_TINY).all(axis=1)
+    return np.asarray(np.einsum("ni,nij->nj", amounts[held], joints[chosen[held]]))
+
+
+def _find_rays(E: Array, joints: Array) -> Array:
+    """Directions of the torques of squeezes, E^T e = 0 with e >= 0, shape (m, 2), length one."""
+    chosen = _choose(len(E), 4)
+    minors = [np.linalg.det(np.delete(E[chosen], k, axis=1)) for k in range(4)]
+    null = np.stack([minors[0], -minors[1], minors[2], -minors[3]], axis=1)
+    sizes = np.linalg.norm(null, axis=1)
+    null, chosen = null[sizes > _TINY] / sizes[sizes > _TINY, None], chosen[sizes > _TINY]
+    null *= np.where(null.sum(axis=1) < 0, -1.0, 1.0)[:, None]
+    squeezes = (null >= -_TINY).all(axis=1)
+    rays = np.einsum("ni,nij->nj", null[squeezes], joints[chosen[squeezes]])
+    sizes = np.linalg.norm(rays, axis=1)
+    return np.asarray(rays[sizes > _TINY] / sizes[sizes > _TINY, None])
+
+
+def _find_hull(points: Array) -> Array:
+    """Corners of the convex hull of points in the plane, one after the other, shape (m, 2)."""
+    ordered = sorted(set(map(tuple, points.tolist())))
+    halves = []
+    for way in (ordered, ordered[::-1]):
+        half: list[tuple[float, float]] = []
+        for point in way:
+            while len(half) > 1 and _turn(half[-2], half[-1], point) <= 0:
+                half.pop()
+            half.append(point)
+        halves.append(half)
+    return np.array((halves[0][:-1] + halves[1][:-1]) or ordered)
+
+
+def _turn(one: tuple[float, float], two: tuple[float, float], three: tuple[float, float]) -> float:
+    """Twice the area of a triangle, positive where it is anticlockwise."""
+    (a, b), (c, d), (e, f) = one, two, three
+    return (c - a) * (f - b) - (d - b) * (e - a)
+
+
+@lru_cache(maxsize=16)
+def _choose(count: int, k: int) -> NDArray[np.int64]:
+    """Every choice of k out of `count` rows, shape (m, k)."""
+    return np.array(list(combinations(range(count), k)), dtype=np.int64).reshape(-1, k)

@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+
+from plane import make_formation, make_scene, rotate
+from shipped import BOX, problem_of
+from tipping import box, roll, tipped
+from wholearm import InputError, solve, verify
+from wholearm.common.arrays import Array
+from wholearm.common.errors import AmbiguityError
+from wholearm.contacts.closing import contact_table
+from wholearm.contacts.formation import Formation
+from wholearm.geometry.tracing import trace_phases
+from wholearm.mapping.quasistatic import check_border
+from wholearm.mechanics.uniqueness import find_minors
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.path_domain.plan import plan_curves
+from wholearm.scene.model import Friction, Scene
+
+
+def count_answers(K: Array, loads: Array) -> Array:
+    """How many sets of contacts press, and leave the others apart: a = q + K c, for n loads q."""
+    found = np.zeros(len(loads), dtype=int)
+    for pressed in product((False, True), repeat=len(K)):
+        own = np.array(pressed)
+        c = np.zeros_like(loads)
+        c[:, own] = -np.linalg.solve(K[np.ix_(own, own)], loads[:, own].T).T
+        apart = loads + c @ K.T
+        found += (c[:, own] > 0).all(axis=1) & (apart[:, ~own] > 0).all(axis=1)
+    return found
+
+
+def list_loads(K: Array, count: int) -> Array:
+    """Loads that each set of contacts answers with forces and accelerations of many sizes."""
+    rng, loads = np.random.default_rng(3), []
+    for pressed in product((0.0, 1.0), repeat=len(K)):
+        c, apart = 10.0 ** rng.uniform(-1, 1, (2, count, len(K)))
+        loads.append(apart * np.diag(K) * (1 - np.array(pressed)) - (c * pressed) @ K.T)
+    return np.concatenate(loads)
+
+
+def box_at(mu: float, index: int, share: float) -> tuple[Formation, Any, Array]:
+    """The box on a palm of friction mu in the middle of a phase, with its sliding directions."""
+    problem = problem_of(BOX).with_(friction_palm=mu)
+    curve = trace_phases(problem)[index]
+    point = curve.evaluate(np.array([share * curve.length]))
+    return curve.formation, point.kinematics, curve.segments[-1].Xi
+
+
+@pytest.mark.parametrize("index", [0, 2])
+def test_forces_are_unique_where_all_minors_are_positive(index: int) -> None:
+    for mu in (0.1, 0.3, 0.5):
+        formation, kinematics, Xi = box_at(mu, index, 0.9 if index == 0 else 0.4)
+        A, A_t = kinematics.A[0], kinematics.A_t[0]
+        weighted = A / formation.scene.mass_diagonal
+        K, smooth = weighted @ (A - (formation.friction * Xi)[:, None] * A_t).T, weighted @ A.T
+        ratio, names, _ = find_minors(formation, kinematics, Xi).find_least()
+        answers = count_answers(K, list_loads(K, 100))
+        assert (answers == 1).all() if ratio > 0 else (answers > 1).any()
+        assert (ratio > 0) == (mu < 0.4)
+        # The minor that is named is that of its contacts alone.
+        own = [formation.names.index(name) for name in names.split(" with ")]
+        expected = np.linalg.det(K[np.ix_(own, own)]) / np.linalg.det(smooth[np.ix_(own, own)])
+        assert ratio == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_rod_on_the_palm_is_that_of_painleve() -> None:
+    """Friction mu takes mu a h / (k^2 + a^2) from 1, a and h being the arms of both forces."""
+    scene = make_scene([[-0.05, -1e-4], [0.05, -1e-4], [0.05, 1e-4], [-0.05, 1e-4]], base=0.6)
+    for slope, mu in product((0.4, 1.0, 1.3), (0.5, 2.0)):
+        other = Scene(scene.polygon, scene.fingers, Friction(mu, 0.1, 0.1))
+        formation = make_formation(other, "v1-palm")
+        arm, height = rotate(-slope, [0.05, -1e-4])
+        z = np.array([[0.0, -height, -slope, 1.57, 1.57]])
+        kinematics = formation.evaluate(z, np.zeros((1, 5)))
+        loss = mu * arm * abs(height) / (scene.polygon.gyration_radius**2 + arm**2)
+        found = [find_minors(formation, kinematics, np.array([Xi])).ratios[0] for Xi in (-1.0, 1.0)]
+        # Sliding the other way friction helps, and the least is that of no contact, 1.
+        assert sorted(found) == pytest.approx([1 - loss, 1.0], rel=1e-9)
+        rolling = find_minors(roll(formation, "v1-palm"), kinematics, np.zeros(1))
+        ratio, names, _ = rolling.find_least()
+        assert ratio == pytest.approx(1 - loss, rel=1e-9) and names.startswith("v1-palm slipping")
+
+
+def test_an_ambiguous_scene_is_refused_by_name() -> None:
+    rough = problem_of(BOX).with_(friction_palm=0.5)
+    with pytest.raises(AmbiguityError, match=r"phase 1: ambiguous: v0-palm with v0-finger2, minor"):
+        plan_curves(trace_phases(rough)[:1], rough.epsilon, PlanOptions(), (1,), explained=False)
+    with pytest.raises(InputError, match=r"least_minor: 1 given; allowed are numbers below 1"):
+        solve(rough, least_minor=1.0)
+
+
+def test_replays_tell_the_least_minor_of_each_phase() -> None:
+    report = verify(box(), tipped())
+    minors = [phase.minor for phase in report.phases]
+    assert report.ok and all(minor is not None and 0.1 < minor.ratio < 1 for minor in minors)
+    planned = [own["ratio"] for own in tipped().meta["least_minors"]]
+    found = [minor.ratio for minor in minors if minor is not None]
+    np.testing.assert_allclose(found, planned, atol=5e-3)
+    strict = verify(box(), tipped(), least_minor=0.9)
+    assert not strict.ok and strict.failures[0].startswith("ambiguous: ")
+
+
+def test_maps_know_where_forces_are_not_unique() -> None:
+    for mu, expected in ((0.3, False), (0.5, True)):
+        formation, _, _ = box_at(mu, 0, 0.9)
+        table = contact_table(formation.scene)
+        label = np.array([table.index(contact) for contact in formation.contacts])
+        problem = problem_of(BOX).with_(friction_palm=mu)
+        curve = trace_phases(problem)[0]
+        z = curve.evaluate(np.linspace(0.0, curve.length, 9)).z
+        _, back, ambiguous = check_border(formation.scene, problem.epsilon, label, z, 0)
+        assert ambiguous.any() == expected and (back | ambiguous).all()
