@@ -19,7 +19,7 @@ def test_torques_that_friction_can_hold_are_those_of_the_linear_programme(path: 
     rng, scene = np.random.default_rng(5), problem.scene
     for curve in trace_phases(problem)[::2]:
         contacts = curve.formation.contacts
-        static = find_static_torques(scene, contacts, curve.start)
+        static = find_static_torques([curve.formation], curve.start)
         tau = rng.uniform(-1.0, 1.0, (12, 2)) * scene.torque_limit
         for own, beyond in zip(tau, static.measure(tau), strict=True):
             if abs(beyond) > 1e-4 * scene.scales.torque:

@@ -71,19 +71,24 @@ class Minors(NamedTuple):
     ratios : ndarray, shape (n,)
         1 where friction makes no difference; forces are not unique at zero and below.
     choices : ndarray of int, shape (n,)
-        Whose minor it is, among `names`.
+        Whose minor it is, among `modes`.
+    modes : list of tuple of str
+        Choices of contacts: the mode of each, empty for those left out.
     names : tuple of str
-        Choices of contacts, with the modes of those that do not slide.
+        Of all contacts.
     """
 
     ratios: Array
     choices: NDArray[np.int64]
+    modes: list[tuple[str, ...]]
     names: tuple[str, ...]
 
     def find_least(self) -> tuple[float, str, int]:
         """The least ratio of all places, its contacts, and at which place it is."""
         row = int(self.ratios.argmin())
-        return float(self.ratios[row]), self.names[self.choices[row]], row
+        pairs = zip(self.names, self.modes[self.choices[row]], strict=True)
+        chosen = [(name + mode).strip() for name, mode in pairs if mode]
+        return float(self.ratios[row]), " with ".join(chosen) or "no contact", row
 
 
 class _Choices(NamedTuple):
@@ -125,7 +130,7 @@ def find_minors(
     forces = [G, A, A_t, *([A - slip, A + slip] if held else [])]
     rows = np.concatenate([A, A_t], axis=1) if held else A
     K = (rows / formation.scene.mass_diagonal) @ np.concatenate(forces, axis=1).transpose(0, 2, 1)
-    ratios, names = [np.ones((len(A), 1))], ["no contact"]
+    ratios, modes = [np.ones((len(A), 1))], [("",) * len(kinds)]
     for choices in _list_choices(kinds):
         of_rows = choices.rows[:, :, None]
         smooth = K[:, of_rows, choices.rows[:, None, :] + len(kinds)]
@@ -135,11 +140,9 @@ def find_minors(
         least = _INDEPENDENT * np.einsum("...ii->...i", smooth).prod(axis=-1)
         np.divide(np.linalg.det(rubbed), below, out=own, where=below > least)
         ratios.append(own)
-        for modes in choices.modes:
-            pairs = zip(formation.names, modes, strict=True)
-            names.append(" with ".join((name + mode).strip() for name, mode in pairs if mode))
+        modes += choices.modes
     table = np.concatenate(ratios, axis=1)
-    return Minors(table.min(axis=1), table.argmin(axis=1), tuple(names))
+    return Minors(table.min(axis=1), table.argmin(axis=1), modes, formation.names)
 
 
 @lru_cache(maxsize=64)

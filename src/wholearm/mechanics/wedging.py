@@ -13,6 +13,7 @@ polygon, by its distance from tau, nothing can be held: a motion begins, whateve
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from itertools import combinations
 from typing import NamedTuple
@@ -23,7 +24,6 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
-from ..scene.model import Scene
 
 _TINY = 1e-9
 """What counts as zero of numbers of the order of one."""
@@ -49,18 +49,23 @@ class StaticTorques(NamedTuple):
         return np.asarray((tau @ self.normals.T - self.bounds).max(axis=1))
 
 
-def find_static_torques(scene: Scene, contacts: tuple[Contact, ...], z: Array) -> StaticTorques:
+def find_static_torques(touching: Sequence[Formation], z: Array) -> StaticTorques:
     """Torques with which contact forces and joint friction can balance gravity at `z`, shape (5,).
 
     Parameters
     ----------
-    contacts : tuple of Contact
-        All that touch.
+    touching : sequence of Formation
+        With all contacts that touch, some perhaps in more than one.
+    z : ndarray, shape (5,)
     """
-    formation, scales = Formation(scene, contacts), scene.scales
-    kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
-    slip = formation.friction[:, None] * kinematics.A_t[0]
-    edges = np.concatenate([kinematics.A[0] - slip, kinematics.A[0] + slip])
+    scene = touching[0].scene
+    rows: dict[Contact, tuple[Array, Array]] = {}
+    for formation in touching:
+        kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
+        slip = formation.friction[:, None] * kinematics.A_t[0]
+        rows |= dict(zip(formation.contacts, zip(kinematics.A[0], slip, strict=True), strict=True))
+    edges = np.array([normal + way * slip for normal, slip in rows.values() for way in (-1, 1)])
+    scales = scene.scales
     # Forces count in the scene's force, torques in its torque.
     edges /= np.array([1.0, 1.0, *[scales.length] * 3])
     load = scene.applied_force[:3] / (scales.force * np.array([1.0, 1.0, scales.length]))

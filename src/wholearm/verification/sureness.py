@@ -14,7 +14,7 @@ from ..results.trajectory import Trajectory
 from ..simulation.events import Simulation
 from .verdict import measure_speed
 
-PLACES = 50
+PLACES = 33
 """Instants of a phase at which minors are looked at, and at which torques are."""
 SURE = 1e-3
 """Distance from torques that friction can hold, beyond which a motion begins for sure, relative to
@@ -79,12 +79,12 @@ def find_wedged(
     slow : float
         Speed that passes for rest, relative to the scene's.
     """
-    scene, contacts = problem.scene, phase.formation.contacts
+    scene, touching = problem.scene, [phase.formation]
     if phase.index:
         if measure_speed(scene, motion.z_dot[rows[0]]) > slow * scene.scales.speed:
             return None
-        contacts += problem.phases[phase.index - 1].formation.contacts
-    static = find_static_torques(scene, tuple(dict.fromkeys(contacts)), motion.z[rows[0]])
+        touching.append(problem.phases[phase.index - 1].formation)
+    static = find_static_torques(touching, motion.z[rows[0]])
     start, stop = motion.t[rows[[0, -1]]].tolist()
     t = np.linspace(start, stop, 4 * PLACES)
     # At its end the torques are those of the next phase.

@@ -128,7 +128,7 @@ def verify(
     if plan is not None and set(plan.contacts) != names:
         odd = ", ".join(sorted(set(plan.contacts) ^ names))
         raise InputError("", "contacts", f"trajectory and problem differ in {odd}")
-    seen = observe(problem, torque, plan, tolerance)
+    seen = observe(problem, torque, plan, tolerance, True)
     report = judge(seen, allowance, reduced)
     return report if report.ok and not report.warnings else _help(seen, report, allowance)
 
@@ -142,7 +142,11 @@ def _help(seen: Observation, report: Report, allowance: Allowance) -> Report:
 
 
 def observe(
-    problem: Problem, torque: TorqueProfile, plan: Trajectory | None, tolerance: float = 1e-9
+    problem: Problem,
+    torque: TorqueProfile,
+    plan: Trajectory | None,
+    tolerance: float = 1e-9,
+    sure: bool = False,
 ) -> Observation:
     """Replay torques and look at what happens, closer where that may decide something.
 
@@ -154,6 +158,8 @@ def observe(
         What to compare the replay with.
     tolerance : float
         Of the simulation.
+    sure : bool
+        Whether to see if contact forces are the only ones, and starts sure.
 
     Raises
     ------
@@ -163,7 +169,7 @@ def observe(
     times, closer = choose_times(problem, torque, plan), make_closer(problem, torque.breaks)
     simulation = simulate(problem, torque, tolerance=tolerance, times=times, closer=closer)
     phases = tuple(
-        _report_phase(problem, simulation, torque, plan, index)
+        _report_phase(problem, simulation, torque, plan, index, sure)
         for index in range(int(simulation.phase[-1]) + 1)
     )
     gap = find_finger_gap(problem.scene, simulation, torque.breaks)
@@ -223,6 +229,7 @@ def _report_phase(
     torque: TorqueProfile,
     plan: Trajectory | None,
     index: int,
+    sure: bool,
 ) -> PhaseReport:
     phase = problem.phases[index]
     rows = np.flatnonzero(simulation.phase == index)
@@ -247,8 +254,8 @@ def _report_phase(
         impact=LeastImpulse(impacts[0].contact, impacts[0].value) if impacts else None,
         end_deviation=end,
         deviation=worst,
-        minor=find_least_minor(phase, simulation, rows),
-        wedged=find_wedged(problem, phase, simulation, rows, REST_SPEED),
+        minor=find_least_minor(phase, simulation, rows) if sure else None,
+        wedged=find_wedged(problem, phase, simulation, rows, REST_SPEED) if sure else None,
     )
 
 

@@ -30,7 +30,7 @@ PLACES = 13
 """Places that they go through where that is exceeded."""
 
 
-LOOKS = 25
+LOOKS = 17
 """Places of a stretch without reversals at which contact forces are looked at for being unique."""
 
 
