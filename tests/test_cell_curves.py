@@ -10,6 +10,7 @@ from wholearm.benchmark.stress import cell_curves
 from wholearm.benchmark.stress.cell_curves import best_end, find_best, list_ends
 from wholearm.benchmark.stress.slow_motion import slow_margin
 from wholearm.common.arrays import Array
+from wholearm.geometry.tracing import trace_phases
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import build_problem, read_problem
 
@@ -34,6 +35,22 @@ def test_ends_are_where_the_phase_ends() -> None:
     assert len(ends) > 5 and np.ptp(ends[:, 0]) > 0.01
     assert np.degrees(ends[:, 2]) == pytest.approx(9.5, abs=1e-6)
     assert np.abs(phase.formation.evaluate(ends, ends).C).max() < 1e-9
+
+
+def test_ends_are_found_though_a_joint_turns_far_on_the_way() -> None:
+    """Where the vertex in the corner leaves it, the finger turns by 76 degrees."""
+    table = dict(read_problem(str(HEPTAGON.with_name("triangle.toml"))).table)
+    flush, corner = ["v0-palm", "v1-palm"], ["v1-finger1", "v0-finger2"]
+    phases = [
+        {"contacts": [*flush, "v1-finger1", "v2-finger2"], "until": "v0-finger2"},
+        {"contacts": [*flush, *corner], "until": {"x": 0.0373}},
+        {"contacts": ["v1-palm", *corner], "until": "v2-finger1"},
+    ]
+    problem = build_problem({**table, "phases": phases})
+    start, stop = trace_phases(problem)[1].end, (0.02953, -0.22767)
+    ends = list_ends(problem.scene, problem.phases[2], start, stop)
+    assert len(ends) > 5 and np.abs(ends[0, [0, 2]] - stop).max() < 1e-3
+    assert ends[0, 3] - start[3] > 1.3
 
 
 def test_the_best_curve_is_one_that_a_slow_motion_can_take() -> None:
