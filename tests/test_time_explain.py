@@ -12,6 +12,7 @@ from refused import advising, ask_shoved
 from thrown import shove
 from tipping import box
 from wholearm.common.errors import InfeasibleError, SolverError
+from wholearm.common.shortfalls import Parameter, Place, Shortfall
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.limits import EPSILON
@@ -23,6 +24,7 @@ from wholearm.planning.time_domain.collocation import make_scheme
 from wholearm.planning.time_domain.explain import (
     change_limit,
     explain,
+    is_met,
     list_shortfalls,
     solve_elastic,
 )
@@ -82,6 +84,21 @@ def test_a_force_that_weight_limits_has_its_closed_form() -> None:
     assert float(found[1]) == pytest.approx(1 - LEAST, rel=1e-3)
     # Advice is meant to be within 2 % of what is needed.
     assert 0.98 * LEAST < float(found[2]) < LEAST
+
+
+def test_only_limits_that_a_motion_meets_hold_it_back() -> None:
+    problem, _ = shove()
+    stage, limit = outline(problem), problem.scene.fingers[0].torque_limit
+    place = Place(1, 0.0, "there")
+    torque = Parameter("torque limit of finger 1", limit, "N m", 1, TORQUE)
+    epsilon = Parameter("epsilon", problem.epsilon, "N", -1, EPSILON)
+    for share in (0.5, 1.0):
+        motion = [stage.guess._replace(tau=np.full_like(stage.guess.tau, -share * limit))]
+        assert is_met(torque, motion, []) == (share == 1.0)
+    for share in (0.9, 1.1):
+        amount = share * problem.epsilon
+        short = Shortfall("press", "v0-palm", "c_n", amount, "N", place, amount)
+        assert is_met(epsilon, [stage.guess], [short]) == (share < 1.0)
 
 
 @pytest.mark.parametrize(

@@ -75,8 +75,8 @@ class Best(NamedTuple):
 def list_ends(scene: Scene, phase: Phase, z: Array, stop: tuple[float, float]) -> Array:
     """Places at which a phase with two freedoms ends, those near the pose `stop`, shape (n, 5)."""
     # A joint may turn far on the way there, so that contacts are followed step by step.
-    way = z[[0, 2]] + np.linspace(0.0, 1.0, 4)[:, None] * (np.array(stop) - z[[0, 2]])
-    first = _settle(scene, phase, bend(scene, phase, z, way[None])[0, -1])
+    line = z[[0, 2]] + np.linspace(0.0, 1.0, 4)[:, None] * (np.array(stop) - z[[0, 2]])
+    first = _settle(scene, phase, bend(scene, phase, z, line[None])[0, -1])
     if first is None:
         first = _settle(scene, phase, z)
     if first is None:

@@ -31,11 +31,13 @@ from .collocation import Scheme, blend
 from .motion import TimeMotion, make_motions
 from .own_units import to_si
 from .search import Search
-from .stage import Stage
+from .stage import Stage, StagePoints
 from .way_guess import PacedWay
 
 MISSED = 0.02
 """Least share by which limits are missed along a way that is no way."""
+MET = 0.98
+"""Share of a limit from which on a motion meets it."""
 ADVICE = 0.6
 """Processor time [s] after which no further change of a limit is tried."""
 Replan = Callable[[Problem], object]
@@ -155,7 +157,12 @@ def explain(
 
     elastic = min(short, key=sum_up)
 
+    ranked = rank_shortfalls(list_shortfalls(problem, elastic, search.scheme))
+    solved = [to_si(stage, problem).guess for stage in elastic]
+
     def find_value(parameter: Parameter) -> float | None:
+        if not is_met(parameter, solved, ranked):
+            return np.nan
         aim = search.aiming(Objective.RELAX, parameter)
         solution = aim.solve(elastic)
         # A limit that may be tighter is not what keeps the others from being kept.
@@ -164,11 +171,25 @@ def explain(
         unit = _unit_of(parameter, problem.scene.scales)
         return parameter.value + parameter.sign * unit * solution.cost
 
-    ranked = rank_shortfalls(list_shortfalls(problem, elastic, search.scheme))
     text = f"{name_phases(numbers, 'infeasible')}: {describe_shortfalls(ranked)}"
     error = _advise(problem, phases[0], text, find_value, replan, ranked)
     error.motion = _make_trajectory(problem, phases, search, elastic)
     return error
+
+
+def is_met(
+    parameter: Parameter, motion: Sequence[StagePoints], shortfalls: Sequence[Shortfall]
+) -> bool:
+    """Whether the motion that misses limits least is held back by the limit of a parameter.
+
+    Epsilon is what holds it back if no normal force is short of more than that.
+    """
+    if parameter.key == EPSILON:
+        return all(own.amount < parameter.value for own in shortfalls if own.kind == PRESS)
+    finger = int(parameter.key.split(".")[1]) - 1
+    tables = [part.v[..., 3:] if parameter.is_speed else part.tau for part in motion]
+    most = max(float(np.abs(table[..., finger]).max()) for table in tables)
+    return most > MET * parameter.value
 
 
 def refuse_ways(problem: Problem, phase: Phase, ways: Sequence[PacedWay]) -> None:
