@@ -16,6 +16,9 @@ from ..simulation.simulate import simulate
 
 SAME = 1e-4
 """Largest difference between plan and replay, over the scene's length and in rad."""
+LATE = 1e-3
+"""Largest difference of the times at which phases end, over the scene's time: an end at rest is
+reached so slowly that little in place is much in time."""
 _ROWS = 400
 """Instants of each phase at which the replay is known, besides its steps."""
 
@@ -34,5 +37,5 @@ def find_between(plan: Trajectory) -> Trajectory:
     late = np.abs(replay.phase_starts - starts).max()
     inside = np.clip(plan.t, 0.0, replay.duration)
     error = np.abs(replay.at(inside).z - plan.z) / [*2 * [problem.scene.scales.length], 1, 1, 1]
-    same = late < SAME * problem.scene.scales.time and error.max() < SAME
+    same = late < LATE * problem.scene.scales.time and error.max() < SAME
     return replay if same else plan

@@ -169,7 +169,7 @@ def _average(plan: Trajectory, part: _Part, run: Run) -> list[Force]:
         ends = ends[: max(1, int(np.argmax(np.append(gained, True))))]
     time = run.t[ends[-1]] - plan.phase_starts[part.phase.index]
     middles = (np.arange(_INSTANTS) + 0.5) * min(time, motion.duration) / _INSTANTS
-    planned = motion.evaluate(middles).c_n.mean(axis=0).tolist()
+    planned = np.nanmean(motion.evaluate(middles).c_n, axis=0).tolist()
     share = np.diff(run.t)[ends - 1]
     press = share @ run.press[ends - 1] / share.sum()
     found = [float(press[_find_columns(name, part, run)].sum()) for name in part.contacts]

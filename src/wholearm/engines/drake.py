@@ -43,6 +43,7 @@ def play(problem: Problem, stretch: Stretch, torque: TorqueProfile, setting: Set
     from pydrake.systems.analysis import Simulator
 
     steps = list_steps(problem, stretch, torque, setting.step)
+    setting = setting._replace(step=steps.h / problem.scene.scales.time)
     with _quiet():
         diagram, plant, pairs = _build(problem.scene, steps, setting)
         simulator = Simulator(diagram)

@@ -16,6 +16,8 @@ from ..results.trajectory import Trajectory
 
 ROWS = 200
 """About how many times a phase is looked at."""
+FEWEST = 5000
+"""Fewest steps of a stretch: after a step of torques contacts swing for tens of steps."""
 _LOOKS = 8
 """Instants of each step over which torques are averaged."""
 _LEAST = 1e-3
@@ -115,8 +117,10 @@ def list_stretches(plan: Trajectory, whole: bool) -> list[Stretch]:
     found = []
     for own in [tuple(range(count))] if whole else [(index,) for index in range(count)]:
         motion, start, stop = plan.motions[own[0]], starts[own[0]], starts[own[-1] + 1]
-        at = motion.evaluate(np.zeros(1))
-        forces = dict(zip(motion.contacts, at.c_n[0].tolist(), strict=True))
+        at = motion.evaluate(np.linspace(0.0, motion.duration, ROWS))
+        # Forces are not known of a replay that waits at rest.
+        known = at.c_n[int(np.argmax(np.isfinite(at.c_n).all(axis=1)))]
+        forces = dict(zip(motion.contacts, np.nan_to_num(known).tolist(), strict=True))
         state = at.z[0], at.z_dot[0], at.z_ddot[0]
         found.append(Stretch(own, float(start), float(stop), *state, forces))
     return found
@@ -125,7 +129,7 @@ def list_stretches(plan: Trajectory, whole: bool) -> list[Stretch]:
 def list_steps(problem: Problem, stretch: Stretch, torque: TorqueProfile, step: float) -> Steps:
     """Even steps that fit a stretch, none longer than `step` times the scene's time."""
     duration = stretch.stop - stretch.start
-    count = int(np.ceil(duration / (step * problem.scene.scales.time) - 1e-9))
+    count = max(int(np.ceil(duration / (step * problem.scene.scales.time) - 1e-9)), FEWEST)
     h = duration / count
     places = (np.arange(count * _LOOKS) + 0.5) * (h / _LOOKS) - h / 2
     places = stretch.start + np.maximum(places, _LEAST * h)
