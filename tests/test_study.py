@@ -12,7 +12,6 @@ import pytest
 from misbehaving import misbehave
 from wholearm.benchmark.stress.cases import draw_case
 from wholearm.benchmark.stress.files import look, run_file
-from wholearm.benchmark.stress.journal import Journal
 from wholearm.benchmark.stress.mutation import BASE, draw_mutant
 from wholearm.benchmark.stress.plans import Finding
 from wholearm.benchmark.stress.problems import compare_values
@@ -24,6 +23,7 @@ from wholearm.benchmark.stress.workers import run_tasks
 from wholearm.cli.bench import name_study
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
+from wholearm.common.journal import Journal
 
 
 def test_a_worker_that_hangs_or_dies_is_replaced() -> None:

@@ -155,3 +155,16 @@ def test_numbers_that_overflow_are_named(tmp_path: Path) -> None:
     path.write_text("t,tau1,tau2\n0,0,0\n1,-1e308,0\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"tau1: -1e308 on line 3 given; allowed are -1e\+30"):
         read_torque_csv(str(path))
+
+
+def test_a_stretch_of_torques_is_the_same_torques() -> None:
+    breaks = np.array([0.0, 0.3, 0.5])
+    profile = TorqueProfile(breaks, np.random.default_rng(0).normal(size=(2, 2, 4)))
+    part = profile.cut(0.1, 0.4)
+    assert part.breaks.tolist() == [0.1, 0.3, 0.4]
+    times = np.linspace(0.1, 0.4, 50)[:-1]
+    np.testing.assert_allclose(part.at(times), profile.at(times), atol=1e-13)
+    longer = profile.cut(-0.1, 0.7)
+    for time, end in ((-0.05, 0.0), (0.6, 0.5)):
+        at, held = longer.at(np.array([time])), profile.at(np.array([end]))
+        np.testing.assert_allclose(at, held, atol=1e-13)

@@ -30,6 +30,7 @@ from .compare import compare
 from .engines import add_export, add_replay
 from .predict import predict
 from .progress import clear_progress, show_progress
+from .robustness import add_robustness
 
 if TYPE_CHECKING:
     from ..planning.result import Plan
@@ -106,6 +107,7 @@ def build_parser() -> argparse.ArgumentParser:
             None,
             "replay a plan in MuJoCo or Drake and compare it with the plan",
         ),
+        ("robustness", add_robustness, None, "see how much error a plan bears"),
         ("bench", add_bench, None, "measure run time against error, or run the stress study"),
     ):
         own = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")

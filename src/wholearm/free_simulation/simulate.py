@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -80,7 +79,7 @@ def simulate_free(
     if not 1e-14 <= tolerance <= 1e-2:
         raise InputError("", "tolerance", f"{tolerance!r} is not between 1e-14 and 1e-2")
     if until is not None:
-        profile = _cut(profile, require_number(until, "until", positive=True))
+        profile = profile.cut(0.0, require_number(until, "until", positive=True))
     starts = [0.0] if plan is None else plan.phase_starts[:-1].tolist()
     hint = None if plan is None or start is not None else _recall(problem, plan, 0)
     return _simulate(problem, profile, state, starts, hint, rate, tolerance)
@@ -105,7 +104,7 @@ def simulate_phases(
     for last, phase in enumerate(problem.phases[: len(starts) - 1]):
         if phase.end is not End.REST and last + 2 < len(starts):
             continue
-        profile = _cut(plan.torque, float(starts[last + 1]), float(starts[first]))
+        profile = plan.torque.cut(float(starts[first]), float(starts[last + 1]))
         row = int(np.flatnonzero(plan.phase == first)[0])
         state = np.concatenate([plan.z[row], plan.z_dot[row]])
         hint = _recall(problem, plan, row)
@@ -170,41 +169,6 @@ def _require_apart(problem: Problem, z: Array) -> None:
     if depths[which] > 10 * problem.scene.touching:
         pair = ("palm and object", "finger 1 and object", "finger 2 and object", "both fingers")
         raise SimulationError(f"{pair[which]} overlap by {depths[which]:.3g} m at the start")
-
-
-def _cut(profile: TorqueProfile, stop: float, start: float | None = None) -> TorqueProfile:
-    """The torques from `start` to `stop`, those of their end held after it."""
-    breaks, coefficients = profile.breaks, profile.coefficients
-    first = float(breaks[0]) if start is None else start
-    inner = breaks[(breaks > first) & (breaks < stop)]
-    near = 1e-12 * max(abs(first), abs(stop))
-    inner = inner[(inner > first + near) & (inner < stop - near)]
-    new = np.array([first, *inner, stop])
-    pieces = []
-    for a, b in pairwise(new.tolist()):
-        k = int(np.searchsorted(breaks, (a + b) / 2, side="right")) - 1
-        if k >= len(coefficients):
-            held = np.zeros_like(coefficients[0])
-            held[:, 0] = coefficients[-1].sum(axis=1)
-            pieces.append(held)
-            continue
-        pieces.append(_restrict(coefficients[k], breaks[k], breaks[k + 1], a, b))
-    return TorqueProfile(new, np.array(pieces))
-
-
-def _restrict(coefficients: Array, start: float, stop: float, a: float, b: float) -> Array:
-    """The same polynomials over a part [a, b] of [start, stop]."""
-    if a == start and b == stop:
-        return coefficients
-    # x = shift + scale u, where u runs from -1 to 1 over the part.
-    scale, shift = (b - a) / (stop - start), (a + b - start - stop) / (stop - start)
-    result = np.zeros_like(coefficients)
-    power = np.zeros(coefficients.shape[1])
-    power[0] = 1.0
-    for k in range(coefficients.shape[1]):
-        result += coefficients[:, k : k + 1] * power
-        power = shift * power + scale * np.append(0.0, power[:-1])
-    return result
 
 
 __all__ = ["PhaseRun", "SimulationError", "simulate_free", "simulate_phases"]

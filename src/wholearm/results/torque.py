@@ -6,6 +6,7 @@ import csv
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -61,6 +62,22 @@ class TorqueProfile:
         squares = np.einsum("kjd,de,kje->k", self.coefficients, moments, self.coefficients)
         return float(squares @ np.diff(self.breaks) / 2)
 
+    def cut(self, start: float, stop: float) -> TorqueProfile:
+        """The same torques from `start` to `stop` [s], those of the ends held beyond them."""
+        near = 1e-12 * max(abs(start), abs(stop))
+        inner = self.breaks[(self.breaks > start + near) & (self.breaks < stop - near)]
+        new = np.array([start, *inner, stop])
+        pieces = np.zeros((len(new) - 1, *self.coefficients.shape[1:]))
+        for piece, (a, b) in zip(pieces, pairwise(new.tolist()), strict=True):
+            middle = (a + b) / 2
+            if not self.breaks[0] < middle < self.breaks[-1]:
+                piece[:, 0] = self.at(np.array([middle]))[0]
+                continue
+            k = int(np.searchsorted(self.breaks, middle, side="right")) - 1
+            first, last = self.breaks[k : k + 2].tolist()
+            piece[:] = _restrict(self.coefficients[k], first, last, a, b)
+        return TorqueProfile(new, pieces)
+
     @staticmethod
     def fit(breaks: Array, function: Callable[[Array], Array], degree: int) -> TorqueProfile:
         """Interpolate `function`, t -> (n, 2) [N m], at Chebyshev nodes of each piece.
@@ -100,6 +117,21 @@ class TorqueProfile:
         middle, half = (tau[pieces] + tau[pieces + 1]) / 2, (tau[pieces + 1] - tau[pieces]) / 2
         breaks = np.append(t[pieces], t[-1])
         return TorqueProfile(breaks, np.stack([middle, half], axis=2))
+
+
+def _restrict(coefficients: Array, start: float, stop: float, a: float, b: float) -> Array:
+    """The same polynomials over a part [a, b] of [start, stop]."""
+    if a == start and b == stop:
+        return coefficients
+    # x = shift + scale u, where u runs from -1 to 1 over the part.
+    scale, shift = (b - a) / (stop - start), (a + b - start - stop) / (stop - start)
+    result = np.zeros_like(coefficients)
+    power = np.zeros(coefficients.shape[1])
+    power[0] = 1.0
+    for k in range(coefficients.shape[1]):
+        result += coefficients[:, k : k + 1] * power
+        power = shift * power + scale * np.append(0.0, power[:-1])
+    return result
 
 
 def read_torque_csv(path: str) -> TorqueProfile:

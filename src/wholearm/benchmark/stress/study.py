@@ -12,8 +12,8 @@ from typing import Any
 from ... import __version__
 from ...common.errors import InputError
 from ...common.files import make_folder, write_text
+from ...common.journal import Journal
 from .files import run_file
-from .journal import Journal
 from .plans import OBJECTIVES, run_scene
 from .problems import compare_values, list_trials, run_trial
 from .report import format_summary, stamp_machine

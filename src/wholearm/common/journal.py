@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 from typing import Any
 
-from ...common.errors import InputError
+from .errors import InputError
 
 
 class Journal:

@@ -1,0 +1,112 @@
+"""The command ``wholearm robustness``: how much error a plan bears."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING
+
+from ..common.errors import InputError
+from .progress import clear_progress, show_progress
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from ..robustness.uncertainty import Uncertainty
+
+
+def add_robustness(parser: argparse.ArgumentParser) -> None:
+    """Add what `robustness` takes."""
+    parser.add_argument("problem", help="problem file (TOML)")
+    parser.add_argument("plan", help="trajectory file (.npz)")
+    text = "samples to replay, a Latin hypercube of all ranges (1000)"
+    parser.add_argument("--samples", type=int, default=1000, help=text)
+    parser.add_argument("--seed", type=int, default=0, help="of the samples (0)")
+    text = "only this phase, from its planned start at rest (default: the whole plan)"
+    parser.add_argument("--phase", type=int, metavar="K", help=text)
+    text = (
+        "half widths of ranges: mass, inertia (0.05), friction (0.1), gain of the torques (0.01), "
+        "all relative; geometry, start_x (2e-4 m), delay (1e-3 s); 0 leaves a number as it is"
+    )
+    parser.add_argument("--vary", metavar="NAME=WIDTH", nargs="+", default=[], help=text)
+    text = "of a sample-and-hold of the torques [Hz] (1000; 0: torques as planned)"
+    parser.add_argument("--sample-rate", type=float, metavar="HZ", default=1000.0, help=text)
+    text = "file to write results to, one by one (default: NAME_robustness.jsonl); a study that is "
+    text += "there goes on where it was stopped"
+    parser.add_argument("-o", "--output", metavar="FILE", help=text)
+    parser.add_argument("--fresh", action="store_true", help="begin anew instead")
+    text = "also draw the motion with its noisy copies (.png, .pdf, .svg)"
+    parser.add_argument("--figure", metavar="FILE", help=text)
+    parser.add_argument("--jobs", type=int, help="worker processes (default: all cores)")
+    text = "run on the cluster of this Dask scheduler (extra: cluster)"
+    parser.add_argument("--scheduler", metavar="ADDRESS", help=text)
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    parser.set_defaults(run=_robustness)
+
+
+def _robustness(options: argparse.Namespace) -> int:
+    from ..common.files import require_ending, require_writable
+    from ..problem.read import read_problem
+    from ..results.trajectory_file import load_trajectory
+    from ..robustness.report import to_dict, to_text
+    from ..robustness.study import assess_robustness
+
+    stem = os.path.splitext(os.path.basename(options.problem))[0]
+    output = options.output or f"{stem}_robustness.jsonl"
+    require_writable(output)
+    require_ending(output, ".jsonl")
+    if options.figure is not None:
+        from ..figures import plots
+
+        require_writable(options.figure)
+        plots.require_format(options.figure)
+    study = assess_robustness(
+        read_problem(options.problem),
+        load_trajectory(options.plan),
+        samples=options.samples,
+        seed=options.seed,
+        uncertainty=_read_ranges(options),
+        phase=options.phase,
+        path=output,
+        fresh=options.fresh,
+        start=_choose_executor(options),
+        progress=show_progress(),
+    )
+    clear_progress()
+    if options.figure is not None:
+        from ..figures.robustness import draw_robustness
+
+        plots.save(draw_robustness(study), options.figure)
+    print(json.dumps(to_dict(study), indent=2) if options.json else to_text(study))
+    if not options.json:
+        print("wrote " + ", ".join(filter(None, (output, options.figure))))
+    return 0
+
+
+def _read_ranges(options: argparse.Namespace) -> Uncertainty:
+    from ..robustness.uncertainty import Uncertainty
+
+    widths = {}
+    for text in options.vary:
+        name, _, value = text.partition("=")
+        try:
+            widths[name] = float(value)
+        except ValueError:
+            given = f"{text!r} given; NAME=WIDTH is needed, such as mass=0.1"
+            raise InputError("", "--vary", given) from None
+    return Uncertainty(widths, options.sample_rate or None)
+
+
+def _choose_executor(options: argparse.Namespace) -> Callable[[], Executor] | None:
+    if options.jobs is not None and options.jobs < 1:
+        raise InputError("", "--jobs", f"{options.jobs} given; allowed are 1 and more")
+    if options.scheduler is not None:
+        from ..robustness.cluster import connect
+
+        return partial(connect, options.scheduler)
+    from ..robustness.study import use_processes
+
+    return partial(use_processes, options.jobs)

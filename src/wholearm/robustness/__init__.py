@@ -1,0 +1,1 @@
+"""How much error a plan bears: samples of scenes and torques, replayed free of assumptions."""

@@ -1,0 +1,228 @@
+"""One sample: what becomes of a plan when numbers are off."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.errors import InputError, SimulationError
+from ..contacts.closing import close_fingers, describe_obstacle
+from ..free_simulation.result import FreeSimulation
+from ..free_simulation.simulate import simulate_free
+from ..problem.definition import Problem
+from ..results.torque import TorqueProfile
+from ..results.trajectory import Trajectory
+from ..simulation.events import OutcomeKind
+from .uncertainty import Uncertainty, change_problem, change_torques
+
+DISTANCE = 1e-3
+"""How far from the planned place a goal counts as reached [m]."""
+ANGLE = math.radians(1.0)
+"""How far from the planned angle [rad]."""
+PAUSE = 1e-3
+"""Time for which a planned contact may be open, in the scene's unit of time, and still be kept."""
+SNAPSHOTS = 24
+"""Poses of a motion that are kept for figures."""
+
+
+class Window(NamedTuple):
+    """A phase by the clock of a plan.
+
+    Attributes
+    ----------
+    phase : int
+        Its number.
+    stop : float, [s]
+    contacts : tuple of str
+        That it is planned with.
+    gained : str
+        The contact that it ends with; empty where it ends otherwise.
+    """
+
+    phase: int
+    stop: float
+    contacts: tuple[str, ...]
+    gained: str
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """What is tried: a plan or one phase of it, with numbers that are off.
+
+    Attributes
+    ----------
+    problem : Problem
+    torque : TorqueProfile
+        From time 0 on.
+    state : ndarray, shape (5,)
+        Configuration at the start, at rest. Where numbers are off the object is put on the palm at
+        the same x and phi, and the fingers are closed on it.
+    windows : tuple of Window
+    goal : ndarray, shape (3,)
+        The pose that is planned for the end.
+    uncertainty : Uncertainty
+    """
+
+    problem: Problem
+    torque: TorqueProfile
+    state: Array
+    windows: tuple[Window, ...]
+    goal: Array
+    uncertainty: Uncertainty
+
+    def run(self, sample: Array) -> dict[str, Any]:
+        """What becomes of one sample, as plain values.
+
+        Parameters
+        ----------
+        sample : ndarray, shape (len(varied) + 1,)
+            A row of `Uncertainty.draw`.
+
+        Returns
+        -------
+        dict
+            `distance` [m] and `angle` [rad] from the goal; `reached` and `kept`; the first contact
+            that was `lost`, the number of its `phase` and the `time` [s]; the `least` c_n [N]
+            of planned contacts; `path`, poses at even times; `ended`, empty or why the simulation
+            ended early or could not begin.
+        """
+        names = [own.name for own in self.uncertainty.varied]
+        changes = dict(zip(names, sample[:-1].tolist(), strict=True))
+        return self.change(changes, self.uncertainty.sample_rate, float(sample[-1]))
+
+    def change(
+        self, changes: Mapping[str, float], rate: float | None = None, offset: float = 0.0
+    ) -> dict[str, Any]:
+        """The same for numbers that are off by `changes`, torques sampled and held at a rate."""
+        torque = change_torques(self.torque, changes, rate, offset)
+        try:
+            simulation = self.simulate(changes, torque)
+        except (InputError, SimulationError) as error:
+            return {"ended": str(error), "reached": False, "kept": False, "lost": "start"}
+        return self.judge(simulation, changes.get("delay", 0.0))
+
+    def simulate(self, changes: Mapping[str, float], torque: TorqueProfile) -> FreeSimulation:
+        """Replay torques in the scene whose numbers are off, free of assumptions.
+
+        Raises
+        ------
+        InputError, SimulationError
+            If the changed scene has no start.
+        """
+        problem = change_problem(self.problem, changes)
+        x = self.state[:1] + changes.get("start_x", 0.0)
+        closed = close_fingers(problem.scene, x, self.state[2:3])
+        if text := describe_obstacle(closed):
+            raise SimulationError(f"the hand cannot close at the start: {text}")
+        return simulate_free(problem, torque, start=closed.z[0])
+
+    def judge(self, simulation: FreeSimulation, delay: float = 0.0) -> dict[str, Any]:
+        """Compare a motion with the plan; as `run`."""
+        off = simulation.z[-1, :3] - self.goal
+        distance, angle = float(np.hypot(off[0], off[1])), float(abs(off[2]))
+        given_up = simulation.outcome.kind is OutcomeKind.GIVEN_UP
+        lost, phase, time, least = self._follow(simulation, delay)
+        even = np.linspace(0.0, simulation.t[-1], SNAPSHOTS)
+        path = np.column_stack([np.interp(even, simulation.t, column) for column in simulation.z.T])
+        return {
+            "distance": distance,
+            "angle": angle,
+            "reached": distance <= DISTANCE and angle <= ANGLE and not given_up,
+            "kept": not lost and not given_up,
+            "lost": lost,
+            "phase": phase,
+            "time": time,
+            "least": least,
+            "path": path.tolist(),
+            "ended": simulation.outcome.text if given_up else "",
+        }
+
+    def _follow(
+        self, simulation: FreeSimulation, delay: float
+    ) -> tuple[str, int | None, float | None, float]:
+        """The first planned contact that is lost, its phase and when, and the least c_n.
+
+        A phase goes on from when the last one's contact was gained to when its own is, or to its
+        end by the clock.
+        """
+        pause = PAUSE * self.problem.scene.scales.time
+        began, losses, least = 0.0, list[tuple[float, int, str]](), math.inf
+        for window in self.windows:
+            gains = [own.start for own in simulation.stretches if own.contact == window.gained]
+            gain = min((time for time in gains if time > began), default=math.inf)
+            planned = window.stop + delay
+            for name in window.contacts:
+                time, force = _find_loss(simulation, name, began, min(planned, gain), pause)
+                least = min(least, force)
+                if time is not None:
+                    losses.append((time, window.phase, name))
+            began = max(planned, gain) if window.gained else planned
+            if began > simulation.t[-1]:
+                # What ends the whole motion may be a little short: that is for the goal to say.
+                if window is not self.windows[-1]:
+                    losses.append((planned, window.phase, window.gained))
+                break
+        if not losses:
+            return "", None, None, least
+        first, phase, name = min(losses)
+        return name, phase, first, least
+
+
+def _find_loss(
+    simulation: FreeSimulation, name: str, start: float, stop: float, pause: float
+) -> tuple[float | None, float]:
+    """When a contact opens for longer than a pause, None if it does not; and its least c_n."""
+    column = simulation.contacts.index(name)
+    t, c_n = simulation.t, simulation.c_n[:, column]
+    here = (t >= start) & (t < stop)
+    known = c_n[here & (c_n == c_n)]
+    least = float(known.min()) if len(known) else math.inf
+    closed_until = start
+    for own in simulation.stretches:
+        if own.contact == name and own.stop > closed_until:
+            if own.start > closed_until + pause or closed_until >= stop:
+                break
+            closed_until = own.stop
+    return (closed_until if closed_until < stop - pause else None), least
+
+
+def make_trial(
+    problem: Problem, plan: Trajectory, uncertainty: Uncertainty, phase: int | None = None
+) -> Trial:
+    """What is tried of a plan: all of it, or the phase of a number.
+
+    Raises
+    ------
+    InputError
+        If the plan has no phase of that number, or one that does not start at rest.
+    """
+    starts = plan.phase_starts
+    count = len(starts) - 1
+    if phase is not None and not 1 <= phase <= count:
+        raise InputError("", "--phase", f"{phase} given; the plan has phases 1 to {count}")
+    first, last = (0, count - 1) if phase is None else (phase - 1, phase - 1)
+    rows = np.flatnonzero((plan.phase >= first) & (plan.phase <= last))
+    speed = problem.scene.scales
+    units = np.array([speed.speed, speed.speed, *[speed.rate] * 3])
+    if np.abs(plan.z_dot[rows[0]] / units).max() > 1e-6:
+        given = f"{phase} given; it does not start at rest, so that it is no trial of its own"
+        raise InputError("", "--phase", given)
+    begin = float(starts[first])
+    windows = tuple(
+        Window(
+            own.number,
+            float(starts[own.index + 1]) - begin,
+            tuple(own.formation.names),
+            own.until.contact.name if own.until.contact is not None else "",
+        )
+        for own in problem.phases[first : last + 1]
+    )
+    torque = plan.torque.cut(begin, float(starts[last + 1]))
+    torque = TorqueProfile(torque.breaks - begin, torque.coefficients)
+    goal = plan.q[rows[-1]]
+    return Trial(problem, torque, plan.z[rows[0]], windows, goal, uncertainty)

@@ -1,0 +1,199 @@
+"""What is not known exactly of a scene and of what carries torques out, and by how much."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.errors import InputError
+from ..common.require import require_number
+from ..problem.definition import Problem
+from ..results.torque import TorqueProfile
+from ..scene.model import Friction
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number of a problem that may be off, or one of its torques.
+
+    Attributes
+    ----------
+    name : str
+    default : float
+        Half width of its range.
+    unit : str
+        Of the half width; empty for a relative one.
+    """
+
+    name: str
+    default: float
+    unit: str = ""
+
+
+PARAMETERS = (
+    Parameter("mass", 0.05),
+    Parameter("inertia", 0.05),
+    Parameter("friction_palm", 0.1),
+    Parameter("friction_finger1", 0.1),
+    Parameter("friction_finger2", 0.1),
+    Parameter("length1", 2e-4, "m"),
+    Parameter("length2", 2e-4, "m"),
+    Parameter("base1_x", 2e-4, "m"),
+    Parameter("base1_y", 2e-4, "m"),
+    Parameter("base2_x", 2e-4, "m"),
+    Parameter("base2_y", 2e-4, "m"),
+    Parameter("start_x", 2e-4, "m"),
+    Parameter("gain1", 0.01),
+    Parameter("gain2", 0.01),
+    Parameter("delay", 1e-3, "s"),
+)
+"""All that can be varied. A delay is never negative: its range is [0, half width]."""
+
+NAMES = tuple(parameter.name for parameter in PARAMETERS)
+GROUPS: Mapping[str, tuple[str, ...]] = {
+    "friction": ("friction_palm", "friction_finger1", "friction_finger2"),
+    "geometry": ("length1", "length2", "base1_x", "base1_y", "base2_x", "base2_y"),
+    "gain": ("gain1", "gain2"),
+}
+"""Names that stand for several."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Half widths of the ranges, by name of the parameter, and how torques are carried out.
+
+    Attributes
+    ----------
+    widths : mapping of str to float
+        Those that are left out have their defaults; zero leaves a parameter as it is.
+    sample_rate : float or None, [Hz]
+        Of a sample-and-hold of the torques, whose first sample is anywhere in a period; None for
+        torques as planned.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown, or a width is not a number from zero to what makes sense: below one
+        for relative ones.
+    """
+
+    widths: Mapping[str, float] = field(default_factory=dict)
+    sample_rate: float | None = 1000.0
+
+    def __post_init__(self) -> None:
+        widths = {parameter.name: parameter.default for parameter in PARAMETERS}
+        for key, value in self.widths.items():
+            if key not in (*NAMES, *GROUPS):
+                allowed = ", ".join((*GROUPS, *NAMES))
+                raise InputError("", f"range of {key}", f"is unknown; allowed are {allowed}")
+            for name in GROUPS.get(key, (key,)):
+                widths[name] = require_number(value, f"range of {key}", nonnegative=True)
+        for parameter in PARAMETERS:
+            if not parameter.unit and widths[parameter.name] >= 1:
+                given = f"{widths[parameter.name]:g} given; a relative range is below 1"
+                raise InputError("", f"range of {parameter.name}", given)
+        if self.sample_rate is not None:
+            require_number(self.sample_rate, "sample rate", positive=True)
+        object.__setattr__(self, "widths", widths)
+
+    @property
+    def varied(self) -> tuple[Parameter, ...]:
+        """The parameters with a range."""
+        return tuple(own for own in PARAMETERS if self.widths[own.name] > 0)
+
+    def draw(self, count: int, seed: int) -> Array:
+        """Samples of a Latin hypercube, shape (count, len(varied) + 1).
+
+        Each parameter has one sample in each of `count` slices of its range, so that its effect
+        does not drown in that of the others. The last column is where in a period of the
+        sample-and-hold the torques begin, in [0, 1).
+        """
+        generator = np.random.default_rng(seed)
+        slices = generator.permuted(
+            np.tile(np.arange(count)[:, None], len(self.varied) + 1), axis=0
+        )
+        shares = (slices + generator.random(slices.shape)) / count
+        centred = 2 * shares[:, :-1] - 1
+        delay = [own.name == "delay" for own in self.varied]
+        centred[:, delay] = shares[:, :-1][:, delay]
+        widths = np.array([self.widths[own.name] for own in self.varied])
+        return np.column_stack([centred * widths, shares[:, -1]])
+
+
+def change_problem(problem: Problem, changes: Mapping[str, float]) -> Problem:
+    """The problem in a scene whose numbers are off; its start is left as it is.
+
+    Parameters
+    ----------
+    changes : mapping of str to float
+        By name of the parameter: relative, or in the parameter's unit. Those of torques and of the
+        start do nothing here.
+
+    Raises
+    ------
+    InputError
+        If a number makes no sense any more.
+    """
+    scene = problem.scene
+
+    def change(name: str) -> float:
+        return changes.get(name, 0.0)
+
+    body = scene.polygon
+    assert body.inertia is not None
+    mass, inertia = body.mass * (1 + change("mass")), body.inertia * (1 + change("inertia"))
+    first, second = (
+        replace(
+            finger,
+            length=finger.length + change(f"length{number}"),
+            base=np.asarray(finger.base) + [change(f"base{number}_{axis}") for axis in "xy"],
+        )
+        for number, finger in enumerate(scene.fingers, start=1)
+    )
+    parts = ("palm", "finger1", "finger2")
+    mu = {part: getattr(scene.friction, part) * (1 + change(f"friction_{part}")) for part in parts}
+    new = replace(
+        scene,
+        polygon=replace(body, mass=mass, inertia=inertia),
+        fingers=(first, second),
+        friction=Friction(**mu),
+    )
+    return replace(problem, scene=new)
+
+
+def change_torques(
+    torque: TorqueProfile,
+    changes: Mapping[str, float],
+    sample_rate: float | None = None,
+    offset: float = 0.0,
+) -> TorqueProfile:
+    """Torques as they are carried out: sampled and held, late, and of the wrong size.
+
+    Parameters
+    ----------
+    changes : mapping of str to float
+        `gain1`, `gain2` relative, and `delay` [s], during which the first torques hold.
+    sample_rate : float or None, [Hz]
+    offset : float
+        Share of a period by which the first sample is early, in [0, 1).
+    """
+    breaks, coefficients = torque.breaks, torque.coefficients
+    if sample_rate is not None:
+        start, stop = torque.breaks[0], torque.breaks[-1]
+        ticks = np.arange(1, np.ceil((stop - start) * sample_rate) + 1) - offset
+        inner = start + ticks / sample_rate
+        inner = inner[(inner > start) & (inner < stop)]
+        breaks = np.concatenate([[start], inner, [stop]])
+        coefficients = torque.at(breaks[:-1])[:, :, None]
+    gains = 1 + np.array([changes.get("gain1", 0.0), changes.get("gain2", 0.0)])
+    coefficients = coefficients * gains[:, None]
+    delay = changes.get("delay", 0.0)
+    if delay > 0:
+        first = np.zeros((1, *coefficients.shape[1:]))
+        first[0, :, 0] = torque.at(torque.breaks[:1])[0] * gains
+        breaks = np.concatenate([breaks[:1], breaks + delay])
+        coefficients = np.concatenate([first, coefficients])
+    return TorqueProfile(breaks, coefficients)

@@ -1,0 +1,220 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import wholearm
+from wholearm.cli.command import main
+from wholearm.common.errors import InputError
+from wholearm.figures.robustness import draw_robustness
+from wholearm.planning.result import Plan
+from wholearm.problem.definition import Problem
+from wholearm.robustness.report import to_dict, to_text
+from wholearm.robustness.sensitivity import measure_sensitivities
+from wholearm.robustness.study import Robustness, assess_robustness
+from wholearm.robustness.trial import Trial, Window, make_trial
+from wholearm.robustness.uncertainty import Uncertainty, change_problem
+
+PROBLEM = Path(__file__).parents[1] / "problems" / "heptagon_four_contacts.toml"
+NONE = dict.fromkeys(("inertia", "friction", "geometry", "start_x", "gain", "delay"), 0.0)
+FEW = Uncertainty({**NONE, "friction_finger1": 0.1}, sample_rate=None)
+"""Of mass and of one friction."""
+THREADS: Callable[[], Executor] = partial(ThreadPoolExecutor, 2)
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    """The first slide of the heptagon alone."""
+    whole = wholearm.load(str(PROBLEM))
+    return whole.with_({"phases": [whole.table["phases"][0]], "epsilon": 0.3})
+
+
+@pytest.fixture(scope="module")
+def plan(problem: Problem) -> Plan:
+    return wholearm.solve(problem, replay=False)
+
+
+@pytest.fixture(scope="module")
+def trial(problem: Problem, plan: Plan) -> Trial:
+    return make_trial(problem, plan.trajectory, FEW)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("study") / "study.jsonl"
+
+
+@pytest.fixture(scope="module")
+def study(problem: Problem, plan: Plan, written: Path) -> Robustness:
+    return assess_robustness(problem, plan, samples=5, uncertainty=FEW, path=written, start=THREADS)
+
+
+def test_nothing_off_is_the_plan(trial: Trial) -> None:
+    """What is left is the simulator's tolerance, 1e-9 of the scene's length, many times over."""
+    record = trial.change({})
+    assert record["reached"] and record["kept"] and not record["lost"]
+    assert record["distance"] < 1e-8 and record["angle"] < 1e-8
+    assert record["least"] == pytest.approx(0.3, abs=1e-5)
+
+
+def test_a_start_that_is_off_closes_the_fingers_there(trial: Trial) -> None:
+    begun = trial.simulate({"start_x": 2e-4}, trial.torque.cut(0.0, 1e-6)).z[0]
+    assert begun[0] == pytest.approx(trial.state[0] + 2e-4, abs=1e-12)
+    gaps = trial.problem.phases[0].formation.evaluate(begun[None], np.zeros((1, 5))).C
+    assert np.abs(gaps).max() < 1e-12
+
+
+def test_what_is_far_off_loses_contacts_and_misses(trial: Trial) -> None:
+    record = trial.change({"gain1": -0.3, "gain2": 0.3})
+    assert not record["reached"] and not record["kept"]
+    assert record["lost"] in trial.windows[0].contacts and record["phase"] == 1
+
+
+def test_a_hand_that_cannot_close_is_counted(trial: Trial) -> None:
+    record = trial.change({"base1_x": 1.0})
+    assert record["lost"] == "start" and "finger 1" in record["ended"] and not record["reached"]
+
+
+def test_a_study_that_was_stopped_ends_the_same(
+    problem: Problem, plan: Plan, study: Robustness, written: Path, tmp_path: Path
+) -> None:
+    path, calls = tmp_path / "part.jsonl", list[str]()
+    lines = written.read_text().splitlines(keepends=True)
+    assert len(lines) == 6
+    path.write_text("".join(lines[:4]) + lines[4][:20])
+    again = assess_robustness(
+        problem, plan, samples=5, uncertainty=FEW, path=path, start=THREADS, progress=calls.append
+    )
+    assert len(calls) == 2 and calls[-1].startswith("5 of 5 samples")
+    numbers = [json.loads(line)["sample"] for line in path.read_text().splitlines()[1:]]
+    assert sorted(numbers) == list(range(5))
+    assert again.records == study.records
+
+
+def test_another_range_is_another_study(problem: Problem, plan: Plan, tmp_path: Path) -> None:
+    path, calls = tmp_path / "study.jsonl", list[str]()
+    run = partial(assess_robustness, problem, plan, samples=1, path=path, start=THREADS)
+    run(uncertainty=FEW)
+    run(uncertainty=Uncertainty({**FEW.widths, "mass": 0.01}, None), progress=calls.append)
+    assert len(calls) == 1
+
+
+def test_the_report_says_what_was_counted(study: Robustness) -> None:
+    text, values = to_text(study), to_dict(study)
+    reached = sum(record["reached"] for record in study.records)
+    assert f"({reached} of 5," in text and values["reached"]["count"] == reached
+    assert json.loads(json.dumps(values))["samples"] == 5
+    assert "mass               5 %" in text and "start_x" not in text
+
+
+def test_sensitivities_are_those_of_the_simulator_that_is_told_contacts(
+    problem: Problem, trial: Trial
+) -> None:
+    """By differences of its forces at the same instant, with another step."""
+    found = measure_sensitivities(trial)
+    slopes = {own.name: own.slope for own in found.of}
+    torque = trial.torque.cut(0.0, found.time)
+    for name, step in (("mass", 1e-4), ("friction_finger1", 2e-4)):
+        forces = []
+        for change in (-step, step):
+            replay = wholearm.simulate(change_problem(problem, {name: change}), torque)
+            forces.append(replay.c_n[-1, replay.contacts.index(found.contact)])
+        assert slopes[name] == pytest.approx((forces[1] - forces[0]) / (2 * step), rel=1e-4)
+
+
+def test_the_figure_shows_every_sample(study: Robustness) -> None:
+    motion, ends = draw_robustness(study).axes
+    assert (motion.get_xlabel(), ends.get_xlabel()) == ("x [mm]", "distance from the goal [mm]")
+    _, labels = ends.get_legend_handles_labels()
+    assert sum(int(label.rpartition(" ")[2]) for label in labels) == 5
+
+
+@pytest.mark.parametrize(
+    "options, text",
+    [
+        (["--vary", "mass"], "--vary: 'mass' given; NAME=WIDTH is needed"),
+        (["--vary", "weight=1"], "range of weight: is unknown"),
+        (["--phase", "9"], "--phase: 9 given; the plan has phases 1 to 1"),
+        (["--jobs", "0"], "--jobs: 0 given"),
+        (["-o", "out.csv"], "out.csv"),
+    ],
+)
+def test_bad_options_are_named(
+    plan: Plan,
+    options: list[str],
+    text: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    plan.save("plan.npz")
+    assert main(["robustness", str(PROBLEM), "plan.npz", *options]) == 2
+    assert text in capsys.readouterr().err
+
+
+def follow(
+    stretches: list[tuple[str, float, float]], windows: tuple[Window, ...]
+) -> dict[str, Any]:
+    """The verdict on a motion of 1 s in which contacts press as given."""
+    names = tuple(dict.fromkeys(name for window in windows for name in window.contacts))
+    scales = SimpleNamespace(time=0.1)
+    scene: Any = SimpleNamespace(scene=SimpleNamespace(scales=scales))
+    trial = Trial(scene, None, np.zeros(5), windows, np.zeros(3), FEW)  # type: ignore[arg-type]
+    t = np.linspace(0, 1, 11)
+    simulation: Any = SimpleNamespace(
+        t=t,
+        z=np.zeros((11, 5)),
+        c_n=np.ones((11, len(names))),
+        contacts=names,
+        stretches=[
+            SimpleNamespace(contact=name, start=start, stop=stop) for name, start, stop in stretches
+        ],
+        outcome=SimpleNamespace(kind=None, text=""),
+    )
+    return trial.judge(simulation)
+
+
+ONE = (Window(1, 1.0, ("a", "b"), "c"),)
+TWO = (Window(1, 0.5, ("a", "b"), "c"), Window(2, 1.0, ("b", "c"), ""))
+
+
+@pytest.mark.parametrize(
+    "stretches, windows, lost",
+    [
+        ([("a", 0, 1), ("b", 0, 1)], ONE, None),
+        ([("a", 0, 0.4), ("a", 0.40005, 1), ("b", 0, 1)], ONE, None),
+        ([("a", 0, 0.4), ("a", 0.41, 1), ("b", 0, 1)], ONE, ("a", 1, 0.4)),
+        ([("a", 0, 1), ("b", 0.2, 1)], ONE, ("b", 1, 0.0)),
+        ([("a", 0, 0.5), ("b", 0, 1), ("c", 0.5, 1)], TWO, None),
+        ([("a", 0, 0.47), ("b", 0, 1), ("c", 0.47, 1)], TWO, None),
+        ([("a", 0, 0.5), ("b", 0, 1), ("c", 0.53, 1)], TWO, None),
+        ([("a", 0, 0.5), ("b", 0, 1), ("c", 0.5, 0.8)], TWO, ("c", 2, 0.8)),
+        ([("a", 0, 0.5), ("b", 0, 1)], TWO, ("c", 1, 0.5)),
+    ],
+)
+def test_contacts_have_to_press_while_their_phase_lasts(
+    stretches: list[tuple[str, float, float]],
+    windows: tuple[Window, ...],
+    lost: tuple[str, int, float] | None,
+) -> None:
+    record = follow(stretches, windows)
+    found = (record["lost"], record["phase"], record["time"]) if record["lost"] else None
+    assert found == lost and record["kept"] == (lost is None)
+
+
+def test_what_cannot_be_tried_is_refused(problem: Problem, plan: Plan) -> None:
+    with pytest.raises(InputError, match="--phase: 2 given; the plan has phases 1 to 1"):
+        assess_robustness(problem, plan, phase=2)
+    with pytest.raises(InputError, match="samples: 0 given"):
+        assess_robustness(problem, plan, samples=0)
+    with pytest.raises(InputError, match="torques alone"):
+        assess_robustness(problem, plan.trajectory.torque)
