@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from wholearm.problem.read import build_problem
 from wholearm.scene.model import Scene
 
 
+@cache
 def hexagon(
     lengths: tuple[float, float] = (0.18, 0.18), base: float = -0.08, solid: bool = True
 ) -> Problem:
@@ -44,6 +46,7 @@ def shorten(problem: Problem) -> Problem:
     return replace(problem, phases=problem.phases[:3])
 
 
+@cache
 def make_way(solid: bool) -> Problem:
     """Finger 2 pushes the hexagon below a free finger 1, which has to make way for the other."""
     table = tomllib.loads(HEXAGON.read_text(encoding="utf-8"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -40,6 +41,7 @@ def evaluate(torque: TorqueProfile, t: float) -> Array:
     return np.asarray(torque.coefficients[k] @ x ** np.arange(torque.coefficients.shape[2]))
 
 
+@cache
 def pushed(mu: float = 0.3, contacts: str = "v0-palm v1-palm v2-finger1") -> Problem:
     """A box on the palm that finger 1 leans on, and finger 2 far off; both slide freely.
 

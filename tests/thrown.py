@@ -5,6 +5,8 @@ What it does then is known in closed form, whatever the fingers do.
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from scipy.integrate import quad
 
@@ -22,6 +24,7 @@ LEVER = HALF * np.sqrt(2.0)
 """From its centroid to a vertex [m]."""
 
 
+@cache
 def shove(run: float = 0.01, mu: float = 0.3) -> tuple[Problem, float]:
     """Finger 1 pushes the square over the palm, on which it then slides `run` [m] to rest.
 
@@ -33,6 +36,7 @@ def shove(run: float = 0.01, mu: float = 0.3) -> tuple[Problem, float]:
     return Problem("shove", scene, 0.05, start, phases), float(np.sqrt(2 * run / (mu * 9.81)))
 
 
+@cache
 def heave(turn: float = 0.15) -> tuple[Problem, float]:
     """Finger 1 heaves the square over vertex 0, which rolls; it then rises by `turn` [rad] to rest.
 
@@ -45,6 +49,7 @@ def heave(turn: float = 0.15) -> tuple[Problem, float]:
     return Problem("heave", scene, 0.05, start, phases), _rising_time(0.4 - turn, 0.4, True)
 
 
+@cache
 def lift(turn: float = 0.02) -> tuple[Problem, float]:
     """Both fingers lift the square over vertex 0, which then slides without friction.
 
@@ -58,6 +63,7 @@ def lift(turn: float = 0.02) -> tuple[Problem, float]:
     return Problem("lift", scene, 0.05, start, phases), _rising_time(0.4, 0.4 + turn, False)
 
 
+@cache
 def raised(stop: float = 0.5) -> Problem:
     """Both fingers turn the square over vertex 0 to `stop` [rad], from rest to rest.
 
@@ -69,6 +75,7 @@ def raised(stop: float = 0.5) -> Problem:
     return Problem("raise", scene, 0.05, start, (phase,))
 
 
+@cache
 def parting() -> Problem:
     """Finger 1 pushes a box over the palm that finger 2 touches as well at the start."""
     corners = [[-0.045, -0.03], [0.045, -0.03], [0.045, 0.09], [-0.045, 0.09]]
