@@ -35,7 +35,7 @@ def coarse(objective: str) -> Solution:
     problem = landing()
     start = trace_phases(problem)[-1].end
     search = search_for(objective)
-    stages = guess_stages(problem, problem.phases[4:], start, search.scheme, 4, 2.0)
+    stages = guess_stages(problem, problem.phases[4:], start, search.scheme, 8, 2.0)
     solution = search.solve(stages)
     assert solution.success
     return solution
