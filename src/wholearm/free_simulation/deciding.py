@@ -125,7 +125,9 @@ def decide(run: Run) -> bool | None:
         Whether everything rests; None where no modes obey them.
     """
     system, scales = run.system, run.system.scales
-    pattern = Pattern(run, find_closed(run))
+    closed = find_closed(run)
+    _end_chatter(run, closed)
+    pattern = Pattern(run, closed)
     later = AHEAD * scales.time
     now = pattern.pose(run.z, run.v, run.tau(run.t))
     first = try_modes(now, pattern.recall(run.modes)) or _solve(run, now)
@@ -232,11 +234,24 @@ def _snap(run: Run, pattern: Pattern) -> None:
     chosen = (*modes.kept, *(pattern.closed[k] for k in pattern.standing))
     rows = system.evaluate(run.z, run.v, chosen)
     count = len(modes.kept)
-    gradients = np.vstack([rows.A[:count], rows.A_t[count:], np.eye(system.n)[pattern.joints]])
-    if not len(gradients):
+    _settle(run, np.vstack([rows.A[:count], rows.A_t[count:], np.eye(system.n)[pattern.joints]]))
+
+
+def _end_chatter(run: Run, closed: Sequence[int]) -> None:
+    """Close at rest, and all at once, what is closed and parts more slowly than `CHATTER`."""
+    system, speed = run.system, run.system.scales.speed
+    rows = system.evaluate(run.z, run.v, closed)
+    if (np.abs(rows.A @ run.v) > STANDING * speed).any():
+        sticks = (np.abs(rows.A_t @ run.v) < CHATTER * speed) & (system.friction[list(closed)] > 0)
+        _settle(run, np.vstack([rows.A, rows.A_t[sticks]]))
+
+
+def _settle(run: Run, rows: Array) -> None:
+    """Take away the speeds along some rows, the shortest way in the metric of masses."""
+    if not len(rows):
         return
-    root = np.sqrt(system.mass)
-    scaled = gradients / root
+    root = np.sqrt(run.system.mass)
+    scaled = rows / root
     scaled /= np.linalg.norm(scaled, axis=1)[:, None]
     change = np.linalg.lstsq(scaled, scaled @ (root * run.v), rcond=1e-9)[0]
     run.take_impulse(run.v - change / root)

@@ -17,6 +17,8 @@ from .contact_problem import APART, BACK, FORTH, STICKS, Answer, ContactProblem,
 from .deciding import Pattern, find_closed
 from .state import AHEAD, CHATTER, STANDING, Run
 
+CHATTER_PAUSE = 1e-3
+"""Time in which the end of the impacts of a pair is told once, relative to the scene's time."""
 ROUNDS = 30
 """Most impacts at one instant; what is left after them is plastic."""
 
@@ -52,11 +54,20 @@ def _collide(
         if rates[k] >= -STANDING * run.system.scales.speed or answer.c_n[k] <= 0:
             continue
         name, text = run.system.names[pair], run.system.pairs[pair].text
-        kind = EventKind.IMPACT if bouncing else EventKind.CHATTER
-        after = f"{text or name} at {-rates[k]:.4g} m/s"
-        note = after if bouncing else f"the impacts of {name} come ever closer and are over"
-        run.note(kind, note, name, float(-rates[k]))
+        if bouncing:
+            note = f"{text or name} at {-rates[k]:.4g} m/s"
+            run.note(EventKind.IMPACT, note, name, float(-rates[k]))
+        elif not _is_told(run, name):
+            note = f"the impacts of {name} come ever closer and are over"
+            run.note(EventKind.CHATTER, note, name, float(-rates[k]))
     run.take_impulse(v)
+
+
+def _is_told(run: Run, name: str) -> bool:
+    """Whether it has just been said that the impacts of a pair are over."""
+    brief = CHATTER_PAUSE * run.system.scales.time
+    own = [e for e in run.events if (e.kind, e.contact) == (EventKind.CHATTER, name)]
+    return bool(own) and run.t - own[-1].time < brief
 
 
 def _pose(run: Run, closed: Sequence[int], v: Array) -> ContactProblem:
@@ -105,15 +116,6 @@ def jolt(run: Run) -> bool:
     answer = solve(_pose(run, pattern.closed, run.v + later * free))
     if answer is None:
         return False
-    change = answer.change
-    names = " ".join(system.names[pair] for pair in pattern.closed)
-    if np.abs(change / system.units[system.n :]).max() < 10 * AHEAD:
-        return False
-    run.note(
-        EventKind.INCONSISTENT,
-        f"no finite forces keep {names} closed: an impact without a collision",
-        names,
-    )
     # With the modes that it ends in, the impact at the instant itself is linear.
     problem = _pose(run, pattern.closed, run.v)
     ways = {0.0: STICKS, 1.0: FORTH, -1.0: BACK}
@@ -121,5 +123,14 @@ def jolt(run: Run) -> bool:
     for own, way in zip(problem.owner, answer.way, strict=True):
         choice[own] = ways[float(way)] if choice[own] != APART else APART
     exact = try_modes(problem, choice)
-    run.take_impulse(run.v + (exact or answer).change)
+    units = system.units[system.n :]
+    if exact is None or (np.abs(exact.change) < STANDING * units).all():
+        return False
+    names = " ".join(system.names[pair] for pair in pattern.closed)
+    run.note(
+        EventKind.INCONSISTENT,
+        f"no finite forces keep {names} closed: an impact without a collision",
+        names,
+    )
+    run.take_impulse(run.v + exact.change)
     return True

@@ -10,7 +10,7 @@ from ..common.arrays import Array
 from ..results.sampled import interpolate_quintic
 from ..simulation.locate import find_root
 from ..simulation.runge_kutta import ORDER
-from .state import AHEAD, ARMED, CLOSED, Run
+from .state import AHEAD, ARMED, CHATTER, CLOSED, Run
 
 GROWTH = 10.0
 """Largest growth of a step."""
@@ -132,7 +132,7 @@ class _Motion:
                     return h, whole, view
             run.rejected += 1
             if not error < np.inf or h < least:
-                raise StuckError(f"steps at t = {run.t:.6g} s become too short")
+                raise StuckError
             run.h = h * (max(0.1, 0.9 * error ** (-1 / ORDER)) if error > 1 else 0.5)
 
     def view(self, before: Array, h: float) -> View:
@@ -261,5 +261,6 @@ class _Motion:
         rows = run.system.evaluate(run.z, run.v, np.flatnonzero(near).tolist())
         rate = rows.A @ run.v
         bend = rows.A @ s.outputs[s.to.acceleration] + rows.bend
-        back = (rate > 0) & (bend < 0)
+        # What parts more slowly was closed when the modes were chosen.
+        back = (rate >= CHATTER * run.system.scales.speed) & (bend < 0)
         return float((-rate[back] / bend[back]).min(initial=np.inf))

@@ -44,9 +44,11 @@ def play(run: Run, touching: float) -> None:
             continue
         try:
             move(run)
-        except StuckError as error:
-            run.note(EventKind.GIVEN_UP, str(error).partition(" at t")[0] + " become too short")
-            return
+        except StuckError:
+            # Forces grow without bound where the motion jams.
+            if not jolt(run):
+                run.note(EventKind.GIVEN_UP, "steps become too short")
+                return
 
 
 def _advances(run: Run) -> bool:

@@ -11,10 +11,11 @@ from ..common.arrays import Array
 from ..common.errors import InputError, SimulationError
 from ..common.require import require_number
 from ..common.sharing import exclusive
-from ..problem.definition import End, Problem
+from ..problem.definition import Problem
 from ..results.narrow import Torques, narrow
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
+from ..simulation.tolerances import SLOW, is_slower
 from .hand import build_system, measure_gaps
 from .play import play
 from .result import FreeSimulation, collect
@@ -91,7 +92,7 @@ def simulate_phases(
 ) -> tuple[PhaseRun, ...]:
     """Simulate the phases of a plan one by one, each from its planned start.
 
-    Phases that pass into one another in motion are simulated together.
+    Phases that pass into one another in motion, by the plan's velocities, are simulated together.
 
     Parameters
     ----------
@@ -100,12 +101,14 @@ def simulate_phases(
     plan : Trajectory
     """
     starts, found = plan.phase_starts, []
+    rows = [int(row) for row in np.flatnonzero(np.diff(plan.phase, prepend=-1))]
+    rests = [is_slower(problem.scene, plan.z_dot[row], SLOW) for row in rows] + [True]
     first = 0
-    for last, phase in enumerate(problem.phases[: len(starts) - 1]):
-        if phase.end is not End.REST and last + 2 < len(starts):
+    for last in range(len(rows)):
+        if not rests[last + 1]:
             continue
         profile = plan.torque.cut(float(starts[first]), float(starts[last + 1]))
-        row = int(np.flatnonzero(plan.phase == first)[0])
+        row = rows[first]
         state = np.concatenate([plan.z[row], plan.z_dot[row]])
         hint = _recall(problem, plan, row)
         clock = starts[first : last + 1].tolist()
