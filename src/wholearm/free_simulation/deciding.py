@@ -25,7 +25,7 @@ from .contact_problem import (
     solve,
     try_modes,
 )
-from .state import AHEAD, CHATTER, CLOSED, STANDING, STILL, Run
+from .state import AHEAD, CLOSED, STANDING, STILL, Run
 from .stepper import Modes
 from .system import Rows, System
 
@@ -46,7 +46,7 @@ def find_closed(run: Run) -> tuple[int, ...]:
         return ()
     found = sorted(touching.tolist(), key=lambda pair: pair not in run.modes.kept)
     rows = system.evaluate(run.z, run.v, found)
-    slow = rows.A @ run.v < CHATTER * scales.speed
+    slow = rows.A @ run.v < run.chatter
     unit = rows.A / np.sqrt((rows.A**2 / system.mass).sum(axis=1))[:, None] / np.sqrt(system.mass)
     chosen: list[int] = []
     for k in np.flatnonzero(slow):
@@ -238,11 +238,11 @@ def _snap(run: Run, pattern: Pattern) -> None:
 
 
 def _end_chatter(run: Run, closed: Sequence[int]) -> None:
-    """Close at rest, and all at once, what is closed and parts more slowly than `CHATTER`."""
+    """Close at rest, and all at once, what is closed and parts more slowly than chatter."""
     system, speed = run.system, run.system.scales.speed
     rows = system.evaluate(run.z, run.v, closed)
     if (np.abs(rows.A @ run.v) > STANDING * speed).any():
-        sticks = (np.abs(rows.A_t @ run.v) < CHATTER * speed) & (system.friction[list(closed)] > 0)
+        sticks = (np.abs(rows.A_t @ run.v) < run.chatter) & (system.friction[list(closed)] > 0)
         _settle(run, np.vstack([rows.A, rows.A_t[sticks]]))
 
 

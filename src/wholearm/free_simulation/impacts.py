@@ -15,7 +15,7 @@ from ..common.arrays import Array
 from ..simulation.events import EventKind
 from .contact_problem import APART, BACK, FORTH, STICKS, Answer, ContactProblem, solve, try_modes
 from .deciding import Pattern, find_closed
-from .state import AHEAD, CHATTER, STANDING, Run
+from .state import AHEAD, STANDING, Run
 
 CHATTER_PAUSE = 1e-3
 """Time in which the end of the impacts of a pair is told once, relative to the scene's time."""
@@ -34,7 +34,7 @@ def collide(run: Run) -> bool:
         if not (rates < -limit).any():
             break
         hit = True
-        bouncing = -rates.min() > CHATTER * run.system.scales.speed and turn < ROUNDS
+        bouncing = -rates.min() > run.chatter and turn < ROUNDS
         _collide(run, closed, rates, run.restitution if bouncing else 0.0, bouncing)
     return hit
 

@@ -10,7 +10,7 @@ from ..common.arrays import Array
 from ..results.sampled import interpolate_quintic
 from ..simulation.locate import find_root
 from ..simulation.runge_kutta import ORDER
-from .state import AHEAD, ARMED, CHATTER, CLOSED, Run
+from .state import AHEAD, ARMED, CLOSED, Run
 
 GROWTH = 10.0
 """Largest growth of a step."""
@@ -262,5 +262,5 @@ class _Motion:
         rate = rows.A @ run.v
         bend = rows.A @ s.outputs[s.to.acceleration] + rows.bend
         # What parts more slowly was closed when the modes were chosen.
-        back = (rate >= CHATTER * run.system.scales.speed) & (bend < 0)
+        back = (rate >= run.chatter) & (bend < 0)
         return float((-rate[back] / bend[back]).min(initial=np.inf))

@@ -22,6 +22,10 @@ STANDING = 1e-9
 CHATTER = 1e-6
 """Speed of impacts below which they count as the last one, relative to the scene's: what is closed
 and parts more slowly is pressed together again before it is apart by more than rounding."""
+BURST = 3e-4
+"""Time, relative to the scene's, in which `MANY` impacts raise `CHATTER` tenfold, and twice as many
+a hundredfold: fingers may knock an object to and fro for ever."""
+MANY = 20
 STILL = 1e-10
 """Acceleration that counts as none, relative to the scene's."""
 AHEAD = 2e-5
@@ -98,6 +102,16 @@ class Run:
     def v(self) -> Array:
         """Velocities, shape (n,)."""
         return self.y[self.system.n : 2 * self.system.n]
+
+    @property
+    def chatter(self) -> float:
+        """Speed of impacts that count as the last one [m/s]."""
+        since, recent = self.t - BURST * self.system.scales.time, 0
+        for event in reversed(self.events):
+            if event.time < since:
+                break
+            recent += event.kind is EventKind.IMPACT
+        return CHATTER * self.system.scales.speed * 10.0 ** min(recent // MANY, 2)
 
     @property
     def end(self) -> float:
