@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from ..common.arrays import Array
-from ..contacts.formation import Formation, find_touching
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..scene.model import Scene
 from .departure import find_pairs
+from .pressing import press_in
 from .shapes import LINKS, OBJECT, PALM, Pair, Shape, find_rounding, list_pairs, list_shapes
 from .stretch import Run, Setting, Steps, Stretch, list_steps
 
@@ -26,8 +26,6 @@ DISSIPATION = 1000.0
 """Damping of contacts by Hunt and Crossley, times the scene's speed."""
 _EVERY = 4
 """Steps from one look at the forces to the next: contacts swing ten times as slowly."""
-_APART = 0.1
-"""Share of a contact's row that no other contact has, from which on it is another place."""
 _ROUGH = 1e12
 """Friction of vertices and edges, which makes that of a pair twice the other shape's."""
 
@@ -188,33 +186,10 @@ def _share_friction(pair: Pair) -> tuple[tuple[str, float], tuple[str, float]]:
 
 
 def _press(problem: Problem, stretch: Stretch, setting: Setting) -> Array:
-    """The planned start, with the contacts pressed in as far as the planned forces press them.
-
-    What touches elsewhere without a force, as a contact that has just been let go, just touches.
-    """
-    scene, formation = problem.scene, problem.phases[stretch.phases[0]].formation
-    touching = find_touching(scene, stretch.z)
-    contacts = formation.contacts + tuple(c for c in touching if c not in formation.contacts)
-    A = Formation(scene, contacts).evaluate(stretch.z[None], stretch.z_dot[None]).A[0]
-    # The nearest such place by the kinetic energy of getting there.
-    weight = 1 / np.sqrt(scene.mass_diagonal)
-    rows = _drop_repeated(A * weight, formation.n_contacts)
-    forces = np.array([stretch.c_n.get(c.name, 0.0) for c in contacts])
-    corners = scene.polygon.n_vertices
-    share = np.array([len(find_pairs(c.name, corners)) for c in contacts])
-    depth = forces / share / _find_stiffness(scene, setting)
-    return np.asarray(stretch.z - weight * (np.linalg.pinv((A * weight)[rows]) @ depth[rows]))
-
-
-def _drop_repeated(rows: Array, kept: int) -> list[int]:
-    """The first rows, and of the others those that are not at the place of one before."""
-    unit, chosen = rows / np.linalg.norm(rows, axis=1)[:, None], list(range(kept))
-    for row in range(kept, len(rows)):
-        known = unit[chosen]
-        rest = unit[row] - np.linalg.pinv(known) @ (known @ unit[row])
-        if np.linalg.norm(rest) > _APART:
-            chosen.append(row)
-    return chosen
+    """The planned start, with contacts pressed in."""
+    corners, stiffness = problem.scene.polygon.n_vertices, _find_stiffness(problem.scene, setting)
+    shares = {name: len(find_pairs(name, corners)) for name in stretch.c_n}
+    return press_in(problem, stretch, {name: n * stiffness for name, n in shares.items()})
 
 
 def _find_stiffness(scene: Scene, setting: Setting) -> float:

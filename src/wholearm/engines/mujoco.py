@@ -7,11 +7,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..common.arrays import Array
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
+from .departure import find_pairs
 from .mjcf import Softness, write_mjcf
+from .pressing import press_in
 from .shapes import list_pairs
 from .stretch import Run, Setting, Stretch, list_steps
+
+_LITTLE = 1e-6
+"""Depth at which contacts are looked at, over the scene's length."""
 
 
 def play(problem: Problem, stretch: Stretch, torque: TorqueProfile, setting: Setting) -> Run:
@@ -28,9 +34,9 @@ def play(problem: Problem, stretch: Stretch, torque: TorqueProfile, setting: Set
     text = write_mjcf(problem, step=steps.h, softness=Softness().scale(setting.softness))
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = stretch.z, steps.v
     names = tuple(pair.name for pair in list_pairs(problem.scene))
     numbers = _number_pairs(model, problem)
+    data.qpos[:], data.qvel[:] = _press(problem, stretch, model, data, numbers), steps.v
     states, press, start = [(stretch.z, stretch.z_dot)], [], 0
     for end in steps.ends:
         total = np.zeros(len(names))
@@ -58,3 +64,32 @@ def _number_pairs(model: Any, problem: Problem) -> NDArray[np.int64]:
         first, second = (model.geom(name).id for name in (pair.first, pair.second))
         table[first, second] = table[second, first] = number
     return table
+
+
+def _press(
+    problem: Problem, stretch: Stretch, model: Any, data: Any, numbers: NDArray[np.int64]
+) -> Array:
+    """The planned start, with contacts pressed in.
+
+    The stiffness of a contact, which MuJoCo makes of its time constant and of the inertias that
+    meet there, is read where all are pressed in a little.
+    """
+    import mujoco
+
+    nowhere = dict.fromkeys(stretch.c_n, np.inf)
+    little = _LITTLE * problem.scene.scales.length
+    touching = {name: max(force, 0.0) / little for name, force in stretch.c_n.items()}
+    data.qpos[:] = press_in(problem, stretch, {**nowhere, **touching})
+    mujoco.mj_forward(model, data)
+    contact, found = data.contact, np.zeros(len(list_pairs(problem.scene)))
+    held = contact.efc_address >= 0
+    rows = contact.efc_address[held]
+    own = data.efc_KBIP[rows, 0] * data.efc_KBIP[rows, 2] / data.efc_R[rows]
+    np.add.at(found, numbers[contact.geom1[held], contact.geom2[held]], own)
+    names, corners = [pair.name for pair in list_pairs(problem.scene)], problem.scene.polygon
+    stiffness = {
+        name: sum(found[names.index(pair)] for pair in find_pairs(name, corners.n_vertices))
+        for name in stretch.c_n
+    }
+    mujoco.mj_resetData(model, data)
+    return press_in(problem, stretch, {k: v if v > 0 else np.inf for k, v in stiffness.items()})
