@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from .scene.polygon import Polygon
     from .simulation.events import Simulation
     from .simulation.simulate import simulate
+    from .tuning.tune import tune
     from .verification.free import verify_free
     from .verification.free_report import FreeReport
     from .verification.verify import verify
@@ -98,6 +99,7 @@ _HOMES = {
     "simulate": "simulation.simulate",
     "simulate_free": "free_simulation.simulate",
     "solve": "planning.plan",
+    "tune": "tuning.tune",
     "verify": "verification.verify",
     "verify_free": "verification.free",
 }
@@ -148,6 +150,7 @@ __all__ = [
     "simulate",
     "simulate_free",
     "solve",
+    "tune",
     "verify",
     "verify_free",
 ]

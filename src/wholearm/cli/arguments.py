@@ -121,6 +121,17 @@ def add_predict(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
 
 
+def add_tune(parser: argparse.ArgumentParser) -> None:
+    """Add what `tune` takes."""
+    parser.add_argument("problem", help="problem file (TOML)")
+    parser.add_argument("-o", "--output", metavar="FILE", help="torques to write (.csv)")
+    text = "how hard quasistatic torques squeeze: 0 as little as needed, 1 as hard as helps (0.5)"
+    parser.add_argument("--squeeze", type=float, default=0.5, help=text)
+    text = "raises beyond the first that reaches the end: 0 none, 1 all that keep contacts (0.5)"
+    parser.add_argument("--share", type=float, default=0.5, help=text)
+    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+
+
 def add_compare(parser: argparse.ArgumentParser) -> None:
     """Add what `compare` takes."""
     parser.add_argument("problem", help="problem file (TOML)")

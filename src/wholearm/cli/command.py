@@ -1,4 +1,4 @@
-"""The command line: ``wholearm solve|verify|plot|predict|compare|map|export|replay|bench``.
+"""The command line: ``wholearm solve|verify|plot|predict|tune|compare|map|export|replay|bench``.
 
 Exit status 0 means done and all contacts held, 1 infeasible or a contact lost or a goal missed,
 2 bad input, 130 interrupted, 143 terminated. Each command imports what it needs and nothing else.
@@ -22,6 +22,7 @@ from .arguments import (
     add_plot,
     add_predict,
     add_solve,
+    add_tune,
     add_verify,
     name_simulator,
 )
@@ -31,6 +32,7 @@ from .engines import add_export, add_replay
 from .predict import predict
 from .progress import clear_progress, show_progress
 from .robustness import add_robustness
+from .tune import tune
 
 if TYPE_CHECKING:
     from ..planning.result import Plan
@@ -98,6 +100,7 @@ def build_parser() -> argparse.ArgumentParser:
         ("verify", add_verify, _verify, "replay torques open loop and check the motion"),
         ("plot", add_plot, _plot, "draw force margins, torques and snapshots"),
         ("predict", add_predict, predict, "see up to which speed slow motions keep every contact"),
+        ("tune", add_tune, tune, "tune torques from quasistatic ones by steps of 10 percent"),
         ("compare", add_compare, compare, "put plans and torques for a problem side by side"),
         ("map", add_map, _map, "draw the contact formations over (x, phi)"),
         ("export", add_export, None, "write scene and plan for a physics engine"),

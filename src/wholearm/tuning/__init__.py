@@ -1,0 +1,1 @@
+"""Torques found as by hand: from quasistatic ones, by steps of 10 %, judged by simulations."""
