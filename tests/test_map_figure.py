@@ -108,7 +108,7 @@ def test_plan_is_drawn_over_the_map(chart: FormationMap, trajectory: Trajectory)
 def test_equal_maps_give_equal_files(heptagon: Problem, tmp_path: Path) -> None:
     paths = [tmp_path / "one.svg", tmp_path / "two.svg"]
     for path in paths:
-        plots.save(draw_map(build_map(heptagon, 20, Window((-0.05, 0.05), (-0.2, 0.0)))), path)
+        plots.save(draw_map(build_map(heptagon, 20, Window((-0.03, 0.03), (-0.1, 0.0)))), path)
     assert paths[0].read_bytes() == paths[1].read_bytes()
 
 

@@ -195,7 +195,7 @@ def test_torques_do_not_jitter(phase: int, objective: str) -> None:
     ends = [0.0, *motion.times[steps], motion.duration]
     hair = 1e-9 * motion.duration
     for start, stop in pairwise(ends):
-        t = np.linspace(start + hair, stop - hair, 601)
+        t = np.linspace(start + hair, stop - hair, 401)
         for tau in motion.evaluate(t).tau.T:
             # A swing is one of 1 % of the limit. A plan has a few switches, not dozens.
             assert count_swings(tau, 0.01 * LIMIT) <= 5

@@ -94,7 +94,7 @@ def test_every_sample_obeys_newton_and_euler(
 ) -> None:
     trajectory = plans[objective]
     starts = trajectory.phase_starts
-    for t in np.random.default_rng(1).uniform(0, trajectory.duration, 100):
+    for t in np.random.default_rng(1).uniform(0, trajectory.duration, 60):
         phase = int(np.searchsorted(starts, t, side="right")) - 1
         formation = problem.phases[phase].formation
         own = trajectory.motions[phase].evaluate(np.array([t - starts[phase]]))
