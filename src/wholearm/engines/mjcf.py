@@ -41,7 +41,7 @@ class Softness(NamedTuple):
     """
 
     press: float = 10.0
-    rub: float = 1000.0
+    rub: float = 400.0
     impedance: float = 0.01
     ratio: float = 100.0
 
