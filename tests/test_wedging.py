@@ -1,16 +1,17 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from shipped import BOX, HEPTAGON, IMPACTS, plan_of, problem_of
-from wholearm import verify
-from wholearm.common.arrays import Array
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.wedging import find_static_torques
+from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.statics import balances
+from wholearm.verification.sureness import find_wedged
 
 
 @pytest.mark.parametrize("path", [BOX, IMPACTS], ids=lambda path: path.stem)
@@ -26,24 +27,31 @@ def test_torques_that_friction_can_hold_are_those_of_the_linear_programme(path: 
                 assert balances(scene, contacts, curve.start, own) == (beyond < 0)
 
 
-def test_a_wedged_start_is_told() -> None:
-    """The last phase of the margin's plan begins with a grip that friction alone can hold."""
+def test_a_wedged_start_lasts_until_nothing_balances_the_torques() -> None:
+    """From torques that the linear programme balances straight to four times as much."""
+    problem, plan = problem_of(BOX), plan_of(BOX)
+    phase = problem.phases[-1]
+    rows = np.flatnonzero(plan.phase == phase.index)
+    first = last = plan.tau[rows[0]]
+    duration = plan.t[rows[-1]] - plan.t[rows[0]]
+    z, contacts = plan.z[rows[0]], phase.formation.contacts
+    while not balances(problem.scene, contacts, z, first):
+        first, last = first / 2, first
+    first = first / 2
+    halves = (first + last) / 2, (last - first) / 2
+    torque = TorqueProfile(plan.t[rows[[0, -1]]], np.stack(halves, axis=-1)[None])
+    wedged = find_wedged(problem, phase, replace(plan, torque=torque), rows, 1e-9)
+    assert wedged is not None and 0 < wedged < duration
+    for share, held in ((0.0, True), (0.97, True), (1.03, False)):
+        tau = first + share * wedged / duration * (last - first)
+        assert balances(problem.scene, contacts, z, tau) == held
+
+
+def test_plans_leave_rest_surely() -> None:
+    """Where the largest margin of a phase is that of its start, too, friction could hold it."""
     problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON, "margin")
-    report = verify(problem, plan)
-    phase = report.phases[-1]
-    wedged = phase.wedged
-    assert wedged is not None and wedged == pytest.approx(plan.meta["wedged"][-1], rel=1e-3)
-    contacts, start = (
-        problem.phases[-1].formation.contacts,
-        plan.motions[-1].evaluate(np.zeros(1)).z[0],
-    )
-
-    def held(share: float) -> bool:
-        tau: Array = plan.torque.at(np.array([phase.start + share * wedged]))[0]
-        return balances(problem.scene, contacts, start, tau)
-
-    if wedged:
-        assert held(0.5) and held(0.98) and not held(1.02)
-        assert any("may stay wedged" in text for text in report.warnings)
-    else:
-        assert not held(0.0)
+    assert plan.meta["wedged"] == [0.0] * 5
+    for phase in problem.phases:
+        row = int(np.flatnonzero(plan.phase == phase.index)[0])
+        contacts = phase.formation.contacts
+        assert not balances(problem.scene, contacts, plan.z[row], plan.tau[row])

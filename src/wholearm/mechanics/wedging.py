@@ -25,6 +25,9 @@ from ..common.arrays import Array
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 
+SURE = 1e-3
+"""Distance from torques that friction can hold, beyond which a motion begins for sure, relative to
+the scene's torque."""
 _TINY = 1e-9
 """What counts as zero of numbers of the order of one."""
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ..contacts.formation import Kinematics
 from ..mechanics.uniqueness import find_minors
-from ..mechanics.wedging import find_static_torques
+from ..mechanics.wedging import SURE, find_static_torques
 from ..problem.definition import Phase, Problem
 from ..results.report import LeastMinor
 from ..results.trajectory import Trajectory
@@ -16,9 +16,6 @@ from .verdict import measure_speed
 
 PLACES = 33
 """Instants of a phase at which minors are looked at, and at which torques are."""
-SURE = 1e-3
-"""Distance from torques that friction can hold, beyond which a motion begins for sure, relative to
-the scene's torque."""
 _LEANS = 1 - 1e-6
 """Share of U c_n from which on a tangential force is that of sliding."""
 

@@ -23,6 +23,7 @@ from ...solvers.statistics import SolverStatistics, book
 from ..options import Objective
 from .data import PhaseData
 from .elements import Grid, Profile
+from .sure_start import SureStart
 from .terms import CHAINED, LEAST_B, SOFT, LimitShape, NLPColumns, list_columns, write_terms
 
 
@@ -208,6 +209,7 @@ def make_bounds(
     units: Units,
     tightening: Tightening,
     relaxation: Relaxation | None = None,
+    start: SureStart | None = None,
 ) -> dict[str, Array]:
     """Bounds of the NLP, with every limit tightened."""
     tight, speed_share, duration, _ = tightening
@@ -218,6 +220,10 @@ def make_bounds(
     high[:, 0] = np.maximum(b_max * speed_share / units.profile[0], 2 * LEAST_B)
     # From rest and to rest, with no way back.
     low[0, node["a"]], high[-1, node["a"]] = LEAST_B, -LEAST_B
+    if start is not None:
+        _, a_unit, force = units.profile
+        low[0, node["a"]] = max(start.least_a / a_unit, LEAST_B)
+        low[0, node["squeeze"]], high[0, node["squeeze"]] = start.low / force, start.high / force
     low[:, node["extra"]] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
     rows, signs, bounds = data.limits.sides
     # The constant part of what limits are of is on this side.

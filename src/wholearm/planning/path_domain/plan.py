@@ -19,12 +19,13 @@ from ...geometry.curve import Curve
 from ..advice import describe_changes, find_changes, name_phases
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
-from .data import PhaseData, StalledError, join
+from .data import PhaseData, StalledError, join, prepare
 from .fastest import is_hopeless
 from .first_guess import guess_slowly
 from .misses import MISS, ROUNDS
 from .motion import PathMotion
 from .rounds import Plans, Round
+from .sure_start import WORTH, find_sure_start
 from .task import Task
 
 _MESHES = 6
@@ -127,7 +128,28 @@ def plan_curves(
     if options.goal is Objective.MARGIN and plans[0].value < task.lost:
         late = _explain_duration(task)
         raise late or SolverError(f"{task.name}: the margin found is below epsilon")
-    return plans
+    return plans if options.goal is Objective.TIME else _leave_rest(task, plans)
+
+
+def _leave_rest(task: Task, plans: Plans) -> Plans:
+    """The plans, or others with a start that friction cannot hold, if it can hold theirs.
+
+    Those of least time push off as hard as limits allow.
+    """
+    motion, margin = plans[0].motion, 0.0
+    if task.options.goal is Objective.MARGIN:
+        margin = plans[0].value - task.epsilon
+    data = prepare(motion.curve, task.epsilon, motion.grid, task.phases[0])
+    start = find_sure_start(data, motion.profile, margin)
+    if start is None:
+        return plans
+    found = _plan_finer(replace(task, start=start))
+    if isinstance(found, _Stuck):
+        return plans
+    loss = sum(own.value for own in plans) - sum(own.value for own in found)
+    if task.options.goal is Objective.EFFORT:
+        loss = -loss
+    return found if loss <= WORTH * sum(own.value for own in plans) else plans
 
 
 def _explain_duration(task: Task) -> InfeasibleError | None:

@@ -28,6 +28,7 @@ from .nlp import (
     unpack,
 )
 from .start import balance, start_at
+from .sure_start import SureStart
 from .task import EARLY, Task
 
 _SHARE = 0.5
@@ -201,7 +202,7 @@ class Round:
         """Solve on this mesh; in words how the solver ended if there is no solution."""
         weight = self.task.options.time_weight
         given = self.nlp, self.data, self.units, self.tightening, self.solution, weight
-        found = _solve(*given)
+        found = _solve(*given, self.task.start)
         return found if isinstance(found, str) else replace(self, solution=found)
 
     def tighten(self, ease: bool) -> Round:
@@ -272,9 +273,10 @@ def _solve(
     tightening: Tightening,
     start: PathSolution,
     time_weight: float,
+    sure: SureStart | None,
 ) -> PathSolution | str:
     """Solve once; the solution, or in words how the solver ended."""
-    bounds = make_bounds(nlp, data, units, tightening)
+    bounds = make_bounds(nlp, data, units, tightening, start=sure)
     if (bounds["lbg"] > bounds["ubg"]).any():
         return "limits that hold between the nodes too leave nothing"
     result = nlp.solver(

@@ -15,6 +15,7 @@ from .elements import DEGREE
 from .mesh import SOFT, START, Mesh, find_ends
 from .misses import MISS
 from .nlp import PathNLP, build_path_nlp
+from .sure_start import SureStart
 from .switches import Switch
 from .terms import LimitShape
 
@@ -31,6 +32,7 @@ class Task:
     options: PlanOptions
     phases: Sequence[int]
     duration: float | None
+    start: SureStart | None = None
 
     @property
     def name(self) -> str:
