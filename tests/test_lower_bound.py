@@ -6,11 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
-from scipy.optimize import brentq
 
 from shipped import HEPTAGON, IMPACTS, problem_of
-from toys import Toy, constant, inertia
+from toys import LIMIT, Toy, constant, find_time_growing, find_time_viscous, inertia
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions, inverse
@@ -25,7 +23,7 @@ from wholearm.planning.path_domain.misses import MISS
 from wholearm.planning.path_domain.plan import plan_path
 from wholearm.planning.path_domain.sequence_plan import plan_sequence
 
-LIMIT, EPSILON = 2.0, 0.05
+EPSILON = 0.05
 
 
 def bound(toy: Toy) -> LowerBound:
@@ -33,34 +31,6 @@ def bound(toy: Toy) -> LowerBound:
         found = bound_least_time([toy.curve], toy.epsilon)
     assert found is not None
     return found
-
-
-def viscous(drag: float) -> float:
-    """Time of a way of 1 m with v' = F - B v, then v' = -F - B v."""
-
-    def rise(t: float) -> float:
-        return LIMIT / drag * (t + math.expm1(-drag * t) / drag)
-
-    def fall(t: float) -> float:
-        return LIMIT / drag * (math.expm1(drag * t) / drag - t)
-
-    def brake(t: float) -> float:
-        return math.log(1 - math.expm1(-drag * t)) / drag
-
-    start = brentq(lambda t: rise(t) + fall(brake(t)) - 1, 1e-3, 20)
-    return float(start + brake(start))
-
-
-def growing() -> float:
-    """(1 + s) |a| <= F: b is 2 F log(1 + s) from the start, 2 F log(2 / (1 + s)) to the end."""
-    switch = math.sqrt(2) - 1
-
-    def slow(u: float, b: float) -> float:
-        return 2 * u / math.sqrt(2 * LIMIT * b)
-
-    first = quad(lambda u: slow(u, math.log1p(u * u)), 0, math.sqrt(switch))[0]
-    last = quad(lambda u: slow(u, -math.log1p(-u * u / 2)), 0, math.sqrt(1 - switch))[0]
-    return float(first + last)
 
 
 STEP = math.sqrt(0.75 * LIMIT), math.sqrt(0.5 * LIMIT)
@@ -71,14 +41,14 @@ CLOSED = [
     (Toy(constant(1.0), speed_limit=(0.3, np.inf)), 1 / 0.3 + 0.3 / LIMIT),
     (Toy(constant(1.0), speed_limit=(1.2, np.inf)), 1 / 1.2 + 1.2 / LIMIT),
     (Toy(constant(1.0), speed_limit=(1.6, np.inf)), math.sqrt(2.0)),
-    (Toy(inertia(lambda s, later: 1.0 + s)), growing()),
+    (Toy(inertia(lambda s, later: 1.0 + s)), find_time_growing()),
     (
         Toy(inertia(lambda s, later: np.where(later, 2.0, 1.0)), breaks=(0.5,)),
         (2 * STEP[0] - STEP[1]) / LIMIT + STEP[1] / (LIMIT / 2),
     ),
-    (Toy(constant(1.0, 0.0, 0.1)), viscous(0.1)),
-    (Toy(constant(1.0, 0.0, 0.5)), viscous(0.5)),
-    (Toy(constant(1.0, 0.0, 3.0)), viscous(3.0)),
+    (Toy(constant(1.0, 0.0, 0.1)), find_time_viscous(0.1)),
+    (Toy(constant(1.0, 0.0, 0.5)), find_time_viscous(0.5)),
+    (Toy(constant(1.0, 0.0, 3.0)), find_time_viscous(3.0)),
 ]
 
 

@@ -6,10 +6,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from scipy.integrate import quad, trapezoid
-from scipy.optimize import brentq
+from scipy.integrate import trapezoid
 
-from toys import Toy, constant, inertia
+from toys import LIMIT, Toy, constant, find_time_growing, find_time_viscous, inertia
 from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve
 from wholearm.planning.options import CHOICES, Objective
@@ -42,7 +41,6 @@ EPSILON = 0.05
 ELEMENTS = 6
 INTERVALS = ELEMENTS * (DEGREE + 1) - 1
 UNITS = Units(0.04, 0.03, 7.0, np.array([1.7, 0.6]), 1.3, 9.0)
-LIMIT = 2.0
 SIDES = (*((row, 1.0) for row in range(6)), (4, -1.0), (5, -1.0))
 SHAPE = LimitShape(6, SIDES, (0, 1, 2, 3), (4, 5), (4, 5))
 """Four sliding contacts and two torques."""
@@ -336,33 +334,12 @@ def test_inertia_that_steps_at_a_reversal() -> None:
 
 
 def test_inertia_that_grows_along_the_way() -> None:
-    """(1 + s) |a| <= F: b is 2 F log(1 + s) from the start, 2 F log(2 / (1 + s)) to the end."""
-    toy = Toy(inertia(lambda s, later: 1.0 + s))
-    switch = math.sqrt(2) - 1
-
-    def slow(u: float, b: float) -> float:
-        return 2 * u / math.sqrt(2 * LIMIT * b)
-
-    exact = quad(lambda u: slow(u, math.log1p(u * u)), 0, math.sqrt(switch))[0]
-    exact += quad(lambda u: slow(u, -math.log1p(-u * u / 2)), 0, math.sqrt(1 - switch))[0]
-    check_accuracy(toy, exact, -1)
+    check_accuracy(Toy(inertia(lambda s, later: 1.0 + s)), find_time_growing(), -1)
 
 
 @pytest.mark.parametrize("drag", [0.1, 0.5])
 def test_viscous_joints(drag: float) -> None:
-    """Speeding up v' = F - B v, braking v' = -F - B v."""
-
-    def speeding(t: float) -> float:
-        return LIMIT / drag * (t + math.expm1(-drag * t) / drag)
-
-    def braking(t: float) -> float:
-        return LIMIT / drag * (math.expm1(drag * t) / drag - t)
-
-    def brake_time(t: float) -> float:
-        return math.log(1 - math.expm1(-drag * t)) / drag
-
-    start = brentq(lambda t: speeding(t) + braking(brake_time(t)) - 1, 1e-3, 20)
-    check_accuracy(Toy(constant(1.0, 0.0, drag)), start + brake_time(start), -1)
+    check_accuracy(Toy(constant(1.0, 0.0, drag)), find_time_viscous(drag), -1)
 
 
 def test_no_speed_comes_out_imaginary(data: PhaseData, profile: Profile) -> None:

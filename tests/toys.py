@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,6 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.integrate import quad
+from scipy.optimize import brentq
 
 from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve, Segment
@@ -28,6 +31,10 @@ Law = Callable[[Array, NDArray[np.bool_]], tuple[Array, ...]]
 """Coefficients (Ta, Tl, Tv), each (n, 2), at n arc lengths, before or after the break."""
 
 
+LIMIT = 2.0
+"""Largest torque of a toy [N m]."""
+
+
 @dataclass(frozen=True)
 class Toy:
     """A point on a line with one contact: c_n = squeeze and tau = Ta a + Tl squeeze + Tv v.
@@ -38,7 +45,7 @@ class Toy:
     law: Law
     length: float = 1.0
     breaks: tuple[float, ...] = ()
-    limit: tuple[float, float] = (2.0, 2.0)
+    limit: tuple[float, float] = (LIMIT, LIMIT)
     speed_limit: tuple[float, float] = (np.inf, np.inf)
     epsilon: float = 0.05
 
@@ -129,3 +136,31 @@ def inertia(of: Callable[[Array, NDArray[np.bool_]], Array]) -> Law:
         return np.column_stack([of(s, later), 0 * s]), flat, flat
 
     return law
+
+
+def find_time_viscous(drag: float) -> float:
+    """Time of a way of 1 m with v' = F - B v, then v' = -F - B v."""
+
+    def rise(t: float) -> float:
+        return LIMIT / drag * (t + math.expm1(-drag * t) / drag)
+
+    def fall(t: float) -> float:
+        return LIMIT / drag * (math.expm1(drag * t) / drag - t)
+
+    def brake(t: float) -> float:
+        return math.log(1 - math.expm1(-drag * t)) / drag
+
+    start = brentq(lambda t: rise(t) + fall(brake(t)) - 1, 1e-3, 20)
+    return float(start + brake(start))
+
+
+def find_time_growing() -> float:
+    """(1 + s) |a| <= F: b is 2 F log(1 + s) from the start, 2 F log(2 / (1 + s)) to the end."""
+    switch = math.sqrt(2) - 1
+
+    def slow(u: float, b: float) -> float:
+        return 2 * u / math.sqrt(2 * LIMIT * b)
+
+    first = quad(lambda u: slow(u, math.log1p(u * u)), 0, math.sqrt(switch))[0]
+    last = quad(lambda u: slow(u, -math.log1p(-u * u / 2)), 0, math.sqrt(1 - switch))[0]
+    return float(first + last)
