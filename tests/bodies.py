@@ -10,7 +10,7 @@ import numpy as np
 from wholearm.common.arrays import Array
 from wholearm.free_simulation.play import play
 from wholearm.free_simulation.state import Run
-from wholearm.free_simulation.system import Pair, System
+from wholearm.free_simulation.system import Pair, Structure, System
 from wholearm.results.torque import TorqueProfile
 from wholearm.scene.model import Scales
 
@@ -37,17 +37,17 @@ def make_body(
         for i, (a, b) in enumerate(corners):
             x, y = z[0] + c * a - s * b, z[1] + s * a + c * b
             gap, slip = nx * x + ny * y - distance, ny * x - nx * y
-            pairs.append(Pair(f"v{i}-line{k}", gap, slip, mu))
+            pairs.append(Pair(f"v{i}-line{k}", gap, slip))
     none = np.zeros(3)
+    structure = Structure(z, ca.SX.sym("geometry", 0), tuple(pairs), (), (False, False, True))
     return System(
-        z,
+        structure,
+        np.zeros(0),
         np.array([mass, mass, inertia]),
         mass * np.array([*weight, 0.0]),
         none,
         none,
-        (),
-        tuple(pairs),
-        (False, False, True),
+        np.full(len(pairs), mu),
         Scales(np.sqrt(inertia / mass), mass, mass * G),
     )
 

@@ -19,21 +19,69 @@ The links slide on each other without friction, as no coefficient is given for t
 
 from __future__ import annotations
 
+from functools import lru_cache
+from typing import NamedTuple
+
 import casadi as ca
 import numpy as np
 
 from ..common.arrays import Array, Expression
-from ..common.sharing import Store, exclusive
+from ..common.sharing import exclusive
 from ..contacts.elemental import build_features, rotate_quarter
 from ..contacts.links import build_finger_gap
 from ..contacts.obstacles import build_apart
 from ..scene.model import Scene
-from .system import Pair, System
+from .system import Pair, Structure, System
+
+
+class _Link(NamedTuple):
+    """A link as expressions: its joint, tip, axis, normal of the touching side, size and angle."""
+
+    base: Expression
+    tip: Expression
+    axis: Expression
+    normal: Expression
+    length: Expression
+    radius: Expression
+    theta: Expression
+
+
+class _Bodies(NamedTuple):
+    """The object and both links as expressions of z and of the numbers of a scene.
+
+    Vertices and directions of the edges, which run from each vertex to the next, have the shape
+    (2, n_v).
+    """
+
+    z: Expression
+    geometry: Expression
+    vertices: Expression
+    along: Expression
+    lengths: Expression
+    links: tuple[_Link, _Link]
 
 
 def build_system(scene: Scene) -> System:
-    """The hand and the object as a system with five coordinates, the same for equal scenes."""
-    return _SYSTEMS(scene)
+    """The hand and the object as a system with five coordinates."""
+    rounded = tuple(finger.radius > 0 for finger in scene.fingers)
+    structure = _build(scene.polygon.n_vertices, rounded, scene.fingers_collide)
+    links = [[*np.asarray(f.base), f.length, f.radius] for f in scene.fingers]
+    parts = {"m": scene.friction.palm, "1": scene.friction.finger1, "2": scene.friction.finger2}
+    slides = [name[0] in "tj" for name in structure.names]
+    friction = [
+        0.0 if slide else parts[name[-1]]
+        for name, slide in zip(structure.names, slides, strict=True)
+    ]
+    return System(
+        structure,
+        np.concatenate([scene.polygon.vertices.ravel(), *links]),
+        scene.mass_diagonal,
+        scene.applied_force,
+        scene.viscous,
+        scene.dry,
+        np.array(friction),
+        scene.scales,
+    )
 
 
 @exclusive
@@ -54,105 +102,107 @@ def measure_gaps(scene: Scene, z: Array) -> Array:
     return np.asarray(function(z.T).full().T)
 
 
-def _build(scene: Scene) -> System:
-    pairs = _list_palm(scene)
+@lru_cache(maxsize=16)
+def _build(count: int, rounded: tuple[bool, ...], collide: bool) -> Structure:
+    """The structure of all scenes with as many vertices, and links with or without a radius."""
+    bodies = _place(count, rounded)
+    pairs = _list_palm(bodies)
     for finger in range(2):
-        pairs += _list_sides(scene, finger) + _list_ends(scene, finger)
-    if scene.fingers_collide:
-        pairs += _list_link_pairs(scene)
-    return System(
-        build_features(scene).z,
-        scene.mass_diagonal,
-        scene.applied_force,
-        scene.viscous,
-        scene.dry,
-        (3, 4),
-        tuple(pairs),
-        (False, False, True, True, True),
-        scene.scales,
-    )
+        pairs += _list_sides(bodies, finger) + _list_ends(bodies, finger, rounded[finger])
+    if collide:
+        pairs += _list_link_pairs(bodies, any(rounded))
+    turns = (False, False, True, True, True)
+    return Structure(bodies.z, bodies.geometry, tuple(pairs), (3, 4), turns)
 
 
-_SYSTEMS = Store(_build, lambda scene: (*scene.equations, scene.scales))
+def _place(count: int, rounded: tuple[bool, ...]) -> _Bodies:
+    z, geometry = ca.SX.sym("z", 5), ca.SX.sym("geometry", 2 * count + 8)
+    corners = ca.reshape(geometry[: 2 * count], 2, count)
+    run = ca.horzcat(corners[:, 1:], corners[:, :1]) - corners
+    lengths = ca.sqrt(ca.sum1(run**2))
+    c, s = ca.cos(z[2]), ca.sin(z[2])
+    turn = ca.vertcat(ca.horzcat(c, -s), ca.horzcat(s, c))
+    vertices = turn @ corners + ca.repmat(z[:2], 1, count)
+    along = turn @ (run / ca.repmat(lengths, 2, 1))
+    links = []
+    for finger in range(2):
+        x, y, length, radius = ca.vertsplit(geometry[2 * count + 4 * finger :][:4])
+        base, theta = ca.vertcat(x, y), z[3 + finger]
+        axis = ca.vertcat(ca.cos(theta), ca.sin(theta))
+        normal = rotate_quarter(axis) if finger == 0 else -rotate_quarter(axis)
+        thick = radius if rounded[finger] else ca.SX(0)
+        links.append(_Link(base, base + length * axis, axis, normal, length, thick, theta))
+    return _Bodies(z, geometry, vertices, along, lengths, (links[0], links[1]))
 
 
-def _list_palm(scene: Scene) -> list[Pair]:
-    p, mu = build_features(scene).vertices, scene.friction.palm
+def _list_palm(bodies: _Bodies) -> list[Pair]:
+    p = bodies.vertices
     return [
-        Pair(f"v{i}-palm", p[1, i], p[0, i], mu, text=f"v{i} touches the palm")
+        Pair(f"v{i}-palm", p[1, i], p[0, i], text=f"v{i} touches the palm")
         for i in range(p.shape[1])
     ]
 
 
-def _list_sides(scene: Scene, finger: int) -> list[Pair]:
+def _list_sides(bodies: _Bodies, finger: int) -> list[Pair]:
     """Vertices against both sides of a link."""
-    link, part = build_features(scene).links[finger], scene.fingers[finger]
-    mu, k = scene.friction.of(finger), finger + 1
-    side = 1.0 if finger == 0 else -1.0
+    link, k, side = bodies.links[finger], finger + 1, 1.0 if finger == 0 else -1.0
     # What touches a side between its ends has the whole object on that side, by convexity.
-    middle = link.normal.T @ (build_features(scene).z[:2] - link.base)
+    middle = link.normal.T @ (bodies.z[:2] - link.base)
     pairs = []
-    for i in range(scene.polygon.n_vertices):
-        run = link.vertex_run[i]
+    for i in range(bodies.vertices.shape[1]):
+        away = bodies.vertices[:, i] - link.base
+        run, level = link.axis.T @ away, link.normal.T @ away
         for name, way, text in (("finger", 1.0, ""), ("back", -1.0, "the far side of ")):
-            gap = way * (link.vertex_gap[i] + part.radius) - part.radius
-            ranges = (run, part.length - run, way * middle)
+            ranges = (run, link.length - run, way * middle)
             text = f"v{i} touches {text}finger {k}"
-            pairs.append(Pair(f"v{i}-{name}{k}", gap, way * side * run, mu, ranges, text))
+            gap = way * level - link.radius
+            pairs.append(Pair(f"v{i}-{name}{k}", gap, way * side * run, ranges, text))
     return pairs
 
 
-def _list_ends(scene: Scene, finger: int) -> list[Pair]:
+def _list_ends(bodies: _Bodies, finger: int, rounded: bool) -> list[Pair]:
     """Vertices and edges against the tip of a link and the circle about its joint."""
-    features, part = build_features(scene), scene.fingers[finger]
-    link, z, mu, k = features.links[finger], features.z, scene.friction.of(finger), finger + 1
-    axis = (link.tip - link.base) / part.length
-    along = ca.vertcat(features.edge_normals[1, :], -features.edge_normals[0, :])
-    count, pairs = scene.polygon.n_vertices, []
-    for name, centre, out in (("tip", link.tip, axis), ("joint", link.base, -axis)):
-        far = ca.repmat(centre, 1, count) - features.vertices
-        runs = ca.sum1(along * far)
-        gaps = -ca.sum1(features.edge_normals * far) - part.radius
+    link, k, count = bodies.links[finger], finger + 1, bodies.vertices.shape[1]
+    normals = ca.vertcat(-bodies.along[1, :], bodies.along[0, :])
+    pairs = []
+    for name, centre, out in (("tip", link.tip, link.axis), ("joint", link.base, -link.axis)):
+        far = ca.repmat(centre, 1, count) - bodies.vertices
+        runs, gaps = ca.sum1(bodies.along * far), -ca.sum1(normals * far) - link.radius
         for i in range(count):
-            length = float(features.edge_lengths[i])
-            slip = -runs[i] - part.radius * (z[2] - z[3 + finger])
+            slip = -runs[i] - link.radius * (bodies.z[2] - link.theta)
             text = f"e{i} touches the {name} of finger {k}"
-            ranges: tuple[Expression, ...] = (runs[i], length - runs[i])
-            pairs.append(Pair(f"e{i}-{name}{k}", gaps[i], slip, mu, ranges, text))
-            if part.radius == 0:
+            edge: tuple[Expression, ...] = (runs[i], bodies.lengths[i] - runs[i])
+            pairs.append(Pair(f"e{i}-{name}{k}", gaps[i], slip, edge, text))
+            if not rounded:
                 continue
-            away = -far[:, i]
+            away, before = -far[:, i], (i - 1) % count
             ahead, across = out.T @ away, rotate_quarter(out).T @ away
-            before = (i - 1) % count
-            beyond = runs[before] - float(features.edge_lengths[before])
-            slip = -part.radius * ca.atan2(across, ahead)
-            gap = ca.sqrt(ca.sumsqr(away)) - part.radius
+            ranges = (ahead, runs[before] - bodies.lengths[before], -runs[i])
+            slip = -link.radius * ca.atan2(across, ahead)
+            gap = ca.sqrt(ca.sumsqr(away)) - link.radius
             text = f"v{i} touches the {name} of finger {k}"
-            ranges = (ahead, beyond, -runs[i])
-            pairs.append(Pair(f"v{i}-{name}{k}", gap, slip, mu, ranges, text))
+            pairs.append(Pair(f"v{i}-{name}{k}", gap, slip, ranges, text))
     return pairs
 
 
-def _list_link_pairs(scene: Scene) -> list[Pair]:
+def _list_link_pairs(bodies: _Bodies, rounded: bool) -> list[Pair]:
     """Tips and joints of either link against the other link."""
-    links = build_features(scene).links
-    thick = sum(part.radius for part in scene.fingers)
-    pairs = []
+    links, pairs = bodies.links, []
+    thick = links[0].radius + links[1].radius
     for own, other in ((0, 1), (1, 0)):
-        mine, theirs, part = links[own], links[other], scene.fingers[other]
-        axis = (theirs.tip - theirs.base) / part.length
+        mine, theirs = links[own], links[other]
         for name, point, rest in (("tip", mine.tip, mine.base), ("joint", mine.base, mine.tip)):
             behind = theirs.normal.T @ (rest - theirs.base)
-            run, level = axis.T @ (point - theirs.base), theirs.normal.T @ (point - theirs.base)
+            run = theirs.axis.T @ (point - theirs.base)
+            level = theirs.normal.T @ (point - theirs.base)
             for side, way in (("finger", 1.0), ("back", -1.0)):
                 title = f"{name}{own + 1}-{side}{other + 1}"
-                ranges = (run, part.length - run, way * behind)
+                ranges = (run, theirs.length - run, way * behind)
                 pairs.append(_slide(title, way * level - thick, ranges))
-    if thick == 0:
+    if not rounded:
         return pairs
-    outs = [link.tip - link.base for link in links]
-    ends = [("tip", link.tip, out) for link, out in zip(links, outs, strict=True)]
-    joints = [("joint", link.base, -out) for link, out in zip(links, outs, strict=True)]
+    ends = [("tip", link.tip, link.axis) for link in links]
+    joints = [("joint", link.base, -link.axis) for link in links]
     for first, second in ((ends[0], ends[1]), (ends[0], joints[1]), (joints[0], ends[1])):
         run = second[1] - first[1]
         gap = ca.sqrt(ca.sumsqr(run)) - thick
@@ -162,4 +212,4 @@ def _list_link_pairs(scene: Scene) -> list[Pair]:
 
 
 def _slide(name: str, gap: Expression, ranges: tuple[Expression, ...]) -> Pair:
-    return Pair(name, gap, ca.SX(0), 0.0, ranges, "finger 1 touches finger 2")
+    return Pair(name, gap, ca.SX(0), ranges, "finger 1 touches finger 2")

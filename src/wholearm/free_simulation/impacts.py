@@ -53,7 +53,7 @@ def _collide(
     for k, pair in enumerate(closed):
         if rates[k] >= -STANDING * run.system.scales.speed or answer.c_n[k] <= 0:
             continue
-        name, text = run.system.names[pair], run.system.pairs[pair].text
+        name, text = run.system.names[pair], run.system.structure.pairs[pair].text
         if bouncing:
             note = f"{text or name} at {-rates[k]:.4g} m/s"
             run.note(EventKind.IMPACT, note, name, float(-rates[k]))

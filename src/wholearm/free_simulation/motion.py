@@ -63,13 +63,13 @@ class _Motion:
         system, modes = run.system, run.modes
         scales, n = system.scales, system.n
         self.unit = scales.length
-        self.watched = np.ones(len(system.pairs), dtype=bool)
+        self.watched = np.ones(len(system.names), dtype=bool)
         self.kept = list(modes.kept)
         self.watched[self.kept] = False
         self.stuck = [modes.kept.index(pair) for pair in modes.stuck]
         self.mu, self.dry = system.friction[list(modes.stuck)], system.dry[list(modes.held)]
-        held = [scales.torque if system.turns[i] else scales.force for i in modes.held]
-        self.friction_units = np.array([scales.force] * len(self.stuck) + held)
+        held = system.friction_units[list(modes.held)]
+        self.friction_units = np.append(np.full(len(self.stuck), scales.force), held)
         self.slides, self.turning = np.flatnonzero(modes.Xi), np.flatnonzero(modes.sigma)
         self.Xi = np.array(modes.Xi)[self.slides] / scales.speed
         self.sigma = np.array(modes.sigma)[self.turning] / system.units[n + self.turning]

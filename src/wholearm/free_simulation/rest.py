@@ -46,7 +46,7 @@ def _list_margins(run: Run) -> Array:
     bound[: len(stuck)] = mu[stuck, None] * c[stuck]
     bound[len(stuck) :, 0] = system.dry[list(modes.held)]
     unit = np.full(len(P), scales.force)
-    unit[k + len(stuck) :][[system.turns[i] for i in modes.held]] = scales.torque
+    unit[k + len(stuck) :] = system.friction_units[list(modes.held)]
     margins = np.vstack([c[:k], bound - c[k:], bound + c[k:]])
     margins /= np.concatenate([unit, unit[k:]])[:, None]
     margins[:, 0] += ROUNDING

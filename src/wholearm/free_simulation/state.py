@@ -83,7 +83,7 @@ class Run:
         self.t, self.piece = float(torque.breaks[0]), 0
         self.y = np.concatenate([z, v, np.zeros(LOSSES)])
         self.modes = hint or Modes(sigma=(0.0,) * system.n)
-        self.armed = np.zeros(len(system.pairs), dtype=bool)
+        self.armed = np.zeros(len(system.names), dtype=bool)
         self.h = 0.02 * system.scales.time
         self.impact = 0.0
         self.decisions, self.decided_at = 0, -math.inf
@@ -154,9 +154,18 @@ class Run:
         """The steps of the present modes, with their inputs set to the present state."""
         system, modes = self.system, self.modes
         degree = self.torque.coefficients.shape[2] - 1
-        s = build_stepper(system, modes.kept, modes.stuck, modes.held, degree)
-        s.inputs[s.at.tolerance] = self.tolerance
-        s.inputs[s.at.Xi], s.inputs[s.at.sigma] = modes.Xi, modes.sigma
+        s = build_stepper(system.structure, modes.kept, modes.stuck, modes.held, degree)
+        inputs, at = s.inputs, s.at
+        inputs[at.tolerance], inputs[at.Xi], inputs[at.sigma] = (
+            self.tolerance,
+            modes.Xi,
+            modes.sigma,
+        )
+        inputs[at.geometry], inputs[at.lift] = system.geometry, 1 / system.mass
+        inputs[at.applied], inputs[at.viscous] = system.applied, system.viscous
+        inputs[at.dry], inputs[at.mu] = system.dry, system.friction[list(modes.kept)]
+        inputs[at.units], inputs[at.force] = system.units, system.scales.force
+        inputs[at.friction_units] = system.friction_units
         self.feed(s)
         return s
 

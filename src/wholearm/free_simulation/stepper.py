@@ -11,7 +11,7 @@ import numpy as np
 from ..common.arrays import Array, Expression
 from ..simulation.layout import lay_out
 from ..simulation.runge_kutta import GLIMPSES, build_error, build_step
-from .system import System
+from .system import Structure
 
 LOSSES = 4
 """Integrals along the motion: work of the torques, losses to viscous, dry and sliding friction."""
@@ -42,7 +42,11 @@ class Modes(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """Where each input of a step is in its packed vector; compare `simulation.layout.Inputs`."""
+    """Where each input of a step is in its packed vector; compare `simulation.layout.Inputs`.
+
+    Those from `geometry` on are numbers of the system: M^-1, gravity, friction of coordinates and
+    of the kept pairs, units of z and z', of forces and of the friction of coordinates.
+    """
 
     y: slice
     t: int
@@ -53,6 +57,15 @@ class Inputs(NamedTuple):
     stay: slice
     piece: slice
     torque: slice
+    geometry: slice
+    lift: slice
+    applied: slice
+    viscous: slice
+    dry: slice
+    mu: slice
+    units: slice
+    force: int
+    friction_units: slice
     size: int
 
 
@@ -84,14 +97,14 @@ class Stepper(NamedTuple):
 
 @lru_cache(maxsize=256)
 def build_stepper(
-    system: System,
+    structure: Structure,
     kept: tuple[int, ...],
     stuck: tuple[int, ...],
     held: tuple[int, ...],
     degree: int,
 ) -> Stepper:
     """Return the steps of a set of modes, for torques of a polynomial degree."""
-    return _Equations(system, kept, stuck, held, degree).compile()
+    return _Equations(structure, kept, stuck, held, degree).compile()
 
 
 class _Equations:
@@ -99,16 +112,17 @@ class _Equations:
 
     def __init__(
         self,
-        system: System,
+        structure: Structure,
         kept: tuple[int, ...],
         stuck: tuple[int, ...],
         held: tuple[int, ...],
         degree: int,
     ) -> None:
-        self.system, self.kept, self.stuck, self.held = system, kept, stuck, held
-        self.n, k, s = system.n, len(kept), len(stuck) + len(held)
-        size = 2 * self.n + LOSSES
-        self.at = Inputs(*lay_out(size, None, None, None, k, self.n, s, 2, 2 * degree + 2))
+        self.structure, self.kept, self.stuck, self.held = structure, kept, stuck, held
+        self.n, k, s = structure.n, len(kept), len(stuck) + len(held)
+        n, size, g = structure.n, 2 * structure.n + LOSSES, structure.geometry.shape[0]
+        numbers = (g, n, n, n, n, k, 2 * n, None, n)
+        self.at = Inputs(*lay_out(size, None, None, None, k, n, s, 2, 2 * degree + 2, *numbers))
         self.to = Outputs(*lay_out(size, self.n, k, s, k, 2, None, None))
         self.degree = degree
         self.dips: list[Expression] = []
@@ -122,19 +136,18 @@ class _Equations:
         y, t, h = packed[at.y], packed[at.t], packed[at.h]
 
         def rate(state: Expression, time: Expression) -> Expression:
-            rates, _, _, _, _, least = self._move(state, time, packed)
+            rates, _, _, _, _, least = self._move(state, time, packed, packed[at.geometry])
             self.dips.append(least)
             return rates
 
         end, fifth, third = build_step(rate, y, t, h, 2 * n)
-        units = ca.DM(self.system.units)
-        error = build_error(fifth, third, y[: 2 * n], units, packed[at.tolerance])
+        error = build_error(fifth, third, y[: 2 * n], packed[at.units], packed[at.tolerance])
         dip = ca.mmin(ca.vertcat(*(self.dips[stage] for stage in GLIMPSES)))
         moved = self._correct(end[: 2 * n], packed)
         end = ca.vertcat(moved, end[2 * n :])
         functions = []
         for state, time, extra in ((end, t + h, (error, dip)), (y, t, (0, 0))):
-            rates, *parts, _ = self._move(state[: 2 * n], time, packed)
+            rates, *parts, _ = self._move(state[: 2 * n], time, packed, packed[at.geometry])
             outputs = ca.vertcat(state, rates[n : 2 * n], *parts, *extra)
             functions.append(ca.Function("step", [packed], [ca.densify(outputs)]))
         inputs, results = np.zeros(at.size), np.zeros(self.to.size)
@@ -146,50 +159,46 @@ class _Equations:
         return Stepper(inputs, results, at, self.to, step, look, buffers)
 
     def _build_move(self) -> Expression:
-        """CasADi function (state, time, packed) -> rates, c_n, f, v_t, tau, least that holds."""
-        system, n, at = self.system, self.n, self.at
+        """CasADi function (state, time, packed, geometry) -> rates, c_n, f, v_t, tau, spare.
+
+        The last is what friction and contacts have left, in units of the scene.
+        """
+        structure, n, at = self.structure, self.n, self.at
         k, stick = len(self.kept), [self.kept.index(pair) for pair in self.stuck]
-        z, v, time = system.z, ca.SX.sym("v", n), ca.SX.sym("time")
+        z, v, time = structure.z, ca.SX.sym("v", n), ca.SX.sym("time")
         packed = ca.SX.sym("packed", at.size)
-        Xi, sigma = packed[at.Xi], packed[at.sigma]
-        _, _, A, A_t, bend, bend_t = system.build_rows(self.kept, v)
-        mu = system.friction[list(self.kept)]
-        G = A - ca.repmat(ca.DM(mu) * Xi, 1, n) * A_t
+        Xi, sigma, mu = packed[at.Xi], packed[at.sigma], packed[at.mu]
+        _, _, A, A_t, bend, bend_t = structure.build_rows(self.kept, v)
+        G = A - ca.repmat(mu * Xi, 1, n) * A_t
         hold = ca.DM(np.eye(n)[list(self.held)].reshape(len(self.held), n))
         P = ca.vertcat(A, *(A_t[row, :] for row in stick), hold)
         G = ca.vertcat(G, *(A_t[row, :] for row in stick), hold)
         curve = ca.vertcat(bend, *(bend_t[row] for row in stick), ca.DM(len(self.held), 1))
         tau = self._torque(time, packed)
-        viscous, dry = ca.DM(system.viscous) * v, ca.DM(system.dry) * sigma
+        viscous, dry = packed[at.viscous] * v, packed[at.dry] * sigma
         drive = ca.SX(n, 1)
-        for row, coordinate in enumerate(system.driven):
+        for row, coordinate in enumerate(structure.driven):
             drive[coordinate] = tau[row]
-        lift = ca.DM(1 / system.mass)
-        force = ca.DM(system.applied) + drive - viscous - dry
+        lift = packed[at.lift]
+        force = packed[at.applied] + drive - viscous - dry
         if P.shape[0]:
-            c = ca.solve(P @ (lift * G.T), -curve - P @ (lift * force))
+            spread = ca.repmat(lift, 1, P.shape[0])
+            c = ca.solve(P @ (spread * G.T), -curve - P @ (lift * force))
             force = force + G.T @ c
         else:
             c = ca.SX(0, 1)
         v_t, (c_n, f) = A_t @ v, ca.vertsplit(c, [0, k, c.shape[0]])
         losses = [ca.dot(part, v) for part in (drive, viscous, dry)]
-        losses.append(ca.dot(ca.DM(mu) * Xi * c_n, v_t))
-        bounds = ca.vertcat(
-            *(mu[row] * c_n[row] for row in stick), *(system.dry[i] for i in self.held)
-        )
-        units = self.measure_forces()
-        least = ca.vertcat(1.0, c_n / units[0], (bounds - ca.fabs(f)) / units[1])
-        outputs = [ca.vertcat(v, lift * force, *losses), c_n, f, v_t, tau, ca.mmin(least)]
-        return ca.Function(
-            "move", [ca.vertcat(z, v), time, packed], [ca.densify(part) for part in outputs]
-        )
-
-    def measure_forces(self) -> tuple[Expression, Expression]:
-        """The scene's units of c_n and of f."""
-        scales = self.system.scales
-        own = [scales.force] * len(self.stuck)
-        own += [scales.torque if self.system.turns[i] else scales.force for i in self.held]
-        return ca.DM([scales.force] * len(self.kept)), ca.DM(own)
+        losses.append(ca.dot(mu * Xi * c_n, v_t))
+        bounds = [mu[row] * c_n[row] for row in stick]
+        bounds += [packed[at.dry][i] for i in self.held]
+        units = [packed[at.force] for _ in stick]
+        units += [packed[at.friction_units][i] for i in self.held]
+        spare = (ca.vertcat(ca.SX(0, 1), *bounds) - ca.fabs(f)) / ca.vertcat(ca.SX(0, 1), *units)
+        least = ca.mmin(ca.vertcat(1.0, c_n / packed[at.force], spare))
+        outputs = [ca.vertcat(v, lift * force, *losses), c_n, f, v_t, tau, least]
+        inputs = [ca.vertcat(z, v), time, packed, structure.geometry]
+        return ca.Function("move", inputs, [ca.densify(part) for part in outputs])
 
     def _torque(self, time: Expression, packed: Expression) -> Expression:
         start, stop = packed[self.at.piece][0], packed[self.at.piece][1]
@@ -205,10 +214,10 @@ class _Equations:
 
         A step leaves gaps of the size of its error, so one Newton iteration closes them.
         """
-        system, n = self.system, self.n
-        z, v = system.z, ca.SX.sym("v", n)
+        structure, n = self.structure, self.n
+        z, v = structure.z, ca.SX.sym("v", n)
         packed = ca.SX.sym("packed", self.at.size)
-        gap, slip, A, A_t, _, _ = system.build_rows(self.kept, v)
+        gap, slip, A, A_t, _, _ = structure.build_rows(self.kept, v)
         stick = [self.kept.index(pair) for pair in self.stuck]
         hold = ca.DM(np.eye(n)[list(self.held)].reshape(len(self.held), n))
         P = ca.vertcat(A, *(A_t[row, :] for row in stick), hold)
@@ -216,12 +225,12 @@ class _Equations:
         if not P.shape[0]:
             return ca.Function("correct", [state, packed], [state])
         wanted = ca.vertcat(ca.DM(len(self.kept), 1), packed[self.at.stay])
-        lift = ca.DM(1 / system.mass) * P.T
+        lift = ca.repmat(packed[self.at.lift], 1, P.shape[0]) * P.T
         off = ca.vertcat(gap, *(slip[row] for row in stick), *(z[i] for i in self.held)) - wanted
         y, given = ca.MX.sym("y", 2 * n), ca.MX.sym("packed", self.at.size)
-        off_function = ca.Function("off", [z, packed], [P, lift, off])
-        P, lift, off = off_function(y[:n], given)
+        off_function = ca.Function("off", [z, packed, structure.geometry], [P, lift, off])
+        P, lift, off = off_function(y[:n], given, given[self.at.geometry])
         place = y[:n] - lift @ ca.solve(P @ lift, off)
-        P, lift, _ = off_function(place, given)
+        P, lift, _ = off_function(place, given, given[self.at.geometry])
         speed = y[n:] - lift @ ca.solve(P @ lift, P @ y[n:])
         return ca.Function("correct", [y, given], [ca.vertcat(place, speed)])

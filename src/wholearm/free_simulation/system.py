@@ -3,6 +3,8 @@
 The motion is M z'' = f + S tau - B z' - friction + A^T c_n + A_t^T c_t with a constant diagonal M.
 A pair of features has a gap C(z), whose gradient is its row of A, and a slip coordinate s(z), whose
 gradient is its row of A_t: how far the features have slid over each other while they touch.
+
+What is compiled is a `Structure`, which knows of no numbers; a `System` has those of one scene.
 """
 
 from __future__ import annotations
@@ -20,6 +22,9 @@ from ..common.batch import Batch
 from ..common.sharing import Keeper, kept_property
 from ..scene.model import Scales
 
+_ANYWHERE = 1e9
+"""Range of features that face each other wherever they are [m]."""
+
 
 @dataclass(frozen=True, eq=False)
 class Pair:
@@ -32,8 +37,6 @@ class Pair:
         Positive when apart.
     slip : scalar expression of z, [m]
         Its rate is the sliding velocity v_t while they touch.
-    friction : float
-        Coulomb's coefficient.
     ranges : tuple of scalar expressions, [m]
         All positive where the two face each other; the gap means nothing elsewhere.
     text : str
@@ -43,7 +46,6 @@ class Pair:
     name: str
     gap: Expression
     slip: Expression
-    friction: float
     ranges: tuple[Expression, ...] = ()
     text: str = ""
 
@@ -65,52 +67,31 @@ class Rows(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class System(Keeper):
-    """Coordinates, what moves them and what may touch.
+class Structure(Keeper):
+    """Coordinates and features of bodies of any size and weight.
 
     Attributes
     ----------
     z : SX symbol, shape (n,)
-    mass : ndarray, shape (n,)
-        Diagonal of M.
-    applied : ndarray, shape (n,)
-        Gravity as a force on z.
-    viscous, dry : ndarray, shape (n,)
-        Friction of the coordinates themselves: B, and the largest dry one.
+    geometry : SX symbol, shape (g,)
+        Numbers that gaps and slip coordinates depend on besides.
+    pairs : tuple of Pair
     driven : tuple of int
         Coordinates that the two torques act on; empty where there are none.
-    pairs : tuple of Pair
     turns : tuple of bool, length n
         Which coordinates are angles.
-    scales : Scales
-        Units that tolerances count in.
     """
 
     z: Expression
-    mass: Array
-    applied: Array
-    viscous: Array
-    dry: Array
-    driven: tuple[int, ...]
+    geometry: Expression
     pairs: tuple[Pair, ...]
+    driven: tuple[int, ...]
     turns: tuple[bool, ...]
-    scales: Scales
 
     @property
     def n(self) -> int:
         """Number of coordinates."""
-        return len(self.mass)
-
-    @cached_property
-    def units(self) -> Array:
-        """Units of z, then of z', shape (2 n,)."""
-        place = np.where(self.turns, 1.0, self.scales.length)
-        return np.concatenate([place, place / self.scales.time])
-
-    @cached_property
-    def friction(self) -> Array:
-        """Coefficients of all pairs, shape (N,)."""
-        return np.array([pair.friction for pair in self.pairs])
+        return len(self.turns)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -128,28 +109,87 @@ class System(Keeper):
         return gap, slip, A, A_t, bend, bend_t
 
     @kept_property
-    def _rows(self) -> Batch:
+    def rows(self) -> Batch:
+        """Slips, A, A_t, A' v and A_t' v of all pairs, of z, v and the geometry."""
         v = ca.SX.sym("v", self.n)
         _, slip, *rows = self.build_rows(range(len(self.pairs)), v)
         outputs = [ca.densify(part) for part in (slip, *rows)]
-        return Batch(ca.Function("rows", [self.z, v], outputs))
+        return Batch(ca.Function("rows", [self.z, v, self.geometry], outputs))
 
     @kept_property
-    def _gaps(self) -> Batch:
-        far = 1e3 * self.scales.length
+    def gaps(self) -> Batch:
+        """Gaps and ranges of all pairs, of z and the geometry."""
         gaps = ca.vertcat(ca.SX(0, 1), *(pair.gap for pair in self.pairs))
-        least = [ca.mmin(ca.vertcat(far, *pair.ranges)) for pair in self.pairs]
+        least = [ca.mmin(ca.vertcat(_ANYWHERE, *pair.ranges)) for pair in self.pairs]
         both = ca.densify(ca.horzcat(gaps, ca.vertcat(ca.SX(0, 1), *least)))
-        return Batch(ca.Function("gaps", [self.z], [both]))
+        return Batch(ca.Function("gaps", [self.z, self.geometry], [both]))
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """A structure with its numbers.
+
+    Attributes
+    ----------
+    structure : Structure
+    geometry : ndarray, shape (g,)
+    mass : ndarray, shape (n,)
+        Diagonal of M.
+    applied : ndarray, shape (n,)
+        Gravity as a force on z.
+    viscous, dry : ndarray, shape (n,)
+        Friction of the coordinates themselves: B, and the largest dry one.
+    friction : ndarray, shape (N,)
+        Coulomb's coefficient of each pair.
+    scales : Scales
+        Units that tolerances count in.
+    """
+
+    structure: Structure
+    geometry: Array
+    mass: Array
+    applied: Array
+    viscous: Array
+    dry: Array
+    friction: Array
+    scales: Scales
+
+    @property
+    def n(self) -> int:
+        """Number of coordinates."""
+        return self.structure.n
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all pairs."""
+        return self.structure.names
+
+    @property
+    def driven(self) -> tuple[int, ...]:
+        """Coordinates that the two torques act on."""
+        return self.structure.driven
+
+    @cached_property
+    def units(self) -> Array:
+        """Units of z, then of z', shape (2 n,)."""
+        place = np.where(self.structure.turns, 1.0, self.scales.length)
+        return np.concatenate([place, place / self.scales.time])
+
+    @cached_property
+    def friction_units(self) -> Array:
+        """Units of the friction of coordinates, shape (n,) [N, N m]."""
+        return np.where(self.structure.turns, self.scales.torque, self.scales.force)
 
     def evaluate(self, z: Array, v: Array, chosen: Sequence[int]) -> Rows:
         """Rows of some pairs at one state."""
-        _, A, A_t, bend, bend_t = (part[0, list(chosen)] for part in self._rows(z[None], v[None]))
+        found = self.structure.rows(z[None], v[None], self.geometry[None])
+        _, A, A_t, bend, bend_t = (part[0, list(chosen)] for part in found)
         return Rows(A, A_t, bend[:, 0], bend_t[:, 0])
 
     def evaluate_slip(self, z: Array, chosen: Sequence[int]) -> Array:
         """Slip coordinates of some pairs, shape (m,) [m]."""
-        return np.asarray(self._rows(z[None], z[None])[0][0, list(chosen), 0])
+        slips = self.structure.rows(z[None], z[None], self.geometry[None])[0]
+        return np.asarray(slips[0, list(chosen), 0])
 
     def measure(self, z: Array) -> tuple[Array, Array]:
         """Gaps of all pairs and how far inside their ranges they are, shape (m, N) each [m].
@@ -158,7 +198,8 @@ class System(Keeper):
         ----------
         z : ndarray, shape (m, n)
         """
-        both = self._gaps(z)[0]
+        geometry = np.broadcast_to(self.geometry, (len(z), len(self.geometry)))
+        both = self.structure.gaps(z, geometry)[0]
         return both[:, :, 0], both[:, :, 1]
 
     def stored(self, z: Array, v: Array) -> Array:
