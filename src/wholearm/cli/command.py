@@ -29,6 +29,7 @@ from .arguments import (
 from .bench import add_bench, name_study
 from .compare import compare
 from .engines import add_export, add_replay
+from .map import draw, protect
 from .predict import predict
 from .progress import clear_progress, show_progress
 from .robustness import add_robustness
@@ -57,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(given: Sequence[str]) -> int:
     try:
-        named = name_study([_protect(text) for text in name_simulator(given)])
+        named = name_study([protect(text) for text in name_simulator(given)])
         options = build_parser().parse_args(named)
         status: int = options.run(options)
         sys.stdout.flush()
@@ -102,7 +103,7 @@ def build_parser() -> argparse.ArgumentParser:
         ("predict", add_predict, predict, "see up to which speed slow motions keep every contact"),
         ("tune", add_tune, tune, "tune torques from quasistatic ones by steps of 10 percent"),
         ("compare", add_compare, compare, "put plans and torques for a problem side by side"),
-        ("map", add_map, _map, "draw the contact formations over (x, phi)"),
+        ("map", add_map, draw, "draw the contact formations over (x, phi)"),
         ("export", add_export, None, "write scene and plan for a physics engine"),
         (
             "replay",
@@ -304,59 +305,3 @@ def _replay(options: argparse.Namespace, torques: TorqueProfile) -> Trajectory:
     from ..simulation.simulate import simulate
 
     return simulate(load(options.problem), torques, progress=show_progress()).trajectory
-
-
-def _map(options: argparse.Namespace) -> int:
-    from ..problem.read import read_problem
-
-    route = [_read_pair(text, "--list", "X,PHI in m and degrees") for text in options.list or ()]
-    phi = options.phi and _read_pair(options.phi, "--phi", "LOW,HIGH in degrees")
-    if phi and not 0 < phi[1] - phi[0] <= 360:
-        raise InputError("", "--phi", f"{options.phi!r} given; LOW < HIGH <= LOW + 360 is needed")
-    if route:
-        from math import radians
-
-        from ..mapping.route import format_route, list_formations
-
-        poses = [(x, radians(angle)) for x, angle in route]
-        print(format_route(list_formations(read_problem(options.problem), *poses)), end="")
-        if options.output is None:
-            return 0
-    return _draw_map(options, phi)
-
-
-def _draw_map(options: argparse.Namespace, phi: tuple[float, float] | None) -> int:
-    from ..common.files import require_writable
-    from ..figures import plots
-    from ..figures.formation_map import draw_map
-    from ..mapping.formation_map import build_map, choose_window
-    from ..problem.read import read_problem
-    from ..results.trajectory_file import load_trajectory
-
-    output = options.output or f"map_{_stem(options.problem)}.png"
-    plots.require_format(output)
-    require_writable(output)
-    problem = read_problem(options.problem)
-    plan = None if options.plan is None else load_trajectory(options.plan)
-    window = choose_window(problem, phi)
-    plots.save(draw_map(build_map(problem, window=window, progress=show_progress()), plan), output)
-    clear_progress()
-    print(f"wrote {output}", file=sys.stderr if options.list else sys.stdout)
-    return 0
-
-
-def _read_pair(text: str, key: str, allowed: str) -> tuple[float, float]:
-    from ..common.require import require_number
-
-    parts = text.split(",")
-    try:
-        first, second = (require_number(float(part), key) for part in parts)
-    except ValueError:
-        raise InputError("", key, f"{text.strip()!r} given; allowed is {allowed}") from None
-    return first, second
-
-
-def _protect(text: str) -> str:
-    """Keep argparse from taking a pair of numbers that starts with a minus for an option."""
-    pair = text[:1] == "-" and text[1:2] in tuple(".0123456789") and "," in text
-    return f" {text}" if pair else text
