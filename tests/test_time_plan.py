@@ -164,7 +164,7 @@ def test_margins_with_rolling_contacts_are_those_along_the_curve() -> None:
     phase, allowed = problem.phases[1], along.meta["phase_durations"][1]
     assert phase.formation.rolling
     start = along.motions[1].evaluate(np.zeros(1)).z[0]
-    options = PlanOptions("margin", time_intervals=6, mode_search=False)
+    options = PlanOptions("margin", time_intervals=8, mode_search=False)
     (within,) = plan_phases(problem, (phase,), start, options, allowed)
     # Forces on an eighth of the phase cannot follow as closely.
     assert within.value == pytest.approx(along.meta["phase_values"][1], rel=3e-2)
