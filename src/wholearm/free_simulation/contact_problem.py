@@ -135,6 +135,15 @@ def read(problem: ContactProblem, c_n: Array, f: Array, residual: float = 0.0) -
     return Answer(c_n, f, p.b_n + p.A @ change, r_t, way, change, residual)
 
 
+def is_unique(problem: ContactProblem) -> bool:
+    """Whether there is one solution for sure, as nothing stands that might stick and K is positive.
+
+    A matrix whose symmetric part is positive definite has positive principal minors only.
+    """
+    _, s_t, K, _ = _scale(problem)
+    return not len(s_t) and bool(np.linalg.eigvalsh(K + K.T).min(initial=1.0) > SINGULAR)
+
+
 def list_answers(problem: ContactProblem) -> list[Answer] | None:
     """Every solution with other rates than the others; None where that is too much to look through.
 

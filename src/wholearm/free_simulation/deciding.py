@@ -21,6 +21,7 @@ from .contact_problem import (
     STICKS,
     Answer,
     ContactProblem,
+    is_unique,
     list_answers,
     solve,
     try_modes,
@@ -168,7 +169,8 @@ def _solve(run: Run, problem: ContactProblem) -> Answer | None:
 def _choose(run: Run, pattern: Pattern, problem: ContactProblem) -> Answer | None:
     """The answer that is nearest to the last one."""
     last = pattern.recall(run.modes)
-    found = list_answers(problem) or []
+    run.unique = is_unique(problem)
+    found = [] if run.unique else list_answers(problem) or []
     if len(found) > 1:
         modes = [pattern.describe(answer) for answer in found]
         if run.modes.kept or len(problem.b_n):

@@ -84,6 +84,31 @@ def build_system(scene: Scene) -> System:
     )
 
 
+def is_apart(system: System, z: Array, touching: float) -> bool:
+    """Whether lines along palm, links and edges show that nothing overlaps; False says nothing.
+
+    Parameters
+    ----------
+    touching : float, [m]
+        Overlap that counts as none.
+    """
+    gaps = dict(zip(system.names, system.measure(z[None])[0][0] >= -touching, strict=True))
+
+    def hold(*names: str) -> bool:
+        return all(gaps[name] for name in names)
+
+    corners = range(sum(name.endswith("-palm") for name in system.names))
+    parts = [hold(*(f"v{i}-palm" for i in corners))]
+    for k in "12":
+        sides = [hold(*(f"v{i}-{side}{k}" for i in corners)) for side in ("finger", "back")]
+        edges = [hold(f"e{i}-tip{k}", f"e{i}-joint{k}") for i in corners]
+        parts.append(any(sides + edges))
+    if "tip1-finger2" in gaps:
+        lines = [(a, b, side) for a, b in ("12", "21") for side in ("finger", "back")]
+        parts.append(any(hold(f"tip{a}-{s}{b}", f"joint{a}-{s}{b}") for a, b, s in lines))
+    return all(parts)
+
+
 @exclusive
 def measure_gaps(scene: Scene, z: Array) -> Array:
     """Least gaps of the bodies at n configurations, shape (n, 4) [m], negative where they overlap.

@@ -100,11 +100,36 @@ class _Motion:
             run.steps += 1
             run.record(s)
             run.armed = end.gaps[-1] > ARMED * self.unit
-            if found or (run.t >= run.stop and (run.torque_steps() or not run.next_piece())):
+            if found:
                 return
             floor = np.where(end.values > 0, self.slack, floor)
+            if run.t >= run.stop:
+                steps = run.torque_steps()
+                if not run.next_piece():
+                    return
+                if steps:
+                    end = end._replace(values=self._look_again(end))
+                    if not self._holds(end):
+                        return
+                    run.record(s)
             start = end
             run.feed(s)
+
+    def _look_again(self, end: View) -> Array:
+        """Values at the present state with the torques of the piece that begins there."""
+        self.run.feed(self.s)
+        self.s.look()
+        return self._measure(end.ranges[-1])
+
+    def _holds(self, end: View) -> bool:
+        """Whether the modes are the only answer after a step of the torques, by more than rounding.
+
+        Everything that touches has to press and slide, as it did before.
+        """
+        touches = np.abs(end.gaps[-1]) < CLOSED * self.unit
+        plain = self.run.unique and not len(self.friction_units)
+        clear = bool((end.values > 10 * self.slack).all())
+        return plain and clear and not (touches & self.watched).any()
 
     def _try_step(self, before: Array) -> tuple[float, bool, View]:
         """Make a step within the tolerance; its length, and whether it ends the torques' piece."""

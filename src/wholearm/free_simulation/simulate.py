@@ -16,7 +16,7 @@ from ..results.narrow import Torques, narrow
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..simulation.tolerances import SLOW, is_slower
-from .hand import build_system, measure_gaps
+from .hand import build_system, is_apart, measure_gaps
 from .play import play
 from .result import FreeSimulation, collect
 from .state import Run
@@ -128,8 +128,10 @@ def _simulate(
     tolerance: float,
 ) -> FreeSimulation:
     z, v = np.split(state, 2)
-    _require_apart(problem, z)
-    run = Run(build_system(problem.scene), profile, z, v, restitution, tolerance, hint)
+    system = build_system(problem.scene)
+    if not is_apart(system, z, problem.scene.touching):
+        _require_apart(problem, z)
+    run = Run(system, profile, z, v, restitution, tolerance, hint)
     play(run, problem.scene.touching)
     return collect(run, problem, starts)
 

@@ -64,6 +64,8 @@ class Run:
         What keeps which contacts at present.
     armed : ndarray of bool, shape (N,)
         Pairs that have been apart, so that their closing is an event.
+    unique : bool
+        Whether the present modes were the only answer for sure when they were chosen.
     impact : float, [J]
         Energy lost to impacts so far.
     """
@@ -88,7 +90,7 @@ class Run:
         self.impact = 0.0
         self.decisions, self.decided_at = 0, -math.inf
         self.steps = self.rejected = 0
-        self.resting = False
+        self.resting = self.unique = False
         self.residual = 0.0
         self.records: list[Record] = []
         self.events: list[Event] = []

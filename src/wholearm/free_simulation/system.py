@@ -10,7 +10,7 @@ What is compiled is a `Structure`, which knows of no numbers; a `System` has tho
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -153,6 +153,7 @@ class System:
     dry: Array
     friction: Array
     scales: Scales
+    _known: dict[bytes, list[Array]] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def n(self) -> int:
@@ -182,8 +183,13 @@ class System:
 
     def evaluate(self, z: Array, v: Array, chosen: Sequence[int]) -> Rows:
         """Rows of some pairs at one state."""
-        found = self.structure.rows(z[None], v[None], self.geometry[None])
-        _, A, A_t, bend, bend_t = (part[0, list(chosen)] for part in found)
+        key = z.tobytes() + v.tobytes()
+        if key not in self._known:
+            # Decisions look at one state, and at one a moment later, many times.
+            if len(self._known) > 1:
+                self._known.pop(next(iter(self._known)))
+            self._known[key] = self.structure.rows(z[None], v[None], self.geometry[None])[1:]
+        A, A_t, bend, bend_t = (part[0, list(chosen)] for part in self._known[key])
         return Rows(A, A_t, bend[:, 0], bend_t[:, 0])
 
     def evaluate_slip(self, z: Array, chosen: Sequence[int]) -> Array:
