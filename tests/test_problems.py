@@ -29,7 +29,11 @@ SLOW = [
     for objective in ("effort", "margin")
     if (name, objective) != ("square", "effort")
 ]
-SLOW += [*((name, "time") for name in LONG), ("heptagon_impact", "margin")]
+SLOW += [
+    *((name, "time") for name in LONG),
+    ("heptagon_impact", "margin"),
+    ("box_rolling", "effort"),
+]
 """Those that take long to plan and to look at; landings of the square for effort are left.
 
 `kernels` plans and verifies every problem and objective.
