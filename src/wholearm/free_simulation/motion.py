@@ -26,6 +26,10 @@ SPEED_ROUNDING = 1e-12
 """Likewise of a sliding or turning speed."""
 
 
+TURNING = 1e-4
+"""Speed, relative to the scene's, below which sliding or turning may be about to reverse."""
+
+
 class StuckError(ArithmeticError):
     """Steps become too short to get anywhere."""
 
@@ -128,7 +132,8 @@ class _Motion:
         """
         touches = np.abs(end.gaps[-1]) < CLOSED * self.unit
         plain = self.run.unique and not len(self.friction_units)
-        clear = bool((end.values > 10 * self.slack).all())
+        least = np.where(self.slack == SPEED_ROUNDING, TURNING, 10 * self.slack)
+        clear = bool((end.values > least).all())
         return plain and clear and not (touches & self.watched).any()
 
     def _try_step(self, before: Array) -> tuple[float, bool, View]:
