@@ -22,6 +22,7 @@ from wholearm.mechanics.dynamics import Directions, PathForces
 from wholearm.planning.lower_bound import rows
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain import data as path_data
+from wholearm.planning.path_domain import plan as path_plan
 from wholearm.planning.path_domain.motion import PathMotion
 from wholearm.planning.path_domain.plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
@@ -88,6 +89,8 @@ class Toy:
             patch.setattr(rows, "inverse", self._inverse)
             patch.setattr(path_data, "inverse", self._inverse)
             patch.setattr(path_data, "reduced_inertia", lambda *_: np.ones(1))
+            # A toy has no shape that friction could hold at rest.
+            patch.setattr(path_plan, "find_sure_start", lambda *_: None)
             yield
 
     def _inverse(
