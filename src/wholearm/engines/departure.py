@@ -22,7 +22,7 @@ OPEN = 0.1
 """Gap at which a contact is open, over the departure that is allowed."""
 SLOW = 0.1
 """Share of the planned sliding speed below which a contact sticks."""
-MOVES = 0.02
+MOVES = 2e-3
 """Sliding speed from which on a contact is known to slide, over the scene's speed."""
 PRESS = 0.25
 """Normal force above which a contact that is not planned presses, and from which on forces are
