@@ -12,7 +12,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..common.arrays import Array
-from ..simulation.events import EventKind
 from .contact_problem import (
     APART,
     BACK,
@@ -28,7 +27,8 @@ from .contact_problem import (
 )
 from .state import AHEAD, CLOSED, STANDING, STILL, Run
 from .stepper import Modes
-from .system import Rows, System
+from .system import Rows
+from .telling import tell_ambiguity, tell_changes
 
 DEPENDENT = 1e-7
 """Share of a row that others leave, below which it is no constraint of its own."""
@@ -148,7 +148,7 @@ def decide(run: Run) -> bool | None:
         stands(run) and (np.abs(acceleration) < still).all() and (np.abs(coming) < still).all()
     )
     modes = _make_modes(run, pattern, answer, system.evaluate(z, v, pattern.closed))
-    _tell(run, pattern, modes, rests)
+    tell_changes(run, pattern.closed, modes, rests)
     run.modes = modes
     _snap(run, pattern)
     return rests
@@ -174,7 +174,7 @@ def _choose(run: Run, pattern: Pattern, problem: ContactProblem) -> Answer | Non
     if len(found) > 1:
         modes = [pattern.describe(answer) for answer in found]
         if run.modes.kept or len(problem.b_n):
-            _tell_ambiguity(run, pattern, modes)
+            tell_ambiguity(run, pattern, modes)
         away = [sum(a != b for a, b in zip(own, last, strict=True)) for own in modes]
         return found[int(np.argmin(away))]
     return try_modes(problem, last) or _solve(run, problem) or (found[0] if found else None)
@@ -257,85 +257,3 @@ def _settle(run: Run, rows: Array) -> None:
     scaled /= np.linalg.norm(scaled, axis=1)[:, None]
     change = np.linalg.lstsq(scaled, scaled @ (root * run.v), rcond=1e-9)[0]
     run.take_impulse(run.v - change / root)
-
-
-def _name(system: System, joint: int) -> str:
-    known = joint in system.driven
-    return f"joint {system.driven.index(joint) + 1}" if known else f"coordinate {joint + 1}"
-
-
-def _tell(run: Run, pattern: Pattern, modes: Modes, rests: bool) -> None:
-    """Record what changes."""
-    system, before = run.system, run.modes
-    names = system.names
-    gone = [pair for pair in before.kept if pair not in modes.kept]
-    new = [pair for pair in modes.kept if pair not in before.kept]
-    gaps, ranges = (part[0] for part in system.measure(run.z[None]))
-    near = CLOSED * system.scales.length
-    for pair in gone:
-        # What still touches, at the end of its range, is a neighbour's from there on.
-        heirs = [p for p in new if names[p][-1:] == names[pair][-1:]]
-        if heirs and abs(gaps[pair]) < near and ranges[pair] < near:
-            text = f"{names[pair]} goes on as {names[heirs[0]]}"
-            run.note(EventKind.PASS, text, names[heirs[0]])
-            new.remove(heirs[0])
-        elif pair not in pattern.closed or run.records:
-            run.note(EventKind.CONTACT_LOST, f"{names[pair]} is lost", names[pair])
-    for pair in new if run.records else ():
-        run.note(EventKind.GAINED, f"{names[pair]} presses", names[pair])
-    for pair in modes.kept:
-        if pair not in before.kept or not run.records:
-            continue
-        old = before.Xi[before.kept.index(pair)]
-        now = modes.Xi[modes.kept.index(pair)]
-        _tell_change(run, names[pair], old, now, "slides", system.friction[pair] > 0)
-    for joint in np.flatnonzero(system.dry > 0) if run.records else ():
-        old, now = before.sigma[joint], modes.sigma[joint]
-        moves = not (run.resting and rests)
-        _tell_change(run, _name(system, int(joint)), old, now, "turns", moves)
-    if rests and not run.resting:
-        run.note(EventKind.REST, "everything rests")
-    elif run.resting and not rests:
-        run.note(EventKind.START, "the motion begins")
-
-
-def _tell_change(run: Run, name: str, old: float, now: float, verb: str, rubs: bool) -> None:
-    if old == now or not rubs:
-        return
-    contact = verb == "slides"
-    if now == 0:
-        text = f"{name} sticks" if contact else f"friction holds {name}"
-        run.note(EventKind.STICK, text, name)
-    elif old == 0:
-        text = f"{name} slips" if contact else f"{name} starts to turn"
-        run.note(EventKind.SLIP, text, name)
-    else:
-        run.note(EventKind.REVERSAL, f"{name} {verb} the other way", name)
-
-
-def _tell_ambiguity(run: Run, pattern: Pattern, answers: Sequence[Sequence[int]]) -> None:
-    """Record that there are several answers, once for each set of contacts."""
-    names = [run.system.names[pair] for pair in pattern.closed]
-    words = {APART: "parts", STICKS: "presses", FORTH: "slides +", BACK: "slides -"}
-    standing = set(pattern.standing.tolist())
-    texts = []
-    for answer in answers:
-        parts = [
-            f"{name} {'sticks' if mode == STICKS and k in standing else words[mode]}"
-            for k, (name, mode) in enumerate(zip(names, answer, strict=False))
-            if any(other[k] != mode for other in answers)
-        ]
-        parts += [
-            f"{_name(run.system, int(joint))} "
-            f"{ {STICKS: 'is held', FORTH: 'turns +', BACK: 'turns -'}[mode] }"
-            for joint, mode in zip(pattern.joints, answer[len(names) :], strict=True)
-        ]
-        texts.append(", ".join(parts) or "the rest accelerates otherwise")
-    text = f"{len(answers)} motions are possible with {', '.join(names) or 'no contact'} closed ("
-    text += "; or ".join(texts) + ")"
-    last = [event for event in run.events if event.kind is EventKind.AMBIGUOUS]
-    if not last or last[-1].text.split(" at t =")[0] != text:
-        run.note(EventKind.AMBIGUOUS, text, " ".join(names))
-
-
-__all__ = ["Pattern", "decide", "find_closed"]

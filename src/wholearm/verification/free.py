@@ -14,6 +14,7 @@ import numpy as np
 from ..common.errors import InputError
 from ..common.require import require_number
 from ..common.sharing import exclusive
+from ..free_simulation.hand import build_system
 from ..free_simulation.result import FreeSimulation
 from ..free_simulation.simulate import simulate_free, simulate_phases
 from ..problem.definition import Phase, Problem
@@ -21,7 +22,6 @@ from ..results.narrow import Torques, narrow
 from ..results.report import Deviation
 from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, OutcomeKind
-from ..simulation.tolerances import REST_WINDOW
 from .free_report import FreePhase, FreeReport, Loss
 from .verdict import DEPARTURE
 
@@ -46,7 +46,8 @@ def verify_free(
     tolerance : float
         Of the simulation.
     departure : float
-        How far the end of a phase may be from the plan; as of `verify`.
+        How far the end of a phase may be from the plan, as of `verify`, and how far contacts of a
+        phase may open, over the scene's length: bounces by less are events, but no failure.
     restitution : float
         Poisson's coefficient of impacts.
 
@@ -67,16 +68,18 @@ def verify_free(
     whole = simulate_free(problem, torque if plan is None else plan, **options)
     warnings = _warn("whole", whole)
     if plan is None:
-        phases, failures = _follow(problem, whole)
+        phases, failures = _follow(problem, whole, allowed)
         return FreeReport(problem.name, whole, (), phases, tuple(failures), tuple(warnings))
     failures, alone = [], []
     for part in simulate_phases(problem, plan, **options):
-        found = _compare(problem, plan, part.simulation, range(part.first, part.last + 1))
+        own = range(part.first, part.last + 1)
+        found = _compare(problem, plan, part.simulation, own, allowed)
         alone += found
         title = f"phases {found[0].number} to {found[-1].number}" if found[1:] else ""
         warnings += _warn(f"{title or f'phase {found[0].number}'} alone", part.simulation)
         failures += _fail(problem, part.simulation, found, allowed)
-    by_clock = _compare(problem, plan, whole, range(len(plan.phase_starts) - 1))
+    every = range(len(plan.phase_starts) - 1)
+    by_clock = _compare(problem, plan, whole, every, allowed)
     return FreeReport(
         problem.name, whole, tuple(alone), tuple(by_clock), tuple(failures), tuple(warnings)
     )
@@ -89,7 +92,8 @@ def _fail(
     texts = [] if simulation.outcome.kind is OutcomeKind.ENDED else [simulation.outcome.text]
     for phase in phases:
         texts += [
-            f"phase {phase.number} alone: {loss.contact} is lost at t = {loss.time:.5g} s"
+            f"phase {phase.number} alone: {loss.contact} is lost at t = {loss.time:.5g} s and "
+            f"opens by {loss.gap:.2g} m"
             for loss in phase.losses
         ]
         end = phase.deviation
@@ -108,14 +112,18 @@ def _warn(title: str, simulation: FreeSimulation) -> list[str]:
 
 
 def _compare(
-    problem: Problem, plan: Trajectory, simulation: FreeSimulation, indices: range
+    problem: Problem,
+    plan: Trajectory,
+    simulation: FreeSimulation,
+    indices: range,
+    allowed: float,
 ) -> list[FreePhase]:
     """Phases by the clock: where each ends, and which of its contacts are lost meanwhile."""
     found, starts = [], plan.phase_starts
     for index in indices:
         phase = problem.phases[index]
         start, stop = float(starts[index]), float(starts[index + 1])
-        losses = _find_losses(problem, simulation, phase, start, stop)
+        losses = _find_losses(problem, simulation, phase, start, stop, allowed)
         row = int(np.searchsorted(simulation.t, stop, side="right")) - 1
         last = int(np.flatnonzero(plan.phase == index)[-1])
         away = np.abs(simulation.z[row] - plan.z[last])
@@ -126,7 +134,7 @@ def _compare(
 
 
 def _follow(
-    problem: Problem, simulation: FreeSimulation
+    problem: Problem, simulation: FreeSimulation, allowed: float
 ) -> tuple[tuple[FreePhase, ...], list[str]]:
     """Phases of torques alone: each until what ends it has happened."""
     found: list[FreePhase] = []
@@ -136,10 +144,11 @@ def _follow(
     for phase, after in zip(problem.phases, following, strict=True):
         stop = _find_end(simulation, phase, after, start)
         last = float(simulation.t[-1]) if stop is None else stop
-        losses = _find_losses(problem, simulation, phase, start, last)
+        losses = _find_losses(problem, simulation, phase, start, last, allowed)
         found.append(FreePhase(phase.number, start, last, stop is not None, tuple(losses), None))
         failures += [
-            f"{loss.contact} is lost at t = {loss.time:.5g} s, phase {phase.number}"
+            f"{loss.contact} is lost at t = {loss.time:.5g} s, phase {phase.number}, and opens by "
+            f"{loss.gap:.2g} m"
             for loss in losses
         ]
         if stop is None:
@@ -173,19 +182,23 @@ def _find_end(
 
 
 def _find_losses(
-    problem: Problem, simulation: FreeSimulation, phase: Phase, start: float, stop: float
+    problem: Problem,
+    simulation: FreeSimulation,
+    phase: Phase,
+    start: float,
+    stop: float,
+    allowed: float,
 ) -> list[Loss]:
-    """When contacts of a phase do not press for longer than a moment, the first time of each.
-
-    The end of a phase, where a rounding decides which contact goes first, does not count.
-    """
-    window = REST_WINDOW * problem.scene.scales.time
-    found = []
+    """Contacts of a phase that open by more than is allowed, over the scene's length."""
+    system, found = build_system(problem.scene), []
     for name in phase.formation.names:
         own = [(s.start, s.stop) for s in simulation.stretches if s.contact == name]
-        edges = _list_gaps(own, start, stop)
-        long = [first for first, after in edges if after - first > window]
-        found += [Loss(name, long[0])] if long else []
+        for first, after in _list_gaps(own, start, stop):
+            rows = np.flatnonzero((simulation.t >= first) & (simulation.t <= after))
+            gaps = system.measure(simulation.z[rows])[0][:, system.names.index(name)]
+            if gaps.max(initial=0.0) > allowed * problem.scene.scales.length:
+                found.append(Loss(name, first, float(gaps.max())))
+                break
     return sorted(found, key=lambda loss: loss.time)
 
 

@@ -15,10 +15,11 @@ MOST = 60
 
 
 class Loss(NamedTuple):
-    """A contact of a phase that does not press any more, and since when [s]."""
+    """A contact of a phase that opens, when it stops pressing [s], and by how much it opens [m]."""
 
     contact: str
     time: float
+    gap: float
 
 
 class FreePhase(NamedTuple):
@@ -32,7 +33,7 @@ class FreePhase(NamedTuple):
     reached : bool
         Whether its end came.
     losses : tuple of Loss
-        Contacts of the phase that did not press for longer than a moment, by time.
+        Contacts of the phase that opened by more than a bounce, by time.
     deviation : Deviation or None
         From the plan at its end; None without a plan.
     """
