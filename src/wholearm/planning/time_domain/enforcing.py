@@ -25,6 +25,8 @@ from .search import Search, Solution
 
 ROUNDS = 24
 """Most times that limits are tightened."""
+STALLED = 9
+"""Times after which tightening does not lead anywhere, and finer intervals are tried instead."""
 REFINEMENTS = 8
 """Most times that intervals are halved because of misses."""
 MOST = 64
@@ -48,7 +50,7 @@ _COARSE = 0.1
 
 def enforce_between(search: Search, solution: Solution) -> Solution:
     """Go on from a solution until it is accurate and limits hold between points too."""
-    refined, first = 0, solution.cost
+    refined, tightened, first = 0, 0, solution.cost
     raised = [Raised.none(stage) for stage in solution.stages]
     for _ in range(ROUNDS):
         motions = make_motions(solution.stages, search.scheme)
@@ -84,12 +86,15 @@ def enforce_between(search: Search, solution: Solution) -> Solution:
             refined = REFINEMENTS
         if worst <= 1:
             return solution._replace(error=float(sum(own.sum() for own in gains)))
-        raised = [own.further(miss) for own, miss in zip(raised, misses, strict=True)]
+        raised, tightened = (
+            [own.further(m) for own, m in zip(raised, misses, strict=True)],
+            tightened + 1,
+        )
         limits = [own.limits for own in raised]
         tighter = search.run(
             solution.nlp, solution.stages, limits, solution.multipliers, solution.margin
         )
-        if not tighter.success:
+        if not tighter.success or tightened % STALLED == 0:
             tighter = _halve_missed(search, solution, misses)
             raised = [Raised.none(stage) for stage in tighter.stages]
         if not tighter.success:
