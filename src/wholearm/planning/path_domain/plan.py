@@ -57,6 +57,13 @@ class _Stuck(NamedTuple):
     between: bool
 
 
+class _Solved(NamedTuple):
+    """Plans of all phases, and the mesh and solution that they come from."""
+
+    plans: Plans
+    round_: Round
+
+
 def plan_path(
     curve: Curve,
     epsilon: float,
@@ -109,33 +116,34 @@ def plan_curves(
         return _insist(_plan_finer(changes, insist=False))
 
     try:
-        plans = _plan_finer(task)
+        found = _plan_finer(task)
     except JammingError as jam:
         if not explained or len(curves) > 1:
             raise
         from .explain import explain_jam
 
         raise explain_jam(curves[0], epsilon, jam, replan) from None
-    if isinstance(plans, _Stuck):
+    if isinstance(found, _Stuck):
         if not explained:
-            raise SolverError(plans.reason)
+            raise SolverError(found.reason)
         from .explain import explain
 
-        guessed = guess_slowly(join(plans.parts))
+        guessed = guess_slowly(join(found.parts))
         raise _explain_duration(task) or explain(
-            plans.parts, *guessed, phases, plans.reason, replan
+            found.parts, *guessed, phases, found.reason, replan
         )
-    if options.goal is Objective.MARGIN and plans[0].value < task.lost:
+    if options.goal is Objective.MARGIN and found.plans[0].value < task.lost:
         late = _explain_duration(task)
         raise late or SolverError(f"{task.name}: the margin found is below epsilon")
-    return plans if options.goal is Objective.TIME else _leave_rest(task, plans)
+    return found.plans if options.goal is Objective.TIME else _leave_rest(task, found)
 
 
-def _leave_rest(task: Task, plans: Plans) -> Plans:
+def _leave_rest(task: Task, found: _Solved) -> Plans:
     """The plans, or others with a start that friction cannot hold, if it can hold theirs.
 
     Those of least time push off as hard as limits allow.
     """
+    plans = found.plans
     motion, margin = plans[0].motion, 0.0
     if task.options.goal is Objective.MARGIN:
         margin = plans[0].value - task.epsilon
@@ -143,13 +151,14 @@ def _leave_rest(task: Task, plans: Plans) -> Plans:
     start = find_sure_start(data, motion.profile, margin)
     if start is None:
         return plans
-    found = _plan_finer(replace(task, start=start))
-    if isinstance(found, _Stuck):
+    bounded = replace(found.round_, task=replace(task, start=start)).solve()
+    other = bounded if isinstance(bounded, str) else _enforce_between(bounded)
+    if not isinstance(other, _Solved):
         return plans
-    loss = sum(own.value for own in plans) - sum(own.value for own in found)
+    loss = sum(own.value for own in plans) - sum(own.value for own in other.plans)
     if task.options.goal is Objective.EFFORT:
         loss = -loss
-    return found if loss <= WORTH * sum(own.value for own in plans) else plans
+    return other.plans if loss <= WORTH * sum(own.value for own in plans) else plans
 
 
 def _explain_duration(task: Task) -> InfeasibleError | None:
@@ -188,14 +197,14 @@ def _roughen(options: PlanOptions) -> PlanOptions:
     return replace(options, accuracy=max(options.accuracy, _ROUGH))
 
 
-def _insist(found: Plans | _Stuck) -> Plans:
+def _insist(found: _Solved | _Stuck) -> Plans:
     """The plans, or an error."""
     if isinstance(found, _Stuck):
         raise SolverError(found.reason)
-    return found
+    return found.plans
 
 
-def _plan_finer(task: Task, insist: bool = True) -> Plans | _Stuck:
+def _plan_finer(task: Task, insist: bool = True) -> _Solved | _Stuck:
     """Plan, on a finer grid where limits that hold between the nodes leave nothing, or no time.
 
     What so few elements cannot keep at their nodes, twice as many may: they are tried if that is
@@ -209,12 +218,12 @@ def _plan_finer(task: Task, insist: bool = True) -> Plans | _Stuck:
             if not found.between and (stuck or not insist):
                 return stuck or found
             stuck = found
-        elif task.options.goal is not Objective.MARGIN or found[0].value >= task.lost:
+        elif task.options.goal is not Objective.MARGIN or found.plans[0].value >= task.lost:
             break
     return found
 
 
-def _plan(task: Task, finer: int = 1, insist: bool = True) -> Plans | _Stuck:
+def _plan(task: Task, finer: int = 1, insist: bool = True) -> _Solved | _Stuck:
     """Solve on meshes that suit the plan more and more, and make limits hold between nodes too.
 
     If that is not insisted on, only where a sweep has found a motion.
@@ -225,14 +234,14 @@ def _plan(task: Task, finer: int = 1, insist: bool = True) -> Plans | _Stuck:
     found = round_.solve()
     if isinstance(found, str):
         return _Stuck(round_.parts, f"{task.name}: {found}", between=False)
-    best: Plans | _Stuck | None = None
+    best: _Solved | _Stuck | None = None
     for _ in range(_AGAIN):
         found = _suit(found)
-        plans = _enforce_between(found)
-        if best is not None and isinstance(plans, _Stuck):
+        kept = _enforce_between(found)
+        if best is not None and isinstance(kept, _Stuck):
             return best
-        best = plans
-        if isinstance(plans, _Stuck) or plans[0].error <= task.options.accuracy:
+        best = kept
+        if isinstance(kept, _Stuck) or kept.plans[0].error <= task.options.accuracy:
             break
         better = found.adapt(dearer=True)[1]
         refined = better.solve() if better else ""
@@ -256,7 +265,7 @@ def _suit(found: Round) -> Round:
     return found
 
 
-def _enforce_between(round_: Round) -> Plans | _Stuck:
+def _enforce_between(round_: Round) -> _Solved | _Stuck:
     """Tighten limits until they hold between nodes too."""
     task, data = round_.task, round_.data
     wasteful = float(round_.wasted.sum()) > _WASTED * task.options.accuracy
@@ -264,7 +273,7 @@ def _enforce_between(round_: Round) -> Plans | _Stuck:
         misses = round_.misses
         if misses.find_worst(data) <= MISS and not wasteful:
             try:
-                return round_.summarise()
+                return _Solved(round_.summarise(), round_)
             except StalledError as stall:
                 return _Stuck(round_.parts, f"{task.name}: {stall}", between=True)
         found = round_.tighten(wasteful).solve()
