@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from .scene.polygon import Polygon
     from .simulation.events import Simulation
     from .simulation.simulate import simulate
+    from .tuning.result import Tuning
     from .tuning.tune import tune
     from .verification.free import verify_free
     from .verification.free_report import FreeReport
@@ -83,6 +84,7 @@ _HOMES = {
     "SolverError": "common.errors",
     "Status": "planning.result",
     "TorqueProfile": "results.torque",
+    "Tuning": "tuning.result",
     "Trajectory": "results.trajectory",
     "Until": "problem.definition",
     "WholearmError": "common.errors",
@@ -133,6 +135,7 @@ __all__ = [
     "Status",
     "TorqueProfile",
     "Trajectory",
+    "Tuning",
     "Until",
     "WholearmError",
     "__version__",

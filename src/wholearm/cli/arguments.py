@@ -125,11 +125,13 @@ def add_tune(parser: argparse.ArgumentParser) -> None:
     """Add what `tune` takes."""
     parser.add_argument("problem", help="problem file (TOML)")
     parser.add_argument("-o", "--output", metavar="FILE", help="torques to write (.csv)")
+    text = "let each phase have one more step of its torques, which stops it at its end"
+    parser.add_argument("--brake", action="store_true", help=text)
     text = "how hard quasistatic torques squeeze: 0 as little as needed, 1 as hard as helps (0.5)"
     parser.add_argument("--squeeze", type=float, default=0.5, help=text)
-    text = "raises beyond the first that reaches the end: 0 none, 1 all that keep contacts (0.5)"
-    parser.add_argument("--share", type=float, default=0.5, help=text)
-    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+    text = "raises beyond the first that reaches the end: 0 none, 1 all that keep contacts (1)"
+    parser.add_argument("--share", type=float, default=1.0, help=text)
+    parser.add_argument("--json", action="store_true", help="print every trial as JSON")
 
 
 def add_compare(parser: argparse.ArgumentParser) -> None:

@@ -9,7 +9,7 @@ from .progress import clear_progress, show_progress
 
 
 def tune(options: argparse.Namespace) -> int:
-    """Tune, print what became of each phase, and write the torques if all phases have some."""
+    """Tune, print what became of each phase, and write the torques if they hold."""
     from ..common.files import require_ending, require_writable, write_text
     from ..geometry.path_guess import load
     from ..tuning.tune import tune as run
@@ -17,12 +17,12 @@ def tune(options: argparse.Namespace) -> int:
     if options.output is not None:
         require_writable(options.output)
         require_ending(options.output, ".csv")
-    problem, report = load(options.problem), show_progress()
-    found = run(problem, squeeze=options.squeeze, share=options.share, progress=report)
+    given = {key: getattr(options, key) for key in ("brake", "squeeze", "share")}
+    found = run(load(options.problem), **given, progress=show_progress())
     clear_progress()
     print(json.dumps(found.to_dict(), indent=2) if options.json else found.to_text())
     if options.output is not None and found.ok:
         write_text(options.output, found.to_csv())
         if not options.json:
             print(f"wrote {options.output}")
-    return 0 if found.ok else 1
+    return found.exit_status

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from ..simulation.events import EventKind
@@ -12,7 +14,7 @@ from .rest import hold
 from .state import ARMED, NO_PROGRESS, Run
 
 
-def play(run: Run, touching: float) -> None:
+def play(run: Run, touching: float, halt: Callable[[Run], bool] | None = None) -> None:
     """Simulate until the torques end.
 
     Parameters
@@ -20,9 +22,11 @@ def play(run: Run, touching: float) -> None:
     run : Run
     touching : float, [m]
         Gap that counts as closed at the start.
+    halt : callable, optional
+        Asked at every event whether that is enough.
     """
     _close(run, touching)
-    while run.t < run.end:
+    while run.t < run.end and not (halt is not None and halt(run)):
         if run.t >= run.stop:
             run.next_piece()
         collide(run)
@@ -35,6 +39,8 @@ def play(run: Run, touching: float) -> None:
         if rests is None:
             if not jolt(run):
                 run.note(EventKind.GIVEN_UP, "no motion obeys the laws of contact")
+                if not run.records:
+                    run.record(None)
                 return
             continue
         run.resting = rests

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -47,6 +48,7 @@ def simulate_free(
     until: float | None = None,
     restitution: float = 0.0,
     tolerance: float = 1e-9,
+    halt: Callable[[Run], bool] | None = None,
 ) -> FreeSimulation:
     """Simulate torques without being told which contacts hold, also after one is lost.
 
@@ -64,6 +66,8 @@ def simulate_free(
         Poisson's coefficient, 0 for plastic impacts to 1.
     tolerance : float
         As of `simulate`.
+    halt : callable, optional
+        Asked at every event, with the run, whether that is enough.
 
     Raises
     ------
@@ -83,7 +87,7 @@ def simulate_free(
         profile = profile.cut(0.0, require_number(until, "until", positive=True))
     starts = [0.0] if plan is None else plan.phase_starts[:-1].tolist()
     hint = None if plan is None or start is not None else _recall(problem, plan, 0)
-    return _simulate(problem, profile, state, starts, hint, rate, tolerance)
+    return _simulate(problem, profile, state, starts, hint, rate, tolerance, halt)
 
 
 @exclusive
@@ -126,13 +130,14 @@ def _simulate(
     hint: Modes | None,
     restitution: float,
     tolerance: float,
+    halt: Callable[[Run], bool] | None = None,
 ) -> FreeSimulation:
     z, v = np.split(state, 2)
     system = build_system(problem.scene)
     if not is_apart(system, z, problem.scene.touching):
         _require_apart(problem, z)
     run = Run(system, profile, z, v, restitution, tolerance, hint)
-    play(run, problem.scene.touching)
+    play(run, problem.scene.touching, halt)
     return collect(run, problem, starts)
 
 

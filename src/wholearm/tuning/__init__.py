@@ -1,1 +1,1 @@
-"""Torques found as by hand: from quasistatic ones, by steps of 10 %, judged by simulations."""
+"""Torques found by trial and error, in steps of 10 %, as Yeap and Trinkle tuned theirs by hand."""

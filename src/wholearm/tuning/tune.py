@@ -1,123 +1,224 @@
-"""The 10 % procedure on a whole problem, phase after phase."""
+"""Tune the torques of a problem, phase by phase, by the 10 % rule."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-
-import numpy as np
+from typing import NamedTuple
 
 from ..common.arrays import Array
 from ..common.errors import InputError, name_source
 from ..common.require import require_number
 from ..common.sharing import exclusive
-from ..mechanics.metric import metric_weights
 from ..problem.check import require_phases
 from ..problem.definition import End, Phase, Problem
 from ..quasistatic.predict import SQUEEZE, find_torques
+from ..quasistatic.prediction import QuasistaticTorques
 from ..quasistatic.road import Road, make_road
-from ..results.torque import TorqueProfile
-from ..verification.instants import answer
-from ..verification.verify import verify
-from .phase import PhaseTuning, tune_phase
-from .trial import Bench, Outcome, Sight
-from .tuned import Tuned
+from ..results.torque_table import read_rows
+from ..simulation.tolerances import REST_WINDOW
+from ..verification.free import verify_free
+from .result import PhaseTuning, Tuning
+from .rule import FACTOR, Drive, Rule
+from .trial import Bench, Outcome, Step, Trial, make_rows
 
-SHARE = 0.5
-"""Which of the raises that reach the end is taken, from the first, 0, to the last, 1."""
-DWELL = 1e-5
-"""How much later than its end the torques of a phase step to those of the next, over the scene's
-time: not before, whatever the rounding."""
+PAUSE = 0.2
+"""How long the object is held at the end of each phase, relative to the scene's time."""
+_LOWERED = 6
+"""How many times the acting torque is lowered for that, less one."""
 
 
 @exclusive
 def tune(
     problem: Problem,
     *,
+    brake: bool = False,
     squeeze: float = SQUEEZE,
-    share: float = SHARE,
+    share: float = 1.0,
     progress: Callable[[str], None] | None = None,
-) -> Tuned:
-    """Find torques by steps of 10 % from quasistatic ones, phase by phase.
+) -> Tuning:
+    """Tune torques from the quasistatic ones, in steps of 10 %, by free simulations.
+
+    Each phase has constant torques. That of the finger behind the motion is raised until the
+    object slides to the end of the phase, and further for speed until a contact is lost; then it
+    is lowered by 10 %.
 
     Parameters
     ----------
     problem : Problem
+    brake : bool
+        Whether each phase may have one more step of its torques, which stops it at its end.
     squeeze : float
-        How hard quasistatic torques squeeze, from 0 to 1; see `predict`.
+        How hard the quasistatic torques squeeze; as of `predict`.
     share : float
-        Which of the raises between the first that reaches the end of a phase, 0, and the last that
-        keeps every contact, 1, is taken.
+        Which of the raises that reach the end of a phase is taken, from the first, 0, to the last
+        that keeps every contact, 1.
     progress : callable, optional
-        Receives a line for each phase.
+        Shown each trial, in words.
 
     Raises
     ------
     InputError
-        If a phase cannot be carried out geometrically, or a number is out of its range.
+        If the phases cannot be carried out geometrically, or a number is out of its range.
     """
     require_phases(problem)
     for key, value in (("squeeze", squeeze), ("share", share)):
         if not 0 <= require_number(value, key) <= 1:
             raise InputError("", key, f"{value!r} given; allowed are 0 to 1")
     found: list[PhaseTuning] = []
-    z = problem.start
+    steps: list[Step] = []
+    z, clock = problem.start, 0.0
     with name_source(problem.source):
         for phase in problem.phases:
-            if progress is not None:
-                progress(f"tuning phase {phase.number} of {len(problem.phases)}")
-            found.append(_tune(problem, phase, z, squeeze, share))
-            if not found[-1].steps:
-                break
-            z = found[-1].outcome.z
-    torque = join(found, DWELL * problem.scene.scales.time)
-    whole = len(found) == len(problem.phases) and bool(found[-1].steps)
-    report = verify(problem, torque) if torque is not None and whole else None
-    return Tuned(problem.name, problem.epsilon, tuple(found), torque, report)
+            setting = _Setting(problem, phase, brake, squeeze, share, progress or _say_nothing)
+            own, end, reason = setting.tune(z)
+            found.append(own)
+            if end is None:
+                return Tuning(
+                    problem.name, tuple(found), None, None, f"phase {phase.number}: {reason}"
+                )
+            steps += [step._replace(time=clock + step.time) for step in own.steps]
+            clock += own.duration + setting.pause
+            z = end
+    rows = make_rows(steps, clock)
+    report = verify_free(problem, read_rows(rows))
+    return Tuning(problem.name, tuple(found), rows, report, report.reason)
 
 
-def join(found: Sequence[PhaseTuning], dwell: float) -> TorqueProfile | None:
-    """The torques of phases one after the other, each a `dwell` [s] longer; None without any."""
-    starts, rows, now = list[float](), list[Array](), 0.0
-    for own in found:
-        for start, tau in own.steps:
-            starts.append(now + start)
-            rows.append(tau)
-        now += own.outcome.time + dwell if own.steps else 0.0
-    if not rows:
-        return None
-    return TorqueProfile(np.array([*starts, now]), np.array(rows)[..., None])
+def _say_nothing(text: str) -> None:
+    """Where nobody looks."""
 
 
-def _tune(problem: Problem, phase: Phase, z: Array, squeeze: float, share: float) -> PhaseTuning:
-    """Tune one phase from rest at `z`."""
-
-    def give_up(reason: str) -> PhaseTuning:
-        outcome = Outcome(Sight.HELD, reason, 0.0, 0.0, np.inf, z)
-        return PhaseTuning(phase.number, 0, np.full(2, np.nan), 0, 0, (), outcome, 0, reason)
-
-    if phase.end is not End.REST:
-        return give_up(f"passes into the next one in motion (end = {phase.end.value!r})")
-    road = make_road(phase, z, problem.phases[phase.index + 1 :])
-    if road is None:
-        return give_up("has not one or two freedoms")
-    torques = find_torques(road, problem.epsilon, squeeze)
-    if torques is None:
-        return give_up("has no quasistatic torques all along")
-    tau, bench = torques.tau[0], Bench(problem, phase, z)
-    first = find_acting(road, tau)
-    tuned = tune_phase(bench, phase.number, tau, first, share)
-    if tuned.steps:
-        return tuned
-    other = tune_phase(bench, phase.number, tau, 3 - first, share)
-    return other if other.steps else replace(tuned, simulations=bench.simulations)
+_Balance = tuple[Road, QuasistaticTorques]
+"""The way along a phase, and what balances it."""
 
 
-def find_acting(road: Road, tau: Array) -> int:
-    """The finger, 1 or 2, whose torque sets the object in motion when it is raised by a share."""
-    formation, way = road.phase.formation, road.z_s[0]
-    signs = np.concatenate([road.directions.Xi[0], road.directions.sigma[0]])
-    instant = answer(formation, road.z[0], np.zeros(5), signs)
-    assert instant is not None
-    ahead = metric_weights(formation.scene) * way @ instant.acceleration
-    return int((ahead[1:] * tau).argmax()) + 1
+class _Setting(NamedTuple):
+    """A phase, and how it is tuned."""
+
+    problem: Problem
+    phase: Phase
+    brake: bool
+    squeeze: float
+    share: float
+    tell: Callable[[str], None]
+
+    @property
+    def after(self) -> Phase | None:
+        return next(iter(self.problem.phases[self.phase.index + 1 :]), None)
+
+    @property
+    def pause(self) -> float:
+        """How long the object is held at the end [s]."""
+        return PAUSE * self.problem.scene.scales.time
+
+    def tune(self, z: Array) -> tuple[PhaseTuning, Array | None, str]:
+        """Tune it from rest at `z`; where it ends at rest, or why it does not."""
+        own = PhaseTuning(self.phase.number, str(self.phase.until))
+        if self.phase.end is not End.REST:
+            return own, None, "it passes into the next one in motion; the rule tunes phases to rest"
+        found = self._balance(self.phase, z)
+        if found is None:
+            return own, None, "no quasistatic motion keeps every contact, where tuning would start"
+        road, torques = found
+        acting = _find_acting(road, torques)
+        bench = Bench(self.problem, self.phase, z)
+        title = f"phase {self.phase.number} of {len(self.problem.phases)}"
+        rule = Rule(bench, torques.tau, acting, lambda text: self.tell(f"{title}: {text}"))
+        own = replace(own, acting=acting + 1, quasistatic=rule.scale(0))
+        drives = rule.drive()
+        drives = drives[: 1 + round(self.share * (len(drives) - 1))]
+        if not drives:
+            return self._sum_up(own, bench, bench.trials[-1]), None, _explain(bench)
+        if not self.brake:
+            return self._arrive(own, rule, drives, found)
+        brake = rule.brake(drives)
+        if brake is None:
+            text = "no torque in steps of 10 % brings it to rest at its end: a trial "
+            own = replace(self._sum_up(own, bench, drives[-1].trial), raised=drives[-1].raised)
+            return own, None, text + bench.trials[-1].to_text()
+        own = replace(own, raised=drives[-1].raised, braked=brake.raised, supported=brake.supported)
+        return self._hold(own, rule, brake.trial, found)
+
+    def _arrive(
+        self, own: PhaseTuning, rule: Rule, drives: Sequence[Drive], balance: _Balance
+    ) -> tuple[PhaseTuning, Array | None, str]:
+        """The fastest drive that is held where it arrives; the slowest arrives most gently."""
+        kept: tuple[PhaseTuning, Array | None, str] | None = None
+        for drive in drives:
+            last = self._hold(replace(own, raised=drive.raised), rule, drive.trial, balance)
+            if last[1] is None:
+                return last if kept is None else kept
+            kept = last
+        assert kept is not None
+        return kept
+
+    def _hold(
+        self, own: PhaseTuning, rule: Rule, trial: Trial, balance: _Balance
+    ) -> tuple[PhaseTuning, Array | None, str]:
+        """Hold the object where a trial has arrived: as it is, or lowered for the next phase."""
+        own = replace(self._sum_up(own, rule.bench, trial), steps=trial.steps)
+        reason = ""
+        for tau in self._list_holds(trial, balance):
+            steps = trial.steps if tau is None else (*trial.steps, Step(trial.time, tau))
+            landing = rule.bench.land(steps, trial.time, self.pause, self.after)
+            own = replace(own, steps=steps, simulations=rule.bench.simulations)
+            rate = f"{self.phase.until} is reached at {trial.rate:.3g}"
+            rate += " rad/s" if rule.bench.is_angle else " m/s"
+            rate += f" at t = {trial.time:.5g} s, and "
+            if landing.parted > REST_WINDOW * self.problem.scene.scales.time:
+                reason = f"{rate}{landing.contact} parts for {1e3 * landing.parted:.3g} ms"
+            elif not landing.rests:
+                reason = f"{rate}the object does not come to rest there"
+            else:
+                return own, landing.z, ""
+        return own, None, reason
+
+    def _list_holds(self, trial: Trial, own: _Balance) -> list[tuple[float, float] | None]:
+        """What may hold the object: what it arrives with, or quasistatic torques lowered.
+
+        Those are of the next phase, or of the end of the last one.
+        """
+        row, found = (-1, own) if self.after is None else (0, self._balance(self.after, trial.z))
+        if found is None:
+            return [None]
+        road, torques = found
+        acting = _find_acting(road, torques)
+        first, second = (float(tau) for tau in torques.tau[row])
+        lowered = [
+            (first / FACTOR**n, second) if acting == 0 else (first, second / FACTOR**n)
+            for n in range(1, _LOWERED)
+        ]
+        return [None, *lowered]
+
+    def _balance(self, phase: Phase, z: Array) -> _Balance | None:
+        """The way along a phase and its quasistatic torques, if there are any."""
+        road = make_road(phase, z, self.problem.phases[phase.index + 1 :])
+        torques = None if road is None else find_torques(road, self.problem.epsilon, self.squeeze)
+        return None if road is None or torques is None else (road, torques)
+
+    def _sum_up(self, own: PhaseTuning, bench: Bench, trial: Trial) -> PhaseTuning:
+        return replace(
+            own,
+            duration=trial.time,
+            rate=trial.rate,
+            least=trial.least,
+            weakest=trial.weakest,
+            trials=tuple(bench.trials),
+            simulations=bench.simulations,
+        )
+
+
+def _find_acting(road: Road, torques: QuasistaticTorques) -> int:
+    """The finger behind the motion: the index of the torque that works most."""
+    return int((torques.tau * road.z_s[:, 3:]).mean(axis=0).argmax())
+
+
+def _explain(bench: Bench) -> str:
+    """Why no torque drives the object to the end of a phase."""
+    nearest = min(bench.trials, key=lambda trial: trial.short)
+    last = bench.trials[-1]
+    text = f"no constant torques reach {bench.phase.until}: the nearest trial {nearest.to_text()}"
+    if last.outcome is Outcome.LOSES:
+        return f"{text}, and raised {len(bench.trials) - 1} times it {last.to_text()}"
+    return f"{text}, up to the torque limit"

@@ -8,6 +8,7 @@ alone are followed by what happens: a phase ends where its `until` is reached.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -64,7 +65,7 @@ def verify_free(
     if plan is not None and set(plan.contacts) != names:
         odd = ", ".join(sorted(set(plan.contacts) ^ names))
         raise InputError("", "contacts", f"trajectory and problem differ in {odd}")
-    options = {"tolerance": tolerance, "restitution": restitution}
+    options: dict[str, Any] = {"tolerance": tolerance, "restitution": restitution}
     whole = simulate_free(problem, torque if plan is None else plan, **options)
     warnings = _warn("whole", whole)
     if plan is None:

@@ -69,7 +69,7 @@ def _look_at(
     row = _find_row(simulation, index, contact, kind, time)
     z, v, tau = simulation.z[row], simulation.z_dot[row], simulation.tau[row]
     epsilon = max(problem.epsilon, LEAST * problem.scene.scales.force)
-    way = measure_way(phase, z[None], v[None])
+    way = _measure_way(phase, z[None], v[None])
     columns = [simulation.contacts.index(name) for name in formation.names]
     rests = bool(np.isnan(simulation.c_n[row, columns]).all())
     if rests:
@@ -124,7 +124,7 @@ def find_approach(problem: Problem, simulation: Simulation) -> Approach | None:
     phase, scales = problem.phases[int(simulation.phase[-1])], problem.scene.scales
     rows = np.flatnonzero(simulation.phase == phase.index)
     t, v = simulation.t[rows], simulation.z_dot[rows]
-    way = measure_way(phase, simulation.z[rows], v)
+    way = _measure_way(phase, simulation.z[rows], v)
     if way is None:
         return None
     is_angle = phase.until.coordinate == "phi"
@@ -144,7 +144,7 @@ def find_approach(problem: Problem, simulation: Simulation) -> Approach | None:
     )
 
 
-def measure_way(phase: Phase, z: Array, v: Array) -> tuple[Array, Array, Array] | None:
+def _measure_way(phase: Phase, z: Array, v: Array) -> tuple[Array, Array, Array] | None:
     """Distance to the end of a phase at n states, its gradient, (n, 5), and its bend, (n,).
 
     The bend is what the velocity alone adds to its second derivative, towards the end.
