@@ -26,7 +26,9 @@ from .search import Search, Solution
 ROUNDS = 24
 """Most times that limits are tightened."""
 STALLED = 9
-"""Times after which tightening does not lead anywhere, and finer intervals are tried instead."""
+"""Times of tightening in which it has to lead somewhere."""
+_CREEPS = 0.1
+"""Share of the miss that is left then if it does; otherwise finer intervals are tried instead."""
 REFINEMENTS = 8
 """Most times that intervals are halved because of misses."""
 MOST = 64
@@ -50,7 +52,8 @@ _COARSE = 0.1
 
 def enforce_between(search: Search, solution: Solution) -> Solution:
     """Go on from a solution until it is accurate and limits hold between points too."""
-    refined, tightened, first = 0, 0, solution.cost
+    refined, first = 0, solution.cost
+    tries: list[float] = []
     raised = [Raised.none(stage) for stage in solution.stages]
     for _ in range(ROUNDS):
         motions = make_motions(solution.stages, search.scheme)
@@ -86,15 +89,15 @@ def enforce_between(search: Search, solution: Solution) -> Solution:
             refined = REFINEMENTS
         if worst <= 1:
             return solution._replace(error=float(sum(own.sum() for own in gains)))
-        raised, tightened = (
-            [own.further(m) for own, m in zip(raised, misses, strict=True)],
-            tightened + 1,
-        )
+        raised = [own.further(miss) for own, miss in zip(raised, misses, strict=True)]
+        tries.append(worst)
         limits = [own.limits for own in raised]
         tighter = search.run(
             solution.nlp, solution.stages, limits, solution.multipliers, solution.margin
         )
-        if not tighter.success or tightened % STALLED == 0:
+        crept = len(tries) >= STALLED and worst > _CREEPS * tries[-STALLED]
+        if not tighter.success or crept:
+            tries.clear()
             tighter = _halve_missed(search, solution, misses)
             raised = [Raised.none(stage) for stage in tighter.stages]
         if not tighter.success:
