@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import matplotlib
@@ -321,39 +322,23 @@ def _is_ambiguous(chart: FormationMap) -> bool:
 
 def _draw_legend(figure: Figure, with_path: bool, crossed: bool, ambiguous: bool) -> None:
     arrow: Any = {"marker": ">", "ms": 5, "lw": 1.4}
+    line = partial(Line2D, [], [])
     handles: list[Any] = [
-        Line2D([], [], color=_FORTH, label="quasistatic motion possible, +x or +\u03c6", **arrow),
-        Line2D([], [], color=_BACK, label="possible, \u2212x or \u2212\u03c6", **arrow),
-        Line2D([], [], color=_LINE, lw=0.9, label="border: an edge flush, four contacts"),
-        Line2D(
-            [],
-            [],
-            color=_LINE,
-            lw=0.7,
-            ls=(0, (1, 1.6)),
-            label="side of the link gives way to its tip",
-        ),
-        Line2D([], [], color=_INK, marker="o", ms=4, ls="none", label="crossing: five contacts"),
-        Line2D(
-            [],
-            [],
-            color=_FREE,
-            marker="$\u2194$",
-            ms=8,
-            ls="none",
-            label="possible ways inside a cell",
-        ),
+        line(color=_FORTH, label="quasistatic motion possible, +x or +\u03c6", **arrow),
+        line(color=_BACK, label="possible, \u2212x or \u2212\u03c6", **arrow),
+        line(color=_LINE, lw=0.9, label="border: an edge flush, four contacts"),
+        line(color=_LINE, lw=0.7, ls=(0, (1, 1.6)), label="side of the link gives way to its tip"),
+        line(color=_INK, marker="o", ms=4, ls="none", label="crossing: five contacts"),
+        line(color=_FREE, marker="$\u2194$", ms=8, ls="none", label="possible ways inside a cell"),
         _patch(_LOST, "cannot be reached"),
     ]
     if crossed:
         handles.append(_patch(_CROSSED, "the fingers would overlap"))
     if ambiguous:
         look: Any = {"marker": "x", "ms": 4, "lw": 2.2, "ls": (0, (1.5, 1.5))}
-        handles.append(
-            Line2D([], [], color=_AMBIGUOUS, label="contact forces would not be unique", **look)
-        )
+        handles.append(line(color=_AMBIGUOUS, label="contact forces would not be unique", **look))
     if with_path:
-        handles.insert(6, Line2D([], [], color=_INK, lw=5, alpha=0.42, label="plan, by phase"))
+        handles.insert(6, line(color=_INK, lw=5, alpha=0.42, label="plan, by phase"))
     note = (
         "Cells: what touches the palm | finger 1 (right) | finger 2 (left); "
         "v vertex, e edge touched by the tip, * vertex on the tip's arc"

@@ -61,17 +61,15 @@ def solve(
     samples : int, default 201
         Rows per phase of the trajectory, at least 2.
     transcription : {"auto", "time"}
-        ``"auto"`` plans phases with one freedom, joined at rest or by impacts, along their curves
-        and others in the time domain; ``"time"`` plans all there.
+        Phases with one freedom along their curves and others in the time domain, or all there.
     time_intervals : int, optional
         Of each phase in the time domain, at least 4; by default 32 for a phase with one freedom
         that is planned alone and 10 for others.
     degree, scheme : int, default 3; {"radau", "legendre"}
         Number of collocation points per interval in the time domain, from 2 to 6, and which.
-    opening : float, default 0.01
-        Least acceleration, over gravity, with which the gap of a contact let go opens there.
-    clearance : float, default 5e-4
-        Least such gap over the object's radius of gyration, from a third of the first stage on.
+    opening, clearance : float, default 0.01, 5e-4
+        Least acceleration of the gap of a contact let go there, over gravity, and least gap over
+        the object's radius of gyration, from a third of the first stage on.
     mode_search : bool, default True
         Whether contact modes are changed, in the time domain, for as long as that betters a plan.
     replay : bool, default True
@@ -92,8 +90,7 @@ def solve(
     InputError
         If an option is out of its range or the problem's phases cannot be traced.
     InfeasibleError, JammingError, SolverError, ReplayError
-        If there is no plan, or none that holds when it is replayed; the message names the phase,
-        the limit, the place and the time.
+        If there is no plan, or none that holds in its replay; names phase, limit, place and time.
     """
     return solve_with(problem, PlanOptions(objective=objective, **options), progress)
 

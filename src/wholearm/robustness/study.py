@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -26,6 +26,8 @@ from .statistics import Share, count_share
 from .trial import Trial, make_trial
 from .uncertainty import Uncertainty
 
+Task = tuple[int, tuple[float, ...]]
+"""Number and values of a sample."""
 DRAWN = 200
 """Samples whose paths are kept, for figures."""
 
@@ -110,9 +112,7 @@ def assess_robustness(
         Number of the only phase that is tried, from its planned start at rest.
     path : path, optional
         File to which results are written one by one. A study that is there already goes on where it
-        was stopped, and ends the same to the last bit.
-    fresh : bool
-        Begin anew instead.
+        was stopped, and ends the same to the last bit, unless it is to be `fresh`.
     start : callable, optional
         Makes a `concurrent.futures.Executor`, anew when its workers have died; processes on all
         cores if left out.
@@ -135,14 +135,10 @@ def assess_robustness(
     journal = None if path is None else Journal(os.fspath(path), stamp, fresh)
     found = {} if journal is None else {own["sample"]: own for own in journal.records}
     tasks = ((k, tuple(drawn[k].tolist())) for k in range(samples) if k not in found)
-    for (number, _), answer in run_all(partial(_run, trial), tasks, start or use_processes):
-        if isinstance(answer, DiedError):
-            answer = {"ended": str(answer), "reached": False, "kept": False, "lost": "worker"}
-        elif isinstance(answer, Exception):
-            raise answer
-        found[number] = {"sample": number, **answer}
+    for record in _list_records(trial, tasks, start or use_processes):
+        found[record["sample"]] = record
         if journal is not None:
-            journal.add(found[number])
+            journal.add(record)
         if progress is not None:
             good = sum(own["reached"] for own in found.values())
             progress(f"{len(found)} of {samples} samples, {good} reach the goal")
@@ -150,7 +146,19 @@ def assess_robustness(
     return Robustness(trial, drawn, seed, records)
 
 
-def _run(trial: Trial, task: tuple[int, tuple[float, ...]]) -> dict[str, Any]:
+def _list_records(
+    trial: Trial, tasks: Iterable[Task], start: Callable[[], Executor]
+) -> Iterator[dict[str, Any]]:
+    """Records as they come; a sample that workers die of has one that says so."""
+    for (number, _), answer in run_all(partial(_run, trial), tasks, start):
+        if isinstance(answer, DiedError):
+            answer = {"ended": str(answer), "reached": False, "kept": False, "lost": "worker"}
+        elif isinstance(answer, Exception):
+            raise answer
+        yield {"sample": number, **answer}
+
+
+def _run(trial: Trial, task: Task) -> dict[str, Any]:
     number, sample = task
     record = trial.run(np.array(sample))
     if number >= DRAWN:

@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ...common.errors import AmbiguityError, JammingError, SolverError
+from ...common.errors import JammingError, SolverError
 from ...common.minima import find_minima
 from ...common.shortfalls import Parameter
 from ...geometry.curve import Curve, describe_pose
-from ...mechanics.dynamics import Directions, PathForces, inverse, reduced_inertia
+from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
 from ...mechanics.limits import PRESS, SPEED, TORQUE, LimitSet, make_limits
-from ...mechanics.uniqueness import describe_minor, find_minors
 from ...results.torque import TorqueProfile
 from .elements import Elements, Grid, Profile
 from .motion import PathMotion, directions_of
@@ -28,10 +27,6 @@ TORQUE_ERROR = 5e-7
 """Largest error of the torque's polynomials between the knots, over the torque limit."""
 PLACES = 13
 """Places that they go through where that is exceeded."""
-
-
-LOOKS = 17
-"""Places of a stretch without reversals at which contact forces are looked at for being unique."""
 
 
 class Sampling(NamedTuple):
@@ -239,39 +234,6 @@ def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
     limits = make_limits(formation, epsilon)
     kept = limits.without(SPEED), limits.only(SPEED)
     return PhaseData(curve, epsilon, *kept, grid, nodes, sampling, knots, checks)
-
-
-def require_unique(curve: Curve, least: float, phase: int) -> None:
-    """Require contact forces to be the only ones along a curve.
-
-    Parameters
-    ----------
-    curve : Curve
-    least : float
-        Least ratio of a principal minor to that without friction.
-    phase : int
-        Its number, for messages.
-
-    Raises
-    ------
-    AmbiguityError
-        If one is less. Where friction jams the curve this is left to `prepare`.
-    """
-    formation, segments = curve.formation, curve.segments
-    if not formation.friction.any():
-        return
-    s = np.concatenate([np.linspace(own.start, own.stop, LOOKS) for own in segments])
-    point = curve.evaluate(s)
-    Xi = np.repeat([own.Xi for own in segments], LOOKS, axis=0)
-    still = (formation.sliding_friction > 0) & (Xi == 0).all(axis=0)
-    sticking = tuple(np.flatnonzero(still).tolist())
-    ratio, names, row = find_minors(formation, point.kinematics, Xi, sticking).find_least()
-    if ratio >= least:
-        return
-    sigma = np.repeat([own.sigma for own in segments], LOOKS, axis=0)
-    if reduced_inertia(formation, point.kinematics, Directions(Xi, sigma)).min() > 0:
-        text = describe_minor(ratio, names, describe_pose(point.z[row]), least)
-        raise AmbiguityError(f"phase {phase}: {text}")
 
 
 def join(parts: Sequence[PhaseData]) -> PhaseData:

@@ -128,13 +128,12 @@ def plan_curves(
             raise SolverError(found.reason)
         from .explain import explain
 
-        guessed = guess_slowly(join(found.parts))
-        raise _explain_duration(task) or explain(
-            found.parts, *guessed, phases, found.reason, replan
-        )
-    if options.goal is Objective.MARGIN and found.plans[0].value < task.lost:
+        slow = guess_slowly(join(found.parts))
         late = _explain_duration(task)
-        raise late or SolverError(f"{task.name}: the margin found is below epsilon")
+        raise late or explain(found.parts, *slow, phases, found.reason, replan)
+    if options.goal is Objective.MARGIN and found.plans[0].value < task.lost:
+        least = SolverError(f"{task.name}: the margin found is below epsilon")
+        raise _explain_duration(task) or least
     return found.plans if options.goal is Objective.TIME else _leave_rest(task, found)
 
 

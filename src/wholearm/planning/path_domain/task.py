@@ -10,7 +10,7 @@ import numpy as np
 from ...geometry.curve import Curve
 from ..advice import name_phases
 from ..options import Objective, PlanOptions
-from .data import PhaseData, join, prepare, require_unique
+from .data import PhaseData, join, prepare
 from .elements import DEGREE
 from .mesh import SOFT, START, Mesh, find_ends
 from .misses import MISS
@@ -18,6 +18,7 @@ from .nlp import PathNLP, build_path_nlp
 from .sure_start import SureStart
 from .switches import Switch
 from .terms import LimitShape
+from .unique import require_unique
 
 EARLY = 1e-5
 """Accuracy from which on few elements will do, and limits are tightened before all solves."""
@@ -54,7 +55,7 @@ class Task:
         return max(-(-intervals // DEGREE), 3)
 
     def require_unique(self) -> None:
-        """Require contact forces to be the only ones; see `data.require_unique`."""
+        """Require contact forces to be the only ones; see `unique.require_unique`."""
         for curve, phase in zip(self.curves, self.phases, strict=True):
             require_unique(curve, self.options.least_minor, phase)
 

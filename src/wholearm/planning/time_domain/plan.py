@@ -31,8 +31,8 @@ from .enforcing import DEARER, enforce_between, is_hopeless
 from .mesh import resample
 from .mode_search import improve
 from .modes import LEAST_INTERVALS
-from .motion import TimeMotion, make_motions
-from .own_units import to_si, unit_of
+from .motion import TimeMotion
+from .phase_plans import list_plans
 from .refinement import bisect_intervals
 from .search import Search, Solution
 from .stage import Stage
@@ -108,21 +108,33 @@ def plan_phases(
     attempts = Attempts(problem, phases, z, search, to_go, patient)
     known = _go_on(search, attempts, begun[0]) if begun else None
     if known is not None:
-        return _summarise(problem, search, phases, known, begun[0].attempt)
+        return list_plans(problem, search, phases, known, begun[0].attempt)
     first, name = _begin(search, attempts.first, fastest, pinned)
     if first.success:
-        return _summarise(problem, search, phases, first, name)
+        return list_plans(problem, search, phases, first, name)
+    return _look_further(search, attempts, problem, phases, first, explained)
+
+
+def _look_further(
+    search: Search,
+    attempts: Attempts,
+    problem: Problem,
+    phases: Sequence[Phase],
+    first: Solution,
+    explained: bool,
+) -> list[PhasePlan[TimeMotion]]:
+    """Make further attempts where the first one has led nowhere, or say why there is no plan."""
     from .explain import refuse
 
     def replan(other: Problem) -> object:
         own = [other.phases[phase.index] for phase in phases]
-        rough = replace(options, accuracy=max(options.accuracy, ROUGH))
-        return plan_phases(other, own, z, rough, explained=False, patient=False)
+        rough = replace(search.options, accuracy=max(search.options.accuracy, ROUGH))
+        return plan_phases(other, own, attempts.z, rough, explained=False, patient=False)
 
     refuse(search, problem, phases, attempts.first.stages, replan if explained else None)
     *_, last = outcomes = _try_all(search, problem, attempts, first)
     if last.solution.success:
-        return _summarise(problem, search, phases, last.solution, last.name)
+        return list_plans(problem, search, phases, last.solution, last.name)
     raise _explain(search, problem, attempts, outcomes, replan if explained else None)
 
 
@@ -320,30 +332,3 @@ def _halve(search: Search, stages: list[Stage]) -> list[Stage]:
     """Stages with all intervals halved."""
     every = [np.ones(stage.intervals, dtype=int) for stage in stages]
     return bisect_intervals(stages, search.scheme, every)
-
-
-def _summarise(
-    problem: Problem, search: Search, phases: Sequence[Phase], solution: Solution, attempt: str
-) -> list[PhasePlan[TimeMotion]]:
-    """The plan of each phase; the sequences of modes that were tried count for the first."""
-    plans, tried = [], search.tried
-    unit, margin = unit_of(search.goal, problem.scene.scales), solution.margin
-    weight = search.options.time_weight * problem.scene.scales.torque**2
-    solved = [to_si(stage, problem) for stage in solution.stages]
-    motions = make_motions(solved, search.scheme)
-    for phase in phases:
-        stages = zip(motions, solved, strict=True)
-        motion = TimeMotion([own for own, stage in stages if stage.phase == phase.index])
-        torque = motion.torque
-        value = {
-            Objective.TIME: motion.duration,
-            Objective.EFFORT: weight * motion.duration + torque.integrate_squares(),
-            Objective.MARGIN: problem.epsilon + unit * margin,
-        }[search.goal]
-        own = [stage for stage in solution.stages if stage.phase == phase.index]
-        plan = PhasePlan(motion, torque, value, attempt=attempt, stages=own)
-        plans.append(plan._replace(error=solution.error))
-    plans[0] = plans[0]._replace(sequences=tried.sequences, complete=tried.complete)
-    if search.only_begins:
-        plans[0] = plans[0]._replace(solution=solution)
-    return plans
