@@ -73,6 +73,19 @@ def test_a_pinched_square_does_not_creep() -> None:
     assert [event.kind for event in run.events] == [EventKind.REST]
 
 
+def test_a_square_slips_when_no_friction_can_hold_it_any_more() -> None:
+    # The lower corners, 0.06 m above the joints, need the least torque: tau = N (0.06 - mu radius).
+    problem, _, _ = pinch(0.3)
+    falling = TorqueProfile(np.array([0.0, 1.0]), np.array([[[0.15, -0.15], [-0.15, 0.15]]]))
+    run = simulate_free(problem, falling)
+    starts = run.find(EventKind.START)
+    least = 0.2 * 9.81 * (0.06 - 0.6 * 0.005) / (2 * 0.6)
+    assert [event.time for event in starts] == pytest.approx([1 - least / 0.3], abs=1e-8)
+    assert (run.z[run.t < starts[0].time] == run.z[0]).all()
+    # Other corners would have let it go before.
+    assert run.find(EventKind.AMBIGUOUS)
+
+
 def test_a_square_that_is_pinched_too_weakly_falls_to_the_palm() -> None:
     # Friction needs mu 2 N = m g, and N is at most the torque over the lower corners' height.
     problem, torque, _ = pinch(0.9 * 0.2 * 9.81 * 0.06 / (2 * 0.6), until=1.0)

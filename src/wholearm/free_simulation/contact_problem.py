@@ -83,6 +83,8 @@ class Answer(NamedTuple):
     c_n : ndarray, shape (k,)
     f : ndarray, shape (s,)
     r_n, r_t : ndarray, shape (k,) and (s,)
+    shares : ndarray, shape (s,)
+        Friction over the most that it may be.
     way : ndarray, shape (s,)
         +1 or -1 where friction is at its bound and gives way in that direction, 0 where it holds.
     change : ndarray, shape (n,)
@@ -95,6 +97,7 @@ class Answer(NamedTuple):
     f: Array
     r_n: Array
     r_t: Array
+    shares: Array
     way: Array
     change: Array
     residual: float
@@ -132,7 +135,8 @@ def read(problem: ContactProblem, c_n: Array, f: Array, residual: float = 0.0) -
     edge = most - np.abs(f) <= EDGE * np.maximum(most, 1e-3 * np.abs(f).max(initial=0.0))
     r_t = p.b_t + p.T @ change
     way = np.where(edge, np.where(f != 0, -np.sign(f), np.sign(r_t)), 0.0)
-    return Answer(c_n, f, p.b_n + p.A @ change, r_t, way, change, residual)
+    shares = np.abs(f) / np.maximum(most, np.finfo(float).tiny)
+    return Answer(c_n, f, p.b_n + p.A @ change, r_t, shares, way, change, residual)
 
 
 def is_unique(problem: ContactProblem) -> bool:

@@ -131,22 +131,21 @@ def decide(run: Run) -> bool | None:
     pattern = Pattern(run, closed)
     later = AHEAD * scales.time
     now = pattern.pose(run.z, run.v, run.tau(run.t))
+    free = now.lift * system.push(run.v, run.tau(run.t), pattern.sigma)
     first = try_modes(now, pattern.recall(run.modes)) or _solve(run, now)
     if first is None:
         return None
-    free = now.lift * system.push(run.v, run.tau(run.t), pattern.sigma)
     acceleration = free + first.change
     v = run.v + later * acceleration
     z = run.z + later * (run.v + v) / 2
     then = pattern.pose(z, v, run.tau(run.t + later))
-    answer = _choose(run, pattern, then)
+    coming = then.lift * system.push(v, run.tau(run.t + later), pattern.sigma)
+    answer = _choose(run, pattern, then, coming)
     if answer is None:
         return None
-    still = STILL * system.units[system.n :] / scales.time
-    coming = then.lift * system.push(v, run.tau(run.t + later), pattern.sigma) + answer.change
-    rests = bool(
-        stands(run) and (np.abs(acceleration) < still).all() and (np.abs(coming) < still).all()
-    )
+    # What rests leaves its last modes by rounding, before it takes others in which it rests.
+    still = run.resting or _is_still(run, acceleration)
+    rests = stands(run) and still and _is_still(run, coming + answer.change)
     modes = _make_modes(run, pattern, answer, system.evaluate(z, v, pattern.closed))
     tell_changes(run, pattern.closed, modes, rests)
     run.modes = modes
@@ -159,6 +158,12 @@ def stands(run: Run) -> bool:
     return bool((np.abs(run.v) < STANDING * run.system.units[run.system.n :]).all())
 
 
+def _is_still(run: Run, acceleration: Array) -> bool:
+    system = run.system
+    still = STILL * system.units[system.n :] / system.scales.time
+    return bool((np.abs(acceleration) < still).all())
+
+
 def _solve(run: Run, problem: ContactProblem) -> Answer | None:
     answer = solve(problem)
     if answer is not None:
@@ -166,8 +171,11 @@ def _solve(run: Run, problem: ContactProblem) -> Answer | None:
     return answer
 
 
-def _choose(run: Run, pattern: Pattern, problem: ContactProblem) -> Answer | None:
-    """The answer that is nearest to the last one."""
+def _choose(run: Run, pattern: Pattern, problem: ContactProblem, free: Array) -> Answer | None:
+    """The answer that is nearest to the last one: what rests goes on resting if it may.
+
+    `free` has the accelerations without contacts, shape (n,).
+    """
     last = pattern.recall(run.modes)
     run.unique = is_unique(problem)
     found = [] if run.unique else list_answers(problem) or []
@@ -175,8 +183,9 @@ def _choose(run: Run, pattern: Pattern, problem: ContactProblem) -> Answer | Non
         modes = [pattern.describe(answer) for answer in found]
         if run.modes.kept or len(problem.b_n):
             tell_ambiguity(run, pattern, modes)
+        starts = [run.resting and not _is_still(run, free + a.change) for a in found]
         away = [sum(a != b for a, b in zip(own, last, strict=True)) for own in modes]
-        return found[int(np.argmin(away))]
+        return found[min(range(len(found)), key=lambda k: (starts[k], away[k]))]
     return try_modes(problem, last) or _solve(run, problem) or (found[0] if found else None)
 
 
@@ -206,25 +215,26 @@ def _make_modes(run: Run, pattern: Pattern, answer: Answer, rows: Rows) -> Modes
     kept = {k for k in order if presses[k] and adds(rows.A[k])}
     count = len(pattern.standing)
     stuck, Xi = [], pattern.Xi.copy()
-    # Of contacts that stick as one, those of a flush edge, the one that has to hold comes first.
-    for j in np.argsort(-np.abs(answer.f[:count]), kind="stable"):
-        k, way = pattern.standing[j], answer.way[j]
-        if k in kept:
+    held, sigma = [], pattern.sigma.copy()
+    sigma[pattern.joints] = answer.way[count:]
+    # Of what sticks as one, as the contacts of a flush edge do, what has to hold comes first.
+    for j in np.argsort(-answer.shares, kind="stable").tolist():
+        way = answer.way[j]
+        if j >= count:
+            joint = int(pattern.joints[j - count])
+            if way == 0 and adds(np.eye(system.n)[joint]):
+                held.append(joint)
+        elif (k := int(pattern.standing[j])) in kept:
             Xi[k] = way
             if way == 0 and adds(rows.A_t[k]):
                 stuck.append(k)
-    held, sigma = [], pattern.sigma.copy()
-    for joint, way in zip(pattern.joints, answer.way[count:], strict=True):
-        sigma[joint] = way
-        if way == 0 and adds(np.eye(system.n)[joint]):
-            held.append(int(joint))
     # What touches without a force stays, for as long as it needs none.
     kept |= {k for k in order if not presses[k] and answer.r_n[k] <= still and adds(rows.A[k])}
     kept_pairs = sorted(kept)
     return Modes(
         tuple(closed[k] for k in kept_pairs),
         tuple(sorted(closed[k] for k in stuck)),
-        tuple(held),
+        tuple(sorted(held)),
         tuple(float(Xi[k]) for k in kept_pairs),
         tuple(sigma.tolist()),
     )

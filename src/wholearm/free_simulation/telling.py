@@ -30,6 +30,9 @@ def _name(system: System, joint: int) -> str:
 
 def tell_changes(run: Run, closed: Sequence[int], modes: Modes, rests: bool) -> None:
     """Record what changes."""
+    if rests and run.resting:
+        # Other forces that hold the same rest are no event.
+        return
     system, before = run.system, run.modes
     names = system.names
     gone = [pair for pair in before.kept if pair not in modes.kept]
@@ -55,11 +58,10 @@ def tell_changes(run: Run, closed: Sequence[int], modes: Modes, rests: bool) -> 
         _tell_change(run, names[pair], old, now, "slides", system.friction[pair] > 0)
     for joint in np.flatnonzero(system.dry > 0) if run.records else ():
         old, now = before.sigma[joint], modes.sigma[joint]
-        moves = not (run.resting and rests)
-        _tell_change(run, _name(system, int(joint)), old, now, "turns", moves)
-    if rests and not run.resting:
+        _tell_change(run, _name(system, int(joint)), old, now, "turns", True)
+    if rests:
         run.note(EventKind.REST, "everything rests")
-    elif run.resting and not rests:
+    elif run.resting:
         run.note(EventKind.START, "the motion begins")
 
 
