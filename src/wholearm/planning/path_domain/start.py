@@ -34,6 +34,8 @@ _PLAIN = 1e-10
 """What is added to the squares of rows that may depend on each other, over the mean of all."""
 _PICARD = 2
 """Rounds in which speeds and corners are made to agree."""
+_WILD = 10.0
+"""How much larger than usual s'' is in a corner of limits that hardly cross there."""
 _NODES = DEGREE + 1
 
 
@@ -137,6 +139,10 @@ class _Corners(NamedTuple):
             a = np.where(held, wanted, np.where(pushed, high, low))
             between = share * press + (1 - share) * other
             squeeze = np.where(held, between, np.where(pushed, press, other))
+            wild = np.abs(a) > _WILD * np.median(np.abs(found.slopes))
+            if wild.any() and not wild.all():
+                a = np.where(wild, wanted, a)
+                squeeze[wild] = np.interp(grid.s[wild], grid.s[~wild], squeeze[~wild])
             rise = grid.integrate(a)
             for run in runs:
                 end = run[0] if pushed[run[0]] else run[-1]
