@@ -19,11 +19,13 @@ from .snapshots import place_vertices, trace_link
 from .style import FINGERS, INK, PALETTE, STYLE
 
 _KINDS = (
-    ("goal and contacts kept", PALETTE[2], "o"),
+    ("contacts kept too", PALETTE[2], "o"),
     ("goal reached", PALETTE[0], "s"),
     ("goal missed", PALETTE[6], "x"),
 )
 """What becomes of a sample, its colour and its mark."""
+_LEAST = 1e-4
+"""What lesser distances [mm] and angles [deg] are drawn as."""
 
 
 def draw_robustness(study: Robustness) -> Figure:
@@ -77,16 +79,19 @@ def _draw_ends(axes: Axes, study: Robustness) -> None:
     records = [record for record in study.records if "distance" in record]
     for kind, (label, colour, marker) in enumerate(_KINDS):
         own = [record for record in records if find_kind(record) == kind]
-        across = [1e3 * record["distance"] for record in own]
-        up = [math.degrees(record["angle"]) for record in own]
+        across = np.maximum([1e3 * record["distance"] for record in own], _LEAST)
+        up = np.maximum([math.degrees(record["angle"]) for record in own], _LEAST)
         text = f"{label}: {len(own)}"
         axes.plot(across, up, marker, ms=3.5, color=colour, alpha=0.7, label=text, mew=0.9)
     goal = (1e3 * DISTANCE, math.degrees(ANGLE))
     axes.set(xscale="log", yscale="log", xlabel="distance from the goal [mm]")
     axes.set_ylabel("angle from the goal [deg]")
+    axes.set(
+        xlim=(min(axes.get_xlim()[0], 0.05), None), ylim=(_LEAST / 2, max(axes.get_ylim()[1], 2.0))
+    )
     axes.axvline(goal[0], color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
     axes.axhline(goal[1], color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
-    axes.legend(loc="lower right")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, fontsize=8)
     beyond = len(study.records) - len(records)
     title = f"ends of {len(records)} samples" + (f"; {beyond} never started" if beyond else "")
     axes.set_title(title, fontsize=9)
