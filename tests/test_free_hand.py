@@ -96,7 +96,7 @@ def test_a_square_that_is_pinched_too_weakly_falls_to_the_palm() -> None:
     assert np.abs(run.energies.residual).max() < 1e-9
 
 
-@pytest.mark.parametrize("seed", [3, 7, 45, 98])
+@pytest.mark.parametrize("seed", [3, 45, 103, 264])
 def test_random_runs_gain_no_energy_and_overlap_nowhere(seed: int) -> None:
     draw = draw_run(seed)
     run = run_draw(draw)

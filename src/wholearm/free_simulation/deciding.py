@@ -25,7 +25,7 @@ from .contact_problem import (
     solve,
     try_modes,
 )
-from .state import AHEAD, CLOSED, STANDING, STILL, Run
+from .state import AHEAD, CLOSED, STANDING, STILL, SUNK, Run
 from .stepper import Modes
 from .system import Rows
 from .telling import tell_ambiguity, tell_changes
@@ -36,22 +36,19 @@ DEPENDENT = 1e-7
 
 def find_closed(run: Run) -> tuple[int, ...]:
     """Pairs that touch and do not part, each constraint once."""
-    system, scales = run.system, run.system.scales
-    ahead = run.z + AHEAD * scales.time * run.v
-    gaps, ranges = system.measure(np.array([run.z, ahead]))
-    near = CLOSED * scales.length
-    faces = (ranges[0] > near) | ((ranges[0] > -near) & (ranges[1] >= ranges[0]))
-    # A gap that is smaller by far than the features themselves; others are behind one another.
-    touching = np.flatnonzero((np.abs(gaps[0]) < near) & faces)
+    system, unit = run.system, run.system.scales.length
+    gaps, faces = run.face(run.z, run.v)
+    touching = np.flatnonzero((gaps < CLOSED * unit) & (gaps > -SUNK * unit) & faces)
     if not len(touching):
         return ()
     found = sorted(touching.tolist(), key=lambda pair: pair not in run.modes.kept)
     rows = system.evaluate(run.z, run.v, found)
     slow = rows.A @ run.v < run.chatter
-    unit = rows.A / np.sqrt((rows.A**2 / system.mass).sum(axis=1))[:, None] / np.sqrt(system.mass)
+    size = np.sqrt((rows.A**2 / system.mass).sum(axis=1))[:, None]
+    lines = rows.A / size / np.sqrt(system.mass)
     chosen: list[int] = []
     for k in np.flatnonzero(slow):
-        if all(np.abs(unit[k] - unit[j]).max() > DEPENDENT for j in chosen):
+        if all(np.abs(lines[k] - lines[j]).max() > DEPENDENT for j in chosen):
             chosen.append(int(k))
     return tuple(sorted(found[k] for k in chosen))
 

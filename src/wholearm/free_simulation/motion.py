@@ -10,7 +10,7 @@ from ..common.arrays import Array
 from ..results.sampled import interpolate_quintic
 from ..simulation.locate import find_root
 from ..simulation.runge_kutta import ORDER
-from .state import AHEAD, ARMED, CLOSED, Run
+from .state import AHEAD, ARMED, CLOSED, SUNK, Run
 
 GROWTH = 10.0
 """Largest growth of a step."""
@@ -92,6 +92,10 @@ class _Motion:
         s.look()
         run.record(s)
         start = self.view(s.outputs, 0.0)
+        # What touches already may sink by rounding; what is behind something else never closes.
+        shallow = start.gaps[-1] > -SUNK * self.unit
+        sunk = np.minimum(start.gaps[-1], 0.0) - 0.5 * CLOSED * self.unit
+        self.level = np.where(shallow, sunk, -np.inf)
         # Values that start below zero may stay there: modes are judged a moment later.
         floor = np.maximum(self.slack, self.slack - start.values)
         run.h = min(run.h, self._time_to_return(start))
@@ -246,7 +250,7 @@ class _Motion:
     ) -> float | None:
         """When a pair closes within a step; None if it does not, or where the two do not face."""
         system = self.run.system
-        level = 0.0 if self.run.armed[pair] else -0.5 * CLOSED * self.unit
+        level = 0.0 if self.run.armed[pair] else float(self.level[pair])
 
         def gap(step: float) -> float:
             self._step_to(step)
@@ -260,14 +264,14 @@ class _Motion:
         first = gap(left) if left > 0 else float(start.gaps[-1, pair]) - level
         root = find_root(gap, right, first, high, self.near, 1e-17 * self.unit, low=left)
         self._step_to(root)
-        ranges = system.measure(self.s.outputs[None, : system.n])[1]
-        return root if ranges[0, pair] >= -CLOSED * self.unit else None
+        n, out = system.n, self.s.outputs
+        return root if self.run.face(out[:n], out[n : 2 * n])[1][pair] else None
 
     def _find_closing(
         self, start: View, end: View, passed: set[int]
     ) -> tuple[int, float, float] | None:
         """The first pair that closes within the step, and a bracket of when."""
-        level = np.where(self.run.armed, 0.0, -0.5 * CLOSED * self.unit)
+        level = np.where(self.run.armed, 0.0, self.level)
         below = np.vstack([start.gaps[-1:], end.gaps]) < level
         crosses = below[1:] & ~below[:-1] & self.watched
         if not crosses.any():

@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..results.torque import TorqueProfile
@@ -15,6 +16,9 @@ from .system import System
 
 CLOSED = 1e-10
 """Gap that counts as closed at an event, relative to the scene's length."""
+SUNK = 1e-6
+"""Overlap up to which features touch, relative to the scene's length; beyond it they are behind one
+another."""
 ARMED = 1e-13
 """Gap from which on a pair has been apart, relative to the scene's length."""
 STANDING = 1e-9
@@ -145,6 +149,14 @@ class Run:
         before, after = self.torque.coefficients[self.piece : self.piece + 2]
         jump = after @ (-1.0) ** np.arange(after.shape[1]) - before.sum(axis=1)
         return bool(np.abs(jump).max() > TORQUE_STEP * self.system.scales.torque)
+
+    def face(self, z: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Gaps of all pairs at a state, and which of them face each other, shape (N,) each."""
+        scales = self.system.scales
+        gaps, ranges = self.system.measure(np.array([z, z + AHEAD * scales.time * v]))
+        near = CLOSED * scales.length
+        lasting = (ranges[0] > -near) & (ranges[1] >= ranges[0])
+        return gaps[0], (ranges[0] > near) | lasting
 
     def take_impulse(self, v: Array) -> None:
         """Change the velocity; what energy that costs is lost to impacts."""
