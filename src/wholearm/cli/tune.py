@@ -17,7 +17,7 @@ def tune(options: argparse.Namespace) -> int:
     if options.output is not None:
         require_writable(options.output)
         require_ending(options.output, ".csv")
-    given = {key: getattr(options, key) for key in ("brake", "squeeze", "share")}
+    given = {key: getattr(options, key) for key in ("brake", "stops", "squeeze", "share")}
     found = run(load(options.problem), **given, progress=show_progress())
     clear_progress()
     print(json.dumps(found.to_dict(), indent=2) if options.json else found.to_text())

@@ -2,7 +2,8 @@
 
 The finger behind the motion acts: the one whose torque works most in the quasistatic motion. Its
 torque alone is tuned, from the quasistatic one at the start of the phase. The other finger supports
-and keeps its torque, unless no brake holds; then it is raised while braking.
+and keeps its torque there; where no drive reaches the end with that, the one with which it presses
+most along the phase; and where no brake holds it is raised while braking.
 """
 
 from __future__ import annotations
@@ -25,10 +26,16 @@ _RAISED = 60
 """Most times a torque is raised or lowered: a factor of 300."""
 _SUPPORT = 3
 """So many times the supporting torque is raised at once, by a third, as each needs a search."""
+_ENOUGH = 250
+"""Simulations of a phase after which no further drive or support is tried."""
+_SUPPORTED = 13
+"""It is raised fewer times than this."""
 _SOONER = 0.02
 """Share of the time by which another 10 % has to bring the end sooner."""
 _SEARCH = 24
 """Most trials that look for the instant to brake."""
+_SOON = 1e-3
+"""Share of a drive's time: where the end is reached with a brake that early it is none."""
 _LOSSES = 4
 """Most of them that may lose a contact."""
 
@@ -70,8 +77,10 @@ class Rule:
     Parameters
     ----------
     bench : Bench
-    balance : ndarray, shape (n, 2), [N m]
-        Quasistatic torques along the phase.
+    tau : ndarray, shape (2,), [N m]
+        Quasistatic torques that are raised and lowered.
+    last : ndarray, shape (2,), [N m]
+        Those at the end of the phase.
     acting : int
         Index of the acting finger.
     tell : callable
@@ -79,10 +88,10 @@ class Rule:
     """
 
     def __init__(
-        self, bench: Bench, balance: Array, acting: int, tell: Callable[[str], None]
+        self, bench: Bench, tau: Array, last: Array, acting: int, tell: Callable[[str], None]
     ) -> None:
         self.bench, self.acting, self.tell = bench, acting, tell
-        self.tau, self.last = balance[0], balance[-1]
+        self.tau, self.last = tau, last
         self.limit = bench.problem.scene.torque_limit
         scales = bench.problem.scene.scales
         self.slow = SLOW * scales.speed / (scales.length if bench.is_angle else 1.0)
@@ -112,36 +121,46 @@ class Rule:
                 break
         return found
 
-    def brake(self, drives: Sequence[Drive]) -> Brake | None:
-        """Stop the fastest drive at the end of the phase, as soon as 10 % steps allow.
+    def brake(self, drives: Sequence[Drive]) -> tuple[Drive, Brake] | None:
+        """Stop a drive at the end of the phase, the fastest that lets itself be stopped.
 
         The acting torque is lowered to less than the slowest drive's and than balances the object
-        at the end. Where no such torque stops it there without losing a contact the supporting one
-        is raised, too.
+        at the end. Where no such torque stops any drive there without losing a contact the
+        supporting one is raised, too.
         """
+        count = len(drives)
+        chosen = [drives[k] for k in sorted({count - 1, count // 2, count // 4, 0}, reverse=True)]
         share = float(self.last[self.acting] / self.tau[self.acting])
         balance = math.floor(math.log(max(share, FACTOR**-_RAISED)) / math.log(FACTOR))
         first = min(drives[0].raised - 1, balance)
-        for supported in range(0, _RAISED, _SUPPORT):
+        for supported in range(0, _SUPPORTED, _SUPPORT):
             if abs(self.scale(0, supported)[1 - self.acting]) > self.limit[1 - self.acting]:
                 break
-            best: Brake | None = None
-            for raised in range(first, -_RAISED, -1):
-                steps = [*drives[-1].trial.steps, Step(0.0, self.scale(raised, supported))]
-                trial = self._place(
-                    steps, drives[-1].trial, best and best.trial, _ROUGH * self.slow
-                )
-                if trial is None:
-                    if best or self.bench.trials[-1].outcome is Outcome.LOSES:
-                        break
-                elif best and trial.time > (1 - _SOONER) * best.trial.time:
-                    break
-                else:
-                    best = Brake(raised, supported, trial)
-            if best is not None:
-                last = self._place(list(best.trial.steps), drives[-1].trial, best.trial, self.slow)
-                return None if last is None else best._replace(trial=last)
+            for drive in chosen:
+                if self.bench.simulations > _ENOUGH:
+                    return None
+                found = self._lower(drive.trial, first, supported)
+                if found is not None:
+                    return drive, found
         return None
+
+    def _lower(self, drive: Trial, first: int, supported: int) -> Brake | None:
+        """Lower the acting torque while that brings the end sooner; None if nothing stops there."""
+        best: Brake | None = None
+        for raised in range(first, -_RAISED, -1):
+            steps = [*drive.steps, Step(0.0, self.scale(raised, supported))]
+            trial = self._place(steps, drive, best and best.trial, _ROUGH * self.slow)
+            if trial is None:
+                if best or self.bench.trials[-1].outcome is Outcome.LOSES:
+                    break
+            elif best and trial.time > (1 - _SOONER) * best.trial.time:
+                break
+            else:
+                best = Brake(raised, supported, trial)
+        if best is None:
+            return None
+        last = self._place(list(best.trial.steps), drive, best.trial, self.slow)
+        return None if last is None else best._replace(trial=last)
 
     def _place(
         self, steps: list[Step], drive: Trial, near: Trial | None, slow: float
@@ -167,6 +186,8 @@ class Rule:
             if trial.outcome is Outcome.ARRIVES:
                 if trial.rate < slow:
                     return trial
+                if at < _SOON * drive.time:
+                    return None
                 high, above = at, self._overshoot(trial, slow)
                 below /= 2 if side < 0 else 1
                 side = -1

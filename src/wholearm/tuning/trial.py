@@ -252,11 +252,13 @@ class Bench:
 
     def _close(self, found: FreeSimulation, time: float, at: int) -> tuple[float, float, Array]:
         """How fast the end closes, by how much that becomes less, and where."""
-        if self.pair is None:
+        if self.pair is None and time > 0:
             row = found.trajectory.at([time])
             v, a = row.z_dot[0, self.column], row.z_ddot[0, self.column]
             return -self.sign * float(v), self.sign * float(a), row.z[0]
         z, v, a = found.z[at], found.z_dot[at], found.z_ddot[at]
+        if self.pair is None:
+            return -self.sign * float(v[self.column]), self.sign * float(a[self.column]), z
         rows = self.system.evaluate(z, v, [self.pair])
         return -float(rows.A[0] @ v), float(rows.A[0] @ a + rows.bend[0]), z
 

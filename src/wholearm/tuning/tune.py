@@ -6,12 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
+
 from ..common.arrays import Array
 from ..common.errors import InputError, name_source
 from ..common.require import require_number
 from ..common.sharing import exclusive
 from ..problem.check import require_phases
-from ..problem.definition import End, Phase, Problem
+from ..problem.definition import End, Phase, Problem, Until
 from ..quasistatic.predict import SQUEEZE, find_torques
 from ..quasistatic.prediction import QuasistaticTorques
 from ..quasistatic.road import Road, make_road
@@ -24,6 +26,8 @@ from .trial import Bench, Outcome, Step, Trial, make_rows
 
 PAUSE = 0.2
 """How long the object is held at the end of each phase, relative to the scene's time."""
+_HALVINGS = 2
+"""How often a phase is halved at most."""
 _LOWERED = 6
 """How many times the acting torque is lowered for that, less one."""
 
@@ -33,6 +37,7 @@ def tune(
     problem: Problem,
     *,
     brake: bool = False,
+    stops: bool = False,
     squeeze: float = SQUEEZE,
     share: float = 1.0,
     progress: Callable[[str], None] | None = None,
@@ -48,6 +53,8 @@ def tune(
     problem : Problem
     brake : bool
         Whether each phase may have one more step of its torques, which stops it at its end.
+    stops : bool
+        Whether a phase that then does not succeed may stop halfway, and again in both halves.
     squeeze : float
         How hard the quasistatic torques squeeze; as of `predict`.
     share : float
@@ -70,23 +77,41 @@ def tune(
     z, clock = problem.start, 0.0
     with name_source(problem.source):
         for phase in problem.phases:
-            setting = _Setting(problem, phase, brake, squeeze, share, progress or _say_nothing)
-            own, end, reason = setting.tune(z)
-            found.append(own)
+            after = next(iter(problem.phases[phase.index + 1 :]), None)
+            setting = _Setting(problem, phase, after, brake, squeeze, share, progress or _ignore)
+            parts, end, reason = _carry(setting, z, _HALVINGS if stops and brake else 0)
+            found += parts
             if end is None:
-                return Tuning(
-                    problem.name, tuple(found), None, None, f"phase {phase.number}: {reason}"
-                )
-            steps += [step._replace(time=clock + step.time) for step in own.steps]
-            clock += own.duration + setting.pause
+                reason = f"phase {phase.number}: {reason}"
+                return Tuning(problem.name, tuple(found), None, None, reason)
+            for own in parts:
+                steps += [step._replace(time=clock + step.time) for step in own.steps]
+                clock += own.duration + setting.pause
             z = end
     rows = make_rows(steps, clock)
     report = verify_free(problem, read_rows(rows))
     return Tuning(problem.name, tuple(found), rows, report, report.reason)
 
 
-def _say_nothing(text: str) -> None:
+def _ignore(text: str) -> None:
     """Where nobody looks."""
+
+
+def _carry(
+    setting: _Setting, z: Array, halvings: int
+) -> tuple[list[PhaseTuning], Array | None, str]:
+    """Tune a phase from rest at `z`, with a stop halfway where that does not succeed."""
+    own, end, reason = setting.tune(z)
+    middle = setting.halve(z) if end is None and halvings else None
+    if middle is None:
+        return [own], end, reason
+    first, z_middle, why = _carry(middle, z, halvings - 1)
+    spent = own.simulations
+    first[0] = replace(first[0], simulations=first[0].simulations + spent)
+    if z_middle is None:
+        return first, None, why
+    second, end, reason = _carry(setting, z_middle, halvings - 1)
+    return [*first, *second], end, reason
 
 
 _Balance = tuple[Road, QuasistaticTorques]
@@ -98,19 +123,27 @@ class _Setting(NamedTuple):
 
     problem: Problem
     phase: Phase
+    after: Phase | None
     brake: bool
     squeeze: float
     share: float
     tell: Callable[[str], None]
 
     @property
-    def after(self) -> Phase | None:
-        return next(iter(self.problem.phases[self.phase.index + 1 :]), None)
-
-    @property
     def pause(self) -> float:
         """How long the object is held at the end [s]."""
         return PAUSE * self.problem.scene.scales.time
+
+    def halve(self, z: Array) -> _Setting | None:
+        """The first half of the way from `z`, until x or phi is what it is there."""
+        road = make_road(self.phase, z, self.problem.phases[self.phase.index + 1 :])
+        if road is None or self.phase.end is not End.REST:
+            return None
+        middle = road.z[int(np.searchsorted(road.s, road.length / 2))]
+        turns = abs(middle - z)[2] * self.problem.scene.scales.length > abs(middle - z)[0]
+        name, value = ("phi", middle[2]) if turns else ("x", middle[0])
+        until = Until(coordinate=name, value=float(value))
+        return self._replace(phase=replace(self.phase, until=until), after=self.phase)
 
     def tune(self, z: Array) -> tuple[PhaseTuning, Array | None, str]:
         """Tune it from rest at `z`; where it ends at rest, or why it does not."""
@@ -123,22 +156,40 @@ class _Setting(NamedTuple):
         road, torques = found
         acting = _find_acting(road, torques)
         bench = Bench(self.problem, self.phase, z)
-        title = f"phase {self.phase.number} of {len(self.problem.phases)}"
-        rule = Rule(bench, torques.tau, acting, lambda text: self.tell(f"{title}: {text}"))
+        first = self._tune_by(acting, own, bench, found)
+        if first[1] is not None or first[0].raised is not None:
+            return first
+        # No torque of that finger reaches the end.
+        second = self._tune_by(1 - acting, own, bench, found)
+        return first if second[1] is None else second
+
+    def _tune_by(
+        self, acting: int, own: PhaseTuning, bench: Bench, balance: _Balance
+    ) -> tuple[PhaseTuning, Array | None, str]:
+        """Tune it by the torque of one finger."""
+        torques = balance[1]
+        title = f"phase {self.phase.number} of {len(self.problem.phases)}, finger {acting + 1}"
+        for tau in _list_starts(torques.tau, acting):
+            rule = Rule(
+                bench, tau, torques.tau[-1], acting, lambda text: self.tell(f"{title}: {text}")
+            )
+            drives = rule.drive()
+            if drives:
+                break
         own = replace(own, acting=acting + 1, quasistatic=rule.scale(0))
-        drives = rule.drive()
         drives = drives[: 1 + round(self.share * (len(drives) - 1))]
         if not drives:
             return self._sum_up(own, bench, bench.trials[-1]), None, _explain(bench)
         if not self.brake:
-            return self._arrive(own, rule, drives, found)
-        brake = rule.brake(drives)
-        if brake is None:
+            return self._arrive(own, rule, drives, balance)
+        stopped = rule.brake(drives)
+        if stopped is None:
             text = "no torque in steps of 10 % brings it to rest at its end: a trial "
             own = replace(self._sum_up(own, bench, drives[-1].trial), raised=drives[-1].raised)
             return own, None, text + bench.trials[-1].to_text()
-        own = replace(own, raised=drives[-1].raised, braked=brake.raised, supported=brake.supported)
-        return self._hold(own, rule, brake.trial, found)
+        drive, brake = stopped
+        own = replace(own, raised=drive.raised, braked=brake.raised, supported=brake.supported)
+        return self._hold(own, rule, brake.trial, balance)
 
     def _arrive(
         self, own: PhaseTuning, rule: Rule, drives: Sequence[Drive], balance: _Balance
@@ -212,6 +263,14 @@ class _Setting(NamedTuple):
 def _find_acting(road: Road, torques: QuasistaticTorques) -> int:
     """The finger behind the motion: the index of the torque that works most."""
     return int((torques.tau * road.z_s[:, 3:]).mean(axis=0).argmax())
+
+
+def _list_starts(tau: Array, acting: int) -> list[Array]:
+    """Torques to begin with: those at the start, or the supporting one where it presses most."""
+    hard = tau[0].copy()
+    # The right finger presses anticlockwise, the left one clockwise.
+    hard[1 - acting] = tau[:, 0].max() if acting else tau[:, 1].min()
+    return [tau[0]] if np.array_equal(hard, tau[0]) else [tau[0], hard]
 
 
 def _explain(bench: Bench) -> str:
