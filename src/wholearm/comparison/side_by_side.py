@@ -105,7 +105,7 @@ class Comparison(NamedTuple):
                     own.verdict,
                     show(own.duration, ".5f"),
                     show(own.effort, ".5f"),
-                    show(own.margin, "+.5f"),
+                    show(own.margin, "+z.5f"),
                     at,
                     peaks,
                     show(own.lost, ".5f"),
@@ -122,7 +122,7 @@ class Comparison(NamedTuple):
         rows = []
         for k in range(count):
             row = [str(k + 1)]
-            for part, form in (("lasts", ".5f"), ("margins", "+.4f")):
+            for part, form in (("lasts", ".5f"), ("margins", "+z.4f")):
                 for own in self.contenders:
                     values = getattr(own, part)
                     row.append(show(values[k] if k < len(values) else math.nan, form))

@@ -94,7 +94,7 @@ class Trial(NamedTuple):
             return f"{text} {self.contact} at t = {self.time:.5g} s"
         if self.outcome is Outcome.ARRIVES:
             return f"{text} at t = {self.time:.5g} s, closing at {self.rate:.3g}"
-        return f"{text}, {self.short:.3g} short"
+        return f"{text}, {abs(self.short):.3g} away from it"
 
 
 class Landing(NamedTuple):
