@@ -38,6 +38,20 @@ class Stretch(NamedTuple):
     time: float
 
 
+def list_pauses(
+    stretches: Sequence[Stretch], contact: str, start: float, stop: float
+) -> list[tuple[float, float]]:
+    """When a contact does not press between two times [s], in their order."""
+    pauses, at = [], start
+    for first, last in sorted((own.start, own.stop) for own in stretches if own.contact == contact):
+        if first > at:
+            pauses.append((at, min(first, stop)))
+        at = max(at, last)
+        if at >= stop:
+            return pauses
+    return [*pauses, (at, stop)]
+
+
 @dataclass(frozen=True, eq=False)
 class FreeSimulation(Simulation):
     """A simulated motion for which no contact was assumed, at every step.

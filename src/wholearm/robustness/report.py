@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from typing import Any
 
+from ..results.report import plain
 from .statistics import Share
 from .study import Robustness
 
@@ -50,7 +51,7 @@ def to_text(study: Robustness) -> str:
 
 def to_dict(study: Robustness) -> dict[str, Any]:
     """The same as plain values, for JSON."""
-    return {
+    values = {
         "problem": study.trial.problem.name,
         "phases": [window.phase for window in study.trial.windows],
         "samples": len(study.records),
@@ -70,12 +71,14 @@ def to_dict(study: Robustness) -> dict[str, Any]:
                 "parameter": own.name,
                 "unit": own.unit,
                 "range": own.width,
-                "slope": None if math.isnan(own.slope) else own.slope,
+                "slope": own.slope,
             }
             for own in study.sensitivities.of
         ],
         "nominal": {key: value for key, value in study.nominal.items() if key != "path"},
     }
+    found: dict[str, Any] = plain(values)
+    return found
 
 
 def _describe_miss(record: dict[str, Any]) -> str:

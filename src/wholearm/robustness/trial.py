@@ -12,7 +12,7 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import InputError, SimulationError
 from ..contacts.closing import close_fingers, describe_obstacle
-from ..free_simulation.result import FreeSimulation
+from ..free_simulation.result import FreeSimulation, list_pauses
 from ..free_simulation.simulate import simulate_free
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
@@ -182,13 +182,8 @@ def _find_loss(
     here = (t >= start) & (t < stop)
     known = c_n[here & (c_n == c_n)]
     least = float(known.min()) if len(known) else math.inf
-    closed_until = start
-    for own in simulation.stretches:
-        if own.contact == name and own.stop > closed_until:
-            if own.start > closed_until + pause or closed_until >= stop:
-                break
-            closed_until = own.stop
-    return (closed_until if closed_until < stop - pause else None), least
+    pauses = list_pauses(simulation.stretches, name, start, stop)
+    return next((first for first, after in pauses if after - first > pause), None), least
 
 
 def make_trial(

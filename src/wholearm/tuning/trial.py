@@ -11,7 +11,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..free_simulation.hand import build_system
-from ..free_simulation.result import FreeSimulation
+from ..free_simulation.result import FreeSimulation, list_pauses
 from ..free_simulation.simulate import simulate_free
 from ..free_simulation.state import Run
 from ..problem.definition import Phase, Problem
@@ -197,7 +197,8 @@ class Bench:
         end = arrival + pause
         found = simulate_free(self.problem, read_rows(make_rows(steps, end)), start=self.z)
         names = set(self.names) if after is None else set(after.formation.names)
-        parted = {name: _find_longest(found, name, arrival, end) for name in names}
+        pauses = {name: list_pauses(found.stretches, name, arrival, end) for name in names}
+        parted = {name: max((b - a for a, b in own), default=0.0) for name, own in pauses.items()}
         worst = max(parted, key=parted.__getitem__)
         rests = not found.z_dot[-1].any() and found.t[-1] == end
         return Landing(found.z[-1], rests, parted[worst], worst)
@@ -261,10 +262,3 @@ class Bench:
             return -self.sign * float(v[self.column]), self.sign * float(a[self.column]), z
         rows = self.system.evaluate(z, v, [self.pair])
         return -float(rows.A[0] @ v), float(rows.A[0] @ a + rows.bend[0]), z
-
-
-def _find_longest(found: FreeSimulation, name: str, start: float, end: float) -> float:
-    """The longest time for which a contact does not press [s]."""
-    own = [s for s in found.stretches if s.contact == name and s.stop > start]
-    edges = [start, *(t for s in own for t in (max(s.start, start), s.stop)), end]
-    return max(max(b - a, 0.0) for a, b in zip(edges[::2], edges[1::2], strict=True))

@@ -16,7 +16,7 @@ from ..common.errors import InputError
 from ..common.require import require_number
 from ..common.sharing import exclusive
 from ..free_simulation.hand import build_system
-from ..free_simulation.result import FreeSimulation
+from ..free_simulation.result import FreeSimulation, list_pauses
 from ..free_simulation.simulate import simulate_free, simulate_phases
 from ..problem.definition import Phase, Problem
 from ..results.narrow import Torques, narrow
@@ -193,25 +193,10 @@ def _find_losses(
     """Contacts of a phase that open by more than is allowed, over the scene's length."""
     system, found = build_system(problem.scene), []
     for name in phase.formation.names:
-        own = [(s.start, s.stop) for s in simulation.stretches if s.contact == name]
-        for first, after in _list_gaps(own, start, stop):
+        for first, after in list_pauses(simulation.stretches, name, start, stop):
             rows = np.flatnonzero((simulation.t >= first) & (simulation.t <= after))
             gaps = system.measure(simulation.z[rows])[0][:, system.names.index(name)]
             if gaps.max(initial=0.0) > allowed * problem.scene.scales.length:
                 found.append(Loss(name, first, float(gaps.max())))
                 break
     return sorted(found, key=lambda loss: loss.time)
-
-
-def _list_gaps(
-    stretches: Sequence[tuple[float, float]], start: float, stop: float
-) -> list[tuple[float, float]]:
-    """What stretches leave open between two times."""
-    gaps, at = [], start
-    for first, last in sorted(stretches):
-        if first > at:
-            gaps.append((at, min(first, stop)))
-        at = max(at, last)
-        if at >= stop:
-            return gaps
-    return [*gaps, (at, stop)]

@@ -19,7 +19,7 @@ from ...geometry.curve import Curve
 from ..advice import describe_changes, find_changes, name_phases
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
-from .data import PhaseData, StalledError, join, prepare
+from .data import PhaseData, StalledError, join
 from .fastest import is_hopeless
 from .first_guess import guess_slowly
 from .misses import MISS, ROUNDS
@@ -143,11 +143,10 @@ def _leave_rest(task: Task, found: _Solved) -> Plans:
     Those of least time push off as hard as limits allow.
     """
     plans = found.plans
-    motion, margin = plans[0].motion, 0.0
+    data, margin = found.round_.parts[0], 0.0
     if task.options.goal is Objective.MARGIN:
         margin = plans[0].value - task.epsilon
-    data = prepare(motion.curve, task.epsilon, motion.grid, task.phases[0])
-    start = find_sure_start(data, motion.profile, margin)
+    start = find_sure_start(data, plans[0].motion.profile, margin)
     if start is None:
         return plans
     bounded = replace(found.round_, task=replace(task, start=start)).solve()
