@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 
@@ -94,6 +95,44 @@ def test_a_square_that_is_pinched_too_weakly_falls_to_the_palm() -> None:
     assert {event.contact for event in run.find(EventKind.IMPACT)} == {"v0-palm", "v1-palm"}
     assert run.outcome.kind is OutcomeKind.ENDED
     assert np.abs(run.energies.residual).max() < 1e-9
+
+
+@dataclasses.dataclass
+class Spring:
+    """Torques towards upright links, as a controller holds them."""
+
+    period: float
+    delay: float
+
+    def held(self, t: float, theta: Array, theta_dot: Array, forces: Mapping[str, float]) -> Array:
+        assert t == pytest.approx(self.period * round(t / self.period), abs=1e-12)
+        assert {name[-1] for name in forces} <= {"m"}
+        return 0.5 * (np.pi / 2 - theta) - 0.02 * theta_dot
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0, 1.7])
+def test_a_law_is_sampled_held_and_late(share: float) -> None:
+    link = dict(length=0.18, radius=0.0, inertia=0.005, viscous=0.0, dry=0.0, torque_limit=2.0)
+    bases = ((0.4, -0.01), (-0.4, -0.01))
+    first, second = (Finger(base=base, **link) for base in bases)  # type: ignore[arg-type]
+    square = [[-0.03, -0.03], [0.03, -0.03], [0.03, 0.03], [-0.03, 0.03]]
+    scene = Scene(Polygon(square, 0.2), (first, second), Friction(0.5, 0.5, 0.5))
+    z = np.array([0, 0.03, 0, 1.3, 1.9])
+    problem, law = Problem("spring", scene, 0.05, z, (), checked=True), Spring(0.007, share * 0.007)
+    run = simulate_free(problem, law, start=z, until=0.05)
+    # Constant torques between the instants at which one is taken or takes effect.
+    t, theta, omega = 0.0, z[3:].copy(), np.zeros(2)
+    samples = [law.held(0.0, theta, omega, {})]
+    instants = {0.007 * (k + share): 0 for k in range(1, 8)}
+    instants |= {0.007 * k: k for k in range(1, 8)} | {0.05: 0}
+    for after, k in sorted(own for own in instants.items() if own[0] <= 0.05):
+        tau = samples[max(0, int((t - law.delay) / 0.007 + 1e-9))]
+        h = after - t
+        t, theta, omega = after, theta + h * omega + h**2 * tau / 0.01, omega + h * tau / 0.005
+        if k:
+            samples.append(law.held(after, theta, omega, {}))
+    assert run.t[-1] == 0.05 and run.z[-1, 3:] == pytest.approx(theta, abs=1e-11)
+    assert run.z_dot[-1, 3:] == pytest.approx(omega, abs=1e-9)
 
 
 @pytest.mark.parametrize("seed", [3, 45, 103, 264])

@@ -112,10 +112,9 @@ class _Motion:
                 return
             floor = np.where(end.values > 0, self.slack, floor)
             if run.t >= run.stop:
-                steps = run.torque_steps()
                 if not run.next_piece():
                     return
-                if steps:
+                if run.torque_steps():
                     end = end._replace(values=self._look_again(end))
                     if not self._holds(end):
                         return

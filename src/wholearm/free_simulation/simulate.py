@@ -17,6 +17,7 @@ from ..results.narrow import Torques, narrow
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..simulation.tolerances import SLOW, is_slower
+from .feedback import Feedback, Law
 from .hand import build_system, is_apart, measure_gaps
 from .play import play
 from .result import FreeSimulation, collect
@@ -42,7 +43,7 @@ class PhaseRun(NamedTuple):
 @exclusive
 def simulate_free(
     problem: Problem,
-    what: Torques,
+    what: Torques | Law,
     *,
     start: ArrayLike | None = None,
     until: float | None = None,
@@ -56,12 +57,12 @@ def simulate_free(
     ----------
     problem : Problem
         Its phases count only for the clock of a plan.
-    what : Plan, Trajectory, Simulation or TorqueProfile
+    what : Plan, Trajectory, Simulation, TorqueProfile or Law
     start : array_like, shape (5,) or (10,), optional
         z, and z' if it is not at rest; the problem's start if left out. What is closer than what
         counts as touching is moved onto its contact.
     until : float, optional, [s]
-        The end, if not that of the torques; those of their end hold after it.
+        The end, if not that of the torques; those of their end hold after it. A law needs one.
     restitution : float
         Poisson's coefficient, 0 for plastic impacts to 1.
     tolerance : float
@@ -74,17 +75,22 @@ def simulate_free(
     InputError
         If a number is out of its range.
     SimulationError
-        If features overlap at the start.
+        If features overlap at the start, or a law gives no two numbers.
     """
-    profile, plan = narrow(what)
     state = _require_start(problem, start)
     rate = require_number(restitution, "restitution", nonnegative=True)
     if rate > 1:
         raise InputError("", "restitution", f"{restitution!r} is not between 0 and 1")
     if not 1e-14 <= tolerance <= 1e-2:
         raise InputError("", "tolerance", f"{tolerance!r} is not between 1e-14 and 1e-2")
-    if until is not None:
-        profile = profile.cut(0.0, require_number(until, "until", positive=True))
+    end = None if until is None else require_number(until, "until", positive=True)
+    if isinstance(what, Law):
+        if end is None:
+            raise InputError("", "until", "none given; a law of torques needs an end")
+        feedback = Feedback(what, end)
+        return _simulate(problem, feedback, state, [0.0], None, rate, tolerance, halt)
+    profile, plan = narrow(what)
+    profile = profile if end is None else profile.cut(0.0, end)
     starts = [0.0] if plan is None else plan.phase_starts[:-1].tolist()
     hint = None if plan is None or start is not None else _recall(problem, plan, 0)
     return _simulate(problem, profile, state, starts, hint, rate, tolerance, halt)
@@ -124,7 +130,7 @@ def simulate_phases(
 
 def _simulate(
     problem: Problem,
-    profile: TorqueProfile,
+    profile: TorqueProfile | Feedback,
     state: Array,
     starts: list[float],
     hint: Modes | None,

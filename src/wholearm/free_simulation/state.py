@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..results.torque import TorqueProfile
 from ..simulation.events import Event, EventKind
+from .feedback import Feedback
 from .stepper import LOSSES, Modes, Stepper, build_stepper
 from .system import System
 
@@ -77,16 +78,17 @@ class Run:
     def __init__(
         self,
         system: System,
-        torque: TorqueProfile,
+        torque: TorqueProfile | Feedback,
         z: Array,
         v: Array,
         restitution: float = 0.0,
         tolerance: float = 1e-9,
         hint: Modes | None = None,
     ) -> None:
-        self.system, self.torque = system, torque
+        self.feedback = torque if isinstance(torque, Feedback) else None
+        self.system, self.torque = system, torque.torque if isinstance(torque, Feedback) else torque
         self.restitution, self.tolerance = restitution, tolerance
-        self.t, self.piece = float(torque.breaks[0]), 0
+        self.t, self.piece = float(self.torque.breaks[0]), 0
         self.y = np.concatenate([z, v, np.zeros(LOSSES)])
         self.modes = hint or Modes(sigma=(0.0,) * system.n)
         self.armed = np.zeros(len(system.names), dtype=bool)
@@ -98,6 +100,7 @@ class Run:
         self.residual = 0.0
         self.records: list[Record] = []
         self.events: list[Event] = []
+        self._begin_piece()
 
     @property
     def z(self) -> Array:
@@ -131,9 +134,23 @@ class Run:
 
     def next_piece(self) -> bool:
         """Go on to the next piece of the torques, if there is one."""
-        more = self.piece + 2 < len(self.torque.breaks)
-        self.piece += more
-        return more
+        if self.piece + 2 >= len(self.torque.breaks):
+            return False
+        self.piece += 1
+        self._begin_piece()
+        return True
+
+    def _begin_piece(self) -> None:
+        """Have a law of torques asked, if there is one."""
+        if self.feedback is None:
+            return
+        theta, theta_dot = (part[list(self.system.driven)] for part in (self.z, self.v))
+        forces = {}
+        if self.records:
+            last = self.records[-1]
+            names = (self.system.names[pair] for pair in last.kept)
+            forces = dict(zip(names, last.c_n.tolist(), strict=True))
+        self.feedback.begin(self.piece, theta, theta_dot, forces)
 
     def tau(self, t: float) -> Array:
         """Torques of the present piece at `t`, also beyond its end, shape (2,) [N m]."""
@@ -143,10 +160,8 @@ class Run:
         return np.asarray(coefficients @ x ** np.arange(coefficients.shape[1]))
 
     def torque_steps(self) -> bool:
-        """Whether the torques step at the end of the present piece, or end there."""
-        if self.piece + 2 >= len(self.torque.breaks):
-            return True
-        before, after = self.torque.coefficients[self.piece : self.piece + 2]
+        """Whether the torques step at the start of the present piece."""
+        before, after = self.torque.coefficients[self.piece - 1 : self.piece + 1]
         jump = after @ (-1.0) ** np.arange(after.shape[1]) - before.sum(axis=1)
         return bool(np.abs(jump).max() > TORQUE_STEP * self.system.scales.torque)
 
