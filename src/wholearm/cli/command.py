@@ -1,4 +1,4 @@
-"""The command line: ``wholearm solve|verify|plot|predict|tune|compare|map|export|replay|bench``.
+"""The command line: ``wholearm solve``, ``verify``, ``plot`` and the others.
 
 Exit status 0 means done and all contacts held, 1 infeasible or a contact lost or a goal missed,
 2 bad input, 130 interrupted, 143 terminated. Each command imports what it needs and nothing else.
@@ -30,10 +30,12 @@ from .bench import add_bench, name_study
 from .compare import compare
 from .engines import add_export, add_replay
 from .map import draw, protect
+from .overlay import overlay
 from .predict import predict
 from .progress import clear_progress, show_progress
 from .robustness import add_robustness
 from .tune import tune
+from .viewer import add_animate, add_report
 
 if TYPE_CHECKING:
     from ..planning.result import Plan
@@ -41,7 +43,6 @@ if TYPE_CHECKING:
     from ..results.report import Report
     from ..results.torque import TorqueProfile
     from ..results.trajectory import Trajectory
-    from ..simulation.events import Simulation
     from ..verification.free_report import FreeReport
 
 
@@ -112,6 +113,8 @@ def build_parser() -> argparse.ArgumentParser:
             "replay a plan in MuJoCo or Drake and compare it with the plan",
         ),
         ("robustness", add_robustness, None, "see how much error a plan bears"),
+        ("animate", add_animate, None, "make a movie of a plan, or a page that plays it"),
+        ("report", add_report, None, "put a problem and its plans into one page to open anywhere"),
         ("bench", add_bench, None, "measure run time against error, or run the stress study"),
     ):
         own = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
@@ -275,26 +278,12 @@ def _plot(options: argparse.Namespace) -> int:
     elif options.problem is not None:
         raise InputError("", "--problem", "is for torques (.csv); trajectories bring their own")
     with name_source(options.trajectory):
-        simulation = _overlay(options.simulate, trajectory) if options.simulate else None
+        simulation = overlay(options.simulate, trajectory) if options.simulate else None
         figure = plots.force_margins(trajectory, simulation=simulation)
     plots.save(figure, options.output)
     clear_progress()
     print(f"wrote {options.output}")
     return 0
-
-
-def _overlay(simulator: str, trajectory: Trajectory) -> Simulation:
-    """The motion of a trajectory simulated, with its contacts."""
-    from ..problem.read import read_own_problem
-
-    problem = read_own_problem(trajectory.meta)
-    if simulator == "free":
-        from ..free_simulation.simulate import simulate_free
-
-        return simulate_free(problem, trajectory).show(trajectory.contacts)
-    from ..simulation.simulate import simulate
-
-    return simulate(problem, trajectory.torque, progress=show_progress())
 
 
 def _replay(options: argparse.Namespace, torques: TorqueProfile) -> Trajectory:

@@ -1,0 +1,80 @@
+"""Pages in one file, which open without a network: text, tables, pictures and players."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Iterable, Sequence
+from html import escape
+from importlib import resources
+from typing import Any
+
+PLAYER = "motion"
+CHART = "chart"
+
+
+def build_page(title: str, parts: Iterable[str]) -> str:
+    """A page of HTML with the style and the scripts that its parts need.
+
+    Parameters
+    ----------
+    title : str
+    parts : iterable of str
+        As the other functions of this module make them.
+    """
+    style, script = (_read(name) for name in ("viewer.css", "viewer.js"))
+    head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{style}</style>'
+    body = "\n".join([f"<h1>{escape(title)}</h1>", *parts, f"<script>{script}</script>"])
+    return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head><body>\n{body}\n</body></html>\n'
+
+
+def write_heading(text: str) -> str:
+    """A heading of a section."""
+    return f"<h2>{escape(text)}</h2>"
+
+
+def write_paragraph(text: str, kind: str = "") -> str:
+    """A paragraph, of class `kind` if one is given."""
+    look = f' class="{kind}"' if kind else ""
+    return f"<p{look}>{escape(text)}</p>"
+
+
+def write_text(text: str, title: str = "") -> str:
+    """Text as it stands; under a title it is folded away."""
+    block = f"<pre>{escape(text)}</pre>"
+    return f"<details><summary>{escape(title)}</summary>{block}</details>" if title else block
+
+
+def write_table(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1) -> str:
+    """A table whose first `words` columns are text, and the others numbers."""
+
+    def line(kind: str, cells: Sequence[str]) -> str:
+        looks = [' class="text"' if k < words else "" for k in range(len(cells))]
+        own = zip(looks, cells, strict=True)
+        return "<tr>" + "".join(f"<{kind}{look}>{escape(c)}</{kind}>" for look, c in own) + "</tr>"
+
+    lines = [line("th", heads), *(line("td", row) for row in rows)]
+    return f'<div class="scroll"><table>{"".join(lines)}</table></div>'
+
+
+def write_player(motion: dict[str, Any]) -> str:
+    """A motion to play; see `motion.describe_motion`."""
+    return f'<div class="{PLAYER}">{_embed(motion)}</div>'
+
+
+def write_chart(picture: bytes, places: dict[str, Any]) -> str:
+    """A picture (PNG) with places to click; see `chart.describe_map`."""
+    source = "data:image/png;base64," + base64.b64encode(picture).decode()
+    image = f'<div class="map"><img alt="map of contact formations" src="{source}"></div>'
+    hint = '<p class="choice">Click a border or a crossing to see what touches there.</p>'
+    return f'<div class="{CHART}">{image}{hint}{_embed(places)}</div>'
+
+
+def _embed(value: dict[str, Any]) -> str:
+    """Plain values for a script; a name with a tag in it cannot end them."""
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    return f'<script type="application/json">{text}</script>'
+
+
+def _read(name: str) -> str:
+    return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")

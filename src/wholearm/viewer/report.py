@@ -1,0 +1,114 @@
+"""A report of a problem and its plans in one page."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable, Sequence
+
+from ..comparison.compare import compare
+from ..comparison.side_by_side import Comparison, Contender
+from ..mapping.formation_map import FormationMap, build_map, choose_window
+from ..problem.definition import Problem
+from ..results.trajectory import Trajectory
+from ..results.trajectory_file import load_trajectory
+from . import page
+from .chart import describe_map
+from .motion import describe_motion
+from .tables import JOINT_HEADS, PHASE_HEADS, list_joints, list_phases
+
+_RESOLUTION = 120
+"""Grid of the map: its borders are exact, only cells are drawn by it."""
+
+
+def build_report(
+    problem: Problem,
+    paths: Sequence[str],
+    text: str = "",
+    progress: Callable[[str], None] = lambda text: None,
+    chart: FormationMap | None = None,
+) -> str:
+    """Put plans and torques for a problem, replayed, into one page of HTML.
+
+    Parameters
+    ----------
+    problem : Problem
+    paths : sequence of str
+        Trajectory files (.npz) and torques (.csv).
+    text : str
+        The problem file as it stands.
+    progress : callable
+        Called with what is being done.
+    chart : FormationMap, optional
+        The map of the problem, if it is there already.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be read, or is one of another problem; names the file.
+    """
+    progress("replay")
+    comparison = compare(problem, paths)
+    parts, first = [_summarise(comparison)], None
+    for path, contender in zip(paths, comparison.contenders, strict=True):
+        progress(contender.name)
+        planned = load_trajectory(path) if path.lower().endswith(".npz") else None
+        first = first or planned
+        parts += _describe(problem, contender, planned)
+    progress("map")
+    chart = chart or build_map(problem, _RESOLUTION, choose_window(problem, None))
+    parts += [
+        page.write_heading("Contact formations"),
+        page.write_chart(*describe_map(chart, first)),
+    ]
+    parts += [
+        page.write_heading("Problem"),
+        page.write_text(text or str(problem), "the problem file"),
+    ]
+    parts += [page.write_paragraph(_name_versions())]
+    return page.build_page(problem.name, parts)
+
+
+def _summarise(comparison: Comparison) -> str:
+    heads = ("", "verdict", "duration [s]", "effort [(N m)^2 s]", "least margin [N]", "of")
+    rows = [
+        (
+            own.name,
+            own.verdict,
+            f"{own.duration:.6g}",
+            f"{own.effort:.6g}",
+            "" if own.margin is None else f"{round(own.margin, 4) + 0.0:.4f}",
+            f"{own.contact} in phase {own.phase}" if own.contact else "",
+        )
+        for own in comparison.contenders
+    ]
+    return page.write_table(heads, rows, words=2)
+
+
+def _describe(problem: Problem, contender: Contender, planned: Trajectory | None) -> list[str]:
+    """The section of one plan or table of torques: player, verdict, phases and joints."""
+    parts = [page.write_heading(contender.name)]
+    kind = "ok" if contender.ok else "bad"
+    parts.append(page.write_paragraph(f"{contender.verdict}: {contender.reason}", kind))
+    replayed = None if contender.report is None else contender.report.trajectory
+    shown = planned or replayed
+    if shown is None:
+        return parts
+    ghost = replayed if planned is not None else None
+    parts.append(page.write_player(describe_motion(shown, problem, ghost)))
+    parts.append(page.write_table(PHASE_HEADS, list_phases(problem, shown), words=4))
+    joints = list_joints(shown)
+    if joints:
+        parts.append(page.write_table(JOINT_HEADS, joints, words=2))
+    if contender.report is not None:
+        parts.append(page.write_text(contender.report.to_text(), "what verify says"))
+    timings = shown.meta.get("timings")
+    if isinstance(timings, dict):
+        rows = [(str(name), f"{value:.4g}") for name, value in timings.items() if value is not None]
+        parts.append(page.write_table(("planning took", "s"), rows))
+    return parts
+
+
+def _name_versions() -> str:
+    from .. import __version__
+
+    return f"wholearm {__version__}, Python {platform.python_version()}, {platform.machine()}"

@@ -1,0 +1,56 @@
+"""Phases of a motion, and what its state and forces are on both sides of where they join."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..problem.definition import Problem
+from ..results.trajectory import Trajectory
+
+PHASE_HEADS = ("phase", "contacts", "until", "end", "duration [s]", "least c_n [N]", "of")
+JOINT_HEADS = (
+    "after phase", "contacts: c_n before \u2192 after [N]", "t [s]", "x [mm]", "phi [deg]",
+    "speed before [m/s]", "after", "tau1 before [N m]", "after", "tau2 before", "after",
+)  # fmt: skip
+
+
+def list_phases(problem: Problem, trajectory: Trajectory) -> list[list[str]]:
+    """A row for each phase that the motion enters, under `PHASE_HEADS`."""
+    rows = []
+    for index in np.unique(trajectory.phase):
+        phase, own = problem.phases[index], trajectory.phase == index
+        t, c_n = trajectory.t[own], trajectory.c_n[own]
+        least, name = math.nan, ""
+        if np.isfinite(c_n).any():
+            least = float(np.nanmin(c_n))
+            name = trajectory.contacts[int(np.nanargmin(c_n)) % c_n.shape[1]]
+        contacts = " ".join(contact.name for contact in phase.formation.contacts)
+        figures = [f"{t[-1] - t[0]:.6f}", f"{least:.4f}", name]
+        rows.append([str(index + 1), contacts, str(phase.until), phase.end.value, *figures])
+    return rows
+
+
+def list_joints(trajectory: Trajectory) -> list[list[str]]:
+    """A row for each place where a phase passes into the next one, under `JOINT_HEADS`."""
+    rows = []
+    for after in np.flatnonzero(np.diff(trajectory.phase)) + 1:
+        sides = (after - 1, after)
+        before, later = (trajectory.c_n[k] for k in sides)
+        forces = [
+            f"{name}: {_show(before[k])} \u2192 {_show(later[k])}"
+            for k, name in enumerate(trajectory.contacts)
+            if math.isfinite(before[k]) or math.isfinite(later[k])
+        ]
+        x, _, phi = trajectory.q[after]
+        place = [f"{trajectory.t[after]:.6f}", f"{1e3 * x:.3f}", f"{math.degrees(phi):.3f}"]
+        speeds = [f"{np.hypot(*trajectory.q_dot[k][:2]):.4f}" for k in sides]
+        torques = [f"{trajectory.tau[k, j]:.4f}" for j in (0, 1) for k in sides]
+        number = str(trajectory.phase[after - 1] + 1)
+        rows.append([number, ", ".join(forces), *place, *speeds, *torques])
+    return rows
+
+
+def _show(value: float) -> str:
+    return f"{value:.3f}" if math.isfinite(value) else "none"

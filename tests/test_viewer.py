@@ -1,0 +1,176 @@
+"""Pages and movies; what moves in a page is tried in a browser, where there is one."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from shipped import HEPTAGON, LANDING, chart, plan_of, problem_of
+from wholearm.cli.command import main
+from wholearm.common.errors import InputError
+from wholearm.viewer import page
+from wholearm.viewer.chart import describe_map
+from wholearm.viewer.motion import describe_motion, place_pushes
+from wholearm.viewer.movie import FRAMES, Movie, write_movie
+from wholearm.viewer.report import build_report
+from wholearm.viewer.tables import JOINT_HEADS, PHASE_HEADS, list_joints, list_phases
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+
+
+def test_pushes_and_weight_are_what_accelerates_the_object() -> None:
+    problem, plan = problem_of(LANDING), plan_of(LANDING)
+    pushes = place_pushes(problem.scene, plan)
+    body = problem.scene.polygon
+    assert body.inertia is not None
+    arms = pushes.points - plan.q[:, None, :2]
+    moments = arms[..., 0] * pushes.forces[..., 1] - arms[..., 1] * pushes.forces[..., 0]
+    force, moment = np.nansum(pushes.forces, axis=1), np.nansum(moments, axis=1)
+    force[:, 1] -= body.mass * problem.scene.gravity
+    # Newton and Euler; plans satisfy them between nodes to 1e-6 of the largest forces.
+    scale = np.nanmax(np.abs(pushes.forces))
+    np.testing.assert_allclose(body.mass * plan.q_ddot[:, :2], force, atol=1e-5 * scale)
+    np.testing.assert_allclose(body.inertia * plan.q_ddot[:, 2], moment, atol=1e-6 * scale)
+    np.testing.assert_allclose(np.hypot(*pushes.normals.T), 1.0, rtol=1e-12)
+
+
+def test_a_motion_survives_its_page() -> None:
+    problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
+    text = page.build_page("a <title>", [page.write_player(describe_motion(plan, problem))])
+    assert "a &lt;title&gt;" in text
+    # Nothing is fetched: the only address is the name of SVG's namespace.
+    assert set(re.findall(r"https?://[^\"]+", text)) == {"http://www.w3.org/2000/svg"}
+    assert not re.search(r"\bsrc=\"(?!data:)|\bhref=", text)
+    (found,) = re.findall(r'<script type="application/json">(.*?)</script>', text, re.S)
+    read = json.loads(found)
+    assert len(read["t"]) == len(read["z"]) == len(plan.t)
+    np.testing.assert_allclose(read["z"], plan.z, rtol=1e-5, atol=1e-12)
+    for index, contact in enumerate(read["contacts"]):
+        c_n = np.array([np.nan if v is None else v for v in contact["c_n"]])
+        np.testing.assert_allclose(c_n, plan.c_n[:, index], rtol=1e-5, atol=1e-12)
+
+
+def test_names_cannot_end_a_script() -> None:
+    name = "</script><script>alert(1)"
+    motion = describe_motion(plan_of(HEPTAGON), problem_of(HEPTAGON)) | {"name": name}
+    assert "</script><script>alert" not in page.write_player(motion)
+
+
+def test_tables_say_what_the_joints_of_phases_are() -> None:
+    problem, plan = problem_of(LANDING), plan_of(LANDING)
+    phases, joints = list_phases(problem, plan), list_joints(plan)
+    assert [row[0] for row in phases] == list("123456")
+    assert {len(row) for row in phases} == {len(PHASE_HEADS)}
+    assert {len(row) for row in joints} == {len(JOINT_HEADS)}
+    assert [row[0] for row in joints] == list("12345")
+    duration = sum(float(row[PHASE_HEADS.index("duration [s]")]) for row in phases)
+    assert duration == pytest.approx(plan.duration, abs=1e-5)
+    # The fourth ends at rest, the fifth smoothly: at a speed, the same on both sides.
+    speeds = [row[JOINT_HEADS.index("speed before [m/s]") :][:2] for row in joints]
+    assert speeds[3] == ["0.0000", "0.0000"]
+    assert speeds[4][0] == speeds[4][1] != "0.0000"
+    assert "v3-finger1: 0.050 \u2192 none" in joints[4][1]
+
+
+def test_a_movie_shows_the_whole_motion(tmp_path: Path) -> None:
+    problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
+    movie = Movie(problem, plan, plan, speed=2.0)
+    assert movie.times[[0, -1]] == pytest.approx([0.0, plan.duration])
+    # Not slower than a frame of the whole, and at twice the speed.
+    assert len(movie.times) == pytest.approx(plan.duration / 2.0 * FRAMES + 1, abs=1.0)
+    write_movie(movie, tmp_path / "plan.gif")
+    with Image.open(tmp_path / "plan.gif") as image:
+        frames = getattr(image, "n_frames", 1)
+        assert frames == len(movie.times)
+        assert image.info["duration"] * FRAMES == 1000
+        first = np.array(image.convert("RGB"), dtype=int)
+        image.seek(frames - 1)
+        assert (np.abs(np.array(image.convert("RGB")) - first).max(axis=2) > 60).mean() > 0.01
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, float("nan"), 1e-6])
+def test_a_movie_has_a_speed_that_can_be_shown(speed: float) -> None:
+    with pytest.raises(InputError, match="--speed"):
+        Movie(problem_of(HEPTAGON), plan_of(HEPTAGON), speed=speed)
+
+
+@pytest.mark.parametrize(
+    ("output", "words"),
+    [("plan.avi", "'.avi' given"), ("none/plan.gif", "none")],
+)
+def test_animate_refuses_what_it_cannot_write(
+    output: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plan_of(HEPTAGON).save(str(tmp_path / "plan.npz"))
+    assert main(["animate", str(tmp_path / "plan.npz"), "-o", str(tmp_path / output)]) == 2
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.skipif(shutil.which("ffmpeg") is not None, reason="ffmpeg is there")
+def test_an_mp4_needs_ffmpeg(tmp_path: Path) -> None:
+    movie = Movie(problem_of(HEPTAGON), plan_of(HEPTAGON), speed=100.0)
+    with pytest.raises(InputError, match="needs ffmpeg"):
+        write_movie(movie, tmp_path / "plan.mp4")
+
+
+def open_in_browser(text: str, folder: Path, fragment: str = "") -> str:
+    """What a page has become in a browser, as HTML."""
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        pytest.skip("no Chromium here")
+    (folder / "page.html").write_text(text, encoding="utf-8")
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+    options += ["--no-first-run", "--disable-sync", "--disable-component-update", "--disable-quic"]
+    command = [browser, *options, f"--user-data-dir={folder / 'profile'}", "--dump-dom"]
+    address = f"file://{folder / 'page.html'}{fragment}"
+    done = subprocess.run([*command, address], capture_output=True, text=True, timeout=60)
+    return done.stdout
+
+
+def test_slider_plots_and_map_respond_in_a_browser(tmp_path: Path) -> None:
+    problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
+    places: Any = describe_map(chart(), plan)
+    parts = [page.write_player(describe_motion(plan, problem, plan)), page.write_chart(*places)]
+    acts = """<script>
+      const said = {}, output = document.querySelector("output");
+      const read = () => [output.textContent, document.querySelector(".cursor").getAttribute("x1")];
+      said.first = read();
+      const slider = document.querySelector("input[type=range]");
+      slider.value = 500; slider.dispatchEvent(new Event("input")); said.slid = read();
+      const plot = document.querySelector(".plot"), box = plot.getBoundingClientRect();
+      plot.setPointerCapture = () => {};
+      plot.dispatchEvent(new PointerEvent("pointerdown",
+        { clientX: box.left + box.width * (58 + 932 * 0.25) / 1000, clientY: box.top + 50 }));
+      said.clicked = read();
+      document.querySelector(".map polyline").dispatchEvent(new MouseEvent("click"));
+      said.border = document.querySelector(".choice").textContent;
+      document.body.append(JSON.stringify(said));
+    </script></body>"""
+    text = page.build_page("heptagon", parts).replace("</body>", acts)
+    found = re.findall(r'\{"first".*\}', open_in_browser(text, tmp_path, "#t=0.1"))
+    said = json.loads(found[-1])
+    cursor = [58 + 932 * share for share in (0.1 / plan.duration, 0.5, 0.25)]
+    for key, x in zip(("first", "slid", "clicked"), cursor, strict=True):
+        t = (x - 58) / 932 * plan.duration
+        own = int(plan.phase[np.searchsorted(plan.t, t, side="right") - 1])
+        assert said[key][0] == f"{float(said[key][0].split()[0]):.4f} s, phase {own + 1}"
+        assert float(said[key][0].split()[0]) == pytest.approx(t, abs=1e-3 * plan.duration)
+        assert float(said[key][1]) == pytest.approx(x, abs=1.0)
+    assert said["border"] == places[1]["borders"][0]["text"]
+
+
+def test_a_report_holds_what_was_given(tmp_path: Path) -> None:
+    problem, path = problem_of(HEPTAGON), tmp_path / "plan.npz"
+    plan_of(HEPTAGON).save(str(path))
+    text = build_report(problem, [str(path)], HEPTAGON.read_text(encoding="utf-8"), chart=chart())
+    for words in ("plan.npz", "ok: ", "v3-finger1", "[fingers.1]", "what verify says"):
+        assert words in text
+    assert len(text) < 5e6
