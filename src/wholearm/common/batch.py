@@ -65,3 +65,22 @@ class Batch:
             for output, result in zip(outputs, self._results, strict=True):
                 output[start:stop] = result[: stop - start]
         return [output.transpose(0, 2, 1) for output in outputs]
+
+    @exclusive
+    def at(self, *point: Array) -> list[Array]:
+        """Evaluate at one point, with the least to do besides.
+
+        Parameters
+        ----------
+        *point : ndarray, shape (rows,)
+            One per input.
+
+        Returns
+        -------
+        list of ndarray, shape (columns, rows)
+            One per output.
+        """
+        for store, argument in zip(self._arguments, point, strict=True):
+            store[0] = argument
+        self._run_one()
+        return [result[0].copy() for result in self._results]

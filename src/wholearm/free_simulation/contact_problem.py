@@ -20,6 +20,8 @@ inelastic collisions and Coulomb friction", 1996.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from typing import NamedTuple
 
@@ -45,7 +47,8 @@ APART, STICKS, FORTH, BACK = range(4)
 """Modes of a contact; of a joint all but the first. One without friction that presses sticks."""
 
 
-class ContactProblem(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class ContactProblem:
     """k contacts, s of whatever stands still and may stick, n coordinates.
 
     Attributes
@@ -73,6 +76,29 @@ class ContactProblem(NamedTuple):
     owner: NDArray[np.int64]
     mu: Array
     bound: Array
+
+    @cached_property
+    def scaled(self) -> tuple[Array, Array, Array, Array]:
+        """Units of forces that make the diagonal one, the matrix in them, and the rates without."""
+        rows, pushes, b, s = self.A, self.G, self.b_n, len(self.b_t)
+        if s:
+            rows, pushes = np.vstack([rows, self.T]), np.vstack([pushes, self.T])
+            b = np.concatenate([b, self.b_t])
+        lifted = rows * self.lift
+        units = 1 / np.sqrt((lifted * rows).sum(axis=1))
+        K = (lifted @ pushes.T) * np.outer(units, units)
+        return units[: len(b) - s], units[len(b) - s :], K, units * b
+
+    @cached_property
+    def is_unique(self) -> bool:
+        """Whether there is one solution for sure, as nothing might stick and K is positive.
+
+        A matrix whose symmetric part is positive definite has positive principal minors only.
+        """
+        if len(self.b_t):
+            return False
+        K = self.scaled[2]
+        return not len(K) or bool(np.linalg.eigvalsh(K + K.T)[0] > SINGULAR)
 
 
 class Answer(NamedTuple):
@@ -103,33 +129,78 @@ class Answer(NamedTuple):
     residual: float
 
 
-def solve(problem: ContactProblem) -> Answer | None:
-    """Solve by Lemke's method; None where it finds nothing."""
-    p, (s_n, s_t, K, q) = problem, _scale(problem)
+def solve(problem: ContactProblem, presses: Sequence[bool] = ()) -> Answer | None:
+    """Solve by exchanges of contacts where that ends for sure, or by Lemke's method.
+
+    Parameters
+    ----------
+    problem : ContactProblem
+    presses : sequence of bool, length k
+        Contacts to begin with.
+
+    Returns
+    -------
+    Answer or None
+        None where nothing is found.
+    """
+    found = _exchange(problem, presses) if problem.is_unique else None
+    return found or _solve_by_lemke(problem)
+
+
+def _exchange(p: ContactProblem, presses: Sequence[bool]) -> Answer | None:
+    """Let go what pulls and take what closes: all at once, and one by one where that circles.
+
+    Exchanging the first one that is wrong ends for every P-matrix; see K. G. Murty, "Note on a
+    Bard-type scheme for solving the complementarity problem", 1974.
+    """
+    s_n, _, K, q = p.scaled
+    k = len(q)
+    size = float(np.abs(q).max(initial=0.0)) or 1.0
+    active = np.array(presses, dtype=bool) if len(presses) else q < 0
+    for turn in range(k + 2**k):
+        c = np.zeros(k)
+        at = np.flatnonzero(active)
+        if len(at):
+            c[at] = np.linalg.solve(K[at[:, None], at], -q[at])
+        rates = K @ c + q
+        values = np.where(active, c, rates)
+        wrong = np.flatnonzero(values < -EDGE * size)
+        if not len(wrong):
+            worst = max(float(np.abs(rates[at]).max(initial=0.0)), float(-values.min(initial=0.0)))
+            return read(p, s_n * np.maximum(c, 0.0), np.zeros(0), worst / size)
+        wrong = wrong if turn < k else wrong[:1]
+        active[wrong] = ~active[wrong]
+    return None
+
+
+def _solve_by_lemke(p: ContactProblem) -> Answer | None:
+    s_n, s_t, K, q = p.scaled
     k, s = len(s_n), len(s_t)
-    N, T = K[:k], K[k:]
-    own = np.zeros((s, k))
     held = np.flatnonzero(p.owner >= 0)
-    own[held, p.owner[held]] = p.mu[held] * s_n[p.owner[held]] / s_t[held]
-    unit, none = np.eye(s), np.zeros((k, s))
-    M = np.block([
-        [N[:, :k], N[:, k:], -N[:, k:], none],
-        [T[:, :k], T[:, k:], -T[:, k:], unit],
-        [-T[:, :k], -T[:, k:], T[:, k:], unit],
-        [own, -unit, -unit, np.zeros((s, s))],
-    ])  # fmt: skip
-    found = solve_lcp(M, np.concatenate([q[:k], q[k:], -q[k:], p.bound / s_t]))
+    # Unknowns are c_n, both parts of f, and how fast each of them gives way.
+    M, plus, minus = np.zeros((k + 3 * s, k + 3 * s)), k + s, k + 2 * s
+    M[:plus, :plus] = K
+    M[:plus, plus:minus] = -K[:, k:]
+    M[plus:minus, :minus] = -M[k:plus, :minus]
+    i = np.arange(s)
+    M[k + i, minus + i] = M[plus + i, minus + i] = 1.0
+    M[minus + i, k + i] = M[minus + i, plus + i] = -1.0
+    M[minus + held, p.owner[held]] = p.mu[held] * s_n[p.owner[held]] / s_t[held]
+    found = solve_lcp(M, np.concatenate([q, -q[k:], p.bound / s_t]))
     size = float(np.abs(q).max(initial=0.0)) or 1.0
     if not found.residual <= RESIDUAL * max(size, float((p.bound / s_t).max(initial=0.0))):
         return None
-    c_n, plus, minus = (part for part in np.split(found.z, [k, k + s, k + 2 * s])[:3])
-    return read(p, s_n * c_n, s_t * (plus - minus), found.residual / size)
+    z = found.z
+    return read(p, s_n * z[:k], s_t * (z[k:plus] - z[plus:minus]), found.residual / size)
 
 
 def read(problem: ContactProblem, c_n: Array, f: Array, residual: float = 0.0) -> Answer:
     """What given forces do."""
     p = problem
-    change = p.lift * (p.G.T @ c_n + p.T.T @ f)
+    if not len(f):
+        change = p.lift * (c_n @ p.G)
+        return Answer(c_n, f, p.b_n + p.A @ change, f, f, f, change, residual)
+    change = p.lift * (c_n @ p.G + f @ p.T)
     most = _bound(p, c_n)
     # Friction whose bound is zero by c_n has nothing to give, whichever way.
     edge = most - np.abs(f) <= EDGE * np.maximum(most, 1e-3 * np.abs(f).max(initial=0.0))
@@ -137,15 +208,6 @@ def read(problem: ContactProblem, c_n: Array, f: Array, residual: float = 0.0) -
     way = np.where(edge, np.where(f != 0, -np.sign(f), np.sign(r_t)), 0.0)
     shares = np.abs(f) / np.maximum(most, np.finfo(float).tiny)
     return Answer(c_n, f, p.b_n + p.A @ change, r_t, shares, way, change, residual)
-
-
-def is_unique(problem: ContactProblem) -> bool:
-    """Whether there is one solution for sure, as nothing stands that might stick and K is positive.
-
-    A matrix whose symmetric part is positive definite has positive principal minors only.
-    """
-    _, s_t, K, _ = _scale(problem)
-    return not len(s_t) and bool(np.linalg.eigvalsh(K + K.T).min(initial=1.0) > SINGULAR)
 
 
 def list_answers(problem: ContactProblem) -> list[Answer] | None:
@@ -172,7 +234,7 @@ def try_modes(problem: ContactProblem, choice: Sequence[int]) -> Answer | None:
 
 def _try(p: ContactProblem, choices: NDArray[np.int64]) -> list[Answer]:
     """Solve with each row's modes, and return what is consistent, each motion once."""
-    scaled = s_n, s_t, K, q = _scale(p)
+    scaled = s_n, s_t, K, q = p.scaled
     k, s = len(s_n), len(s_t)
     matrices = np.broadcast_to(K, (len(choices), k + s, k + s)).copy()
     right = np.broadcast_to(-q, (len(choices), k + s)).copy()
@@ -230,13 +292,3 @@ def _bound(p: ContactProblem, c_n: Array) -> Array:
     most = p.bound.copy()
     most[own] += p.mu[own] * c_n[p.owner[own]]
     return most
-
-
-def _scale(p: ContactProblem) -> tuple[Array, Array, Array, Array]:
-    """Units of forces that make the diagonal one, the matrix in them, and the rates without."""
-    s_n = 1 / np.sqrt((p.A**2) @ p.lift)
-    s_t = 1 / np.sqrt((p.T**2) @ p.lift)
-    s = np.concatenate([s_n, s_t])
-    rows, pushes = np.vstack([p.A, p.T]), np.vstack([p.G, p.T])
-    K = (s[:, None] * rows * p.lift) @ (s[:, None] * pushes).T
-    return s_n, s_t, K, s * np.concatenate([p.b_n, p.b_t])

@@ -20,7 +20,6 @@ from .contact_problem import (
     STICKS,
     Answer,
     ContactProblem,
-    is_unique,
     list_answers,
     solve,
     try_modes,
@@ -32,25 +31,27 @@ from .telling import tell_ambiguity, tell_changes
 
 DEPENDENT = 1e-7
 """Share of a row that others leave, below which it is no constraint of its own."""
+_NONE = np.zeros(0)
+_NOTHING = (_NONE, np.zeros(0, dtype=np.int64), _NONE, _NONE)
 
 
 def find_closed(run: Run) -> tuple[int, ...]:
     """Pairs that touch and do not part, each constraint once."""
     system, unit = run.system, run.system.scales.length
     gaps, faces = run.face(run.z, run.v)
-    touching = np.flatnonzero((gaps < CLOSED * unit) & (gaps > -SUNK * unit) & faces)
-    if not len(touching):
+    touching = np.flatnonzero((gaps < CLOSED * unit) & (gaps > -SUNK * unit) & faces).tolist()
+    if not touching:
         return ()
-    found = sorted(touching.tolist(), key=lambda pair: pair not in run.modes.kept)
-    rows = system.evaluate(run.z, run.v, found)
-    slow = rows.A @ run.v < run.chatter
-    size = np.sqrt((rows.A**2 / system.mass).sum(axis=1))[:, None]
-    lines = rows.A / size / np.sqrt(system.mass)
+    rows = system.evaluate(run.z, run.v, touching)
+    slow = (rows.A @ run.v < run.chatter).tolist()
+    lines = rows.A / np.sqrt(system.mass)
+    lines /= np.sqrt((lines**2).sum(axis=1))[:, None]
+    own = (np.abs(lines[:, None] - lines).max(axis=2) > DEPENDENT).tolist()
     chosen: list[int] = []
-    for k in np.flatnonzero(slow):
-        if all(np.abs(lines[k] - lines[j]).max() > DEPENDENT for j in chosen):
-            chosen.append(int(k))
-    return tuple(sorted(found[k] for k in chosen))
+    for k in sorted(range(len(touching)), key=lambda k: touching[k] not in run.modes.kept):
+        if slow[k] and all(own[k][j] for j in chosen):
+            chosen.append(k)
+    return tuple(sorted(touching[k] for k in chosen))
 
 
 class Pattern:
@@ -65,6 +66,7 @@ class Pattern:
         rubs = self.mu > 0
         slow = np.abs(v_t) < STANDING * system.scales.speed
         self.Xi = np.where(rubs & ~slow, np.sign(v_t), 0.0)
+        self.rub = (self.mu * self.Xi)[:, None]
         self.standing = np.flatnonzero(rubs & slow)
         slow = np.abs(run.v) < STANDING * system.units[system.n :]
         self.sigma = np.where((system.dry > 0) & ~slow, np.sign(run.v), 0.0)
@@ -75,12 +77,15 @@ class Pattern:
         system, rows = self.system, self.system.evaluate(z, v, self.closed)
         lift = 1 / system.mass
         free = lift * system.push(v, tau, self.sigma)
+        G, b_n = rows.A - self.rub * rows.A_t, rows.A @ free + rows.bend
+        if not len(self.standing) and not len(self.joints):
+            return ContactProblem(lift, rows.A, G, b_n, np.zeros((0, system.n)), *_NOTHING)
         joints = np.eye(system.n)[self.joints]
         return ContactProblem(
             lift,
             rows.A,
-            rows.A - (self.mu * self.Xi)[:, None] * rows.A_t,
-            rows.A @ free + rows.bend,
+            G,
+            b_n,
             np.vstack([rows.A_t[self.standing], joints]),
             np.concatenate([rows.A_t[self.standing] @ free + rows.bend_t[self.standing],
                             free[self.joints]]),
@@ -127,16 +132,17 @@ def decide(run: Run) -> bool | None:
     _end_chatter(run, closed)
     pattern = Pattern(run, closed)
     later = AHEAD * scales.time
-    now = pattern.pose(run.z, run.v, run.tau(run.t))
-    free = now.lift * system.push(run.v, run.tau(run.t), pattern.sigma)
-    first = try_modes(now, pattern.recall(run.modes)) or _solve(run, now)
+    tau = run.tau(run.t)
+    now = pattern.pose(run.z, run.v, tau)
+    first = _answer(run, now, pattern.recall(run.modes))
     if first is None:
         return None
-    acceleration = free + first.change
+    acceleration = now.lift * system.push(run.v, tau, pattern.sigma) + first.change
     v = run.v + later * acceleration
     z = run.z + later * (run.v + v) / 2
-    then = pattern.pose(z, v, run.tau(run.t + later))
-    coming = then.lift * system.push(v, run.tau(run.t + later), pattern.sigma)
+    tau = run.tau(run.t + later)
+    then = pattern.pose(z, v, tau)
+    coming = then.lift * system.push(v, tau, pattern.sigma)
     answer = _choose(run, pattern, then, coming)
     if answer is None:
         return None
@@ -161,10 +167,13 @@ def _is_still(run: Run, acceleration: Array) -> bool:
     return bool((np.abs(acceleration) < still).all())
 
 
-def _solve(run: Run, problem: ContactProblem) -> Answer | None:
-    answer = solve(problem)
-    if answer is not None:
-        run.residual = max(run.residual, answer.residual)
+def _answer(run: Run, problem: ContactProblem, last: Sequence[int]) -> Answer | None:
+    """An answer: the last one where it still holds."""
+    answer = None if problem.is_unique else try_modes(problem, last)
+    if answer is None:
+        answer = solve(problem, [mode != APART for mode in last[: len(problem.b_n)]])
+        if answer is not None:
+            run.residual = max(run.residual, answer.residual)
     return answer
 
 
@@ -174,7 +183,7 @@ def _choose(run: Run, pattern: Pattern, problem: ContactProblem, free: Array) ->
     `free` has the accelerations without contacts, shape (n,).
     """
     last = pattern.recall(run.modes)
-    run.unique = is_unique(problem)
+    run.unique = problem.is_unique
     found = [] if run.unique else list_answers(problem) or []
     if len(found) > 1:
         modes = [pattern.describe(answer) for answer in found]
@@ -183,7 +192,7 @@ def _choose(run: Run, pattern: Pattern, problem: ContactProblem, free: Array) ->
         starts = [run.resting and not _is_still(run, free + a.change) for a in found]
         away = [sum(a != b for a, b in zip(own, last, strict=True)) for own in modes]
         return found[min(range(len(found)), key=lambda k: (starts[k], away[k]))]
-    return try_modes(problem, last) or _solve(run, problem) or (found[0] if found else None)
+    return _answer(run, problem, last) or (found[0] if found else None)
 
 
 def _make_modes(run: Run, pattern: Pattern, answer: Answer, rows: Rows) -> Modes:

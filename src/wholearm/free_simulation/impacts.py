@@ -8,6 +8,7 @@ energy, which the law allows with friction, less comes back.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -94,7 +95,7 @@ def _expand(
         problem = _pose(run, closed, v)
         pushed = v + problem.lift * (problem.A.T @ given)
         bound = problem.mu * given[problem.owner]
-        problem = _pose(run, closed, pushed)._replace(bound=bound)
+        problem = replace(_pose(run, closed, pushed), bound=bound)
         answer = solve(problem)
         if answer is not None:
             after = pushed + answer.change

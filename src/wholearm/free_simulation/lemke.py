@@ -54,47 +54,53 @@ def solve_lcp(M: Array, q: Array) -> Solution:
     size = float(np.abs(q).max(initial=0.0))
     if n == 0 or (q >= 0).all():
         return Solution(np.zeros(n), q.copy(), 0.0)
-    # Columns: w, z, the artificial z_0, and the right-hand side.
-    table = np.hstack([np.eye(n), -M, -np.ones((n, 1)), q[:, None] / size])
-    basis = list(range(n))
-    row = _choose(table, np.arange(n), -np.ones(n))
-    entering = 2 * n
+    # Columns: the right-hand side, w, z and the artificial z_0.
+    table = np.empty((n, 2 * n + 2))
+    table[:, 0], table[:, 1 : n + 1], table[:, n + 1 : -1] = q / size, np.eye(n), -M
+    table[:, -1] = -1.0
+    basis = np.arange(1, n + 1)
+    row, entering = _choose(table, np.arange(n), -np.ones(n)), 2 * n + 1
     for _ in range(TURNS * n):
-        leaving = basis[row]
+        leaving = int(basis[row])
         table[row] /= table[row, entering]
         factors = table[:, entering].copy()
         factors[row] = 0.0
-        table -= factors[:, None] * table[row]
+        table -= np.outer(factors, table[row])
         basis[row] = entering
-        if leaving == 2 * n:
+        if leaving == 2 * n + 1:
             return _read(M, q, basis)
-        entering = leaving + n if leaving < n else leaving - n
-        rising = np.flatnonzero(table[:, entering] > PIVOT)
+        entering = leaving + n if leaving <= n else leaving - n
+        column = table[:, entering]
+        rising = np.flatnonzero(column > PIVOT)
         if not len(rising):
             break
-        row = _choose(table, rising, table[:, entering])
         # The artificial unknown goes as soon as it may: its level is what is missing.
-        ratios = table[rising, -1] / table[rising, entering]
-        last = np.flatnonzero(np.array(basis)[rising] == 2 * n)
-        if len(last) and ratios[last[0]] <= ratios.min() + TIE:
-            row = int(rising[last[0]])
+        ratios = table[rising, 0] / column[rising]
+        low = rising[ratios <= ratios.min() + TIE]
+        last = low[basis[low] == 2 * n + 1]
+        row = int(last[0]) if len(last) else _choose(table, rising, column[rising])
     return Solution(np.full(n, np.nan), np.full(n, np.nan), np.inf)
 
 
-def _choose(table: Array, rows: NDArray[np.int64], column: Array) -> int:
+def _choose(table: Array, rows: NDArray[np.int64], pivots: Array) -> int:
     """The row with the lexicographically least ratio to its pivot.
 
     For the first pivot the column is negative, so that the ratios are those of what falls most.
     """
-    n = len(table)
-    ratios = np.column_stack([table[rows, -1], table[rows, :n]]) / np.abs(column[rows])[:, None]
-    return int(rows[np.lexsort(ratios.T[::-1])[0]])
+    sizes = np.abs(pivots)
+    ratios = table[rows, 0] / sizes
+    least = np.flatnonzero(ratios == ratios.min())
+    if len(least) > 1:
+        chosen = rows[least]
+        ties = table[chosen, 1 : len(table) + 1] / sizes[least, None]
+        return int(chosen[np.lexsort(ties.T[::-1])[0]])
+    return int(rows[least[0]])
 
 
-def _read(M: Array, q: Array, basis: list[int]) -> Solution:
+def _read(M: Array, q: Array, basis: NDArray[np.int64]) -> Solution:
     """The solution of a complementary basis, solved anew from the problem itself."""
     n = len(q)
-    chosen = np.array([k - n for k in basis if k >= n], dtype=int)
+    chosen = basis[basis > n] - n - 1
     z = np.zeros(n)
     if len(chosen):
         try:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +28,8 @@ SPEED_ROUNDING = 1e-12
 """Likewise of a sliding or turning speed."""
 
 
+EXACT = 1e-14
+"""Gap at which a contact is found closed, relative to the scene's length: some ten roundings."""
 TURNING = 1e-4
 """Speed, relative to the scene's, below which sliding or turning may be about to reverse."""
 
@@ -39,6 +43,8 @@ class View(NamedTuple):
 
     Attributes
     ----------
+    out : ndarray
+        Outputs at its end.
     values : ndarray
         Forces, reserves of friction, speeds and ranges at its end, each positive until something
         happens, in units of the scene.
@@ -48,6 +54,7 @@ class View(NamedTuple):
         Of all pairs then.
     """
 
+    out: Array
     values: Array
     times: Array
     gaps: Array
@@ -65,25 +72,44 @@ class _Motion:
     def __init__(self, run: Run) -> None:
         self.run, self.s = run, run.load()
         system, modes = run.system, run.modes
-        scales, n = system.scales, system.n
-        self.unit = scales.length
+        self.unit, self.per_unit = system.scales.length, 1 / system.units[: system.n]
         self.watched = np.ones(len(system.names), dtype=bool)
-        self.kept = list(modes.kept)
-        self.watched[self.kept] = False
-        self.stuck = [modes.kept.index(pair) for pair in modes.stuck]
-        self.mu, self.dry = system.friction[list(modes.stuck)], system.dry[list(modes.held)]
-        held = system.friction_units[list(modes.held)]
-        self.friction_units = np.append(np.full(len(self.stuck), scales.force), held)
-        self.slides, self.turning = np.flatnonzero(modes.Xi), np.flatnonzero(modes.sigma)
-        self.Xi = np.array(modes.Xi)[self.slides] / scales.speed
-        self.sigma = np.array(modes.sigma)[self.turning] / system.units[n + self.turning]
-        counts = [
-            len(self.kept) + 2 * len(held) + 2 * len(self.stuck),
-            len(self.slides) + len(self.turning),
-            len(self.kept),
-        ]
+        self.watched[list(modes.kept)] = False
+        self.list_values()
+        self.near = 1e-3 * SHORTEST * max(system.scales.time, abs(run.t))
+
+    def list_values(self) -> None:
+        """What is looked at, as a matrix and a constant for all outputs of a step."""
+        run, to = self.run, self.s.to
+        system, modes = run.system, run.modes
+        scales, n, k = system.scales, system.n, len(modes.kept)
+        stuck, held = [modes.kept.index(pair) for pair in modes.stuck], list(modes.held)
+        slides, turning = np.flatnonzero(modes.Xi), np.flatnonzero(modes.sigma)
+        sticks = len(stuck) + len(held)
+        counts = [k + 2 * sticks, len(slides) + len(turning), k]
+        rows, constant = np.zeros((sum(counts), to.size)), np.zeros(sum(counts))
+        i = np.arange(sum(counts))
+        rows[i[:k], to.c_n.start + i[:k]] = 1 / scales.force
+        for j, (reserve, sign) in enumerate(product(range(sticks), (-1.0, 1.0)), start=k):
+            unit, row = scales.force, rows[j]
+            if reserve < len(stuck):
+                row[to.c_n.start + stuck[reserve]] = system.friction[modes.stuck[reserve]] / unit
+            else:
+                joint = held[reserve - len(stuck)]
+                unit = float(system.friction_units[joint])
+                constant[j] = system.dry[joint] / unit
+            row[to.f.start + reserve] = sign / unit
+        at = i[counts[0] :]
+        rows[at[: len(slides)], to.v_t.start + slides] = np.array(modes.Xi)[slides] / scales.speed
+        at = at[len(slides) :]
+        signs = np.array(modes.sigma)[turning] / system.units[n + turning]
+        rows[at[: len(turning)], n + turning] = signs
+        rows[at[len(turning) :], to.ranges.start + np.array(modes.kept, dtype=int)] = 1 / self.unit
+        # Few outputs count.
+        self.columns = np.flatnonzero(rows.any(axis=0))
+        self.rows, self.constant = np.ascontiguousarray(rows[:, self.columns]), constant
         self.slack = np.repeat([ROUNDING, SPEED_ROUNDING, CLOSED], counts)
-        self.near = 1e-3 * SHORTEST * max(scales.time, abs(run.t))
+        self.plain = not sticks
 
     def move(self) -> None:
         """Integrate until something happens or the torques step or end."""
@@ -91,7 +117,7 @@ class _Motion:
         run.stay(s)
         s.look()
         run.record(s)
-        start = self.view(s.outputs, 0.0)
+        start = self.view(None, 0.0)
         # What touches already may sink by rounding; what is behind something else never closes.
         shallow = start.gaps[-1] > -SUNK * self.unit
         sunk = np.minimum(start.gaps[-1], 0.0) - 0.5 * CLOSED * self.unit
@@ -100,11 +126,10 @@ class _Motion:
         floor = np.maximum(self.slack, self.slack - start.values)
         run.h = min(run.h, self._time_to_return(start))
         while True:
-            before = s.outputs.copy()
-            h, whole, end = self._try_step(before)
-            found, end = self._stop_at_event(before, start, floor, h, end)
+            h, whole, end = self._try_step(start)
+            found, end = self._stop_at_event(start, floor, h, end)
             run.t = run.t + float(s.inputs[s.at.h]) if found or not whole else run.stop
-            run.y = s.outputs[s.to.y].copy()
+            run.y = end.out[s.to.y].copy()
             run.steps += 1
             run.record(s)
             run.armed = end.gaps[-1] > ARMED * self.unit
@@ -114,41 +139,36 @@ class _Motion:
             if run.t >= run.stop:
                 if not run.next_piece():
                     return
+                run.feed(s)
                 if run.torque_steps():
-                    end = end._replace(values=self._look_again(end))
+                    s.look()
+                    end = self.view(None, 0.0)
                     if not self._holds(end):
                         return
                     run.record(s)
+            else:
+                run.feed(s)
             start = end
-            run.feed(s)
-
-    def _look_again(self, end: View) -> Array:
-        """Values at the present state with the torques of the piece that begins there."""
-        self.run.feed(self.s)
-        self.s.look()
-        return self._measure(end.ranges[-1])
 
     def _holds(self, end: View) -> bool:
         """Whether the modes are the only answer after a step of the torques, by more than rounding.
 
         Everything that touches has to press and slide, as it did before.
         """
-        touches = np.abs(end.gaps[-1]) < CLOSED * self.unit
-        plain = self.run.unique and not len(self.friction_units)
         least = np.where(self.slack == SPEED_ROUNDING, TURNING, 10 * self.slack)
-        clear = bool((end.values > least).all())
-        return plain and clear and not (touches & self.watched).any()
+        if not (self.run.unique and self.plain and (end.values > least).all()):
+            return False
+        return not ((np.abs(end.gaps[-1]) < CLOSED * self.unit) & self.watched).any()
 
-    def _try_step(self, before: Array) -> tuple[float, bool, View]:
+    def _try_step(self, start: View) -> tuple[float, bool, View]:
         """Make a step within the tolerance; its length, and whether it ends the torques' piece."""
         run, s = self.run, self.s
         inputs, outputs, at, to = s.inputs, s.outputs, s.at, s.to
-        system, remaining = run.system, run.stop - run.t
-        place = system.units[: system.n]
-        speed = float(np.abs(run.v / place).max())
-        push = float(np.abs(outputs[to.acceleration] / place).max())
-        reach = 2 * REACH / (speed + np.sqrt(speed**2 + 2 * push * REACH) + 1e-300)
-        least = SHORTEST * max(system.scales.time, abs(run.t))
+        n, remaining = run.system.n, run.stop - run.t
+        speed = float((np.abs(start.out[n : 2 * n]) * self.per_unit).max())
+        push = float((np.abs(start.out[to.acceleration]) * self.per_unit).max())
+        reach = 2 * REACH / (speed + math.sqrt(speed**2 + 2 * push * REACH) + 1e-300)
+        least = SHORTEST * max(run.system.scales.time, abs(run.t))
         while True:
             h = min(run.h, reach)
             whole = h >= 0.999 * remaining
@@ -157,8 +177,8 @@ class _Motion:
             s.step()
             error = float(outputs[to.error])
             if error <= 1:
-                view = self.view(before, h)
-                sudden = outputs[to.dip] < -1e-6 and h > AHEAD * system.scales.time
+                view = self.view(start.out, h)
+                sudden = outputs[to.dip] < -1e-6 and h > AHEAD * run.system.scales.time
                 if not sudden or (view.values < -self.slack).any():
                     grown = h * min(GROWTH, 0.9 * max(error, 1e-300) ** (-1 / ORDER))
                     run.h = grown if h >= run.h else max(run.h, grown)
@@ -168,46 +188,32 @@ class _Motion:
                 raise StuckError
             run.h = h * (max(0.1, 0.9 * error ** (-1 / ORDER)) if error > 1 else 0.5)
 
-    def view(self, before: Array, h: float) -> View:
-        """Look at the step just made, of length h from the outputs `before`."""
-        system, s = self.run.system, self.s
-        n, out, to = system.n, s.outputs, s.to
+    def view(self, before: Array | None, h: float) -> View:
+        """Look at the step just made, of length h from the outputs `before`, if any."""
+        n, to = self.run.system.n, self.s.to
+        out = self.s.outputs.copy()
+        values = self.rows @ out[self.columns] + self.constant
+        times, gaps, ranges = np.array([h]), out[None, to.gaps], out[None, to.ranges]
+        if before is None:
+            return View(out, values, times, gaps, ranges)
         gone = np.abs(out[:n] - before[:n]) + h * np.abs(out[n : 2 * n] - before[n : 2 * n])
-        count = 1 + int(LOOKS * min(1.0, float((gone / system.units[:n]).max()) / REACH))
-        z, times = out[None, :n], np.array([h])
+        count = 1 + int(LOOKS * min(1.0, float((gone * self.per_unit).max()) / REACH))
         if count > 1:
             times = h * np.arange(1, count + 1) / count
             ends = np.array([before, out])
             knots = ends[:, :n], ends[:, n : 2 * n], ends[:, to.acceleration]
-            first = np.zeros(count, dtype=np.int64)
-            z = interpolate_quintic(np.full(count, h), times, knots, first)[0]
-            z[-1] = out[:n]
-        gaps, ranges = system.measure(z)
-        return View(self._measure(ranges[-1]), times, gaps, ranges)
-
-    def _measure(self, ranges: Array) -> Array:
-        """Values at the end of the step just made."""
-        run, out, to = self.run, self.s.outputs, self.s.to
-        c_n, f, n = out[to.c_n], out[to.f], run.system.n
-        bound = np.concatenate([self.mu * c_n[self.stuck], self.dry])
-        return np.concatenate(
-            [
-                c_n / run.system.scales.force,
-                (bound - f) / self.friction_units,
-                (bound + f) / self.friction_units,
-                self.Xi * out[to.v_t][self.slides],
-                self.sigma * out[n + self.turning],
-                ranges[self.kept] / self.unit,
-            ]
-        )
+            first = np.zeros(count - 1, dtype=np.int64)
+            z = interpolate_quintic(np.full(count - 1, h), times[:-1], knots, first)[0]
+            both = zip(self.run.system.measure(z), (gaps, ranges), strict=True)
+            gaps, ranges = (np.vstack([within, last]) for within, last in both)
+        return View(out, values, times, gaps, ranges)
 
     def _step_to(self, h: float) -> None:
-        self.s.inputs[self.s.at.h] = h
-        self.s.step()
+        if self.s.inputs[self.s.at.h] != h:
+            self.s.inputs[self.s.at.h] = h
+            self.s.step()
 
-    def _stop_at_event(
-        self, before: Array, start: View, floor: Array, h: float, end: View
-    ) -> tuple[bool, View]:
+    def _stop_at_event(self, start: View, floor: Array, h: float, end: View) -> tuple[bool, View]:
         """Shorten the step just made to the first event within it; whether there is one."""
         passed: set[int] = set()
         found = False
@@ -231,16 +237,15 @@ class _Motion:
                 floor = np.where(np.arange(len(floor)) == row, np.inf, floor)
                 found = True
             self._step_to(h)
-            end = self.view(before, h)
+            end = self.view(start.out, h)
 
     def _find_value(self, row: int, floor: float, first: float, last: float, h: float) -> float:
         """When one of the values falls below its floor."""
-        n = self.run.system.n
+        weights, constant = self.rows[row], float(self.constant[row]) + floor
 
         def value(step: float) -> float:
             self._step_to(step)
-            ranges = self.run.system.measure(self.s.outputs[None, :n])[1][0]
-            return float(self._measure(ranges)[row]) + floor
+            return float(weights @ self.s.outputs[self.columns]) + constant
 
         return find_root(value, h, first, last, self.near, 1e-3 * floor)
 
@@ -248,12 +253,12 @@ class _Motion:
         self, start: View, h: float, pair: int, left: float, right: float
     ) -> float | None:
         """When a pair closes within a step; None if it does not, or where the two do not face."""
-        system = self.run.system
         level = 0.0 if self.run.armed[pair] else float(self.level[pair])
+        s, place = self.s, self.s.to.gaps.start + pair
 
         def gap(step: float) -> float:
             self._step_to(step)
-            return float(system.measure(self.s.outputs[None, : system.n])[0][0, pair]) - level
+            return float(s.outputs[place]) - level
 
         # The bracket is that of an interpolation, which grazing may mislead.
         right = right if gap(right) < 0 else h
@@ -261,9 +266,9 @@ class _Motion:
         if high >= 0:
             return None
         first = gap(left) if left > 0 else float(start.gaps[-1, pair]) - level
-        root = find_root(gap, right, first, high, self.near, 1e-17 * self.unit, low=left)
+        root = find_root(gap, right, first, high, self.near, EXACT * self.unit, low=left)
         self._step_to(root)
-        n, out = system.n, self.s.outputs
+        n, out = self.run.system.n, s.outputs
         return root if self.run.face(out[:n], out[n : 2 * n])[1][pair] else None
 
     def _find_closing(
@@ -271,10 +276,11 @@ class _Motion:
     ) -> tuple[int, float, float] | None:
         """The first pair that closes within the step, and a bracket of when."""
         level = np.where(self.run.armed, 0.0, self.level)
-        below = np.vstack([start.gaps[-1:], end.gaps]) < level
-        crosses = below[1:] & ~below[:-1] & self.watched
-        if not crosses.any():
+        below = end.gaps < level
+        below &= self.watched
+        if not below.any():
             return None
+        crosses = below & ~np.vstack([start.gaps[-1:] < level, below[:-1]])
         ranges = np.vstack([start.ranges[-1:], end.ranges])
         crosses &= np.maximum(ranges[1:], ranges[:-1]) > -1e-3 * self.unit
         crosses[:, list(passed)] = False

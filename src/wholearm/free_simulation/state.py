@@ -168,10 +168,13 @@ class Run:
     def face(self, z: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Gaps of all pairs at a state, and which of them face each other, shape (N,) each."""
         scales = self.system.scales
-        gaps, ranges = self.system.measure(np.array([z, z + AHEAD * scales.time * v]))
+        gaps, ranges = self.system.look(z)
         near = CLOSED * scales.length
-        lasting = (ranges[0] > -near) & (ranges[1] >= ranges[0])
-        return gaps[0], (ranges[0] > near) | lasting
+        faces = ranges > near
+        at_end = (ranges > -near) & ~faces
+        if at_end.any():
+            faces |= at_end & (self.system.look(z + AHEAD * scales.time * v)[1] >= ranges)
+        return gaps, faces
 
     def take_impulse(self, v: Array) -> None:
         """Change the velocity; what energy that costs is lost to impacts."""
@@ -207,8 +210,9 @@ class Run:
 
     def stay(self, s: Stepper) -> None:
         """Keep from here on what sticks and is held."""
-        stuck = self.system.evaluate_slip(self.z, self.modes.stuck)
-        s.inputs[s.at.stay] = np.concatenate([stuck, self.z[list(self.modes.held)]])
+        if self.modes.stuck or self.modes.held:
+            stuck = self.system.evaluate_slip(self.z, self.modes.stuck)
+            s.inputs[s.at.stay] = np.concatenate([stuck, self.z[list(self.modes.held)]])
 
     def note(self, kind: EventKind, text: str, contact: str = "", value: float = math.nan) -> None:
         """Record an event."""
@@ -217,16 +221,15 @@ class Run:
 
     def record(self, s: Stepper | None) -> None:
         """Record the present instant, with the forces in a stepper's outputs; None at rest."""
-        system, n = self.system, self.system.n
+        n = self.system.n
         if s is None:
             none = np.full(len(self.modes.kept), np.nan)
             row = (np.zeros(n), self.tau(self.t), self.modes.kept, none, none)
         else:
             out, to = s.outputs, s.to
             c_n = out[to.c_n].copy()
-            mu = system.friction[list(self.modes.kept)]
-            c_t = -mu * np.array(self.modes.Xi) * c_n
-            stuck = [self.modes.kept.index(pair) for pair in self.modes.stuck]
-            c_t[stuck] = out[to.f][: len(stuck)]
+            c_t = c_n * s.inputs[s.at.mu] * -s.inputs[s.at.Xi]
+            for place, pair in enumerate(self.modes.stuck):
+                c_t[self.modes.kept.index(pair)] = out[to.f.start + place]
             row = (out[to.acceleration].copy(), out[to.tau].copy(), self.modes.kept, c_n, c_t)
         self.records.append(Record(self.t, self.y.copy(), *row, self.impact))

@@ -70,7 +70,11 @@ class Inputs(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Where each output is: state, z'', c_n, friction that holds, v_t, tau, error, least within."""
+    """Where each output is.
+
+    State, z'', c_n, friction that holds, v_t, tau, error, least within; gaps and ranges of all
+    pairs.
+    """
 
     y: slice
     acceleration: slice
@@ -80,6 +84,8 @@ class Outputs(NamedTuple):
     tau: slice
     error: int
     dip: int
+    gaps: slice
+    ranges: slice
     size: int
 
 
@@ -123,7 +129,8 @@ class _Equations:
         n, size, g = structure.n, 2 * structure.n + LOSSES, structure.geometry.shape[0]
         numbers = (g, n, n, n, n, k, 2 * n, None, n)
         self.at = Inputs(*lay_out(size, None, None, None, k, n, s, 2, 2 * degree + 2, *numbers))
-        self.to = Outputs(*lay_out(size, self.n, k, s, k, 2, None, None))
+        pairs = len(structure.pairs)
+        self.to = Outputs(*lay_out(size, self.n, k, s, k, 2, None, None, pairs, pairs))
         self.degree = degree
         self.dips: list[Expression] = []
         self._move = self._build_move()
@@ -148,7 +155,8 @@ class _Equations:
         functions = []
         for state, time, extra in ((end, t + h, (error, dip)), (y, t, (0, 0))):
             rates, *parts, _ = self._move(state[: 2 * n], time, packed, packed[at.geometry])
-            outputs = ca.vertcat(state, rates[n : 2 * n], *parts, *extra)
+            gaps = self.structure.gap_function(state[:n], packed[at.geometry])
+            outputs = ca.vertcat(state, rates[n : 2 * n], *parts, *extra, ca.vec(gaps))
             functions.append(ca.Function("step", [packed], [ca.densify(outputs)]))
         inputs, results = np.zeros(at.size), np.zeros(self.to.size)
         buffers = [function.buffer() for function in functions]

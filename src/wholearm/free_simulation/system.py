@@ -10,8 +10,8 @@ What is compiled is a `Structure`, which knows of no numbers; a `System` has tho
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import casadi as ca
@@ -109,20 +109,26 @@ class Structure(Keeper):
         return gap, slip, A, A_t, bend, bend_t
 
     @kept_property
-    def rows(self) -> Batch:
-        """Slips, A, A_t, A' v and A_t' v of all pairs, of z, v and the geometry."""
-        v = ca.SX.sym("v", self.n)
-        _, slip, *rows = self.build_rows(range(len(self.pairs)), v)
-        outputs = [ca.densify(part) for part in (slip, *rows)]
-        return Batch(ca.Function("rows", [self.z, v, self.geometry], outputs))
-
-    @kept_property
-    def gaps(self) -> Batch:
-        """Gaps and ranges of all pairs, of z and the geometry."""
+    def gap_function(self) -> Expression:
+        """CasADi function (z, geometry) -> gaps and ranges of all pairs, shape (N, 2)."""
         gaps = ca.vertcat(ca.SX(0, 1), *(pair.gap for pair in self.pairs))
         least = [ca.mmin(ca.vertcat(_ANYWHERE, *pair.ranges)) for pair in self.pairs]
         both = ca.densify(ca.horzcat(gaps, ca.vertcat(ca.SX(0, 1), *least)))
-        return Batch(ca.Function("gaps", [self.z, self.geometry], [both]))
+        return ca.Function("gaps", [self.z, self.geometry], [both])
+
+    @kept_property
+    def gaps(self) -> Batch:
+        """The same for many places."""
+        return Batch(self.gap_function)
+
+
+@lru_cache(maxsize=256)
+def _build_rows(structure: Structure, chosen: tuple[int, ...]) -> Batch:
+    """A, A_t, A' v, A_t' v and slips of some pairs as columns, of z, v and the geometry."""
+    v = ca.SX.sym("v", structure.n)
+    _, slip, *rows = structure.build_rows(chosen, v)
+    both = ca.densify(ca.horzcat(*rows, slip))
+    return Batch(ca.Function("rows", [structure.z, v, structure.geometry], [both.T]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,9 +159,8 @@ class System:
     dry: Array
     friction: Array
     scales: Scales
-    _known: dict[bytes, list[Array]] = field(default_factory=dict, init=False, repr=False)
 
-    @property
+    @cached_property
     def n(self) -> int:
         """Number of coordinates."""
         return self.structure.n
@@ -183,19 +188,22 @@ class System:
 
     def evaluate(self, z: Array, v: Array, chosen: Sequence[int]) -> Rows:
         """Rows of some pairs at one state."""
-        key = z.tobytes() + v.tobytes()
-        if key not in self._known:
-            # Decisions look at one state, and at one a moment later, many times.
-            if len(self._known) > 1:
-                self._known.pop(next(iter(self._known)))
-            self._known[key] = self.structure.rows(z[None], v[None], self.geometry[None])[1:]
-        A, A_t, bend, bend_t = (part[0, list(chosen)] for part in self._known[key])
-        return Rows(A, A_t, bend[:, 0], bend_t[:, 0])
+        n, found = self.n, self._evaluate(z, v, chosen)
+        return Rows(found[:, :n], found[:, n : 2 * n], found[:, 2 * n], found[:, 2 * n + 1])
 
     def evaluate_slip(self, z: Array, chosen: Sequence[int]) -> Array:
         """Slip coordinates of some pairs, shape (m,) [m]."""
-        slips = self.structure.rows(z[None], z[None], self.geometry[None])[0]
-        return np.asarray(slips[0, list(chosen), 0])
+        return self._evaluate(z, z, chosen)[:, -1]
+
+    def _evaluate(self, z: Array, v: Array, chosen: Sequence[int]) -> Array:
+        if not len(chosen):
+            return np.zeros((0, 2 * self.n + 3))
+        return _build_rows(self.structure, tuple(chosen)).at(z, v, self.geometry)[0]
+
+    def look(self, z: Array) -> tuple[Array, Array]:
+        """As `measure`, at one place: shape (N,) each [m]."""
+        gaps, ranges = self.structure.gaps.at(z, self.geometry)[0]
+        return gaps, ranges
 
     def measure(self, z: Array) -> tuple[Array, Array]:
         """Gaps of all pairs and how far inside their ranges they are, shape (m, N) each [m].
