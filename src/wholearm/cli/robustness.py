@@ -34,6 +34,8 @@ def add_robustness(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--vary", metavar="NAME=WIDTH", nargs="+", default=[], help=text)
     text = "of a sample-and-hold of the torques [Hz] (1000; 0: torques as planned)"
     parser.add_argument("--sample-rate", type=float, metavar="HZ", default=1000.0, help=text)
+    text = "of the simulations, relative to the scene's scales (1e-6)"
+    parser.add_argument("--tolerance", type=float, default=1e-6, help=text)
     text = "file to write results to, one by one (default: NAME_robustness.jsonl); a study that is "
     text += "there goes on where it was stopped"
     parser.add_argument("-o", "--output", metavar="FILE", help=text)
@@ -97,7 +99,7 @@ def _read_ranges(options: argparse.Namespace) -> Uncertainty:
         except ValueError:
             given = f"{text!r} given; NAME=WIDTH is needed, such as mass=0.1"
             raise InputError("", "--vary", given) from None
-    return Uncertainty(widths, options.sample_rate or None)
+    return Uncertainty(widths, options.sample_rate or None, options.tolerance)
 
 
 def _choose_executor(options: argparse.Namespace) -> Callable[[], Executor] | None:

@@ -27,6 +27,8 @@ STANDING = 1e-9
 CHATTER = 1e-6
 """Speed of impacts below which they count as the last one, relative to the scene's: what is closed
 and parts more slowly is pressed together again before it is apart by more than rounding."""
+COARSE = 100.0
+"""The same over the tolerance, where that is coarser than impacts need."""
 BURST = 3e-4
 """Time, relative to the scene's, in which `MANY` impacts raise `CHATTER` tenfold, and twice as many
 a hundredfold: fingers may knock an object to and fro for ever."""
@@ -120,7 +122,8 @@ class Run:
             if event.time < since:
                 break
             recent += event.kind is EventKind.IMPACT
-        return CHATTER * self.system.scales.speed * 10.0 ** min(recent // MANY, 2)
+        least = max(CHATTER, COARSE * self.tolerance)
+        return least * self.system.scales.speed * 10.0 ** min(recent // MANY, 2)
 
     @property
     def end(self) -> float:

@@ -183,6 +183,7 @@ def _stamp(trial: Trial, samples: int, seed: int) -> dict[str, Any]:
         "phases": [own.phase for own in trial.windows],
         "widths": trial.uncertainty.widths,
         "sample_rate": trial.uncertainty.sample_rate,
+        "tolerance": trial.uncertainty.tolerance,
         "samples": samples,
         "seed": seed,
     }

@@ -101,12 +101,14 @@ class Trial:
         """The same for numbers that are off by `changes`, torques sampled and held at a rate."""
         torque = change_torques(self.torque, changes, rate, offset)
         try:
-            simulation = self.simulate(changes, torque)
+            simulation = self.simulate(changes, torque, self.uncertainty.tolerance)
         except (InputError, SimulationError) as error:
             return {"ended": str(error), "reached": False, "kept": False, "lost": "start"}
         return self.judge(simulation, changes.get("delay", 0.0))
 
-    def simulate(self, changes: Mapping[str, float], torque: TorqueProfile) -> FreeSimulation:
+    def simulate(
+        self, changes: Mapping[str, float], torque: TorqueProfile, tolerance: float = 1e-9
+    ) -> FreeSimulation:
         """Replay torques in the scene whose numbers are off, free of assumptions.
 
         Raises
@@ -119,7 +121,7 @@ class Trial:
         closed = close_fingers(problem.scene, x, self.state[2:3])
         if text := describe_obstacle(closed):
             raise SimulationError(f"the hand cannot close at the start: {text}")
-        return simulate_free(problem, torque, start=closed.z[0])
+        return simulate_free(problem, torque, start=closed.z[0], tolerance=tolerance)
 
     def judge(self, simulation: FreeSimulation, delay: float = 0.0) -> dict[str, Any]:
         """Compare a motion with the plan; as `run`."""

@@ -52,6 +52,8 @@ PARAMETERS = (
 )
 """All that can be varied. A delay is never negative: its range is [0, half width]."""
 
+TOLERANCE = 1e-6
+"""Of the simulations of samples, if no other is given, relative to the scene."""
 NAMES = tuple(parameter.name for parameter in PARAMETERS)
 GROUPS: Mapping[str, tuple[str, ...]] = {
     "friction": ("friction_palm", "friction_finger1", "friction_finger2"),
@@ -72,6 +74,8 @@ class Uncertainty:
     sample_rate : float or None, [Hz]
         Of a sample-and-hold of the torques, whose first sample is anywhere in a period; None for
         torques as planned.
+    tolerance : float
+        Of the simulations of samples, relative to the scene: far below what counts as the goal.
 
     Raises
     ------
@@ -82,6 +86,7 @@ class Uncertainty:
 
     widths: Mapping[str, float] = field(default_factory=dict)
     sample_rate: float | None = 1000.0
+    tolerance: float = TOLERANCE
 
     def __post_init__(self) -> None:
         widths = {parameter.name: parameter.default for parameter in PARAMETERS}
