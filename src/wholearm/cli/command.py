@@ -30,6 +30,7 @@ from .bench import add_bench, name_study
 from .compare import compare
 from .engines import add_export, add_replay
 from .map import draw, protect
+from .new import add_new, add_schema
 from .overlay import overlay
 from .predict import predict
 from .progress import clear_progress, show_progress
@@ -98,6 +99,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     for name, add, run, text in (
+        ("new", add_new, None, "write a problem file to begin with"),
+        ("schema", add_schema, None, "print the JSON Schema of problem files, for editors"),
         ("solve", add_solve, _solve, "plan joint torques for a problem file"),
         ("verify", add_verify, _verify, "replay torques open loop and check the motion"),
         ("plot", add_plot, _plot, "draw force margins, torques and snapshots"),

@@ -1,0 +1,54 @@
+"""The commands ``wholearm new`` and ``wholearm schema``: for those who write problem files."""
+
+from __future__ import annotations
+
+import argparse
+import os
+
+
+def add_new(parser: argparse.ArgumentParser) -> None:
+    """Add what `new` takes."""
+    parser.add_argument("name", help="the problem's name; NAME.toml is written")
+    text = "corners of the regular polygon, 3 to 50 (7)"
+    parser.add_argument("--polygon", type=int, default=7, metavar="CORNERS", help=text)
+    text = "from its centre to its corners [m] (0.05)"
+    parser.add_argument("--size", type=float, default=0.05, help=text)
+    text = "of the object [kg] (0.2 at a size of 0.05 m, growing with the area)"
+    parser.add_argument("--mass", type=float, help=text)
+    parser.set_defaults(run=_write)
+
+
+def add_schema(parser: argparse.ArgumentParser) -> None:
+    """Add what `schema` takes."""
+    parser.add_argument("-o", "--output", metavar="FILE", help="file to write, instead of printing")
+    parser.set_defaults(run=_show_schema)
+
+
+def _write(options: argparse.Namespace) -> int:
+    from ..common.errors import InputError
+    from ..common.files import require_writable, write_text
+    from ..mapping.template import write_template
+
+    output = f"{options.name.removesuffix('.toml')}.toml"
+    require_writable(output)
+    if os.path.exists(output):
+        raise InputError(output, "", "is there already; choose another name")
+    name = os.path.splitext(os.path.basename(output))[0]
+    write_text(output, write_template(name, options.polygon, options.size, options.mass))
+    print(f"wrote {output}; next: wholearm solve {output}")
+    return 0
+
+
+def _show_schema(options: argparse.Namespace) -> int:
+    from importlib import resources
+
+    from ..common.files import require_writable, write_text
+
+    text = resources.files("wholearm.problem").joinpath("schema.json").read_text(encoding="utf-8")
+    if options.output is None:
+        print(text, end="")
+        return 0
+    require_writable(options.output)
+    write_text(options.output, text)
+    print(f"wrote {options.output}")
+    return 0
