@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import argparse
 import copy
+import dataclasses
 import json
 import os
 import re
@@ -19,6 +21,7 @@ from shipped import BOX, HEPTAGON, IMPACTS, plan_of, solved
 from tipping import scale, tipped
 from wholearm.cli.command import build_parser, main
 from wholearm.cli.summary import summarise
+from wholearm.planning.options import PlanOptions
 from wholearm.results.torque_table import format_rows, place_rows
 from wholearm.results.trajectory import Trajectory
 from wholearm.results.trajectory_file import load_trajectory
@@ -637,3 +640,36 @@ def test_a_closed_pipe_is_no_traceback(folder: Path) -> None:
     process.stderr.close()
     assert process.wait() == 1
     assert Path("a.npz").exists()
+
+
+def list_parsers(parser: argparse.ArgumentParser) -> list[argparse.ArgumentParser]:
+    inner = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    own = [parser] if not inner else []
+    return own + [q for action in inner for p in action.choices.values() for q in list_parsers(p)]
+
+
+def test_help_shows_every_default() -> None:
+    missing = [
+        f"{parser.prog} {action.option_strings[0]}"
+        for parser in list_parsers(build_parser())
+        for action in parser._actions
+        if action.option_strings and action.nargs != 0 and action.type in (int, float)
+        # Those that select something have none, and say in their text what is done without.
+        if "(" not in (action.help or "") and action.dest not in ("only", "restitution")
+    ]
+    assert missing == []
+    solve = next(p for p in list_parsers(build_parser()) if p.prog == "wholearm solve")
+    known = {action.dest: action.help or "" for action in solve._actions}
+    for own in dataclasses.fields(PlanOptions):
+        if isinstance(own.default, int | float | str) and not isinstance(own.default, bool):
+            (given,) = re.findall(r"\(([^()]*)\)$", known[own.name])
+            assert str(own.default) == given or float(given) == own.default
+
+
+def test_shells_complete(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["completion", "fish"]) == 2
+    assert "allowed are bash, zsh, tcsh" in capsys.readouterr().err
+    pytest.importorskip("shtab", reason="wholearm[completion] is not installed")
+    assert main(["completion", "bash"]) == 0
+    text = capsys.readouterr().out
+    assert "--time-weight" in text and "wholearm" in text

@@ -26,34 +26,32 @@ def add_solve(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("problem", help="problem file (TOML)")
     parser.add_argument("-o", "--output", help="trajectory file to write (default: NAME.npz)")
     parser.add_argument("--torques", metavar="FILE", help="also write the torques as CSV")
-    text = "write samples of the torques at this rate [Hz] instead, and what becomes of the motion"
+    text = "write samples at this rate [Hz] instead, and say what becomes of the motion (none)"
     parser.add_argument("--sample-rate", metavar="HZ", type=float, help=text)
-    text = "of samples: linear (the default), or hold for sample-and-hold"
+    text = "of samples: linear, or hold for sample-and-hold (linear)"
     parser.add_argument("--interpolation", help=text)
-    parser.add_argument(
-        "--objective", default="time", help="time, effort or margin (default: time)"
-    )
+    parser.add_argument("--objective", default="time", help="time, effort or margin (time)")
     text = "relative error of the objective below which refining ends (1e-4)"
     parser.add_argument("--accuracy", type=float, help=text)
-    text = "intervals of each phase along a curve, instead of as many as the accuracy needs"
+    text = "intervals of each phase along a curve (as many as the accuracy needs)"
     parser.add_argument("--intervals", type=int, help=text)
-    parser.add_argument("--duration", type=float, help="longest duration [s], for margin")
-    parser.add_argument("--time-weight", type=float, help="weight of time [(N m)^2], for effort")
-    parser.add_argument("--samples", type=int, help="rows per phase of the trajectory file")
-    parser.add_argument("--transcription", help="auto, or time for the time domain throughout")
-    parser.add_argument(
-        "--opening", type=float, help="least acceleration of contacts that are let go, over gravity"
-    )
-    parser.add_argument(
-        "--clearance",
-        type=float,
-        help="least gap of contacts that were let go, over the radius of gyration",
-    )
-    parser.add_argument(
-        "--time-intervals", type=int, help="intervals of a phase in the time domain"
-    )
-    parser.add_argument("--degree", type=int, help="collocation points of an interval there")
-    parser.add_argument("--scheme", help="radau (the default) or legendre points")
+    text = "longest duration, for margin [s] (twice the least time)"
+    parser.add_argument("--duration", type=float, help=text)
+    text = "weight of time, for effort [(N m)^2] (1)"
+    parser.add_argument("--time-weight", type=float, help=text)
+    text = "rows per phase of the trajectory file (201)"
+    parser.add_argument("--samples", type=int, help=text)
+    text = "auto, or time for the time domain throughout (auto)"
+    parser.add_argument("--transcription", help=text)
+    text = "least acceleration of contacts that are let go, over gravity (0.01)"
+    parser.add_argument("--opening", type=float, help=text)
+    text = "least gap of contacts that were let go, over the radius of gyration (5e-4)"
+    parser.add_argument("--clearance", type=float, help=text)
+    text = "intervals of a phase in the time domain (as many as the accuracy needs)"
+    parser.add_argument("--time-intervals", type=int, help=text)
+    text = "collocation points of an interval there (3)"
+    parser.add_argument("--degree", type=int, help=text)
+    parser.add_argument("--scheme", help="radau or legendre points (radau)")
     text = "keep the contact modes of the first plan that is found"
     parser.add_argument("--no-mode-search", dest="mode_search", action="store_false", help=text)
     text = "return the plan without replaying it"

@@ -28,6 +28,7 @@ from .arguments import (
 )
 from .bench import add_bench, name_study
 from .compare import compare
+from .completion import add_completion
 from .engines import add_export, add_replay
 from .map import draw, protect
 from .new import add_new, add_schema
@@ -118,6 +119,7 @@ def build_parser() -> argparse.ArgumentParser:
         ("robustness", add_robustness, None, "see how much error a plan bears"),
         ("animate", add_animate, None, "make a movie of a plan, or a page that plays it"),
         ("report", add_report, None, "put a problem and its plans into one page to open anywhere"),
+        ("completion", add_completion, None, "print what makes a shell complete all this"),
         ("bench", add_bench, None, "measure run time against error, or run the stress study"),
     ):
         own = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")

@@ -25,7 +25,7 @@ def add_export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("plan", nargs="?", help="trajectory file (.npz) that the model plays")
     text = "file to write (.xml): the scene in MuJoCo's format"
     parser.add_argument("--mjcf", metavar="FILE", required=True, help=text)
-    parser.add_argument("--step", type=float, help="time step of the model [s]")
+    parser.add_argument("--step", type=float, help="time step of the model [s] (from the scene)")
     parser.set_defaults(run=_export)
 
 
@@ -37,13 +37,13 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--engine", required=True, help=text)
     text = "from start to end, instead of phase by phase from each planned start"
     parser.add_argument("--whole", action="store_true", help=text)
-    parser.add_argument("--step", type=float, help="longest time step [s]")
+    parser.add_argument("--step", type=float, help="longest time step [s] (from the scene)")
     text = "softness of contacts, over the default, which is in proportion to the step (1)"
     parser.add_argument("--softness", type=float, help=text)
     text = "how far a replay may be from the plan, over the object's radius of gyration, and in rad"
     words = "3e-3 for mujoco, 1.5e-3 for drake"
     parser.add_argument("--departure", type=float, help=f"{text} ({words})")
-    text = "also replay with steps of a half, a quarter, ... to N halvings"
+    text = "also replay with steps of a half, a quarter, ... to N halvings (0)"
     parser.add_argument("--refine", type=int, metavar="N", default=0, help=text)
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
     parser.set_defaults(run=_replay)

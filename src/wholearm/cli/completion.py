@@ -1,0 +1,44 @@
+"""The command ``wholearm completion``: what makes a shell complete commands, options and files."""
+
+from __future__ import annotations
+
+import argparse
+
+from ..common.errors import InputError
+
+SHELLS = ("bash", "zsh", "tcsh")
+
+
+def add_completion(parser: argparse.ArgumentParser) -> None:
+    """Add what `completion` takes."""
+    parser.add_argument("shell", help="bash, zsh or tcsh; needs the extra completion")
+    parser.set_defaults(run=_print)
+
+
+def _print(options: argparse.Namespace) -> int:
+    if options.shell not in SHELLS:
+        raise InputError("", "shell", f"{options.shell!r} given; allowed are {', '.join(SHELLS)}")
+    try:
+        import shtab
+    except ImportError:
+        text = "is not installed; pip install 'wholearm[completion]' brings it"
+        raise InputError("", "shtab", text) from None
+    from .command import build_parser
+
+    parser = build_parser()
+    _complete_files(parser, shtab.FILE)
+    print(shtab.complete(parser, options.shell))
+    return 0
+
+
+def _complete_files(parser: argparse.ArgumentParser, files: object) -> None:
+    """Let all arguments that name files be completed so."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for own in action.choices.values():
+                _complete_files(own, files)
+        elif action.metavar in ("FILE", "PLAN") or action.dest in _FILES:
+            action.complete = files  # type: ignore[attr-defined]
+
+
+_FILES = {"problem", "plan", "trajectory", "torques", "files", "output"}
