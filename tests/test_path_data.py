@@ -14,14 +14,9 @@ from wholearm.contacts.formation import Formation
 from wholearm.geometry.curve import Curve
 from wholearm.mechanics.dynamics import PathForces, inverse
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.path_domain.data import (
-    PhaseData,
-    Places,
-    choose_sampling,
-    fit_torque,
-    prepare,
-)
+from wholearm.planning.path_domain.data import PhaseData, choose_sampling, prepare
 from wholearm.planning.path_domain.elements import Profile
+from wholearm.planning.path_domain.fitting import fit_torque
 from wholearm.planning.path_domain.mesh import Mesh
 from wholearm.planning.path_domain.motion import directions_of
 from wholearm.planning.path_domain.plan import plan_path
@@ -124,7 +119,7 @@ def test_a_planted_miss_is_found(
     ]
     C0 = data.checks.forces.C0.copy()
     C0[row, contact] -= here + 0.25
-    planted = data._replace(checks=Places(data.checks.forces._replace(C0=C0), data.checks.rates))
+    planted = data._replace(checks=data.checks._replace(forces=data.checks.forces._replace(C0=C0)))
     short, *_ = planted.misses(motion.profile, 0.0)
     interval = row // len(data.sampling.checks)
     # A parabola through the place and its neighbours may dip a little beyond it.

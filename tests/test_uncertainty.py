@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,14 +10,9 @@ import pytest
 from wholearm.common.errors import InputError
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import read_problem
+from wholearm.problem.uncertainty import NAMES, PARAMETERS
 from wholearm.results.torque import TorqueProfile
-from wholearm.robustness.uncertainty import (
-    NAMES,
-    PARAMETERS,
-    Uncertainty,
-    change_problem,
-    change_torques,
-)
+from wholearm.robustness.uncertainty import Uncertainty, change_problem, change_torques
 
 PROBLEM = Path(__file__).parents[1] / "problems" / "heptagon_four_contacts.toml"
 
@@ -62,7 +58,7 @@ def test_samples_come_from_the_seed() -> None:
             "range of weight: is unknown; allowed are friction, geometry, gain, mass",
         ),
         ({"mass": -0.1}, "range of mass: "),
-        ({"friction": 1.0}, "range of friction_palm: 1 given; a relative range is below 1"),
+        ({"friction": 1.0}, "range of friction: 1 given; a relative range is below 1"),
         ({"delay": float("nan")}, "range of delay: "),
     ],
 )
@@ -111,3 +107,27 @@ def test_torques_are_sampled_and_held(torque: TorqueProfile, offset: float) -> N
         np.testing.assert_allclose(
             held.at(within), np.tile(torque.at(ticks[ticks <= start][-1:]), (4, 1)), rtol=1e-12
         )
+
+
+def test_a_problem_brings_its_own_ranges(problem: Problem) -> None:
+    own = problem.with_(uncertainty={"friction": 0.2, "friction_palm": 0.3, "start_x": 5e-4})
+    assert own.table["uncertainty"] == own.uncertainty
+    widths = Uncertainty(own.uncertainty or {}).widths
+    expected = {"friction_palm": 0.3, "friction_finger2": 0.2, "start_x": 5e-4, "mass": 0.05}
+    assert {key: widths[key] for key in expected} == expected
+    assert replace(own, uncertainty=None).table == problem.table
+    assert replace(problem, uncertainty={"mass": 0.1}).table["uncertainty"] == {"mass": 0.1}
+
+
+@pytest.mark.parametrize(
+    "ranges, text",
+    [
+        ({"mas": 0.1}, "uncertainty.mas: unknown key; did you mean 'mass'? allowed are base1_x"),
+        ({"gain": 1}, "uncertainty.gain: 1 given; a relative range is below 1"),
+        ({"start_x": -1e-3}, "uncertainty.start_x: -0.001 is not a number >= 0"),
+        (0.1, "uncertainty: 0.1 is not a table"),
+    ],
+)
+def test_ranges_of_a_problem_are_checked(problem: Problem, ranges: object, text: str) -> None:
+    with pytest.raises(InputError, match=re.escape(text)):
+        problem.with_(uncertainty=ranges)

@@ -100,7 +100,7 @@ class Toy:
         flat = np.zeros((len(z), 2))
         # The segment's number stands in for the directions of its joints.
         Ta, Tl, Tv = self.law(z[:, 0], directions.sigma[:, 0] > 0)
-        return PathForces(none, none, none, one, flat, Ta, flat, Tl, Tv)
+        return PathForces(none, none, none, one, flat, Ta, flat, Tl, Tv, none)
 
 
 class _Point(tuple[Array, Array, Array]):

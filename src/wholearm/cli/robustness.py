@@ -15,6 +15,7 @@ from .progress import clear_progress, show_progress
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
+    from ..problem.definition import Problem
     from ..robustness.uncertainty import Uncertainty
 
 
@@ -28,7 +29,8 @@ def add_robustness(parser: argparse.ArgumentParser) -> None:
     text = "only this phase, from its planned start at rest (default: the whole plan)"
     parser.add_argument("--phase", type=int, metavar="K", help=text)
     text = (
-        "half widths of ranges: mass, inertia (0.05), friction (0.1), gain of the torques (0.01), "
+        "half widths of ranges, instead of the problem's: mass, inertia (0.05), friction (0.1), "
+        "gain of the torques (0.01), "
         "all relative; geometry, start_x (2e-4 m), delay (1e-3 s); 0 leaves a number as it is"
     )
     parser.add_argument("--vary", metavar="NAME=WIDTH", nargs="+", default=[], help=text)
@@ -65,12 +67,13 @@ def _robustness(options: argparse.Namespace) -> int:
 
         require_writable(options.figure)
         plots.require_format(options.figure)
+    problem = read_problem(options.problem)
     study = assess_robustness(
-        read_problem(options.problem),
+        problem,
         load_trajectory(options.plan),
         samples=options.samples,
         seed=options.seed,
-        uncertainty=_read_ranges(options),
+        uncertainty=_read_ranges(options, problem),
         phase=options.phase,
         path=output,
         fresh=options.fresh,
@@ -88,10 +91,12 @@ def _robustness(options: argparse.Namespace) -> int:
     return 0
 
 
-def _read_ranges(options: argparse.Namespace) -> Uncertainty:
+def _read_ranges(options: argparse.Namespace, problem: Problem) -> Uncertainty:
+    """The ranges of the problem or their defaults, and what is given in their place."""
+    from ..problem.uncertainty import read_widths, spread_widths
     from ..robustness.uncertainty import Uncertainty
 
-    widths = {}
+    widths: dict[str, float] = {}
     for text in options.vary:
         name, _, value = text.partition("=")
         try:
@@ -99,7 +104,8 @@ def _read_ranges(options: argparse.Namespace) -> Uncertainty:
         except ValueError:
             given = f"{text!r} given; NAME=WIDTH is needed, such as mass=0.1"
             raise InputError("", "--vary", given) from None
-    return Uncertainty(widths, options.sample_rate or None, options.tolerance)
+    known = read_widths(problem.uncertainty or {}) | spread_widths(widths, "range of {}")
+    return Uncertainty(known, options.sample_rate or None, options.tolerance)
 
 
 def _choose_executor(options: argparse.Namespace) -> Callable[[], Executor] | None:

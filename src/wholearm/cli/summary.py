@@ -6,9 +6,12 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from ..problem.uncertainty import PARAMETERS
+
 if TYPE_CHECKING:
     from ..planning.result import Plan
     from ..results.certificate import Certificate
+    from ..results.range_figures import RangeFigures
     from ..results.replay_figures import ReplayFigures
 
 
@@ -41,6 +44,7 @@ def summarise(plan: Plan, output: str, table: Mapping[str, Any] | None = None) -
     lines += _list_transitions(plan)
     lines += [_describe_replay(plan.replay)]
     lines += [] if plan.certificate is None else _list_bounds(plan.certificate)
+    lines += [] if plan.ranges is None else _describe_ranges(plan, plan.ranges)
     lines += _list_table(table) if table is not None else []
     lines += _describe_sureness(plan)
     value = f"{plan.status.value}: {plan.options.goal.value} = {plan.value:.6f} {plan.unit}"
@@ -75,6 +79,28 @@ def _describe_sureness(plan: Plan) -> list[str]:
         if phase.wedged
     ]
     return ["".join([text, *wedged])]
+
+
+def _describe_ranges(plan: Plan, ranges: RangeFigures) -> list[str]:
+    """What ranges cost, and how wide they may be."""
+    units = {own.name: own.unit for own in PARAMETERS}
+    radii = [
+        f"{name} {1e3 * radius:g} mm" if units[name] == "m" else f"{name} {100 * radius:g} %"
+        for name, radius in ranges.radii.items()
+        if radius and units[name] != "s"
+    ]
+    more = 100 * (plan.value / ranges.nominal - 1)
+    lines = [
+        f"within ranges of {', '.join(radii)}",
+        f"{more:+.1f} % of the {plan.options.goal.value} without ranges, {ranges.nominal:.6f} "
+        f"{plan.unit}",
+    ]
+    if ranges.largest is not None:
+        each = ", ".join("-" if own is None else f"{own:.3g}" for own in ranges.phases)
+        text = f"a plan exists for ranges {ranges.largest:.3g} times as wide as the problem's"
+        more_text = ", as wide as they make sense" if ranges.capped else ""
+        lines.append(f"{text}{more_text}; phase by phase {each}")
+    return lines
 
 
 def _list_bounds(certificate: Certificate) -> list[str]:

@@ -50,8 +50,9 @@ class Directions(NamedTuple):
 class PathForces(NamedTuple):
     """Forces along a curve, affine in a = s'', b = s'^2, the squeeze and the speed.
 
-    c = C0 + Ca a + Cb b + Cl lambda and tau = T0 + Ta a + Tb b + Tl lambda + Tv sqrt(b), with
+    c = C0 + Ca a + Cb b + Cl lambda + Cv sqrt(b), and the same with T for tau, with
     c = [c_n; c_t(rolling)] in N, tau in N m, lambda in N; arrays of shape (n, n_c + R) or (n, 2).
+    Contact forces themselves have no part Cv.
     """
 
     C0: Array
@@ -63,11 +64,13 @@ class PathForces(NamedTuple):
     Tb: Array
     Tl: Array
     Tv: Array
+    Cv: Array
 
     def c(self, a: Array, b: Array, squeeze: Array) -> Array:
         """Contact forces, shape (n, n_c + R) [N], for a, b and squeeze of shape (n,)."""
+        speed = np.sqrt(np.maximum(b, 0.0))[:, None]
         a, b, squeeze = a[:, None], b[:, None], squeeze[:, None]
-        return self.C0 + self.Ca * a + self.Cb * b + self.Cl * squeeze
+        return self.C0 + self.Ca * a + self.Cb * b + self.Cl * squeeze + self.Cv * speed
 
     def tau(self, a: Array, b: Array, squeeze: Array) -> Array:
         """Joint torques, shape (n, 2) [N m], for a, b and squeeze of shape (n,)."""
@@ -185,6 +188,7 @@ def inverse(
         Tb=mass[3:] * z_ss[:, 3:] - reaction(Cb),
         Tl=-reaction(null),
         Tv=scene.viscous[3:] * z_s[:, 3:],
+        Cv=np.zeros_like(C0),
     )
 
 

@@ -54,6 +54,8 @@ class MotionLimit:
         The single number whose change relaxes it.
     weight : ndarray, shape (r,)
         By how much its bounds give way per unit of that.
+    drags : bool
+        Whether its forces depend on the speed itself, and not only on its square.
     """
 
     kind: str
@@ -66,6 +68,7 @@ class MotionLimit:
     scale: float
     parameter: Parameter
     weight: Array
+    drags: bool = False
 
 
 @dataclass(frozen=True, eq=False)

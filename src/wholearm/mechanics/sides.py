@@ -45,7 +45,7 @@ class SideTerms(NamedTuple):
         return SideTerms(
             measure(forces.C0 @ of_c + forces.T0 @ of_tau) - bounds * scale,
             measure(forces.Cb @ of_c + forces.Tb @ of_tau),
-            measure(forces.Tv @ of_tau + rates @ of_rates),
+            measure(forces.Cv @ of_c + forces.Tv @ of_tau + rates @ of_rates),
             measure(forces.Ca @ of_c + forces.Ta @ of_tau),
             measure(forces.Cl @ of_c + forces.Tl @ of_tau),
         )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 from ..common.errors import InputError
 from ..common.require import require_number
 from ..mechanics.uniqueness import LEAST_MINOR, require_minor
+from ..problem.uncertainty import PARAMETERS, read_widths
 
 
 class Objective(Enum):
@@ -42,6 +44,8 @@ CLEARANCE = 5e-4
 class PlanOptions:
     """Options of the planner, each as `wholearm.solve` documents it.
 
+    `ranges` are the radii of a problem's ranges, by name, which `scale_ranges` fills in.
+
     Raises
     ------
     InputError
@@ -64,6 +68,9 @@ class PlanOptions:
     certify: bool = False
     accuracy: float = 1e-4
     least_minor: float = LEAST_MINOR
+    robust: float = 0.0
+    largest: bool = False
+    ranges: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         given = self.objective
@@ -84,10 +91,10 @@ class PlanOptions:
         if self.transcription not in ("auto", "time"):
             given = self.transcription
             raise InputError("", "transcription", f"{given!r} given; allowed are auto and time")
-        for key in ("replay", "mode_search", "certify"):
+        for key in ("replay", "mode_search", "certify", "largest"):
             if not isinstance(value := getattr(self, key), bool):
                 raise InputError("", key, f"{value!r} given; allowed are true and false")
-        for key in ("opening", "clearance"):
+        for key in ("opening", "clearance", "robust"):
             value = require_number(getattr(self, key), key, nonnegative=True)
             object.__setattr__(self, key, value)
         weight = require_number(self.time_weight, "time_weight", positive=True)
@@ -106,6 +113,22 @@ class PlanOptions:
 
         if self.certify and self.objective in (Objective.EFFORT, Objective.MARGIN):
             raise InputError("", "certify", "is for the objective time only")
+        if self.certify and self.robust:
+            raise InputError("", "certify", "does not go with robust: its bounds know of no ranges")
+        if self.largest and not self.robust:
+            raise InputError("", "largest", "is for robust plans only")
+
+    def scale_ranges(self, given: Mapping[str, float], factor: float | None = None) -> PlanOptions:
+        """The same with ranges of so many times a problem's own, or as many as `robust` says."""
+        factor = self.robust if factor is None else factor
+        ranges = (
+            {key: factor * width for key, width in read_widths(given).items()} if factor else {}
+        )
+        for own in PARAMETERS:
+            if not own.unit and ranges.get(own.name, 0.0) >= 1:
+                text = f"{factor:g} makes the range of {own.name} {ranges[own.name]:g}; a relative "
+                raise InputError("", "robust", text + "range is below 1")
+        return replace(self, ranges=ranges)
 
     @property
     def goal(self) -> Objective:

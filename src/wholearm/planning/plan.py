@@ -74,6 +74,11 @@ def solve(
         Whether contact modes are changed, in the time domain, for as long as that betters a plan.
     replay : bool, default True
         Whether to replay the plan, to refine what does not hold and to return only what does.
+    robust : float, default 0
+        Factor on the problem's ranges (`uncertainty`), within which all limits of contact forces
+        hold at the planned places and speeds, under the planned torques; with 0 they do not count.
+    largest : bool, default False
+        Whether to look for the largest such factor with which there is a plan.
     certify : bool, default False
         Whether to bound the least time along curves from below, for `time`.
     least_minor : float, default 0.1, below 1
@@ -102,6 +107,7 @@ def solve_with(
     """Plan with `options` given as one object; see `solve`."""
     require_phases(problem)
     report = progress or (lambda _: None)
+    options = options.scale_ranges(problem.uncertainty or {})
     with open_ledger() as ledger:
         started = time.perf_counter()
         report("tracing the phases")
@@ -121,6 +127,11 @@ def solve_with(
         replayed = time.perf_counter()
         transitions = _assess(planning, report)
         assessed = time.perf_counter()
+        ranges = None
+        if options.robust:
+            from .range_cost import assess_ranges
+
+            ranges = assess_ranges(planning, report)
         certificate = None
         if options.certify:
             from .certify import certify
@@ -152,6 +163,7 @@ def solve_with(
             "python": ".".join(map(str, sys.version_info[:3])),
         },
         certificate,
+        ranges,
     )
     return replace(plan, trajectory=replace(trajectory, meta=write_meta(plan)))
 

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from ..problem.definition import Problem
 from ..results.certificate import Certificate
 from ..results.modes import ModeSpan
+from ..results.range_figures import RangeFigures
 from ..results.replay_figures import ReplayFigures
 from ..results.report import LeastMinor
 from ..results.trajectory import Samples, Trajectory
@@ -132,6 +133,8 @@ class Plan:
         Of this package and those that it plans with.
     certificate : Certificate or None
         Lower bounds of the durations, if they were asked for.
+    ranges : RangeFigures or None
+        What ranges cost, for a robust plan.
     """
 
     problem: Problem
@@ -145,6 +148,7 @@ class Plan:
     timings: Timings
     versions: Mapping[str, str]
     certificate: Certificate | None = None
+    ranges: RangeFigures | None = None
 
     def __repr__(self) -> str:
         value = f"{self.options.goal.value} = {self.value:.6g} {self.unit}"

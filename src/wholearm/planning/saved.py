@@ -12,6 +12,7 @@ from ..problem.definition import Problem
 from ..problem.read import read_own_problem
 from ..results.certificate import Certificate
 from ..results.modes import ModeSpan
+from ..results.range_figures import RangeFigures
 from ..results.replay_figures import ReplayFigures
 from ..results.report import LeastMinor
 from ..results.trajectory import Trajectory
@@ -24,6 +25,7 @@ from .result import Plan, PlannedPhase, Status, Timings
 _OPTIONS = (
     "intervals", "transcription", "time_weight", "duration", "time_intervals", "degree", "scheme",
     "opening", "clearance", "samples", "mode_search", "certify", "accuracy", "least_minor",
+    "robust", "largest",
 )  # fmt: skip
 """Options that stand in `meta` by themselves; `objective` and `replay` do in other ways."""
 
@@ -60,6 +62,7 @@ def write_meta(plan: Plan) -> dict[str, Any]:
         "replay": None if plan.replay is None else plan.replay.to_dict(),
         "certificate": None if plan.certificate is None else plan.certificate.to_dict(),
         "timings": plan.timings._asdict(),
+        "ranges": None if plan.ranges is None else plan.ranges._asdict(),
     }
 
 
@@ -99,6 +102,7 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
     count = len(trajectory.motions)
     given = {name: meta[name] for name in _OPTIONS if name in meta}
     options = PlanOptions(meta["objective"], **given, replay=meta.get("replay") is not None)
+    options = options.scale_ranges(problem.uncertainty or {})
 
     def column(key: str, missing: Any) -> list[Any]:
         values = meta.get(key, [missing] * count)
@@ -134,7 +138,7 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
         for k in range(count)
     )
     replay, timings = meta.get("replay"), meta.get("timings", {})
-    certificate = meta.get("certificate")
+    certificate, ranges = meta.get("certificate"), meta.get("ranges")
     return Plan(
         problem,
         options,
@@ -147,4 +151,5 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
         Timings(*(float(timings.get(name, 0.0)) for name in Timings._fields)),
         dict(meta.get("versions", {})),
         None if certificate is None else Certificate.of(certificate),
+        None if ranges is None else RangeFigures(**ranges),
     )

@@ -18,6 +18,7 @@ from ..contacts.links import evaluate_finger_gap
 from ..scene.model import Scene
 from ..scene.ranges import TURN, check_epsilon, check_place, check_ranges
 from .definition import End, Phase, Problem, Until
+from .uncertainty import spread_widths
 
 
 @exclusive
@@ -34,6 +35,7 @@ def check_problem(problem: Problem) -> None:
     epsilon = require_number(problem.epsilon, "epsilon", nonnegative=True)
     check_ranges(problem.scene)
     check_epsilon(problem.scene, epsilon)
+    spread_widths(problem.uncertainty or {}, "uncertainty.{}")
     check_place(problem.scene, "start.x", float(require_vector(problem.start, "start", 5)[0]))
     for index, phase in enumerate(problem.phases):
         if phase.index != index:

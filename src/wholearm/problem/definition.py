@@ -114,6 +114,9 @@ class Problem:
     table : mapping
         The contents of that file, which trajectory files carry along; in step with the rest. Empty
         where no file can say it: the start has no edge flush on the palm.
+    uncertainty : mapping or None
+        Half widths of the ranges of what is not known exactly, by name; those that are left out
+        have their defaults, see `problem.uncertainty`. None where the problem does not say.
     checked : bool
         Whether it is known to be like one from a file; otherwise it is checked when it is made.
 
@@ -135,6 +138,7 @@ class Problem:
     phases: tuple[Phase, ...]
     source: str = ""
     table: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    uncertainty: Mapping[str, float] | None = None
     checked: bool = field(default=False, repr=False)
 
     def __post_init__(self) -> None:

@@ -25,13 +25,15 @@ from ..scene.polygon import Polygon
 from ..scene.ranges import TURN, check_place, check_ranges
 from .definition import End, Phase, Problem, Until
 from .table import name_keys
+from .uncertainty import GROUPS as PARAMETER_GROUPS
+from .uncertainty import NAMES as PARAMETER_NAMES
 
 _T = TypeVar("_T")
 
 ROLLING = " rolling"
 """Follows the name of a contact that rolls in a phase's `contacts`."""
 
-_OPTIONAL = {"name", "gravity", "fingers_collide", "phases"}
+_OPTIONAL = {"name", "gravity", "fingers_collide", "phases", "uncertainty"}
 _TOP = _OPTIONAL | {"epsilon", "object", "fingers", "friction", "start"}
 _OBJECT = {"vertices", "mass", "inertia"}
 _DEFAULTS = {"radius": 0.0, "viscous": 0.0, "dry": 0.0}
@@ -87,9 +89,9 @@ def _build_problem(table: Mapping[str, Any], source: str) -> Problem:
     if not isinstance(given, list):
         raise InputError("", "phases", f"{given!r} is not a list of [[phases]]")
     phases = tuple(_read_phase(scene, i, entry) for i, entry in enumerate(given))
-    return Problem(
-        table.get("name", "unnamed"), scene, table["epsilon"], start, phases, source, table
-    )
+    ranges = _read_ranges(table) if "uncertainty" in table else None
+    name = table.get("name", "unnamed")
+    return Problem(name, scene, table["epsilon"], start, phases, source, table, ranges)
 
 
 def read_own_problem(meta: Mapping[str, Any], source: str = "") -> Problem:
@@ -127,6 +129,12 @@ def _read_scene(table: Mapping[str, Any]) -> Scene:
         table.get("gravity", 9.81),
         table.get("fingers_collide", True),
     )
+
+
+def _read_ranges(table: Mapping[str, Any]) -> Mapping[str, float]:
+    given = _table(table, "uncertainty")
+    _check_keys(given, "uncertainty", {*PARAMETER_GROUPS, *PARAMETER_NAMES}, required=set())
+    return given
 
 
 def _read_finger(fingers: Mapping[str, Any], key: str) -> Finger:

@@ -137,6 +137,7 @@ def match_table(problem: Problem) -> Mapping[str, Any]:
     if not table:
         return table
     known = {"name": problem.name, "epsilon": problem.epsilon} | describe_scene(problem.scene)
+    known["uncertainty"] = _to_plain(problem.uncertainty)
     differing = {key: value for key, value in known.items() if not _agrees(table, key, value)}
     start = _match_start(table["start"], problem)
     if start is None:
@@ -164,6 +165,8 @@ def write_table(problem: Problem) -> Mapping[str, Any]:
         "start": start,
         "phases": [_match_phase([], phase) for phase in problem.phases],
     }
+    if problem.uncertainty is not None:
+        table["uncertainty"] = _to_plain(problem.uncertainty)
     for key, value in describe_scene(problem.scene).items():
         _set(table, key, value)
     return table

@@ -107,7 +107,7 @@ def assess_robustness(
     seed : int
         Of the samples, a Latin hypercube of all ranges.
     uncertainty : Uncertainty, optional
-        The ranges; their defaults if left out.
+        The ranges; those of the problem, or their defaults, if left out.
     phase : int, optional
         Number of the only phase that is tried, from its planned start at rest.
     path : path, optional
@@ -128,7 +128,7 @@ def assess_robustness(
         raise InputError("", "plan", "torques alone given; a plan with its motion is needed")
     if isinstance(samples, bool) or not isinstance(samples, int) or samples < 1:
         raise InputError("", "samples", f"{samples!r} given; allowed are 1 and more")
-    own = uncertainty or Uncertainty()
+    own = uncertainty or Uncertainty(problem.uncertainty or {})
     trial = make_trial(problem, trajectory, own, phase)
     drawn = own.draw(samples, seed)
     stamp = _stamp(trial, samples, seed)

@@ -8,59 +8,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InputError
 from ..common.require import require_number
 from ..problem.definition import Problem
+from ..problem.uncertainty import PARAMETERS, Parameter, read_widths
 from ..results.torque import TorqueProfile
 from ..scene.model import Friction
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """A number of a problem that may be off, or one of its torques.
-
-    Attributes
-    ----------
-    name : str
-    default : float
-        Half width of its range.
-    unit : str
-        Of the half width; empty for a relative one.
-    """
-
-    name: str
-    default: float
-    unit: str = ""
-
-
-PARAMETERS = (
-    Parameter("mass", 0.05),
-    Parameter("inertia", 0.05),
-    Parameter("friction_palm", 0.1),
-    Parameter("friction_finger1", 0.1),
-    Parameter("friction_finger2", 0.1),
-    Parameter("length1", 2e-4, "m"),
-    Parameter("length2", 2e-4, "m"),
-    Parameter("base1_x", 2e-4, "m"),
-    Parameter("base1_y", 2e-4, "m"),
-    Parameter("base2_x", 2e-4, "m"),
-    Parameter("base2_y", 2e-4, "m"),
-    Parameter("start_x", 2e-4, "m"),
-    Parameter("gain1", 0.01),
-    Parameter("gain2", 0.01),
-    Parameter("delay", 1e-3, "s"),
-)
-"""All that can be varied. A delay is never negative: its range is [0, half width]."""
-
 TOLERANCE = 1e-6
 """Of the simulations of samples, if no other is given, relative to the scene."""
-NAMES = tuple(parameter.name for parameter in PARAMETERS)
-GROUPS: Mapping[str, tuple[str, ...]] = {
-    "friction": ("friction_palm", "friction_finger1", "friction_finger2"),
-    "geometry": ("length1", "length2", "base1_x", "base1_y", "base2_x", "base2_y"),
-    "gain": ("gain1", "gain2"),
-}
-"""Names that stand for several."""
 
 
 @dataclass(frozen=True)
@@ -89,20 +45,9 @@ class Uncertainty:
     tolerance: float = TOLERANCE
 
     def __post_init__(self) -> None:
-        widths = {parameter.name: parameter.default for parameter in PARAMETERS}
-        for key, value in self.widths.items():
-            if key not in (*NAMES, *GROUPS):
-                allowed = ", ".join((*GROUPS, *NAMES))
-                raise InputError("", f"range of {key}", f"is unknown; allowed are {allowed}")
-            for name in GROUPS.get(key, (key,)):
-                widths[name] = require_number(value, f"range of {key}", nonnegative=True)
-        for parameter in PARAMETERS:
-            if not parameter.unit and widths[parameter.name] >= 1:
-                given = f"{widths[parameter.name]:g} given; a relative range is below 1"
-                raise InputError("", f"range of {parameter.name}", given)
+        object.__setattr__(self, "widths", read_widths(self.widths, "range of {}"))
         if self.sample_rate is not None:
             require_number(self.sample_rate, "sample rate", positive=True)
-        object.__setattr__(self, "widths", widths)
 
     @property
     def varied(self) -> tuple[Parameter, ...]:

@@ -6,27 +6,22 @@ there, so polynomials through the knots give them at all places where limits are
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ...common.errors import JammingError, SolverError
+from ...common.errors import JammingError
 from ...common.minima import find_minima
 from ...common.shortfalls import Parameter
 from ...geometry.curve import Curve, describe_pose
 from ...mechanics.dynamics import PathForces, inverse, reduced_inertia
-from ...mechanics.limits import PRESS, SPEED, TORQUE, LimitSet, make_limits
-from ...results.torque import TorqueProfile
+from ...mechanics.limits import CONE, PRESS, SPEED, TORQUE, LimitSet, make_limits
+from ..robust.rows import Spread, spread_limits
 from .elements import Elements, Grid, Profile
-from .motion import PathMotion, directions_of
-
-TORQUE_ERROR = 5e-7
-"""Largest error of the torque's polynomials between the knots, over the torque limit."""
-PLACES = 13
-"""Places that they go through where that is exceeded."""
+from .motion import directions_of
 
 
 class Sampling(NamedTuple):
@@ -37,14 +32,25 @@ class Sampling(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Forces and rates of the joints, d theta / ds with shape (n, 2), at n places of a curve."""
+    """Forces and rates of the joints, d theta / ds with shape (n, 2), at n places of a curve.
+
+    And what ranges change of the force limits there (`robust.rows`), with none in it if there are
+    no ranges.
+    """
 
     forces: PathForces
     rates: Array
+    swings: Array
 
     def pick(self, rows: Any) -> Places:
         """Return the places that `rows` indexes."""
-        return Places(PathForces(*(part[rows] for part in self.forces)), self.rates[rows])
+        forces = PathForces(*(part[rows] for part in self.forces))
+        return Places(forces, self.rates[rows], self.swings[rows])
+
+    def map(self, change: Callable[[Array], Array]) -> Places:
+        """The same with every table changed."""
+        forces = PathForces(*map(change, self.forces))
+        return Places(forces, change(self.rates), change(self.swings))
 
 
 class LimitTerms(NamedTuple):
@@ -77,6 +83,8 @@ class PhaseData(NamedTuple):
         At the knots of every solid interval, interval by interval.
     checks : Places
         At the checks of every solid interval, interval by interval.
+    spread : Spread or None
+        What ranges make of the force limits, if there are any.
     """
 
     curve: Curve
@@ -88,6 +96,7 @@ class PhaseData(NamedTuple):
     sampling: Sampling
     knots: Places
     checks: Places
+    spread: Spread | None = None
 
     @property
     def nonempty(self) -> NDArray[np.int64]:
@@ -113,7 +122,7 @@ class PhaseData(NamedTuple):
             forces.Ca @ of_c + forces.Ta @ of_tau,
             forces.Cb @ of_c + forces.Tb @ of_tau,
             forces.Cl @ of_c + forces.Tl @ of_tau,
-            forces.Tv @ of_tau + self.nodes.rates @ of_rates,
+            forces.Cv @ of_c + forces.Tv @ of_tau + self.nodes.rates @ of_rates,
         )
 
     def evaluate(self, places: Places, profile: Profile) -> Array:
@@ -122,6 +131,10 @@ class PhaseData(NamedTuple):
         values = places.forces.c(*profile) @ of_c + places.forces.tau(*profile) @ of_tau
         if of_rates.any():
             values += places.rates * np.sqrt(profile.b)[:, None] @ of_rates
+        if self.spread is not None:
+            least = self.spread.evaluate(places.forces, places.swings, profile)
+            rows = self.limits.of(PRESS, CONE)
+            values[:, rows] = np.repeat(least, len(rows) // least.shape[1], axis=1)
         return np.asarray(values)
 
     def slack(self, places: Places, profile: Profile, margin: float = 0.0) -> Array:
@@ -189,8 +202,12 @@ class PhaseData(NamedTuple):
         return table
 
 
-def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
+def prepare(
+    curve: Curve, epsilon: float, grid: Grid, phase: int, spread: Spread | None = None
+) -> PhaseData:
     """Evaluate a curve's forces at the nodes of a grid and between them.
+
+    With a `spread`, force limits are those for all ranges.
 
     Raises
     ------
@@ -213,7 +230,10 @@ def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
             f"friction makes the reduced inertia {inertia[worst]:.3g} of its frictionless value"
         )
     forces = inverse(formation, *point[:3], directions, point.kinematics)
-    every = Places(forces, point.z_s[:, 3:])
+    swings = np.zeros((len(s), 0))
+    if spread is not None:
+        swings = spread.find_swings(formation, point, directions, forces, epsilon)
+    every = Places(forces, point.z_s[:, 3:], swings)
     own = len(grid.s) + np.arange(len(between)).reshape(len(nonempty), -1)
     order = np.hstack([nonempty[:, None], own, nonempty[:, None] + 1])
     knots = every.pick(order.ravel())
@@ -225,15 +245,26 @@ def prepare(curve: Curve, epsilon: float, grid: Grid, phase: int) -> PhaseData:
 
     def interpolate(values: Array) -> Array:
         table = values.reshape(len(nonempty), len(sampling.knots), -1)
-        return (through @ table).reshape(len(nonempty) * len(sampling.checks), -1)
+        count = len(nonempty) * len(sampling.checks)
+        return (through @ table).reshape(count, *values.shape[1:])
 
-    checks = Places(
-        PathForces(*(interpolate(part) for part in knots.forces)), interpolate(knots.rates)
-    )
-    nodes = every.pick(slice(None, len(grid.s)))
+    nodes, checks = every.pick(slice(None, len(grid.s))), knots.map(interpolate)
     limits = make_limits(formation, epsilon)
+    if spread is not None:
+        limits = spread_limits(limits)
+        steps = sampling.checks * grid.steps[nonempty, None]
+        inside = (grid.s[nonempty, None] + steps).ravel()
+        owners = np.repeat(grid.segment[nonempty], len(sampling.checks))
+        nodes = _widen(spread, nodes, grid.s, grid.segment)
+        checks = _widen(spread, checks, inside, owners)
     kept = limits.without(SPEED), limits.only(SPEED)
-    return PhaseData(curve, epsilon, *kept, grid, nodes, sampling, knots, checks)
+    return PhaseData(curve, epsilon, *kept, grid, nodes, sampling, knots, checks, spread)
+
+
+def _widen(spread: Spread, places: Places, s: Array, segment: NDArray[np.int64]) -> Places:
+    """Places with forces for the limits within ranges too."""
+    signs = spread.pick_signs(s, segment)
+    return places._replace(forces=spread.extend(places.forces, places.swings, signs))
 
 
 def join(parts: Sequence[PhaseData]) -> PhaseData:
@@ -255,7 +286,8 @@ def join(parts: Sequence[PhaseData]) -> PhaseData:
     def stack(places: Sequence[Places]) -> Places:
         columns = zip(*(own.forces for own in places), strict=True)
         forces = PathForces(*(np.concatenate(column) for column in columns))
-        return Places(forces, np.concatenate([own.rates for own in places]))
+        tables = ([own.rates for own in places], [own.swings for own in places])
+        return Places(forces, *map(np.concatenate, tables))
 
     return parts[0]._replace(
         grid=Grid(
@@ -285,45 +317,3 @@ def choose_sampling(nodes: int) -> Sampling:
     knots, checks = (5, 25) if nodes > 64 else (9, 33)
     angles = np.linspace(0.0, np.pi, checks)
     return Sampling(np.linspace(0.0, 1.0, knots), (1 - np.cos(angles)) / 2)
-
-
-class StalledError(SolverError):
-    """The motion takes no time, or for ever, between two nodes: the grid is too coarse."""
-
-
-def fit_torque(data: PhaseData, motion: PathMotion) -> tuple[TorqueProfile, float]:
-    """Torque of a motion as one polynomial in time per interval, through its values at the knots.
-
-    Where that misses the torque between the knots, it goes through more places. Also returns the
-    integral of tau^T tau [(N m)^2 s].
-
-    Raises
-    ------
-    StalledError
-        If the motion takes no time, or for ever, between two nodes.
-    """
-    knots, checks = data.sampling
-    torque = _fit(data, motion, data.knots, knots)
-    times = motion.times[data.nonempty, None] + motion.durations(checks)
-    wanted = data.checks.forces.tau(*data.interpolate(motion.profile, checks))
-    inner = np.tile((checks > 0) & (checks < 1), len(data.nonempty))
-    misfit = torque.at(times.ravel()[inner]) - wanted[inner]
-    if np.abs(misfit / data.torque_limit).max() > TORQUE_ERROR:
-        every = (len(checks) - 1) // (PLACES - 1)
-        rows = np.tile(np.arange(len(checks)) % every == 0, len(data.nonempty))
-        torque = _fit(data, motion, data.checks.pick(rows), checks[::every])
-    return torque, torque.integrate_squares()
-
-
-def _fit(data: PhaseData, motion: PathMotion, places: Places, fractions: Array) -> TorqueProfile:
-    """Polynomials through the torques at `fractions` of every solid interval."""
-    k = data.nonempty
-    values = places.forces.tau(*data.interpolate(motion.profile, fractions))
-    spans = motion.durations(fractions)
-    if motion.stalls or not (np.diff(spans, axis=1) > 0).all():
-        raise StalledError("the motion all but stops between two nodes; plan with more intervals")
-    x = 2 * spans / spans[:, -1:] - 1
-    vandermonde = x[..., None] ** np.arange(len(fractions))
-    coefficients = np.linalg.solve(vandermonde, values.reshape(len(k), len(fractions), 2))
-    breaks = np.append(motion.times[k], motion.times[-1])
-    return TorqueProfile(breaks, np.asarray(coefficients.transpose(0, 2, 1), dtype=float))

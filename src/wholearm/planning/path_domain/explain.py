@@ -31,9 +31,10 @@ from ..advice import (
     succeeds,
 )
 from ..options import Objective
-from .data import PhaseData, cut, fit_torque, join
+from .data import PhaseData, cut, join
 from .elements import Profile
 from .fastest import is_hopeless
+from .fitting import fit_torque
 from .motion import PathMotion
 from .nlp import (
     Relaxation,

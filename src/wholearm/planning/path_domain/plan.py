@@ -19,9 +19,12 @@ from ...geometry.curve import Curve
 from ..advice import describe_changes, find_changes, name_phases
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
-from .data import PhaseData, StalledError, join
+from ..robust.rows import Guide
+
+from .data import PhaseData, join
 from .fastest import is_hopeless
 from .first_guess import guess_slowly
+from .fitting import StalledError
 from .misses import MISS, ROUNDS
 from .motion import PathMotion
 from .rounds import Plans, Round
@@ -34,6 +37,8 @@ _AGAIN = 3
 """Most times that limits are tightened, each on a mesh that is finer than the one before."""
 _FINER = (1, 2, 4)
 """Elements to try, over those that are asked for."""
+_SPREADS = 3
+"""Most plans within ranges, each with rows for the speed of the one before."""
 _WASTED = 0.02
 """Share of the accuracy that limits may cost by being tightened more than they need."""
 _ROUGH = 1e-2
@@ -62,6 +67,12 @@ class _Solved(NamedTuple):
 
     plans: Plans
     round_: Round
+
+    @property
+    def guides(self) -> tuple[Guide, ...]:
+        """The motion along each curve."""
+        motions = [plan.motion for plan in self.plans]
+        return tuple(Guide(own.grid.s, *own.profile) for own in motions)
 
 
 def plan_path(
@@ -109,14 +120,15 @@ def plan_curves(
     SolverError
         If the solver stops without an answer.
     """
-    task = Task(curves, epsilon, options, phases, duration)
+    task, guides = Task(curves, epsilon, options, phases, duration), tuple[Guide, ...]()
 
     def replan(changed: Sequence[Curve], least: float) -> object:
         changes = replace(task, curves=changed, epsilon=least, options=_roughen(options))
+        changes = replace(changes, guides=guides)
         return _insist(_plan_finer(changes, insist=False))
 
     try:
-        found = _plan_finer(task)
+        found, guides = _plan_within(task)
     except JammingError as jam:
         if not explained or len(curves) > 1:
             raise
@@ -134,15 +146,39 @@ def plan_curves(
     if options.goal is Objective.MARGIN and found.plans[0].value < task.lost:
         least = SolverError(f"{task.name}: the margin found is below epsilon")
         raise _explain_duration(task) or least
-    return found.plans if options.goal is Objective.TIME else _leave_rest(task, found)
+    return found.plans if options.goal is Objective.TIME else _leave_rest(found)
 
 
-def _leave_rest(task: Task, found: _Solved) -> Plans:
+def _plan_within(task: Task) -> tuple[_Solved | _Stuck, tuple[Guide, ...]]:
+    """Plan within the ranges that there are, from the plan without them on; also near what.
+
+    Rows are those for the speed of the plan before. What other signs than theirs would miss is
+    tightened, and where that costs more than it may, the next plan has better ones.
+    """
+    options = task.options
+    if not options.ranges:
+        return _plan_finer(task), ()
+    bare = replace(_roughen(options), ranges={})
+    found, guides = _plan_finer(replace(task, options=bare)), tuple[Guide, ...]()
+    best: _Solved | None = None
+    for _ in range(_SPREADS):
+        if isinstance(found, _Stuck):
+            break
+        guides = found.guides
+        found = _plan_finer(replace(task, guides=guides))
+        if isinstance(found, _Solved):
+            best = found
+            if found.plans[0].error <= options.accuracy:
+                break
+    return best or found, guides
+
+
+def _leave_rest(found: _Solved) -> Plans:
     """The plans, or others with a start that friction cannot hold, if it can hold theirs.
 
     Those of least time push off as hard as limits allow.
     """
-    plans = found.plans
+    plans, task = found.plans, found.round_.task
     data, margin = found.round_.parts[0], 0.0
     if task.options.goal is Objective.MARGIN:
         margin = plans[0].value - task.epsilon

@@ -10,10 +10,11 @@ import numpy as np
 from ...common.arrays import Array
 from ..options import Objective
 from ..phase_plan import PhasePlan
-from .data import PhaseData, cut, fit_torque
+from .data import PhaseData, cut
 from .elements import Elements
 from .fastest import Fastest, find_fastest
 from .first_guess import guess
+from .fitting import fit_torque
 from .mesh import MOST, SHIFTED, Mesh, adapt
 from .misses import Misses, PathSolution, anticipate, price
 from .motion import PathMotion

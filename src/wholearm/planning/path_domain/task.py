@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from ...geometry.curve import Curve
 from ..advice import name_phases
 from ..options import Objective, PlanOptions
+from ..robust.rows import Guide, Spread, spread
 from .data import PhaseData, join, prepare
 from .elements import DEGREE
 from .mesh import SOFT, START, Mesh, find_ends
@@ -26,7 +28,7 @@ EARLY = 1e-5
 
 @dataclass(frozen=True)
 class Task:
-    """What is planned: see `plan_curves`."""
+    """What is planned: see `plan_curves`; with ranges, near `guides`, one for each curve."""
 
     curves: Sequence[Curve]
     epsilon: float
@@ -34,6 +36,15 @@ class Task:
     phases: Sequence[int]
     duration: float | None
     start: SureStart | None = None
+    guides: tuple[Guide, ...] = ()
+
+    @cached_property
+    def spreads(self) -> list[Spread | None]:
+        """What ranges make of the force limits of each curve."""
+        if not self.guides:
+            return [None] * len(self.curves)
+        pairs = zip(self.curves, self.guides, strict=True)
+        return [spread(curve, self.epsilon, self.options.ranges, own) for curve, own in pairs]
 
     @property
     def name(self) -> str:
@@ -96,5 +107,5 @@ class Task:
         found, last = [], len(meshes) - 1
         for k, (curve, mesh) in enumerate(zip(self.curves, meshes, strict=True)):
             grid = mesh.make_grid(curve, elements, (k == 0, k == last))
-            found.append(prepare(curve, self.epsilon, grid, self.phases[k]))
+            found.append(prepare(curve, self.epsilon, grid, self.phases[k], self.spreads[k]))
         return found

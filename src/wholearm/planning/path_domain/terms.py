@@ -69,12 +69,13 @@ class LimitShape(NamedTuple):
         """The shape of a set of limits."""
         rows, signs, _ = limits.sides
         known = [part.any(axis=1) for part in limits.columns[1:]]
+        drags = np.array([limits.limits[k].drags for k in limits.owners])
         return LimitShape(
             len(limits.low),
             tuple(zip(rows.tolist(), signs.tolist(), strict=True)),
             tuple(limits.of(PRESS).tolist()),
             tuple(limits.of(TORQUE).tolist()),
-            tuple(np.flatnonzero(known[0] | known[1]).tolist()),
+            tuple(np.flatnonzero(known[0] | known[1] | drags).tolist()),
         )
 
 

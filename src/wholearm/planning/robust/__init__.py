@@ -1,0 +1,1 @@
+"""Ranges of numbers that are not known exactly, as limits of a plan."""

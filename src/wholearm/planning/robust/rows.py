@@ -1,0 +1,251 @@
+"""Limits of contact forces that hold whatever numbers are within their ranges, along curves.
+
+With the radius r_p of each range, a force limit h c >= low becomes, at the same s and s' and under
+the same torques,
+
+    h c - sum over p of |d(h c - low)/dp| r_p >= low.
+
+What is inside the bars is affine in 1, a = s'', b = s'^2, the squeeze and s' (`sensitivities`): the
+swings. So the left side is the least of rows that are affine too, one for each choice of signs. At
+a place with a known b, what all of them allow is a polygon of a and the squeeze. A fastest motion
+is in its corner with the largest a or in the one with the least. The rows that meet in these two
+are found by adding, corner by corner, the row that is missed most. They are `COPIES` rows for each
+limit, which all that knows of limits takes like any others; the bars themselves are what
+`PhaseData` evaluates, so that tightening makes up for signs that are others in between.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...common.arrays import Array
+from ...contacts.formation import Formation
+from ...geometry.curve import Curve, CurvePoint
+from ...mechanics.dynamics import Directions, PathForces, inverse
+from ...mechanics.limits import CONE, PRESS, SPEED, LimitSet, make_limits
+from ...mechanics.sides import SideTerms
+from ...problem.uncertainty import PARAMETERS
+from ..lower_bound.rows import Rows, eliminate
+from .sensitivities import COUNT, find_force_slopes
+
+COPIES = 5
+"""Rows for each force limit: two for each corner, and one for the motion that is known."""
+_LOOKS = 97
+"""Places of a stretch without reversals at which signs are found."""
+_ROUNDS = 8
+"""Rounds in which corners and rows are made to agree."""
+_LOWER = 0.5
+"""Factor on b where limits leave no corners."""
+_SAME = 1e-9
+"""Miss of a row that is none, over what is much for it."""
+
+
+class Guide(NamedTuple):
+    """A motion along a curve near which one is planned: places [m], s'', s'^2 and squeeze there."""
+
+    s: Array
+    a: Array
+    b: Array
+    squeeze: Array
+
+    def at(self, s: Array) -> tuple[Array, Array, Array]:
+        """The motion at some places."""
+        a, b, squeeze = (np.interp(s, self.s, column) for column in self[1:])
+        return a, b, squeeze
+
+
+class Spread(NamedTuple):
+    """What ranges make of the force limits of a curve.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Numbers with a range that counts.
+    radii : ndarray, shape (p,)
+    rows : ndarray, shape (m, n_c + R)
+        Those of the force limits, h.
+    s : ndarray, shape (n,), [m]
+        Places at which signs are known, segment by segment.
+    segment : ndarray of int, shape (n,)
+    signs : ndarray of int8, shape (n, m, COPIES, p)
+    """
+
+    names: tuple[str, ...]
+    radii: Array
+    rows: Array
+    s: Array
+    segment: NDArray[np.int64]
+    signs: NDArray[np.int8]
+
+    def find_swings(
+        self,
+        formation: Formation,
+        point: CurvePoint,
+        directions: Directions,
+        forces: PathForces,
+        epsilon: float,
+    ) -> Array:
+        """What each range changes of each force limit, shape (n, m, p, COUNT)."""
+        slopes = find_force_slopes(formation, point, directions, forces, self.names)
+        swings = np.einsum("mi,nipq->nmpq", self.rows, slopes)
+        c = _stack(forces)
+        normal = np.arange(self.rows.shape[1]) < formation.n_contacts
+        for k, name in enumerate(self.names):
+            if not name.startswith("friction"):
+                continue
+            part = {"palm": None, "finger1": 0, "finger2": 1}[name.partition("_")[2]]
+            mine = np.array([contact.finger == part for contact in formation.contacts])
+            # A cone's own edge is mu (c_n - epsilon); c_n >= epsilon knows no friction.
+            edges = np.where(normal, self.rows, 0.0) * (~normal & (self.rows != 0)).any(
+                axis=1, keepdims=True
+            )
+            edges[:, : formation.n_contacts] *= mine
+            swings[:, :, k] += np.einsum("mi,niq->nmq", edges, c)
+            swings[:, :, k, 0] -= epsilon * edges.sum(axis=1)
+        return np.asarray(swings * self.radii[:, None])
+
+    def pick_signs(self, s: Array, segment: NDArray[np.int64]) -> NDArray[np.int8]:
+        """Signs at some places, each of a segment, shape (n, m, COPIES, p)."""
+        rows = np.zeros(len(s), dtype=np.int64)
+        for own in set(segment.tolist()):
+            here, known = np.flatnonzero(segment == own), np.flatnonzero(self.segment == own)
+            places = self.s[known]
+            rows[here] = known[np.searchsorted((places[1:] + places[:-1]) / 2, s[here])]
+        return self.signs[rows]
+
+    def extend(self, forces: PathForces, swings: Array, signs: NDArray[np.int8]) -> PathForces:
+        """Forces with one more column for each copy of each limit, of what that is."""
+        spread = np.einsum("nmkp,nmpq->nmkq", signs, swings)
+        copies = spread.shape[2]
+        own = np.repeat(np.einsum("mi,niq->nmq", self.rows, _stack(forces)), copies, axis=1)
+        added = own - spread.reshape(own.shape)
+        names = ("C0", "Ca", "Cb", "Cl", "Cv")
+        wider = {
+            name: np.hstack([getattr(forces, name), added[..., q]]) for q, name in enumerate(names)
+        }
+        return forces._replace(**wider)
+
+    def evaluate(
+        self, forces: PathForces, swings: Array, motion: tuple[Array, Array, Array]
+    ) -> Array:
+        """The left sides of the limits, with their bars, shape (n, m) [N]."""
+        own = forces.c(*motion)[:, : self.rows.shape[1]] @ self.rows.T
+        return np.asarray(own - np.abs(measure(swings, motion)).sum(axis=2))
+
+
+def measure(swings: Array, motion: tuple[Array, Array, Array]) -> Array:
+    """Swings of a motion, shape (n, m, p) [N]."""
+    a, b, squeeze = motion
+    columns = np.stack([np.ones_like(a), a, b, squeeze, np.sqrt(np.maximum(b, 0.0))], axis=-1)
+    return np.asarray(np.einsum("nmpq,nq->nmp", swings, columns))
+
+
+def spread_limits(limits: LimitSet) -> LimitSet:
+    """Limits with `COPIES` rows for each of the forces', in the columns that `extend` adds."""
+    width = len(limits.of(PRESS, CONE)) * COPIES
+    found, first = [], 0
+    for own in limits.limits:
+        forces, joints = own.rows[:, :-4], own.rows[:, -4:]
+        rows = np.hstack([forces, np.zeros((len(forces), width)), joints])
+        if own.kind not in (PRESS, CONE):
+            found.append(replace(own, rows=rows))
+            continue
+        count, begin = len(rows) * COPIES, forces.shape[1] + first
+        rows = np.eye(rows.shape[1])[begin : begin + count]
+        low, high, weight = (np.repeat(part, COPIES) for part in (own.low, own.high, own.weight))
+        text = f"{own.text} within all ranges,"
+        found.append(
+            replace(own, rows=rows, low=low, high=high, weight=weight, text=text, drags=True)
+        )
+        first += count
+    return LimitSet(tuple(found))
+
+
+def spread(curve: Curve, epsilon: float, widths: Mapping[str, float], guide: Guide) -> Spread:
+    """What ranges make of the force limits of a curve, for motions near one that is known.
+
+    Parameters
+    ----------
+    curve : Curve
+    epsilon : float, [N]
+    widths : mapping of str to float
+        Radii of ranges by name; a delay does not count here.
+    guide : Guide
+    """
+    names = [own.name for own in PARAMETERS if widths.get(own.name, 0.0) > 0]
+    names = [name for name in names if name != "delay"]
+    formation, segments = curve.formation, curve.segments
+    angles = np.linspace(0.0, np.pi, _LOOKS)
+    share = (1 - np.cos(angles)) / 2
+    s = np.concatenate([own.start + share * (own.stop - own.start) for own in segments])
+    segment = np.repeat(np.arange(len(segments)), _LOOKS)
+    point = curve.evaluate(s)
+    signs = ([getattr(part, name) for part in segments] for name in ("Xi", "sigma"))
+    directions = Directions(*(np.array(sign)[segment] for sign in signs))
+    forces = inverse(formation, *point[:3], directions, point.kinematics)
+    limits = make_limits(formation, epsilon).without(SPEED)
+    rows = limits.only(PRESS, CONE).rows[:, :-4]
+    none = np.zeros((len(s), len(rows), COPIES, len(names)), dtype=np.int8)
+    radii = np.array([widths[name] for name in names])
+    bare = Spread(tuple(names), radii, rows, s, segment, none)
+    swings = bare.find_swings(formation, point, directions, forces, epsilon)
+    found = _find_signs(bare, limits, forces, swings, point.z_s[:, 3:], guide.at(s))
+    return bare._replace(signs=found)
+
+
+def _find_signs(
+    bare: Spread,
+    limits: LimitSet,
+    forces: PathForces,
+    swings: Array,
+    rates: Array,
+    motion: tuple[Array, Array, Array],
+) -> NDArray[np.int8]:
+    """Signs of the rows that meet in the corners with the largest and the least a."""
+    wider, signs, b = spread_limits(limits), bare.signs.copy(), motion[1].copy()
+    signs[:, :, 4] = np.sign(measure(swings, motion))
+    low = limits.only(PRESS, CONE).low
+    scale = limits.only(PRESS, CONE).scales
+    for turn in range(_ROUNDS):
+        extended = bare.extend(forces, swings, signs)
+        terms = SideTerms.of(wider, extended, rates)
+        cap = np.full(len(b), np.inf)
+        rows = eliminate(terms.press, terms.rate, terms.bend, terms.drag, terms.rest, cap)
+        ends = [_find_corner(terms, rows, b, largest) for largest in (True, False)]
+        with np.errstate(invalid="ignore"):
+            b = np.where(ends[0][0] < ends[1][0], _LOWER * b, b)
+        for end, (a, squeeze) in enumerate(ends):
+            here = np.nan_to_num(a), b, np.nan_to_num(squeeze)
+            slack = bare.evaluate(forces, swings, here) - low
+            known = extended.c(*here)[:, bare.rows.shape[1] :].reshape(*slack.shape, -1)
+            missed = slack < known.min(axis=2) - low - _SAME * scale
+            better = np.sign(measure(swings, here)).astype(np.int8)
+            slots = (2 * end, 2 * end + 1) if turn == 0 else (2 * end + turn % 2,)
+            for slot in slots:
+                signs[:, :, slot] = np.where(missed[..., None], better, signs[:, :, slot])
+    return signs
+
+
+def _find_corner(terms: SideTerms, rows: Rows, b: Array, largest: bool) -> tuple[Array, Array]:
+    """The corner with the largest or the least a at some b: a and the squeeze there."""
+    row = rows.extreme(b, largest).row
+    k, pair = np.arange(len(b))[:, None], np.stack(np.triu_indices(terms.press.shape[1], 1), 1)[row]
+    at_rest = terms.at(np.zeros_like(b), b)
+    (one, other), (r1, r2), (p1, p2) = (
+        part[k, pair].T for part in (at_rest, terms.rate, terms.press)
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        det = r1 * p2 - r2 * p1
+        return (other * p1 - one * p2) / det, (one * r2 - other * r1) / det
+
+
+def _stack(forces: PathForces) -> Array:
+    """Coefficients of the contact forces, shape (n, n_c + R, COUNT)."""
+    parts = np.stack([forces.C0, forces.Ca, forces.Cb, forces.Cl, forces.Cv], axis=-1)
+    assert parts.shape[-1] == COUNT
+    return parts

@@ -1,0 +1,102 @@
+"""Numbers of a problem that are not known exactly, by how much, and the table that says so."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from ..common.errors import InputError
+from ..common.require import require_number
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number of a problem that may be off, or one of its torques.
+
+    Attributes
+    ----------
+    name : str
+    default : float
+        Half width of its range.
+    unit : str
+        Of the half width; empty for a relative one.
+    """
+
+    name: str
+    default: float
+    unit: str = ""
+
+
+PARAMETERS = (
+    Parameter("mass", 0.05),
+    Parameter("inertia", 0.05),
+    Parameter("friction_palm", 0.1),
+    Parameter("friction_finger1", 0.1),
+    Parameter("friction_finger2", 0.1),
+    Parameter("length1", 2e-4, "m"),
+    Parameter("length2", 2e-4, "m"),
+    Parameter("base1_x", 2e-4, "m"),
+    Parameter("base1_y", 2e-4, "m"),
+    Parameter("base2_x", 2e-4, "m"),
+    Parameter("base2_y", 2e-4, "m"),
+    Parameter("start_x", 2e-4, "m"),
+    Parameter("gain1", 0.01),
+    Parameter("gain2", 0.01),
+    Parameter("delay", 1e-3, "s"),
+)
+"""All that can be varied. A delay is never negative: its range is [0, half width]."""
+
+NAMES = tuple(parameter.name for parameter in PARAMETERS)
+GROUPS: Mapping[str, tuple[str, ...]] = {
+    "friction": ("friction_palm", "friction_finger1", "friction_finger2"),
+    "geometry": ("length1", "length2", "base1_x", "base1_y", "base2_x", "base2_y"),
+    "gain": ("gain1", "gain2"),
+}
+"""Names that stand for several."""
+
+
+def read_widths(given: Mapping[str, object], label: str = "uncertainty.{}") -> dict[str, float]:
+    """Half widths of all ranges; what is left out has its default.
+
+    Parameters
+    ----------
+    given, label
+        As for `spread_widths`.
+    """
+    defaults = {parameter.name: parameter.default for parameter in PARAMETERS}
+    return defaults | spread_widths(given, label)
+
+
+def spread_widths(given: Mapping[str, object], label: str) -> dict[str, float]:
+    """Half widths of the ranges that are given, by parameter; zero leaves one as it is.
+
+    A parameter's own range counts before that of a group.
+
+    Parameters
+    ----------
+    given : mapping
+        By name of the parameter, or of a group.
+    label : str
+        What messages call a range, with a place for its name.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown, or a width is not a number from zero to what makes sense: below one
+        for relative ones.
+    """
+    widths = dict[str, float]()
+    for key, value in sorted(given.items(), key=lambda item: item[0] not in GROUPS):
+        if key not in (*NAMES, *GROUPS):
+            allowed = ", ".join((*GROUPS, *NAMES))
+            raise InputError("", label.format(key), f"is unknown; allowed are {allowed}")
+        width, names = require_number(value, label.format(key), nonnegative=True), _list_names(key)
+        if width >= 1 and any(own.name in names and not own.unit for own in PARAMETERS):
+            text = f"{width:g} given; a relative range is below 1"
+            raise InputError("", label.format(key), text)
+        widths |= dict.fromkeys(names, width)
+    return widths
+
+
+def _list_names(key: str) -> tuple[str, ...]:
+    return GROUPS.get(key, (key,))
