@@ -20,7 +20,6 @@ from ..advice import describe_changes, find_changes, name_phases
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
 from ..robust.rows import Guide
-
 from .data import PhaseData, join
 from .fastest import is_hopeless
 from .first_guess import guess_slowly

@@ -156,7 +156,7 @@ class _State(NamedTuple):
     def _move(self, dz: Array, dz_s: Array, name: str = "") -> _Change:
         """What another place and tangent change, with geometry that is off by as much."""
         step = _STEP * self.formation.scene.scales.length
-        z, z_s, _, kinematics = self.point
+        z, z_s = self.point[:2]
         ends = [self._evaluate(name, way * step, z + way * step * dz) for way in (-1, 1)]
         slopes = Kinematics(*((b - a) / (2 * step) for a, b in zip(*ends, strict=True)))
         # P' z' is a quadratic form of the velocity.
