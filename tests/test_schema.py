@@ -21,7 +21,7 @@ from wholearm.problem.read import build_problem
 jsonschema = pytest.importorskip("jsonschema")
 TEXT = resources.files("wholearm.problem").joinpath("schema.json").read_text(encoding="utf-8")
 SCHEMA = json.loads(TEXT)
-TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8"))
+TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8")) | {"uncertainty": {"mass": 0.1}}
 PARTS = SCHEMA["properties"]
 TABLES: dict[str, tuple[dict[str, Any], Callable[[Any], Any]]] = {
     "": (SCHEMA, lambda table: table),
@@ -29,6 +29,7 @@ TABLES: dict[str, tuple[dict[str, Any], Callable[[Any], Any]]] = {
     "fingers": (PARTS["fingers"], lambda table: table["fingers"]),
     "fingers.1": (SCHEMA["definitions"]["finger"], lambda table: table["fingers"]["1"]),
     "friction": (PARTS["friction"], lambda table: table["friction"]),
+    "uncertainty": (PARTS["uncertainty"], lambda table: table["uncertainty"]),
     "start": (PARTS["start"], lambda table: table["start"]),
     "phases[1]": (PARTS["phases"]["items"], lambda table: table["phases"][0]),
 }
@@ -70,6 +71,7 @@ def test_shipped_problems_are_valid(path: Path) -> None:
         ("object", "vertices", [[0.0, 0.0], [1.0, 0.0]]),
         ("fingers.1", "length", "long"),
         ("friction", "palm", 11.0),
+        ("uncertainty", "gain", 1.0),
         ("start", "flush", 0.5),
         ("phases[1]", "end", "soft"),
         ("phases[1]", "until", {"y": 1.0}),

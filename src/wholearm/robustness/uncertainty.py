@@ -14,7 +14,6 @@ from ..problem.uncertainty import PARAMETERS, Parameter, read_widths
 from ..results.torque import TorqueProfile
 from ..scene.model import Friction
 
-
 TOLERANCE = 1e-6
 """Of the simulations of samples, if no other is given, relative to the scene."""
 
