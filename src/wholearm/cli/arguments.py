@@ -56,7 +56,7 @@ def add_solve(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-mode-search", dest="mode_search", action="store_false", help=text)
     text = "return the plan without replaying it"
     parser.add_argument("--no-replay", dest="replay", action="store_false", help=text)
-    text = "keep limits within the problem's ranges ([uncertainty]), or FACTOR times as wide ones (0)"
+    text = "keep limits within the problem's ranges, [uncertainty], or FACTOR times these (0)"
     parser.add_argument("--robust", metavar="FACTOR", nargs="?", type=float, const=1.0, help=text)
     text = "also look for the largest factor with which there is a plan"
     parser.add_argument("--largest", action="store_true", help=text)
