@@ -24,7 +24,7 @@ from wholearm import plots
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.figures.data import choose_snapshots, find_steps
-from wholearm.figures.style import SIZE
+from wholearm.figures.style import WIDTH
 from wholearm.problem.definition import Problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Trajectory, assemble
@@ -154,16 +154,18 @@ def test_snapshots_say_when_and_which_phase(figure: Figure, planned: Trajectory)
 def test_margins_are_the_trajectory_with_breaks_at_phases(
     figure: Figure, planned: Trajectory
 ) -> None:
-    margins = figure.axes[-2]
-    boundaries = np.flatnonzero(np.diff(planned.phase)) + 1
+    margins, steps = figure.axes[-2], find_steps(planned)
+    assert set(np.flatnonzero(np.diff(planned.phase)) + 1) <= set(steps)
+    added = np.insert(np.zeros(len(planned.t), dtype=bool), np.repeat(steps, 2), True)
     for index, name in enumerate(planned.contacts):
         t, values = data_of(line_of(margins, name))
-        rows = ~np.isnan(t)
-        np.testing.assert_array_equal(t[rows], planned.t)
-        np.testing.assert_array_equal(values[rows], planned.c_n[:, index] - 0.05)
-        assert np.isnan(values[~rows]).all()
-        before = np.cumsum(rows)[~rows]
-        assert set(boundaries) <= set(before)
+        np.testing.assert_array_equal(t[~added], planned.t)
+        np.testing.assert_array_equal(values[~added], planned.c_n[:, index] - 0.05)
+        # At a step the line breaks upright: it lasts until then, and goes on from there.
+        np.testing.assert_array_equal(t[added], np.repeat(planned.t[steps], 2))
+        before = planned.c_n[steps - 1, index] - 0.05
+        np.testing.assert_array_equal(values[added][::2], before)
+        assert np.isnan(values[added][1::2]).all()
 
 
 def test_forces_step_at_phases_and_reversals_only(planned: Trajectory) -> None:
@@ -282,16 +284,15 @@ def test_tip_contacts_are_marked_on_the_tips_surface(problem: Problem) -> None:
     assert np.hypot(*(point - tip)) == pytest.approx(finger.radius)
 
 
-def test_snapshots_are_at_least_six_and_at_most_seven(planned: Trajectory) -> None:
+def test_snapshots_are_at_least_six_and_one_of_every_phase(planned: Trajectory) -> None:
     for phases in ([0], [0, 1], [0, 1, 2], [0, 1, 2, 3], list(range(5)), [0, 1] * 5):
         trajectory = repeat(planned, phases)
         rows = choose_snapshots(trajectory)
-        assert 6 <= len(rows) <= 7
+        assert len(rows) == max(6, len(phases) + 1)
         assert rows[0] == 0 and rows[-1] == len(trajectory.t) - 1
         assert (np.diff(rows) > 0).all()
-        if len(phases) < 7:
-            boundaries = np.flatnonzero(np.diff(trajectory.phase)) + 1
-            assert set(boundaries) <= set(rows)
+        boundaries = np.flatnonzero(np.diff(trajectory.phase)) + 1
+        assert set(boundaries) <= set(rows)
 
 
 def test_text_is_inside_and_apart(figure: Figure) -> None:
@@ -300,6 +301,25 @@ def test_text_is_inside_and_apart(figure: Figure) -> None:
 
 def test_text_is_inside_and_apart_for_longer_plans(planned: Trajectory) -> None:
     check_layout(plots.force_margins(repeat(planned, [0, 1, 2, 3, 4] * 4)))
+
+
+@pytest.mark.parametrize("width", [3.5, 7.0])
+def test_text_is_inside_and_apart_in_other_widths(width: float, planned: Trajectory) -> None:
+    figure = plots.force_margins(planned, width=width, motion=True)
+    assert figure.get_figwidth() == width
+    check_layout(figure)
+    pose, angles, speeds = figure.axes[-3:]
+    assert data_of(line_of(pose, "x [mm]"))[1][-1] == pytest.approx(1e3 * planned.q[-1, 0])
+    assert data_of(line_of(angles, "finger 2"))[1][0] == pytest.approx(
+        np.degrees(planned.theta[0, 1])
+    )
+    assert np.nanmax(data_of(line_of(speeds, "finger 1"))[1]) == planned.theta_dot[:, 0].max()
+
+
+@pytest.mark.parametrize("width", [2.0, 50.0, float("nan")])
+def test_widths_that_are_no_paper_are_refused(width: float, planned: Trajectory) -> None:
+    with pytest.raises(InputError, match="width"):
+        plots.force_margins(planned, width=width)
 
 
 def test_loaded_trajectory_gives_the_same_figure(
@@ -364,7 +384,7 @@ def test_save_writes_the_format_of_the_ending_and_the_same_bytes(
         assert b"Date" not in written and b"dc:date" not in written and len(written) < 1_000_000
         if ending == ".png":
             # At least 150 dots per inch.
-            assert int.from_bytes(written[16:20], "big") >= 150 * SIZE[0]
+            assert int.from_bytes(written[16:20], "big") >= 150 * WIDTH
 
 
 @pytest.mark.parametrize("name", ["a.jpg", "a", "png", "a.png.txt"])

@@ -107,6 +107,9 @@ def add_plot(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", required=True, help="figure to write (.png, .pdf, .svg)")
     text = "overlay the simulated forces; free: simulated without telling which contacts hold"
     parser.add_argument("--simulate", choices=SIMULATORS, metavar="[free]", help=text)
+    parser.add_argument("--width", type=float, help="of the figure [in], 3 to 40 (10)")
+    text = "also draw the object's pose, and the joints' angles and speeds"
+    parser.add_argument("--motion", action="store_true", help=text)
 
 
 def add_predict(parser: argparse.ArgumentParser) -> None:

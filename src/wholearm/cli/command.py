@@ -284,7 +284,10 @@ def _plot(options: argparse.Namespace) -> int:
         raise InputError("", "--problem", "is for torques (.csv); trajectories bring their own")
     with name_source(options.trajectory):
         simulation = overlay(options.simulate, trajectory) if options.simulate else None
-        figure = plots.force_margins(trajectory, simulation=simulation)
+        width = plots.WIDTH if options.width is None else options.width
+        figure = plots.force_margins(
+            trajectory, simulation=simulation, width=width, motion=options.motion
+        )
     plots.save(figure, options.output)
     clear_progress()
     print(f"wrote {options.output}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,7 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 from .data import cone_shares, find_steps, sample_torques
-from .style import BAND, FINGERS, GRID, LOST, LOW, SIMULATED, Styles, write
+from .style import BAND, FINGERS, GRID, INK, LOST, LOW, SIMULATED, Styles, write
 
 if TYPE_CHECKING:
     from ..simulation.events import Simulation
@@ -34,14 +35,16 @@ def draw_margins(
     covers further margins `covered` [N], of any shape, too.
     """
     steps, margins = find_steps(trajectory), trajectory.c_n - epsilon
-    t = np.insert(trajectory.t, steps, np.nan)
+    t = np.insert(trajectory.t, np.repeat(steps, 2), np.repeat(trajectory.t[steps], 2))
     lines = []
     for index, name in enumerate(trajectory.contacts):
         # Where margins coincide the earlier, wider line stays visible beside the later one.
         rank = index / max(1, len(trajectory.contacts) - 1)
         colour, line, _ = styles[name]
         look: Any = {"color": colour, "linestyle": line, "linewidth": 3.4 - 2.0 * rank}
-        values = np.insert(margins[:, index], steps, np.nan)
+        # Up to a step the line keeps its last value.
+        ends = np.column_stack([margins[steps - 1, index], np.full(len(steps), np.nan)]).ravel()
+        values = np.insert(margins[:, index], np.repeat(steps, 2), ends)
         lines += axes.plot(t, values, zorder=3 + rank, label=name, **look)
     axes.axhline(0.0, color="black", linewidth=1.3, zorder=2.5)
     every = margins.ravel() if covered is None else np.append(margins, covered)
@@ -129,6 +132,27 @@ def draw_torques(axes: Axes, torque: TorqueProfile, limits: Array) -> list[Line2
     reach = 1.12 * max(float(limits.max()), float(np.abs(tau).max()))
     axes.set(ylim=(-reach, reach), ylabel="joint torque $\\tau$ [N m]")
     return lines
+
+
+def draw_motion(panels: Sequence[Axes], trajectory: Trajectory) -> None:
+    """Draw the object's pose, and the joints' angles and speeds, over time on three axes."""
+    t = trajectory.t
+    pose = np.column_stack([1e3 * trajectory.q[:, :2], np.degrees(trajectory.q[:, 2])])
+    for column, (name, colour, line) in enumerate(
+        (("x [mm]", "#0072B2", "-"), ("y [mm]", "#E69F00", (0, (5, 1.5))), ("phi [deg]", INK, "-."))
+    ):
+        panels[0].plot(t, pose[:, column], color=colour, linestyle=line, label=name)
+    panels[0].set_ylabel("pose")
+    values = (np.degrees(trajectory.theta), trajectory.theta_dot)
+    for axes, own, name in zip(
+        panels[1:], values, ("joint angle\n[deg]", "joint speed\n[rad/s]"), strict=True
+    ):
+        for index, (colour, _) in enumerate(FINGERS):
+            look: Any = {"color": colour, "linewidth": 2.2 - 0.8 * index}
+            axes.plot(t, own[:, index], label=f"finger {index + 1}", **look)
+        axes.set_ylabel(name)
+    for axes in panels:
+        axes.grid(axis="y", color=GRID, linewidth=0.4)
 
 
 def draw_simulation(

@@ -13,7 +13,7 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 
 
-def choose_snapshots(trajectory: Trajectory, least: int = 6, most: int = 7) -> NDArray[np.int64]:
+def choose_snapshots(trajectory: Trajectory, least: int = 6) -> NDArray[np.int64]:
     """Rows of the trajectory to draw: phase boundaries, and instants between if they are few."""
     starts = trajectory.phase_starts
     parts = np.ones(len(starts) - 1, dtype=int)
@@ -24,9 +24,7 @@ def choose_snapshots(trajectory: Trajectory, least: int = 6, most: int = 7) -> N
         own = np.flatnonzero(trajectory.phase == k)
         for t in np.linspace(start, end, parts[k] + 1)[:-1]:
             rows.append(own[np.abs(trajectory.t[own] - t).argmin()])
-    chosen = np.unique(rows)
-    few = np.linspace(0, len(chosen) - 1, min(most, len(chosen)))
-    return np.asarray(chosen[few.round().astype(int)])
+    return np.unique(rows)
 
 
 STEP = 0.1
@@ -50,7 +48,9 @@ def find_steps(trajectory: Trajectory) -> NDArray[np.int64]:
     # The friction of a contact that rolls passes zero without a step.
     slid = np.where(trajectory.rolling, 0.0, trajectory.c_t)
     turns = np.flatnonzero((slid[1:] * slid[:-1] < 0).any(axis=1)) + 1
-    return np.unique(np.concatenate([steps, phases, turns]))
+    every = np.unique(np.concatenate([steps, phases, turns]))
+    # Torques may go on after a motion that has failed.
+    return every[every < len(t)]
 
 
 def sample_torques(torque: TorqueProfile, least: int = 2000) -> tuple[Array, Array]:

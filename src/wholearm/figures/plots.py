@@ -5,11 +5,14 @@ Functions return figures or the artists they drew; nothing is shown and no globa
 
 from __future__ import annotations
 
+import math
 import os
 import textwrap
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import matplotlib
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -22,9 +25,23 @@ from ..problem.read import read_own_problem
 from ..results.narrow import Torques, narrow
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
-from .curves import draw_cones, draw_margins, draw_phases, draw_simulation, draw_torques
-from .snapshots import draw_snapshot, draw_strip, place_contacts, place_vertices, trace_link
-from .style import SIZE, STYLE, choose_styles, inset
+from .curves import (
+    draw_cones,
+    draw_margins,
+    draw_motion,
+    draw_phases,
+    draw_simulation,
+    draw_torques,
+)
+from .snapshots import (
+    draw_snapshot,
+    draw_strip,
+    lay_out_strip,
+    place_contacts,
+    place_vertices,
+    trace_link,
+)
+from .style import STYLE, WIDTH, WIDTHS, Sheet, choose_styles
 
 if TYPE_CHECKING:
     from ..simulation.events import Simulation
@@ -32,12 +49,24 @@ if TYPE_CHECKING:
 _FORMATS: dict[str, dict[str, Any]] = {
     ".png": {"Software": None}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None},
 }  # fmt: skip
-_LEFT, _RIGHT, _BOTTOM = 0.80, 1.30, 0.55  # margins [in]; parts of the figure [in]:
-_TORQUES, _CONES, _GAP, _CAPTION = 1.75, 0.85, 0.22, 0.77
+_LEFT, _RIGHT, _BOTTOM, _TOP, _GAP = 0.80, 1.30, 0.55, 0.40, 0.22  # margins [in]
+_MARGINS, _TORQUES, _CONES, _MOTION = 3.6, 1.75, 0.85, 1.2  # heights of panels [in]
+_SHORT = 0.65
+"""Heights of panels of a slim figure, over those of a wide one."""
+_SLIM = 7.0
+"""Width below which legends stand at the foot, as in a column of a paper [in]."""
+_LINE = 0.17
+"""Height of a line of text [in]."""
 
 
 @exclusive
-def force_margins(what: Torques, *, simulation: Simulation | None = None) -> Figure:
+def force_margins(
+    what: Torques,
+    *,
+    simulation: Simulation | None = None,
+    width: float = WIDTH,
+    motion: bool = False,
+) -> Figure:
     """Draw a motion: snapshots, the force margin of every contact, and the torques.
 
     Parameters
@@ -47,56 +76,110 @@ def force_margins(what: Torques, *, simulation: Simulation | None = None) -> Fig
     simulation : Simulation, optional
         A replay of the same torques, drawn over it with dotted lines; its contacts must be those of
         the trajectory, in that order.
+    width : float, [in]
+        Of the figure, 3 to 40. Below 7 legends stand at the foot.
+    motion : bool
+        Whether to draw the object's pose, and the joints' angles and speeds, too.
 
     Returns
     -------
     Figure
-        Axes in the order: snapshots from left to right, margins, torques, and the friction cones
-        if a contact rolls.
+        Axes in the order: snapshots from left to right, margins, torques, the friction cones
+        if a contact rolls, and pose, angles and speeds.
 
     Raises
     ------
     InputError
-        If its `meta` lacks the problem, or torques alone are given.
+        If its `meta` lacks the problem, torques alone are given, or the width is out of its range.
     """
     _, trajectory = narrow(what)
     if trajectory is None:
         raise InputError("", "", "torques alone have no motion to draw; simulate them")
+    if not WIDTHS[0] <= require_number(width, "width") <= WIDTHS[1]:
+        allowed = f"{WIDTHS[0]:g} to {WIDTHS[1]:g} in"
+        raise InputError("", "width", f"{width:g} given; allowed are {allowed}")
     meta = trajectory.meta
     problem = read_own_problem(meta)
     epsilon = require_number(meta.get("epsilon", problem.epsilon), "meta.epsilon")
-    styles = choose_styles(trajectory.contacts)
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=SIZE)
-        FigureCanvasAgg(figure)
-        low = _BOTTOM + _TORQUES + _GAP
-        rolls = bool(trajectory.rolling.any())
-        cones_at, low = low, low + (_CONES + _GAP if rolls else 0.0)
-        high = draw_strip(figure, trajectory, problem.scene, styles) - _CAPTION
-        width = SIZE[0] - _LEFT - _RIGHT
-        margins = figure.add_axes(inset(_LEFT, low, width, high - low))
-        torques = figure.add_axes(inset(_LEFT, _BOTTOM, width, _TORQUES), sharex=margins)
-        covered = None if simulation is None else simulation.c_n - epsilon
-        draw_margins(margins, trajectory, epsilon, styles, covered)
-        draw_torques(torques, trajectory.torque, problem.scene.torque_limit)
-        if simulation is not None:
-            draw_simulation(margins, torques, simulation, epsilon)
-        panels = [margins, torques]
-        if rolls:
-            panels.append(figure.add_axes(inset(_LEFT, cones_at, width, _CONES), sharex=margins))
-            draw_cones(panels[-1], trajectory, problem.scene, styles, simulation)
-        for axes in panels:
-            draw_phases(axes, trajectory.phase_starts, labels=axes is margins)
+        return _draw(trajectory, problem.scene, epsilon, simulation, width, motion)
+
+
+def _draw(
+    trajectory: Trajectory,
+    scene: Scene,
+    epsilon: float,
+    simulation: Simulation | None,
+    width: float,
+    motion: bool,
+) -> Figure:
+    """Lay the figure out from its foot to its title, and draw it."""
+    styles = choose_styles(trajectory.contacts)
+    rolls = bool(trajectory.rolling.any())
+    strip = lay_out_strip(trajectory, scene, width - 0.3)
+    slim = width < _SLIM
+    columns = max(1, int((width - 0.3) / 1.05))
+    keys = len(trajectory.contacts) + 3 + (simulation is not None)
+    foot = _BOTTOM + (_LINE * math.ceil(keys / columns) + 0.1 if slim else 0.0)
+    share = _SHORT if slim else 1.0
+    sizes = [_MOTION * share] * 3 * motion + [_TORQUES * share] + [_CONES] * rolls
+    sizes.append(_MARGINS * share)
+    title = textwrap.wrap(_title(trajectory, scene, epsilon), max(24, int(11.5 * width)))
+    above = _TOP + _LINE * (len(title) - 1)
+    panels_high = sum(sizes) + _GAP * (len(sizes) - 1) + 0.3
+    sheet = Sheet(width, foot + panels_high + strip.height + above)
+    figure = Figure(figsize=sheet)
+    FigureCanvasAgg(figure)
+    draw_strip(figure, sheet, sheet.height - above, strip, trajectory, scene, styles)
+    low, places = foot, []
+    for size in sizes:
+        places.append(sheet.inset(_LEFT, low, width - _LEFT - (0.12 if slim else _RIGHT), size))
+        low += size + _GAP
+    margins = figure.add_axes(places[-1])
+    torques = figure.add_axes(places[3 * motion], sharex=margins)
+    covered = None if simulation is None else simulation.c_n - epsilon
+    draw_margins(margins, trajectory, epsilon, styles, covered)
+    draw_torques(torques, trajectory.torque, scene.torque_limit)
+    if simulation is not None:
+        draw_simulation(margins, torques, simulation, epsilon)
+    panels = [margins, torques]
+    if rolls:
+        panels.append(figure.add_axes(places[-2], sharex=margins))
+        draw_cones(panels[-1], trajectory, scene, styles, simulation)
+    if motion:
+        own = [figure.add_axes(place, sharex=margins) for place in places[2::-1]]
+        draw_motion(own, trajectory)
+        panels += own
+    if slim:
+        margins.set_ylabel("margin [N]")
+        torques.set_ylabel("torque [N m]")
+    lowest = panels[-1] if motion else torques
+    for axes in panels:
+        draw_phases(axes, trajectory.phase_starts, labels=axes is margins)
+        if axes is not lowest:
+            axes.tick_params(labelbottom=False)
+        if not slim:
             spacing = 0.5 if len(trajectory.contacts) < 14 else 0.1
             axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.02), labelspacing=spacing)
-        torques.set(xlabel="time $t$ [s]", xlim=(0.0, trajectory.duration))
-        for axes in (margins, *panels[2:]):
-            axes.tick_params(labelbottom=False)
-        figure.align_ylabels(panels)
-        look: Any = {"fontsize": 10.5, "fontweight": "bold", "parse_math": False}
-        title = _title(trajectory, problem.scene, epsilon)
-        figure.text(0.2 / SIZE[0], 1 - 0.12 / SIZE[1], title, va="top", **look)
+    if slim:
+        _draw_legend(figure, [margins, torques], columns)
+    lowest.set_xlabel("time $t$ [s]")
+    margins.set_xlim(0.0, trajectory.duration)
+    figure.align_ylabels(panels)
+    look: Any = {"fontsize": 10.5, "fontweight": "bold", "parse_math": False}
+    top = 1 - 0.12 / sheet.height
+    figure.text(0.2 / width, top, "\n".join(title), va="top", **look)
     return figure
+
+
+def _draw_legend(figure: Figure, panels: Sequence[Axes], columns: int) -> None:
+    """One legend of several panels at the foot of a figure."""
+    every = [axes.get_legend_handles_labels() for axes in panels]
+    known = {
+        label: line for lines, labels in every for line, label in zip(lines, labels, strict=True)
+    }
+    look: Any = {"loc": "lower left", "bbox_to_anchor": (0.02, 0.005), "fontsize": 8}
+    figure.legend([*known.values()], [*known], ncols=columns, columnspacing=1.0, **look)
 
 
 def require_format(path: str | os.PathLike[str]) -> str:
@@ -131,6 +214,7 @@ def _title(trajectory: Trajectory, scene: Scene, epsilon: float) -> str:
 
 
 __all__ = [
+    "WIDTH",
     "choose_styles",
     "draw_cones",
     "draw_margins",

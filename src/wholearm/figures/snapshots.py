@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -20,7 +21,12 @@ from ..contacts.elemental import build_features, build_geometry, parse_contact
 from ..results.trajectory import Trajectory
 from ..scene.model import Finger, Scene
 from .data import choose_snapshots
-from .style import FINGERS, INK, SIZE, STRIP, TOP, Styles, inset, write
+from .style import FINGERS, INK, STRIP, Sheet, Styles, write
+
+_CAPTION = 0.42
+"""Height of the caption of a snapshot [in]."""
+_ROOM = 1.38
+"""Width that a snapshot needs for its caption, on average [in]."""
 
 
 def draw_snapshot(
@@ -78,33 +84,96 @@ def trace_link(finger: Finger, angle: float) -> Array:
     return np.asarray(centres + finger.radius * np.column_stack([np.cos(turns), np.sin(turns)]))
 
 
-def draw_strip(figure: Figure, trajectory: Trajectory, scene: Scene, styles: Styles) -> float:
-    """Draw the snapshots side by side at one scale; returns the strip's lower end [in]."""
-    rows = choose_snapshots(trajectory)
-    boxes = np.array([_measure(scene, trajectory.z[row]) for row in rows])
-    widths = np.ptp(boxes[:, :, 0], axis=1)
-    low, high = float(boxes[:, 0, 1].min()), float(boxes[:, 1, 1].max())
-    left, room, spaces = 0.15, SIZE[0] - 0.3, max(1, len(rows) - 1)
-    scale = min((room - 0.12 * spaces) / widths.sum(), STRIP / (high - low))
-    height = scale * (high - low)
-    bottom = float(SIZE[1] - TOP - height)
-    for row, width, box in zip(rows, scale * widths, boxes, strict=True):
-        axes = figure.add_axes(inset(left, bottom, width, height))
-        own = trajectory.motions[trajectory.phase[row]].contacts
-        # What does not press at this instant is left out, unless no force is known.
-        known = dict(zip(trajectory.contacts, np.isfinite(trajectory.c_n[row]), strict=True))
-        names = [name for name in trajectory.contacts if name in own]
-        names = [name for name in names if known[name]] or names
-        draw_snapshot(axes, scene, trajectory.z[row], names, styles)
-        axes.set(xlim=box[:, 0], ylim=(low, high))
-        place = f"phase {trajectory.phase[row] + 1}" if row < rows[-1] else "end"
-        caption = f"{trajectory.t[row]:.3f} s\n{place}"
-        write(axes, caption, (0.5, 0), (0, -3), xycoords="axes fraction", va="top")
-        left += width + (room - scale * widths.sum()) / spaces
-    first, start = figure.axes[0], boxes[0, 0, 0]
-    first.plot([start, start + 0.05], [high - 0.003] * 2, color=INK, linewidth=2.0)
-    write(first, "50 mm", (start + 0.025, high - 0.003), (0, -4), va="top", fontsize=8)
-    return bottom
+class Strip(NamedTuple):
+    """Snapshots side by side, in as many rows as they need, all at one scale.
+
+    Attributes
+    ----------
+    rows : tuple of tuple of int
+        Samples of the trajectory, from left to right.
+    boxes : dict of int to ndarray, shape (2, 2), [m]
+        Lower left and upper right corner of what is seen at each.
+    low, high : float, [m]
+        Lower and upper end of every picture.
+    scale : float, [in/m]
+    """
+
+    rows: tuple[tuple[int, ...], ...]
+    boxes: dict[int, Array]
+    low: float
+    high: float
+    scale: float
+
+    @property
+    def height(self) -> float:
+        """Of all rows with their captions [in]."""
+        return len(self.rows) * (self.scale * (self.high - self.low) + _CAPTION)
+
+
+def lay_out_strip(trajectory: Trajectory, scene: Scene, width: float) -> Strip:
+    """Choose the snapshots of a strip that is `width` wide [in]."""
+    chosen = [int(row) for row in choose_snapshots(trajectory)]
+    lines = math.ceil(len(chosen) / max(2, int(width / _ROOM)))
+    cuts = np.linspace(0, len(chosen), lines + 1).round().astype(int)
+    rows = tuple(tuple(chosen[a:b]) for a, b in pairwise(cuts))
+    boxes = {row: _measure(scene, trajectory.z[row]) for row in chosen}
+    low = min(float(box[0, 1]) for box in boxes.values())
+    high = max(float(box[1, 1]) for box in boxes.values())
+    widest = [
+        (width - 0.12 * max(1, len(row) - 1)) / sum(np.ptp(boxes[k][:, 0]) for k in row)
+        for row in rows
+    ]
+    return Strip(rows, boxes, low, high, min(*widest, STRIP / (high - low)))
+
+
+def draw_strip(
+    figure: Figure,
+    sheet: Sheet,
+    top: float,
+    strip: Strip,
+    trajectory: Trajectory,
+    scene: Scene,
+    styles: Styles,
+) -> None:
+    """Draw the snapshots of a strip whose upper end is at `top` [in]."""
+    room, last = sheet.width - 0.3, strip.rows[-1][-1]
+    height = strip.scale * (strip.high - strip.low)
+    for line, row in enumerate(strip.rows):
+        bottom = top - (line + 1) * height - line * _CAPTION
+        widths = [strip.scale * float(np.ptp(strip.boxes[k][:, 0])) for k in row]
+        left, space = 0.15, (room - sum(widths)) / max(1, len(row) - 1)
+        for k, width in zip(row, widths, strict=True):
+            axes = figure.add_axes(sheet.inset(left, bottom, width, height))
+            _draw_sample(axes, trajectory, k, k == last, scene, styles)
+            axes.set(xlim=strip.boxes[k][:, 0], ylim=(strip.low, strip.high))
+            left += width + space
+    _draw_scale(figure.axes[0], strip)
+
+
+def _draw_sample(
+    axes: Axes, trajectory: Trajectory, row: int, end: bool, scene: Scene, styles: Styles
+) -> None:
+    """Draw hand and object at a sample, with its time and phase below."""
+    own = trajectory.motions[trajectory.phase[row]].contacts
+    # What does not press at this instant is left out, unless no force is known.
+    known = dict(zip(trajectory.contacts, np.isfinite(trajectory.c_n[row]), strict=True))
+    names = [name for name in trajectory.contacts if name in own]
+    names = [name for name in names if known[name]] or names
+    draw_snapshot(axes, scene, trajectory.z[row], names, styles)
+    place = "end" if end else f"phase {trajectory.phase[row] + 1}"
+    caption = f"{trajectory.t[row]:.3f} s\n{place}"
+    write(axes, caption, (0.5, 0), (0, -3), xycoords="axes fraction", va="top")
+
+
+def _draw_scale(axes: Axes, strip: Strip) -> None:
+    """Draw a bar of a round length, about a quarter of an inch long, into the first snapshot."""
+    start = strip.boxes[strip.rows[0][0]][0, 0]
+    power = 10.0 ** math.floor(math.log10(0.5 / strip.scale))
+    length = next(k * power for k in (5.0, 2.0, 1.0) if k * power <= 0.5 / strip.scale)
+    level = strip.high - 0.03 / strip.scale
+    axes.plot([start, start + length], [level] * 2, color=INK, linewidth=2.0)
+    text = f"{1e3 * length:g} mm" if length < 1 else f"{length:g} m"
+    write(axes, text, (start, level), (0, -4), va="top", ha="left", fontsize=8)
 
 
 def _measure(scene: Scene, z: Array) -> Array:

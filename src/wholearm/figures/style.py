@@ -12,8 +12,10 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
-SIZE = (10.0, 8.2)
-"""Width and height of a figure [in]."""
+WIDTH = 10.0
+"""Width of a figure, unless another one is asked for [in]."""
+WIDTHS = (3.0, 40.0)
+"""Least and largest width [in]."""
 # Okabe and Ito's colours without yellow and black, which here are Tol's wine and a grey.
 PALETTE = (
     "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#882255", "#56B4E9", "#D55E00", "#777777",
@@ -41,8 +43,24 @@ class ContactStyle(NamedTuple):
 
 
 Styles = Mapping[str, ContactStyle]
-TOP, STRIP = 0.40, 1.75
-"""Upper margin of the figure, and greatest height of the snapshots [in]."""
+STRIP = 1.75
+"""Greatest height of a row of snapshots [in]."""
+
+
+class Sheet(NamedTuple):
+    """The paper of a figure.
+
+    Attributes
+    ----------
+    width, height : float, [in]
+    """
+
+    width: float
+    height: float
+
+    def inset(self, left: float, bottom: float, width: float, height: float) -> Any:
+        """The same [in] as fractions of the figure."""
+        return tuple(np.array([left, bottom, width, height]) / (2 * tuple(self)))
 
 
 def choose_styles(contacts: Sequence[str]) -> dict[str, ContactStyle]:
@@ -55,8 +73,3 @@ def write(axes: Axes, text: str, place: Any, shift: Any, **look: Any) -> Artist:
     """Write `text` at a place, shifted by points."""
     options: Any = {"ha": "center", "fontsize": 9, "zorder": 5, "textcoords": "offset points"}
     return axes.annotate(text, tuple(place), tuple(shift), **(options | look))
-
-
-def inset(*inches: float) -> Any:
-    """Left, bottom, width and height as fractions of the figure."""
-    return tuple(np.array(inches) / (SIZE + SIZE))
