@@ -8,6 +8,7 @@ several the one that changes the fewest modes is taken.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,18 +32,27 @@ from .telling import tell_ambiguity, tell_changes
 
 DEPENDENT = 1e-7
 """Share of a row that others leave, below which it is no constraint of its own."""
+ROUNDED = 1e-15
+"""Speed that rounding leaves, relative to the largest one."""
 _NONE = np.zeros(0)
 _NOTHING = (_NONE, np.zeros(0, dtype=np.int64), _NONE, _NONE)
 
 
-def find_closed(run: Run) -> tuple[int, ...]:
-    """Pairs that touch and do not part, each constraint once."""
+class Closed(NamedTuple):
+    """Pairs that touch and do not part, each constraint once, and their rows at present."""
+
+    pairs: tuple[int, ...]
+    rows: Rows
+
+
+def find_closed(run: Run) -> Closed:
+    """Look for what is closed."""
     system, unit = run.system, run.system.scales.length
     gaps, faces = run.face(run.z, run.v)
-    touching = np.flatnonzero((gaps < CLOSED * unit) & (gaps > -SUNK * unit) & faces).tolist()
-    if not touching:
-        return ()
+    touching = ((gaps < CLOSED * unit) & (gaps > -SUNK * unit) & faces).nonzero()[0].tolist()
     rows = system.evaluate(run.z, run.v, touching)
+    if not touching:
+        return Closed((), rows)
     slow = (rows.A @ run.v < run.chatter).tolist()
     lines = rows.A / np.sqrt(system.mass)
     lines /= np.sqrt((lines**2).sum(axis=1))[:, None]
@@ -51,32 +61,33 @@ def find_closed(run: Run) -> tuple[int, ...]:
     for k in sorted(range(len(touching)), key=lambda k: touching[k] not in run.modes.kept):
         if slow[k] and all(own[k][j] for j in chosen):
             chosen.append(k)
-    return tuple(sorted(touching[k] for k in chosen))
+    chosen.sort()
+    return Closed(tuple(touching[k] for k in chosen), Rows(*(part[chosen] for part in rows)))
 
 
 class Pattern:
     """What of closed pairs and coordinates stands still, and which way the rest slides."""
 
-    def __init__(self, run: Run, closed: Sequence[int]) -> None:
+    def __init__(self, run: Run, found: Closed) -> None:
         system = run.system
-        self.system, self.closed = system, tuple(closed)
-        rows = system.evaluate(run.z, run.v, closed)
-        v_t = rows.A_t @ run.v
-        self.mu = system.friction[list(closed)]
+        self.system, self.closed, self.rows = system, *found
+        v_t = self.rows.A_t @ run.v
+        self.mu = system.friction[list(self.closed)]
         rubs = self.mu > 0
         slow = np.abs(v_t) < STANDING * system.scales.speed
         self.Xi = np.where(rubs & ~slow, np.sign(v_t), 0.0)
         self.rub = (self.mu * self.Xi)[:, None]
-        self.standing = np.flatnonzero(rubs & slow)
+        self.standing = (rubs & slow).nonzero()[0]
         slow = np.abs(run.v) < STANDING * system.units[system.n :]
         self.sigma = np.where((system.dry > 0) & ~slow, np.sign(run.v), 0.0)
-        self.joints = np.flatnonzero((system.dry > 0) & slow)
+        self.joints = ((system.dry > 0) & slow).nonzero()[0]
 
-    def pose(self, z: Array, v: Array, tau: Array) -> ContactProblem:
-        """The contact problem of accelerations at a state."""
-        system, rows = self.system, self.system.evaluate(z, v, self.closed)
-        lift = 1 / system.mass
-        free = lift * system.push(v, tau, self.sigma)
+    def pose(self, free: Array, rows: Rows) -> ContactProblem:
+        """The contact problem of accelerations at a state, of rows there.
+
+        `free` has the accelerations without contacts, shape (n,).
+        """
+        system, lift = self.system, 1 / self.system.mass
         G, b_n = rows.A - self.rub * rows.A_t, rows.A @ free + rows.bend
         if not len(self.standing) and not len(self.joints):
             return ContactProblem(lift, rows.A, G, b_n, np.zeros((0, system.n)), *_NOTHING)
@@ -119,37 +130,38 @@ class Pattern:
         return choice + [ways[float(way)] for way in answer.way[count:]]
 
 
-def decide(run: Run) -> bool | None:
+def decide(run: Run, found: Closed | None = None) -> bool | None:
     """Take the modes that the laws of contact ask for.
+
+    Parameters
+    ----------
+    run : Run
+    found : Closed, optional
+        What is closed, where that is known.
 
     Returns
     -------
     bool or None
         Whether everything rests; None where no modes obey them.
     """
-    system, scales = run.system, run.system.scales
-    closed = find_closed(run)
-    _end_chatter(run, closed)
-    pattern = Pattern(run, closed)
-    later = AHEAD * scales.time
-    tau = run.tau(run.t)
-    now = pattern.pose(run.z, run.v, tau)
-    first = _answer(run, now, pattern.recall(run.modes))
+    system, lift = run.system, 1 / run.system.mass
+    pattern = Pattern(run, _end_chatter(run, found or find_closed(run)))
+    later = AHEAD * system.scales.time
+    free = lift * system.push(run.v, run.tau(run.t), pattern.sigma)
+    first = _answer(run, pattern.pose(free, pattern.rows), pattern.recall(run.modes))
     if first is None:
         return None
-    acceleration = now.lift * system.push(run.v, tau, pattern.sigma) + first.change
+    acceleration = free + first.change
     v = run.v + later * acceleration
-    z = run.z + later * (run.v + v) / 2
-    tau = run.tau(run.t + later)
-    then = pattern.pose(z, v, tau)
-    coming = then.lift * system.push(v, tau, pattern.sigma)
-    answer = _choose(run, pattern, then, coming)
+    rows = system.evaluate(run.z + later * (run.v + v) / 2, v, pattern.closed)
+    coming = lift * system.push(v, run.tau(run.t + later), pattern.sigma)
+    answer = _choose(run, pattern, pattern.pose(coming, rows), coming)
     if answer is None:
         return None
     # What rests leaves its last modes by rounding, before it takes others in which it rests.
     still = run.resting or _is_still(run, acceleration)
     rests = stands(run) and still and _is_still(run, coming + answer.change)
-    modes = _make_modes(run, pattern, answer, system.evaluate(z, v, pattern.closed))
+    modes = _make_modes(run, pattern, answer, rows)
     tell_changes(run, pattern.closed, modes, rests)
     run.modes = modes
     _snap(run, pattern)
@@ -248,28 +260,30 @@ def _make_modes(run: Run, pattern: Pattern, answer: Answer, rows: Rows) -> Modes
 
 def _snap(run: Run, pattern: Pattern) -> None:
     """Take away what rounding leaves of speeds that are zero."""
-    system, modes = run.system, run.modes
-    chosen = (*modes.kept, *(pattern.closed[k] for k in pattern.standing))
-    rows = system.evaluate(run.z, run.v, chosen)
-    count = len(modes.kept)
-    _settle(run, np.vstack([rows.A[:count], rows.A_t[count:], np.eye(system.n)[pattern.joints]]))
+    kept = [k for k, pair in enumerate(pattern.closed) if pair in run.modes.kept]
+    rows = [pattern.rows.A[kept], pattern.rows.A_t[pattern.standing]]
+    _settle(run, np.vstack([*rows, np.eye(run.system.n)[pattern.joints]]))
 
 
-def _end_chatter(run: Run, closed: Sequence[int]) -> None:
+def _end_chatter(run: Run, found: Closed) -> Closed:
     """Close at rest, and all at once, what is closed and parts more slowly than chatter."""
-    system, speed = run.system, run.system.scales.speed
-    rows = system.evaluate(run.z, run.v, closed)
-    if (np.abs(rows.A @ run.v) > STANDING * speed).any():
-        sticks = (np.abs(rows.A_t @ run.v) < run.chatter) & (system.friction[list(closed)] > 0)
-        _settle(run, np.vstack([rows.A, rows.A_t[sticks]]))
+    system, rows = run.system, found.rows
+    if not (np.abs(rows.A @ run.v) > STANDING * system.scales.speed).any():
+        return found
+    rubs = system.friction[list(found.pairs)] > 0
+    sticks = (np.abs(rows.A_t @ run.v) < run.chatter) & rubs
+    _settle(run, np.vstack([rows.A, rows.A_t[sticks]]))
+    return Closed(found.pairs, system.evaluate(run.z, run.v, found.pairs))
 
 
 def _settle(run: Run, rows: Array) -> None:
     """Take away the speeds along some rows, the shortest way in the metric of masses."""
-    if not len(rows):
-        return
     root = np.sqrt(run.system.mass)
     scaled = rows / root
-    scaled /= np.linalg.norm(scaled, axis=1)[:, None]
-    change = np.linalg.lstsq(scaled, scaled @ (root * run.v), rcond=1e-9)[0]
+    scaled /= np.sqrt((scaled**2).sum(axis=1))[:, None]
+    speed = root * run.v
+    along = scaled @ speed
+    if np.abs(along).max(initial=0.0) <= ROUNDED * np.abs(speed).max():
+        return
+    change = np.linalg.lstsq(scaled, along, rcond=1e-9)[0]
     run.take_impulse(run.v - change / root)

@@ -7,51 +7,57 @@ energy, which the law allows with friction, less comes back.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from ..common.arrays import Array
 from ..simulation.events import EventKind
-from .contact_problem import APART, BACK, FORTH, STICKS, Answer, ContactProblem, solve, try_modes
-from .deciding import Pattern, find_closed
+from .contact_problem import (
+    APART,
+    BACK,
+    FORTH,
+    STICKS,
+    Answer,
+    ContactProblem,
+    read,
+    solve,
+    try_modes,
+)
+from .deciding import Closed, Pattern, find_closed
 from .state import AHEAD, STANDING, Run
 
 CHATTER_PAUSE = 1e-3
 """Time in which the end of the impacts of a pair is told once, relative to the scene's time."""
+SLIDES = 1e-3
+"""Least sliding of what slides on, relative to that before and to the speed of the impact."""
 ROUNDS = 30
 """Most impacts at one instant; what is left after them is plastic."""
 
 
-def collide(run: Run) -> bool:
-    """Change the velocity where closed gaps still close; whether it did."""
-    hit = False
+def collide(run: Run) -> Closed:
+    """Change the velocity where closed gaps still close; what is closed after that."""
+    limit = STANDING * run.system.scales.speed
     for turn in range(ROUNDS + 1):
-        closed = find_closed(run)
-        rows = run.system.evaluate(run.z, run.v, closed)
-        rates = rows.A @ run.v
-        limit = STANDING * run.system.scales.speed
+        found = find_closed(run)
+        rates = found.rows.A @ run.v
         if not (rates < -limit).any():
-            break
-        hit = True
+            return found
         bouncing = -rates.min() > run.chatter and turn < ROUNDS
-        _collide(run, closed, rates, run.restitution if bouncing else 0.0, bouncing)
-    return hit
+        _collide(run, found, rates, run.restitution if bouncing else 0.0, bouncing)
+    return find_closed(run)
 
 
-def _collide(
-    run: Run, closed: Sequence[int], rates: Array, restitution: float, bouncing: bool
-) -> None:
-    problem = _pose(run, closed, run.v)
-    answer = solve(problem)
+def _collide(run: Run, found: Closed, rates: Array, restitution: float, bouncing: bool) -> None:
+    problem = _pose(run, found, run.v)
+    answer = _slide_on(problem) or solve(problem)
     if answer is None:
         raise ArithmeticError("the plastic impact has no solution")
     run.residual = max(run.residual, answer.residual)
     v = run.v + answer.change
     if restitution:
-        v = _expand(run, closed, answer, v, restitution)
-    for k, pair in enumerate(closed):
+        v = _expand(run, found, answer, v, restitution)
+    for k, pair in enumerate(found.pairs):
         if rates[k] >= -STANDING * run.system.scales.speed or answer.c_n[k] <= 0:
             continue
         name, text = run.system.names[pair], run.system.structure.pairs[pair].text
@@ -64,6 +70,25 @@ def _collide(
     run.take_impulse(v)
 
 
+def _slide_on(p: ContactProblem) -> Answer | None:
+    """The impact after which everything slides on as before, if there is one.
+
+    Of several it is the nearest to what was; and without what may stick the problem is small.
+    """
+    k, none = len(p.b_n), np.zeros(0)
+    ways, pushes = np.sign(p.b_t), p.A.copy()
+    pushes[p.owner] -= (p.mu * ways)[:, None] * p.T
+    slides = ContactProblem(p.lift, p.A, pushes, p.b_n, p.T[:0], none, p.owner[:0], none, none)
+    answer = solve(slides) if k and slides.is_unique and ways.all() else None
+    if answer is None:
+        return None
+    rates = p.b_t + p.T @ answer.change
+    least = SLIDES * np.maximum(np.abs(p.b_t), np.abs(p.b_n).max())
+    if ((rates * ways <= least) & (answer.c_n[p.owner] > 0)).any():
+        return None
+    return read(p, answer.c_n, -p.mu * ways * answer.c_n[p.owner], answer.residual)
+
+
 def _is_told(run: Run, name: str) -> bool:
     """Whether it has just been said that the impacts of a pair are over."""
     brief = CHATTER_PAUSE * run.system.scales.time
@@ -71,11 +96,10 @@ def _is_told(run: Run, name: str) -> bool:
     return bool(own) and run.t - own[-1].time < brief
 
 
-def _pose(run: Run, closed: Sequence[int], v: Array) -> ContactProblem:
+def _pose(run: Run, found: Closed, v: Array) -> ContactProblem:
     """The contact problem of velocities: whatever has friction may stick."""
-    system = run.system
-    rows = system.evaluate(run.z, v, closed)
-    mu = system.friction[list(closed)]
+    system, rows = run.system, found.rows
+    mu = system.friction[list(found.pairs)]
     rubs = np.flatnonzero(mu > 0)
     T = rows.A_t[rubs]
     none = np.zeros(len(rubs))
@@ -84,18 +108,16 @@ def _pose(run: Run, closed: Sequence[int], v: Array) -> ContactProblem:
     )
 
 
-def _expand(
-    run: Run, closed: Sequence[int], plastic: Answer, v: Array, restitution: float
-) -> Array:
+def _expand(run: Run, found: Closed, plastic: Answer, v: Array, restitution: float) -> Array:
     """The velocity after the impulses of compression have come back."""
     system = run.system
     before = float(run.v**2 @ system.mass)
     while restitution > 1e-3:
         given = restitution * plastic.c_n
-        problem = _pose(run, closed, v)
+        problem = _pose(run, found, v)
         pushed = v + problem.lift * (problem.A.T @ given)
         bound = problem.mu * given[problem.owner]
-        problem = replace(_pose(run, closed, pushed), bound=bound)
+        problem = replace(_pose(run, found, pushed), bound=bound)
         answer = solve(problem)
         if answer is not None:
             after = pushed + answer.change
@@ -111,14 +133,15 @@ def jolt(run: Run) -> bool:
     It is the limit of time stepping: the impulses of a short time that do not vanish with it.
     """
     system, scales = run.system, run.system.scales
-    pattern = Pattern(run, find_closed(run))
+    found = find_closed(run)
+    pattern = Pattern(run, found)
     later = AHEAD * scales.time
     free = system.push(run.v, run.tau(run.t), pattern.sigma) / system.mass
-    answer = solve(_pose(run, pattern.closed, run.v + later * free))
+    answer = solve(_pose(run, found, run.v + later * free))
     if answer is None:
         return False
     # With the modes that it ends in, the impact at the instant itself is linear.
-    problem = _pose(run, pattern.closed, run.v)
+    problem = _pose(run, found, run.v)
     ways = {0.0: STICKS, 1.0: FORTH, -1.0: BACK}
     choice = [STICKS if c > 0 else APART for c in answer.c_n]
     for own, way in zip(problem.owner, answer.way, strict=True):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +12,7 @@ from ..results.sampled import interpolate_quintic
 from ..simulation.locate import find_root
 from ..simulation.runge_kutta import ORDER
 from .state import AHEAD, ARMED, CLOSED, SUNK, Run
+from .watch import build_watch
 
 GROWTH = 10.0
 """Largest growth of a step."""
@@ -22,16 +22,8 @@ LOOKS = 8
 """Instants of the longest step at which gaps are looked at, its end among them."""
 REACH = 0.3
 """Farthest that a step may go, in units of the scene: gaps are seen every `REACH` / `LOOKS`."""
-ROUNDING = 1e-9
-"""Shortfall of a force that counts as rounding, in the scene's unit."""
-SPEED_ROUNDING = 1e-12
-"""Likewise of a sliding or turning speed."""
-
-
 EXACT = 1e-14
 """Gap at which a contact is found closed, relative to the scene's length: some ten roundings."""
-TURNING = 1e-4
-"""Speed, relative to the scene's, below which sliding or turning may be about to reverse."""
 
 
 class StuckError(ArithmeticError):
@@ -71,45 +63,13 @@ class _Motion:
 
     def __init__(self, run: Run) -> None:
         self.run, self.s = run, run.load()
-        system, modes = run.system, run.modes
+        system = run.system
         self.unit, self.per_unit = system.scales.length, 1 / system.units[: system.n]
-        self.watched = np.ones(len(system.names), dtype=bool)
-        self.watched[list(modes.kept)] = False
-        self.list_values()
+        if run.modes not in run.watches:
+            run.watches[run.modes] = build_watch(system, run.modes, self.s.to)
+        self.watch = run.watches[run.modes]
+        self.slack, self.watched = self.watch.slack, self.watch.pairs
         self.near = 1e-3 * SHORTEST * max(system.scales.time, abs(run.t))
-
-    def list_values(self) -> None:
-        """What is looked at, as a matrix and a constant for all outputs of a step."""
-        run, to = self.run, self.s.to
-        system, modes = run.system, run.modes
-        scales, n, k = system.scales, system.n, len(modes.kept)
-        stuck, held = [modes.kept.index(pair) for pair in modes.stuck], list(modes.held)
-        slides, turning = np.flatnonzero(modes.Xi), np.flatnonzero(modes.sigma)
-        sticks = len(stuck) + len(held)
-        counts = [k + 2 * sticks, len(slides) + len(turning), k]
-        rows, constant = np.zeros((sum(counts), to.size)), np.zeros(sum(counts))
-        i = np.arange(sum(counts))
-        rows[i[:k], to.c_n.start + i[:k]] = 1 / scales.force
-        for j, (reserve, sign) in enumerate(product(range(sticks), (-1.0, 1.0)), start=k):
-            unit, row = scales.force, rows[j]
-            if reserve < len(stuck):
-                row[to.c_n.start + stuck[reserve]] = system.friction[modes.stuck[reserve]] / unit
-            else:
-                joint = held[reserve - len(stuck)]
-                unit = float(system.friction_units[joint])
-                constant[j] = system.dry[joint] / unit
-            row[to.f.start + reserve] = sign / unit
-        at = i[counts[0] :]
-        rows[at[: len(slides)], to.v_t.start + slides] = np.array(modes.Xi)[slides] / scales.speed
-        at = at[len(slides) :]
-        signs = np.array(modes.sigma)[turning] / system.units[n + turning]
-        rows[at[: len(turning)], n + turning] = signs
-        rows[at[len(turning) :], to.ranges.start + np.array(modes.kept, dtype=int)] = 1 / self.unit
-        # Few outputs count.
-        self.columns = np.flatnonzero(rows.any(axis=0))
-        self.rows, self.constant = np.ascontiguousarray(rows[:, self.columns]), constant
-        self.slack = np.repeat([ROUNDING, SPEED_ROUNDING, CLOSED], counts)
-        self.plain = not sticks
 
     def move(self) -> None:
         """Integrate until something happens or the torques step or end."""
@@ -155,8 +115,7 @@ class _Motion:
 
         Everything that touches has to press and slide, as it did before.
         """
-        least = np.where(self.slack == SPEED_ROUNDING, TURNING, 10 * self.slack)
-        if not (self.run.unique and self.plain and (end.values > least).all()):
+        if not (self.run.unique and self.watch.plain and (end.values > self.watch.clear).all()):
             return False
         return not ((np.abs(end.gaps[-1]) < CLOSED * self.unit) & self.watched).any()
 
@@ -192,7 +151,7 @@ class _Motion:
         """Look at the step just made, of length h from the outputs `before`, if any."""
         n, to = self.run.system.n, self.s.to
         out = self.s.outputs.copy()
-        values = self.rows @ out[self.columns] + self.constant
+        values = self.watch.measure(out)
         times, gaps, ranges = np.array([h]), out[None, to.gaps], out[None, to.ranges]
         if before is None:
             return View(out, values, times, gaps, ranges)
@@ -241,11 +200,10 @@ class _Motion:
 
     def _find_value(self, row: int, floor: float, first: float, last: float, h: float) -> float:
         """When one of the values falls below its floor."""
-        weights, constant = self.rows[row], float(self.constant[row]) + floor
 
         def value(step: float) -> float:
             self._step_to(step)
-            return float(weights @ self.s.outputs[self.columns]) + constant
+            return float(self.watch.measure(self.s.outputs)[row]) + floor
 
         return find_root(value, h, first, last, self.near, 1e-3 * floor)
 

@@ -29,9 +29,9 @@ def play(run: Run, touching: float, halt: Callable[[Run], bool] | None = None) -
     while run.t < run.end and not (halt is not None and halt(run)):
         if run.t >= run.stop:
             run.next_piece()
-        collide(run)
+        found = collide(run)
         moved = not stands(run)
-        rests = decide(run)
+        rests = decide(run, found)
         if moved and stands(run):
             rests = decide(run)
         if not _advances(run):

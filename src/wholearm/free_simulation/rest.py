@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..common.arrays import Array
-from .motion import ROUNDING
 from .state import STILL, Run
+from .watch import ROUNDING
 
 
 def hold(run: Run) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +75,8 @@ class Run:
         Whether the present modes were the only answer for sure when they were chosen.
     impact : float, [J]
         Energy lost to impacts so far.
+    watches : dict
+        What is looked at with each of the modes so far.
     """
 
     def __init__(
@@ -102,6 +104,7 @@ class Run:
         self.residual = 0.0
         self.records: list[Record] = []
         self.events: list[Event] = []
+        self.watches: dict[Modes, Any] = {}
         self._begin_piece()
 
     @property
@@ -165,7 +168,7 @@ class Run:
     def torque_steps(self) -> bool:
         """Whether the torques step at the start of the present piece."""
         before, after = self.torque.coefficients[self.piece - 1 : self.piece + 1]
-        jump = after @ (-1.0) ** np.arange(after.shape[1]) - before.sum(axis=1)
+        jump = after[:, ::2].sum(axis=1) - after[:, 1::2].sum(axis=1) - before.sum(axis=1)
         return bool(np.abs(jump).max() > TORQUE_STEP * self.system.scales.torque)
 
     def face(self, z: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
