@@ -9,7 +9,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..results.sampled import interpolate_quintic
-from ..simulation.locate import find_root
+from ..simulation.locate import find_crossing, find_root
 from ..simulation.runge_kutta import ORDER
 from .state import AHEAD, ARMED, CLOSED, SUNK, Run
 from .watch import build_watch
@@ -117,7 +117,9 @@ class _Motion:
         """
         if not (self.run.unique and self.watch.plain and (end.values > self.watch.clear).all()):
             return False
-        return not ((np.abs(end.gaps[-1]) < CLOSED * self.unit) & self.watched).any()
+        near = CLOSED * self.unit
+        touches = (np.abs(end.gaps[-1]) < near) & (end.ranges[-1] > -near)
+        return not (touches & self.watched).any()
 
     def _try_step(self, start: View) -> tuple[float, bool, View]:
         """Make a step within the tolerance; its length, and whether it ends the torques' piece."""
@@ -212,22 +214,30 @@ class _Motion:
     ) -> float | None:
         """When a pair closes within a step; None if it does not, or where the two do not face."""
         level = 0.0 if self.run.armed[pair] else float(self.level[pair])
-        s, place = self.s, self.s.to.gaps.start + pair
+        s, place, n = self.s, self.s.to.gaps.start + pair, self.run.system.n
 
-        def gap(step: float) -> float:
+        def look(step: float) -> tuple[float, float]:
             self._step_to(step)
-            return float(s.outputs[place]) - level
+            return float(s.outputs[place]) - level, self._approach(s.outputs, pair)
 
-        # The bracket is that of an interpolation, which grazing may mislead.
-        right = right if gap(right) < 0 else h
-        high = gap(right)
-        if high >= 0:
+        first = float(start.gaps[-1, pair]) - level, self._approach(start.out, pair)
+        first = look(left) if left > 0 else first
+        last = look(right)
+        if last[0] >= 0 and right < h:
+            # The bracket is that of an interpolation, which grazing may mislead.
+            right, last = h, look(h)
+        if last[0] >= 0:
             return None
-        first = gap(left) if left > 0 else float(start.gaps[-1, pair]) - level
-        root = find_root(gap, right, first, high, self.near, EXACT * self.unit, low=left)
+        near, exact = self.near, EXACT * self.unit
+        root = find_crossing(look, (left, *first), (right, *last), near, exact)
         self._step_to(root)
-        n, out = self.run.system.n, s.outputs
-        return root if self.run.face(out[:n], out[n : 2 * n])[1][pair] else None
+        return root if self.run.face(s.outputs[:n], s.outputs[n : 2 * n])[1][pair] else None
+
+    def _approach(self, out: Array, pair: int) -> float:
+        """Rate of a pair's gap at a state [m/s]."""
+        n = self.run.system.n
+        v = out[n : 2 * n]
+        return float(self.run.system.evaluate(out[:n], v, (pair,)).A[0] @ v)
 
     def _find_closing(
         self, start: View, end: View, passed: set[int]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -91,3 +92,64 @@ def find_root(
         if close:
             break
     return high
+
+
+def find_crossing(
+    look: Callable[[float], tuple[float, float]],
+    low: tuple[float, float, float],
+    high: tuple[float, float, float],
+    near: float,
+    flat: float,
+) -> float:
+    """Root of a function that falls from f >= 0 at `low` to f < 0 at `high`, by its slopes.
+
+    Newton's method from the root of the cubic through both ends, within a bracket that shrinks.
+
+    Parameters
+    ----------
+    look : callable
+        x -> f(x), f'(x)
+    low, high : tuple of three floats
+        x, f, f'
+    near, flat : float
+        As of `find_root`.
+    """
+    (left, f_left, slope), (right, f_right, _) = low, high
+    if f_left <= 0:
+        return left
+    x = left + (right - left) * _cross_cubic(low, high)
+    for _ in range(60):
+        f, slope = look(x)
+        if abs(f) <= flat:
+            return x
+        if f > 0:
+            left, f_left = x, f
+        else:
+            right, f_right = x, f
+        step = -f / slope if slope < 0 else math.inf
+        if not left < x + step < right:
+            step = right - f_right * (right - left) / (f_right - f_left) - x
+            if not left < x + step < right:
+                return right
+        x += step
+        if abs(step) <= near:
+            return x
+    return right
+
+
+def _cross_cubic(low: tuple[float, float, float], high: tuple[float, float, float]) -> float:
+    """Where the cubic through two ends of opposite sign, with its slopes, is zero, in (0, 1)."""
+    (x_0, a, slope_0), (x_1, b, slope_1) = low, high
+    c, d = slope_0 * (x_1 - x_0), slope_1 * (x_1 - x_0)
+    third, second = 2 * (a - b) + c + d, 3 * (b - a) - 2 * c - d
+    u, left, right = a / (a - b), 0.0, 1.0
+    for _ in range(20):
+        value = a + u * (c + u * (second + u * third))
+        left, right = (u, right) if value > 0 else (left, u)
+        slope = c + u * (2 * second + u * 3 * third)
+        new = u - value / slope if slope < 0 else -1.0
+        new = new if left < new < right else (left + right) / 2
+        if abs(new - u) < 1e-12:
+            break
+        u = new
+    return u
