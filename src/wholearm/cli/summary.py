@@ -42,6 +42,7 @@ def summarise(plan: Plan, output: str, table: Mapping[str, Any] | None = None) -
         lines.append(f"{phase.number:>5}  {phase.duration:>12.6f}  {least:>13.6f}  {torque:>19.6f}")
     lines += _list_modes(plan)
     lines += _list_transitions(plan)
+    lines += _list_settlings(plan)
     lines += [_describe_replay(plan.replay)]
     lines += [] if plan.certificate is None else _list_bounds(plan.certificate)
     lines += [] if plan.ranges is None else _describe_ranges(plan, plan.ranges)
@@ -178,6 +179,26 @@ def _list_transitions(plan: Plan) -> list[str]:
             + ("" if row.possible else f"  stops: {row.reason}")
         )
     return [*lines, ""]
+
+
+def _list_settlings(plan: Plan) -> list[str]:
+    """Table of the ends of phases that are held, and what that costs; empty if there are none."""
+    known = [phase.settling for phase in plan.phases if phase.settling is not None]
+    if not known:
+        return []
+    header = "phase  held [ms]  tau [N m]          closes         from [mm]  in [ms]  at [mm/s]"
+    lines = ["", f"{header}  parts for a moment"]
+    for own in known:
+        tau = " ".join(f"{value:8.4f}" for value in own.tau)
+        row = f"{own.phase:>5}  {1e3 * own.duration:>9.3g}  {tau}  {own.contact or '-':<13}"
+        if own.closes:
+            row += f"  {1e3 * own.gap:>9.3g}  {1e3 * own.closes:>7.3g}  {1e3 * own.speed:>9.3g}"
+            row += f"  {', '.join(own.parts) or '-'}"
+        lines.append(row)
+    held = sum(own.duration for own in known)
+    cost = held / (plan.duration - held)
+    lines += [f"warning: {own.warning}" for own in known if own.warning]
+    return [*lines, f"held for {held:.6g} s in all, {cost:.1%} of the motion", ""]
 
 
 def _show(value: float | None) -> str:

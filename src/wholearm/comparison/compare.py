@@ -23,8 +23,8 @@ from .side_by_side import Comparison, Contender
 
 SIMULATIONS = "simulations"
 """Key of a comment of torques, and of the `meta` of a trajectory, with how many it took."""
-_FREE = ("name", "epsilon")
-"""Keys of a problem in which trajectories may differ from it."""
+_FREE = ("name", "epsilon", "settle_gap")
+"""Keys of a problem in which trajectories may differ from it; so may `settle`, of a phase too."""
 
 
 def compare(problem: Problem, paths: Sequence[str]) -> Comparison:
@@ -72,7 +72,7 @@ def _find_difference(own: Any, other: Any, key: str) -> tuple[str, str, str] | N
     """The first key in which two tables differ, and both of its values."""
     if isinstance(own, Mapping) and isinstance(other, Mapping):
         for name in dict.fromkeys([*own, *other]):
-            if key or name not in _FREE:
+            if name != "settle" and (key or name not in _FREE):
                 inner = f"{key}.{name}" if key else str(name)
                 found = _find_difference(own.get(name), other.get(name), inner)
                 if found is not None:

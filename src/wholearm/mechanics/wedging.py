@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
+from ..scene.model import Scene
 
 SURE = 1e-3
 """Distance from torques that friction can hold, beyond which a motion begins for sure, relative to
@@ -52,7 +53,9 @@ class StaticTorques(NamedTuple):
         return np.asarray((tau @ self.normals.T - self.bounds).max(axis=1))
 
 
-def find_static_torques(touching: Sequence[Formation], z: Array) -> StaticTorques:
+def find_static_torques(
+    touching: Sequence[Formation], z: Array, least: float = 0.0
+) -> StaticTorques:
     """Torques with which contact forces and joint friction can balance gravity at `z`, shape (5,).
 
     Parameters
@@ -60,18 +63,57 @@ def find_static_torques(touching: Sequence[Formation], z: Array) -> StaticTorque
     touching : sequence of Formation
         With all contacts that touch, some perhaps in more than one.
     z : ndarray, shape (5,)
+    least : float, [N]
+        Normal force of every contact at which its cone begins: c_n >= least and
+        |c_t| <= mu (c_n - least).
     """
     scene = touching[0].scene
+    edges, normals = _list_edges(touching, z)
+    given = scene.applied_force + least * normals.sum(axis=0)
+    static = _project(scene, edges, given)
+    return static._replace(bounds=static.bounds + np.abs(static.normals) @ scene.dry[3:])
+
+
+def find_stopping_impulses(touching: Sequence[Formation], z: Array, v: Array) -> StaticTorques:
+    """Impulses at the joints that impulses of contacts within their cones can take up.
+
+    Together with those of the contacts they stop the object, which comes with `v`. Everything
+    stops where the momenta of the joints are among them.
+
+    Parameters
+    ----------
+    touching : sequence of Formation
+        With all contacts that touch just after.
+    z, v : ndarray, shape (5,)
+
+    Returns
+    -------
+    StaticTorques
+        With impulses [N m s] for torques, for the momenta J theta' of the joints.
+    """
+    scene = touching[0].scene
+    momentum = scene.mass_diagonal * v
+    momentum[3:] = 0.0
+    return _project(scene, _list_edges(touching, z)[0], momentum)
+
+
+def _list_edges(touching: Sequence[Formation], z: Array) -> tuple[Array, Array]:
+    """Edges of all cones as forces on (q, theta), shape (2 n_c, 5), and the normals, (n_c, 5)."""
     rows: dict[Contact, tuple[Array, Array]] = {}
     for formation in touching:
         kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
         slip = formation.friction[:, None] * kinematics.A_t[0]
         rows |= dict(zip(formation.contacts, zip(kinematics.A[0], slip, strict=True), strict=True))
     edges = np.array([normal + way * slip for normal, slip in rows.values() for way in (-1, 1)])
+    return edges, np.array([normal for normal, _ in rows.values()])
+
+
+def _project(scene: Scene, edges: Array, given: Array) -> StaticTorques:
+    """Torques that together with amounts of the edges balance what is given, shape (5,)."""
     scales = scene.scales
     # Forces count in the scene's force, torques in its torque.
-    edges /= np.array([1.0, 1.0, *[scales.length] * 3])
-    load = scene.applied_force[:3] / (scales.force * np.array([1.0, 1.0, scales.length]))
+    units = np.array([1.0, 1.0, *[scales.length] * 3])
+    edges, load = edges / units, given[:3] / (scales.force * units[:3])
     E, joints = edges[:, :3], -edges[:, 3:]
     corners, rays = _find_corners(E, joints, load), _find_rays(E, joints)
     if not len(corners):
@@ -84,7 +126,7 @@ def find_static_torques(touching: Sequence[Formation], z: Array) -> StaticTorque
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     normals = normals[(normals @ rays.T <= _TINY).all(axis=1)]
     bounds = scales.torque * (normals @ hull.T).max(axis=1) if len(normals) else np.zeros(0)
-    return StaticTorques(normals, bounds + np.abs(normals) @ scene.dry[3:])
+    return StaticTorques(normals, bounds - normals @ given[3:])
 
 
 def _find_corners(E: Array, joints: Array, load: Array) -> Array:

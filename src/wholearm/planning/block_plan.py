@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 from ..common.arrays import Array
 from ..geometry.curve import Curve
 from ..problem.definition import Phase, Problem
 from .options import PlanOptions
 from .path_domain.impact_sequence import ImpactSequence
+from .phase_plan import Settled
 from .stops import Plans, end_of
 
 PLAIN = -1
@@ -111,6 +113,16 @@ class Planning:
     def plans(self) -> Plans:
         """One for each phase."""
         return [plan for block in self.blocks for plan in block.plans]
+
+    @cached_property
+    def settled(self) -> Settled:
+        """The plans with their ends held, where the problem asks for that."""
+        plans, phases = self.plans, self.problem.phases
+        if not any(map(self.problem.settles, phases)):
+            return Settled(plans, (None,) * len(phases))
+        from .settling import settle_plans
+
+        return settle_plans(self.problem, plans)
 
     def find_block(self, number: int) -> int:
         """Index of the block with the phase of a number, counted from 1."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Generic, NamedTuple, TypeVar
 
 from ..problem.definition import Phase
+from ..results.settling import Settling
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion
 from .options import Objective
@@ -49,6 +50,13 @@ class PhasePlan(NamedTuple, Generic[M_co]):
     stages: Sequence[object] = ()
     error: float = math.nan
     solution: object = None
+
+
+class Settled(NamedTuple):
+    """Plans of all phases with their ends held, and how; None where an end is not to be held."""
+
+    plans: list[PhasePlan[Motion]]
+    settlings: tuple[Settling | None, ...]
 
 
 @dataclass

@@ -186,24 +186,25 @@ def _plan(
 
 def assemble_plan(planning: Planning) -> Trajectory:
     """The trajectory of a planning; of its `meta` only what the motion itself depends on."""
-    torque = TorqueProfile.chain([plan.torque for plan in planning.plans])
+    torque = TorqueProfile.chain([plan.torque for plan in planning.settled.plans])
     phases = _list_phases(planning, Ledger(None))
     meta = {
         "rolling": [list(phase.rolling) for phase in phases],
         "modes": [[mode.to_dict() for mode in phase.modes] for phase in phases],
     }
-    motions = [plan.motion for plan in planning.plans]
+    motions = [plan.motion for plan in planning.settled.plans]
     return assemble(motions, torque, meta, planning.options.samples)
 
 
 def _list_phases(
     planning: Planning, ledger: Ledger, sure: Sequence[Sureness] = ()
 ) -> tuple[PlannedPhase, ...]:
+    settled = planning.settled
     return tuple(
         PlannedPhase(
             phase.number,
             plan.value,
-            plan.motion.duration,
+            held.motion.duration,
             tuple(contact.name for contact in phase.formation.rolling),
             getattr(plan.motion, "modes", ()),
             plan.sequences,
@@ -211,9 +212,12 @@ def _list_phases(
             plan.attempt,
             plan.error,
             ledger.of(phase.number),
-            *(sure[phase.index] if sure else (None, None)),
+            *(sure[phase.index] if sure else Sureness(None, None)),
+            settled.settlings[phase.index],
         )
-        for phase, plan in zip(planning.problem.phases, planning.plans, strict=True)
+        for phase, plan, held in zip(
+            planning.problem.phases, planning.plans, settled.plans, strict=True
+        )
     )
 
 

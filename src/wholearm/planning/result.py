@@ -18,6 +18,7 @@ from ..results.modes import ModeSpan
 from ..results.range_figures import RangeFigures
 from ..results.replay_figures import ReplayFigures
 from ..results.report import LeastMinor
+from ..results.settling import Settling
 from ..results.trajectory import Samples, Trajectory
 from ..results.transition import Transition
 from ..solvers.statistics import SolverStatistics
@@ -74,6 +75,8 @@ class PlannedPhase(NamedTuple):
         The least principal minor over that without friction; None in files of earlier versions.
     wedged : float or None, [s]
         For how long friction could hold everything at rest; None if it does not begin so.
+    settling : Settling or None
+        How its end is held, if it is to be; `duration` includes that.
     """
 
     number: int
@@ -88,6 +91,7 @@ class PlannedPhase(NamedTuple):
     statistics: SolverStatistics
     minor: LeastMinor | None = None
     wedged: float | None = None
+    settling: Settling | None = None
 
 
 class Timings(NamedTuple):

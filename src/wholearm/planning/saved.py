@@ -15,6 +15,7 @@ from ..results.modes import ModeSpan
 from ..results.range_figures import RangeFigures
 from ..results.replay_figures import ReplayFigures
 from ..results.report import LeastMinor
+from ..results.settling import Settling
 from ..results.trajectory import Trajectory
 from ..results.trajectory_file import load_trajectory
 from ..results.transition import Transition
@@ -50,6 +51,7 @@ def write_meta(plan: Plan) -> dict[str, Any]:
         "phase_errors": [None if isnan(phase.error) else phase.error for phase in phases],
         "least_minors": [None if own.minor is None else own.minor._asdict() for own in phases],
         "wedged": [phase.wedged for phase in phases],
+        "settling": [own.settling and own.settling.to_dict() for own in phases],
         "phase_durations": [phase.duration for phase in phases],
         **{name: getattr(options, name) for name in _OPTIONS},
         "iterations": [phase.statistics.iterations for phase in phases],
@@ -93,6 +95,10 @@ def _read_minor(given: Mapping[str, Any] | None) -> LeastMinor | None:
     return None if given is None else LeastMinor(**given)
 
 
+def _read_settling(given: Mapping[str, Any] | None) -> Settling | None:
+    return None if given is None else Settling.of(given)
+
+
 def _read_error(given: Any) -> float:
     return nan if given is None else float(given)
 
@@ -134,6 +140,7 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
             statistics[k],
             _read_minor(column("least_minors", None)[k]),
             column("wedged", None)[k],
+            _read_settling(column("settling", None)[k]),
         )
         for k in range(count)
     )

@@ -16,7 +16,14 @@ from ..common.sharing import exclusive
 from ..contacts.formation import Formation, describe, find_touching
 from ..contacts.links import evaluate_finger_gap
 from ..scene.model import Scene
-from ..scene.ranges import TURN, check_epsilon, check_place, check_ranges
+from ..scene.ranges import (
+    TURN,
+    check_epsilon,
+    check_place,
+    check_ranges,
+    check_settle,
+    check_settle_gap,
+)
 from .definition import End, Phase, Problem, Until
 from .uncertainty import spread_widths
 
@@ -37,12 +44,18 @@ def check_problem(problem: Problem) -> None:
     check_epsilon(problem.scene, epsilon)
     spread_widths(problem.uncertainty or {}, "uncertainty.{}")
     check_place(problem.scene, "start.x", float(require_vector(problem.start, "start", 5)[0]))
+    settle = require_number(problem.settle, "settle", nonnegative=True)
+    check_settle(problem.scene, "settle", settle)
+    if problem.settle_gap is not None:
+        gap = require_number(problem.settle_gap, "settle_gap", positive=True)
+        check_settle_gap(problem.scene, gap)
     for index, phase in enumerate(problem.phases):
         if phase.index != index:
             text = f"has the index {phase.index}; phases count up from 0, which makes it {index}"
             raise InputError("", f"phases[{index + 1}]", text)
         _check_formation(phase.formation, f"phases[{index + 1}].contacts")
         _check_until(problem.scene, phase, f"phases[{index + 1}].until")
+        _check_settle(problem.scene, phase, f"phases[{index + 1}].settle")
     for phase, following in zip_longest(problem.phases, problem.phases[1:]):
         _check_end(phase, following)
     _check_fingers(problem)
@@ -94,6 +107,15 @@ def _check_until(scene: Scene, phase: Phase, key: str) -> None:
         raise InputError("", key, f"{until} is already in the phase's contacts")
     if until.value is not None:
         check_coordinate(scene, until, key)
+
+
+def _check_settle(scene: Scene, phase: Phase, key: str) -> None:
+    """Check for how long the end of a phase is held, if it says so itself."""
+    if phase.settle is None:
+        return
+    check_settle(scene, key, require_number(phase.settle, key, nonnegative=True))
+    if phase.settle and phase.end is End.SMOOTH:
+        raise InputError("", key, f"{phase.settle:g} given, but the phase has end = 'smooth'")
 
 
 def check_coordinate(scene: Scene, until: Until, key: str) -> None:

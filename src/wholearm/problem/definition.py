@@ -15,6 +15,9 @@ from ..contacts.formation import Formation
 from ..scene.model import Scene
 from .table import change_table, match_table, write_table
 
+SETTLE_GAP = 3e-3
+"""Gap that closes where the end of a phase is held, over the scene's length: 0.1 mm of 35 mm."""
+
 
 class End(Enum):
     """How a phase passes into the next one."""
@@ -76,12 +79,15 @@ class Phase:
     until : Until
     end : End
         How it passes into the next phase; the last one ends at rest.
+    settle : float or None, [s]
+        For how long its end is held, if it comes to rest there; the problem's if left out.
     """
 
     index: int
     formation: Formation
     until: Until
     end: End = End.REST
+    settle: float | None = None
 
     @property
     def number(self) -> int:
@@ -117,6 +123,11 @@ class Problem:
     uncertainty : mapping or None
         Half widths of the ranges of what is not known exactly, by name; those that are left out
         have their defaults, see `problem.uncertainty`. None where the problem does not say.
+    settle : float, [s]
+        For how long phases that come to rest are held at their ends, so that contacts close that
+        are still open; a phase may have its own.
+    settle_gap : float or None, [m]
+        By how much they may be open; `SETTLE_GAP` of the scene's length if left out.
     checked : bool
         Whether it is known to be like one from a file; otherwise it is checked when it is made.
 
@@ -140,6 +151,8 @@ class Problem:
     table: Mapping[str, Any] = field(default_factory=dict, repr=False)
     uncertainty: Mapping[str, float] | None = None
     checked: bool = field(default=False, repr=False)
+    settle: float = 0.0
+    settle_gap: float | None = None
 
     def __post_init__(self) -> None:
         phases = tuple(phase.move_to(self.scene) for phase in self.phases)
@@ -185,6 +198,16 @@ class Problem:
         with name_source(self.source):
             table = change_table(self.table, {**(changes or {}), **named}, NAMES)
         return build_problem(table, self.source)
+
+    def settles(self, phase: Phase) -> float:
+        """For how long the end of a phase is held, if it comes to rest there [s]."""
+        return self.settle if phase.settle is None else phase.settle
+
+    @property
+    def gap(self) -> float:
+        """By how much a contact may be open that closes at such an end [m]."""
+        default = SETTLE_GAP * self.scene.scales.length
+        return default if self.settle_gap is None else self.settle_gap
 
     @property
     def contacts(self) -> tuple[Contact, ...]:

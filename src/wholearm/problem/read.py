@@ -33,7 +33,9 @@ _T = TypeVar("_T")
 ROLLING = " rolling"
 """Follows the name of a contact that rolls in a phase's `contacts`."""
 
-_OPTIONAL = {"name", "gravity", "fingers_collide", "phases", "uncertainty"}
+_OPTIONAL = {
+    "name", "gravity", "fingers_collide", "phases", "settle", "settle_gap", "uncertainty",
+}  # fmt: skip
 _TOP = _OPTIONAL | {"epsilon", "object", "fingers", "friction", "start"}
 _OBJECT = {"vertices", "mass", "inertia"}
 _DEFAULTS = {"radius": 0.0, "viscous": 0.0, "dry": 0.0}
@@ -91,7 +93,18 @@ def _build_problem(table: Mapping[str, Any], source: str) -> Problem:
     phases = tuple(_read_phase(scene, i, entry) for i, entry in enumerate(given))
     ranges = _read_ranges(table) if "uncertainty" in table else None
     name = table.get("name", "unnamed")
-    return Problem(name, scene, table["epsilon"], start, phases, source, table, ranges)
+    return Problem(
+        name,
+        scene,
+        table["epsilon"],
+        start,
+        phases,
+        source,
+        table,
+        ranges,
+        settle=table.get("settle", 0.0),
+        settle_gap=table.get("settle_gap"),
+    )
 
 
 def read_own_problem(meta: Mapping[str, Any], source: str = "") -> Problem:
@@ -182,7 +195,7 @@ def _read_phase(scene: Scene, index: int, entry: object) -> Phase:
     key = f"phases[{index + 1}]"
     if not isinstance(entry, dict):
         raise InputError("", key, f"{entry!r} is not a table")
-    _check_keys(entry, key, {"contacts", "until", "end"}, required={"contacts"})
+    _check_keys(entry, key, {"contacts", "until", "end", "settle"}, required={"contacts"})
     names = entry["contacts"]
     if not isinstance(names, list) or not names:
         raise InputError("", f"{key}.contacts", f"{names!r} is not a list of contact names")
@@ -193,7 +206,7 @@ def _read_phase(scene: Scene, index: int, entry: object) -> Phase:
     until, end = Until(), End(given)
     if "until" in entry:
         until = _at(f"{key}.until", lambda: read_until(scene, entry["until"]))
-    return Phase(index, formation, until, end)
+    return Phase(index, formation, until, end, entry.get("settle"))
 
 
 def read_formation(scene: Scene, names: Sequence[object]) -> Formation:

@@ -136,7 +136,8 @@ def match_table(problem: Problem) -> Mapping[str, Any]:
     table = problem.table
     if not table:
         return table
-    known = {"name": problem.name, "epsilon": problem.epsilon} | describe_scene(problem.scene)
+    own = {key: getattr(problem, key) for key in ("name", "epsilon", "settle", "settle_gap")}
+    known = own | describe_scene(problem.scene)
     known["uncertainty"] = _to_plain(problem.uncertainty)
     differing = {key: value for key, value in known.items() if not _agrees(table, key, value)}
     start = _match_start(table["start"], problem)
@@ -159,6 +160,8 @@ def write_table(problem: Problem) -> Mapping[str, Any]:
     table: dict[str, Any] = {
         "name": problem.name,
         "epsilon": problem.epsilon,
+        **({"settle": problem.settle} if problem.settle else {}),
+        **({} if problem.settle_gap is None else {"settle_gap": problem.settle_gap}),
         "object": {},
         "fingers": {"1": {}, "2": {}},
         "friction": {},
@@ -196,7 +199,7 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
     return values
 
 
-_DEFAULTS = {"name": "unnamed", "radius": 0.0, "viscous": 0.0, "dry": 0.0} | {
+_DEFAULTS = {"name": "unnamed", "settle": 0.0, "radius": 0.0, "viscous": 0.0, "dry": 0.0} | {
     field.name: field.default for field in fields(Scene)
 }
 
@@ -240,13 +243,15 @@ def _match_phase(entries: Sequence[Mapping[str, Any]], phase: Phase) -> Mapping[
     elif until.value is not None:
         x = until.coordinate == "x"
         own["until"] = {"x": until.value} if x else {"phi_deg": math.degrees(until.value)}
+    if phase.settle is not None:
+        own["settle"] = phase.settle
     for entry in (*entries[phase.index : phase.index + 1], *entries):
         given = entry.get("until")
         if isinstance(given, Mapping) and "phi_deg" in given and until.coordinate == "phi":
             same = math.radians(given["phi_deg"]) == until.value
         else:
             same = given == own.get("until")
-        same = same and entry["contacts"] == own["contacts"]
+        same = same and all(entry.get(key) == own.get(key) for key in ("contacts", "settle"))
         if same and entry.get("end", "rest") == phase.end.value:
             return entry
     return own | ({} if phase.end.value == "rest" else {"end": phase.end.value})

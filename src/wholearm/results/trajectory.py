@@ -58,7 +58,8 @@ class Trajectory:
     ----------
     t : ndarray, shape (n,), [s]
         Even within each phase of a plan; a phase boundary is there twice, since torques and forces
-        step. In a replay any other step is, too.
+        step, and so is where a phase is at its end and is held there. In a replay any other step
+        is, too.
     q, theta : ndarray, shape (n, 3) and (n, 2), [m, m, rad] and [rad]
     q_dot, theta_dot, q_ddot, theta_ddot : ndarray
         First and second derivatives with respect to time.
@@ -66,7 +67,7 @@ class Trajectory:
     contacts : tuple of str, length m
         Every contact of the plan.
     c_n, c_t : ndarray, shape (n, m), [N]
-        NaN where a contact is not in the formation.
+        NaN where a contact is not in the formation, or at rest, where forces are not determined.
     phase : ndarray of int, shape (n,)
         Index of the phase, from 0.
     torque : TorqueProfile
@@ -199,13 +200,18 @@ class Trajectory:
 def assemble(
     motions: Sequence[Motion], torque: TorqueProfile, meta: Mapping[str, Any], samples: int
 ) -> Trajectory:
-    """Sample motions that follow one another, `samples` rows to a phase."""
+    """Sample motions that follow one another, `samples` rows to a phase and two to its held end."""
+    from .settling import SettledMotion
+
     contacts = tuple(dict.fromkeys(name for motion in motions for name in motion.contacts))
     rows, times, forces, start = [], [], [], 0.0
     for motion in motions:
-        local = np.linspace(0.0, motion.duration, samples)
-        row = motion.evaluate(local)
-        wide = np.full((2, samples, len(contacts)), np.nan)
+        if isinstance(motion, SettledMotion):
+            local, row = motion.sample(samples)
+        else:
+            local = np.linspace(0.0, motion.duration, samples)
+            row = motion.evaluate(local)
+        wide = np.full((2, len(local), len(contacts)), np.nan)
         wide[:, :, [contacts.index(name) for name in motion.contacts]] = row.c_n, row.c_t
         rows.append(row)
         times.append(start + local)
@@ -225,7 +231,7 @@ def assemble(
         contacts=contacts,
         c_n=c_n,
         c_t=c_t,
-        phase=np.repeat(np.arange(len(motions)), samples),
+        phase=np.repeat(np.arange(len(motions)), [len(row.z) for row in rows]),
         torque=torque,
         motions=tuple(motions),
         meta=dict(meta),

@@ -59,6 +59,10 @@ DRY = Range(0.0, 1e3)
 """Dry friction, over the torque limit or m g length."""
 SPEED = Range(1e-3, 1e6)
 """Speed limit, in radians in the scene's time."""
+SETTLE = Range(1e-4, 1e3)
+"""Time for which the end of a phase is held, over the scene's, unless it is zero."""
+SETTLE_GAP = Range(1e-6, 0.1)
+"""Gap that is to close in it, over the scene's length."""
 EPSILON = Range(0.0, 1e3)
 """Least normal force, over the weight or what the stronger finger can press with."""
 
@@ -97,6 +101,17 @@ def check_epsilon(scene: Scene, epsilon: float) -> None:
     press = max(finger.torque_limit / finger.length for finger in scene.fingers)
     much = max(scene.polygon.mass * scene.gravity, press)
     EPSILON.check("epsilon", epsilon, "N", much, "times what presses at most")
+
+
+def check_settle(scene: Scene, key: str, value: float) -> None:
+    """Check for how long the end of a phase is held [s]; raises like `check_ranges`."""
+    if value:
+        SETTLE.check(key, value, "s, or 0", scene.scales.time, "times the scene's time")
+
+
+def check_settle_gap(scene: Scene, value: float) -> None:
+    """Check by how much a contact may then be open [m]; raises like `check_ranges`."""
+    SETTLE_GAP.check("settle_gap", value, "m", scene.scales.length, "times the scene's length")
 
 
 def check_place(scene: Scene, key: str, value: float) -> None:

@@ -60,6 +60,7 @@ def find_wedged(
     motion: Trajectory | Simulation,
     rows: NDArray[np.int64],
     slow: float,
+    start: float = -np.inf,
 ) -> float | None:
     """For how long a phase that begins at rest may stay so, wedged by friction [s]; else None.
 
@@ -75,6 +76,8 @@ def find_wedged(
         Its rows in the phase.
     slow : float
         Speed that passes for rest, relative to the scene's.
+    start : float, [s]
+        Since when the phase is to move, if its rows begin with the time for which it is held.
     """
     scene, touching = problem.scene, [phase.formation]
     if phase.index:
@@ -82,7 +85,7 @@ def find_wedged(
             return None
         touching.append(problem.phases[phase.index - 1].formation)
     static = find_static_torques(touching, motion.z[rows[0]])
-    start, stop = motion.t[rows[[0, -1]]].tolist()
+    start, stop = max(start, float(motion.t[rows[0]])), float(motion.t[rows[-1]])
     t = np.linspace(start, stop, 4 * PLACES)
     # At its end the torques are those of the next phase.
     beyond = static.measure(motion.torque.at(t[:-1])) - SURE * scene.scales.torque

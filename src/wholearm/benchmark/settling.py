@@ -1,0 +1,100 @@
+"""Whole plans with their ends of phases held, in a free simulation by the clock.
+
+``python -m wholearm.benchmark.settling problems/*.toml [--output results]`` plans every problem of
+least time as it is and with `settle`, simulates both from the exact start and from starts that are
+0.1 mm to either side, without telling which contacts hold, and lists how far the object's pose ends
+from where it was planned to.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..common.files import write_text
+from ..free_simulation.simulate import simulate_free
+from ..planning.plan import solve
+from ..planning.result import Plan
+from ..problem.definition import Problem
+from ..problem.read import place_start, read_problem
+from .report import stamp
+
+LONGER = 0.099
+"""By how much plans are made longer, over their duration, where no `--settle` is given."""
+OFF = 1e-4
+"""By how much starts are moved [m]."""
+HEAD = (
+    "# Plans whose phases are held at their ends",
+    "",
+    stamp(),
+    "",
+    "Distance of the object's pose from the plan's at the end of the whole, simulated by the clock",
+    "without telling which contacts hold; `short` and `ahead` start 0.1 mm off.",
+    "",
+    "| problem | settle [ms] | time [s] | longer | exact [mm] | [deg] | short [mm] | [deg] "
+    "| ahead [mm] | [deg] |",
+    "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+)
+
+
+class End(NamedTuple):
+    """How far the object ends from the plan [mm], and by how much it is turned [degrees]."""
+
+    position: float
+    angle: float
+
+
+def measure_end(plan: Plan, off: float) -> End:
+    """Simulate a whole plan from a start that is moved by `off` [m] along the palm."""
+    problem, last = plan.problem, plan.trajectory.z[-1]
+    edge = problem.table["start"]["flush"]
+    start = place_start(problem.scene, edge, float(problem.start[0]) + off) if off else None
+    away = simulate_free(problem, plan.trajectory, start=start).z[-1] - last
+    return End(1e3 * float(np.hypot(away[0], away[1])), float(np.degrees(abs(away[2]))))
+
+
+def choose_settle(plan: Plan) -> float:
+    """For how long ends may be held for the whole to be longer by `LONGER` [s]."""
+    trajectory = plan.trajectory
+    ends = np.append(np.flatnonzero(np.diff(trajectory.phase)), len(trajectory.t) - 1)
+    rests = np.abs(trajectory.z_dot[ends]).max(axis=1) < 1e-3 * np.abs(trajectory.z_dot).max()
+    return LONGER * plan.duration / max(int(rests.sum()), 1)
+
+
+def list_rows(problem: Problem, settle: float | None) -> list[str]:
+    """The rows of a problem in the table: without and with `settle`."""
+    plain = solve(problem)
+    held = choose_settle(plain) if settle is None else settle
+    way = np.sign(plain.trajectory.q[len(plain.trajectory.t) // 50, 0] - problem.start[0])
+    rows = []
+    for plan, time in ((plain, 0.0), (solve(problem.with_(settle=held)), held)):
+        ends = [measure_end(plan, off) for off in (0.0, -way * OFF, way * OFF)]
+        longer = plan.duration / plain.duration - 1
+        cells = [f"{1e3 * time:.3g}", f"{plan.duration:.4f}", f"{longer:.1%}"]
+        cells += [f"{value:.1e}" for end in ends for value in end]
+        rows.append(f"| {problem.name} | {' | '.join(cells)} |")
+    return rows
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write the table and print its lines."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("problems", nargs="+", type=Path, help="problem files")
+    parser.add_argument("--settle", type=float, help="for how long ends are held [s]")
+    parser.add_argument("--output", type=Path, default=Path("results"))
+    options = parser.parse_args(arguments)
+    lines = [*HEAD]
+    for path in options.problems:
+        for row in list_rows(read_problem(str(path)), options.settle):
+            lines.append(row)
+            print(row, flush=True)
+    write_text(str(options.output / "bench_settling.md"), "\n".join(lines) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,336 @@
+"""Constant torques that close a contact and then hold still with everything that touches.
+
+A motion that is to stop at a contact may end a little short of it. Torques are looked for that
+
+* from rest, with the contact still open by a gap, drive the formation on until it closes, in one of
+  the ways in which it can begin to move, with every c_n at least epsilon;
+* are in static balance with all that touches once it has closed, every c_n at least epsilon and
+  |c_t| <= mu (c_n - epsilon), and set off in no way that gives one of these contacts up.
+
+At rest all of this is affine in the two torques. The best ones have the largest least margin, each
+over what is ample for it: a linear programme in three unknowns, solved by its vertices.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import combinations, product
+from typing import NamedTuple
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..contacts.elemental import Contact
+from ..contacts.formation import Formation
+from ..scene.model import Scene
+from .dynamics import Directions, force_rows
+from .impact import ViolationKind, compute_impact
+from .wedging import SURE, find_static_torques
+
+LEAST = 1e-2
+"""Margin over what is ample below which torques do not hold, or close, for sure."""
+AMPLE = 0.1
+"""Margin that is ample: of a normal force, a torque or an acceleration, over the scene's."""
+SWIFT = 2.0
+"""Largest acceleration towards a contact, over that which closes its gap in the given time: what
+arrives faster is thrown back farther."""
+_CREEP = 0.02
+"""Ample acceleration of what slides and turns where the directions of sliding are assumed, over the
+scene's."""
+_STILL = 1e-9
+"""Rate of sliding or turning that counts as none, over how fast anything moves; change of a gap
+that counts as none, over how far everything moves."""
+_JAMS = 1e-6
+"""Determinant of K over that without friction, at which and below a way jams."""
+_SMALL = 1e-9
+"""What counts as zero in the linear programme."""
+_FAR = 1e3
+"""Largest margin that is looked for, over what is ample."""
+
+
+class Way(NamedTuple):
+    """A way in which a formation at rest may begin to move; rows are for (1, tau_1, tau_2).
+
+    Attributes
+    ----------
+    acceleration : ndarray, shape (5, 3)
+        z''.
+    c_n : ndarray, shape (n_c, 3), [N]
+    consistent : ndarray, shape (k, 3)
+        Accelerations of sliding contacts and of joints the way that their friction assumes, over
+        the scene's; none with one freedom, where `heading` says it all.
+    heading : ndarray, shape (5,), or None
+        With one freedom, where to, of length one in the metric M5.
+    """
+
+    acceleration: Array
+    c_n: Array
+    consistent: Array
+    heading: Array | None
+
+
+class Standstill(NamedTuple):
+    """Where a motion stops.
+
+    Attributes
+    ----------
+    z : ndarray, shape (5,)
+    formation : Formation
+        That it stops in.
+    gained : Contact or None
+        What it stops at.
+    touching : Formation
+        All that touches.
+    """
+
+    z: Array
+    formation: Formation
+    gained: Contact | None
+    touching: Formation
+
+
+class Hold(NamedTuple):
+    """Constant torques for a standstill.
+
+    Attributes
+    ----------
+    tau : ndarray, shape (2,), [N m]
+    margin : float
+        The least of the margins, over what is ample.
+    acceleration : float, [m/s^2]
+        With which the contact closes from rest; zero where nothing has to close.
+    speed : float, [m/s]
+        At most, on its arrival.
+    parts : tuple of str
+        Contacts that would have to pull in the impact of that arrival: they part for a moment.
+    """
+
+    tau: Array
+    margin: float
+    acceleration: float = 0.0
+    speed: float = 0.0
+    parts: tuple[str, ...] = ()
+
+
+def find_hold(place: Standstill, epsilon: float, gap: float, time: float) -> Hold | None:
+    """The best torques for a standstill; those that only hold where none would close its contact.
+
+    Parameters
+    ----------
+    place : Standstill
+    epsilon : float, [N]
+        Least normal force.
+    gap : float, [m]
+        By how much the contact may be open.
+    time : float, [s]
+        In which it is to close from there.
+
+    Returns
+    -------
+    Hold or None
+        With zero `acceleration` if no torques would close the contact; None if none would hold.
+    """
+    scene = place.formation.scene
+    rest = _list_holding(place, epsilon)
+    opening = _find_opening(place)
+    if opening is not None:
+        closing = _find_closing(place, rest, opening, epsilon, gap, time)
+        if closing is not None:
+            return closing
+    best = maximise_margin(scene, rest)
+    return None if best is None or best[1] < LEAST else Hold(*best)
+
+
+def needs_closing(place: Standstill) -> bool:
+    """Whether the motion stops at a contact that it could stop short of."""
+    return _find_opening(place) is not None
+
+
+def _list_holding(place: Standstill, epsilon: float) -> Array:
+    """Rows of what has to be positive at rest, over what is ample, shape (k, 3)."""
+    touching, z = place.touching, place.z
+    scene = touching.scene
+    static = find_static_torques([touching], z, epsilon)
+    balance = np.column_stack([static.bounds, -static.normals]) / (AMPLE * scene.scales.torque)
+    A = touching.evaluate(z[None], np.zeros((1, 5))).A[0]
+    count = np.linalg.matrix_rank(A / np.sqrt(scene.mass_diagonal), tol=_SMALL)
+    away = []
+    for kept in combinations(range(len(A)), 4) if count == 5 else ():
+        others = [k for k in range(len(A)) if k not in kept]
+        part = Formation(scene, tuple(touching.contacts[k] for k in kept))
+        away += [
+            -_drive(scene, way)
+            for way in list_ways(part, z)
+            if way.heading is not None and (A[others] @ way.heading >= -_SMALL).all()
+        ]
+    return np.vstack([balance, *away])
+
+
+def _drive(scene: Scene, way: Way) -> Array:
+    """How strongly a way with one freedom accelerates, over what is ample, shape (3,)."""
+    assert way.heading is not None
+    drive = (way.heading * scene.mass_diagonal) @ way.acceleration
+    return np.asarray(drive / (AMPLE * math.sqrt(scene.scales.mass) * scene.scales.acceleration))
+
+
+def _find_opening(place: Standstill) -> Array | None:
+    """By how z changes as the gained contact opens, per metre of its gap, shape (5,).
+
+    None if there is no such contact, or if nothing opens it: one that goes on as another feature.
+    """
+    if place.gained is None:
+        return None
+    scene = place.formation.scene
+    at = place.z[None], np.zeros((1, 5))
+    normal = Formation(scene, (place.gained,)).evaluate(*at).A[0][0]
+    root = np.sqrt(scene.mass_diagonal)
+    P, along = place.formation.evaluate(*at).P[0] / root, normal / root
+    free = along - P.T @ np.linalg.lstsq(P.T, along, rcond=_SMALL)[0]
+    rate = float(free @ along)
+    if rate <= _STILL**0.5 * float(along @ along):
+        return None
+    return np.asarray(free / root / rate)
+
+
+def _find_closing(
+    place: Standstill, rest: Array, opening: Array, epsilon: float, gap: float, time: float
+) -> Hold | None:
+    """The best torques that drive the formation on, `gap` before the contact is closed."""
+    assert place.gained is not None
+    scene, scales = place.formation.scene, place.formation.scene.scales
+    z = place.z + gap * opening
+    normal = Formation(scene, (place.gained,)).evaluate(z[None], np.zeros((1, 5))).A[0][0]
+    swift = 2 * gap / time**2
+    best: Hold | None = None
+    for way in list_ways(place.formation, z):
+        if way.heading is not None and normal @ way.heading >= 0:
+            continue
+        closing = -normal @ way.acceleration
+        presses = (way.c_n - [epsilon, 0.0, 0.0]) / (AMPLE * scales.force)
+        speedy, rows = closing / swift, np.vstack([rest, presses, way.consistent])
+        window = np.array([speedy - [1.0, 0.0, 0.0], [SWIFT, 0.0, 0.0] - speedy])
+        found = maximise_margin(scene, rows, window)
+        if found is None or found[1] < LEAST:
+            # Slower than asked for is better than not at all.
+            found = maximise_margin(scene, np.vstack([rows, speedy]))
+        if found is None or found[1] < max(LEAST, best.margin if best else 0.0):
+            continue
+        tau = found[0]
+        if not _is_sure(place, z, tau):
+            continue
+        a = float(closing @ [1.0, *tau])
+        v = way.acceleration @ [1.0, *tau] * math.sqrt(2 * gap / a)
+        best = Hold(tau, found[1], a, math.sqrt(2 * a * gap), find_parting(place, v))
+    return best
+
+
+def _is_sure(place: Standstill, z: Array, tau: Array) -> bool:
+    """Whether no friction can hold the formation at rest before it is there."""
+    own = find_static_torques([place.formation], z)
+    return bool(own.measure(tau[None])[0] > SURE * place.formation.scene.scales.torque)
+
+
+def find_parting(place: Standstill, v: Array) -> tuple[str, ...]:
+    """Contacts that would have to pull for everything that touches to keep doing so in an impact.
+
+    Parameters
+    ----------
+    place : Standstill
+    v : ndarray, shape (5,)
+        Velocity z' just before.
+    """
+    try:
+        impact = compute_impact(place.formation, place.touching, place.z, v)
+    except np.linalg.LinAlgError:
+        return ()
+    return tuple(h.name for h in impact.violations if h.kind is ViolationKind.PULL)
+
+
+def list_ways(formation: Formation, z: Array) -> Iterator[Way]:
+    """Every way in which a formation at rest at `z`, shape (5,), may begin to move."""
+    scene, n_c = formation.scene, formation.n_contacts
+    kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
+    P, inverse_mass = kinematics.P[0], 1 / scene.mass_diagonal
+    scales = scene.scales
+    rates = np.vstack([kinematics.A_t[0] / scales.acceleration, scales.time**2 * np.eye(5)[3:]])
+    drive = np.column_stack([scene.applied_force, np.eye(5)[:, 3:]])
+    plain = np.linalg.det((P * inverse_mass) @ P.T)
+    rolls = list(formation.rolling_rows)
+    for signs, heading in _list_signs(scene, P, rates, rolls):
+        directions = Directions(signs[None, :n_c], signs[None, n_c:])
+        G = force_rows(formation, kinematics, directions)[0]
+        K = (P * inverse_mass) @ G.T
+        if not np.linalg.det(K) > _JAMS * plain:
+            continue
+        applied = drive.copy()
+        applied[3:, 0] -= scene.dry[3:] * signs[n_c:]
+        c = -np.linalg.solve(K, (P * inverse_mass) @ applied)
+        acceleration = inverse_mass[:, None] * (applied + G.T @ c)
+        assumed = signs[:, None] * (rates @ acceleration) / _CREEP
+        consistent = assumed[signs != 0] if heading is None else np.zeros((0, 3))
+        yield Way(acceleration, c[:n_c], consistent, heading)
+
+
+def _list_signs(
+    scene: Scene, P: Array, rates: Array, rolls: list[int]
+) -> Iterator[tuple[Array, Array | None]]:
+    """Directions of contacts and joints, shape (n_c + 2,), zero for what stays, and the heading."""
+    if len(P) == 4:
+        root = np.sqrt(scene.mass_diagonal)
+        heading = np.linalg.svd(P / root)[2][4] / root
+        speeds = rates @ heading
+        speeds[rolls] = 0.0
+        signs = np.where(np.abs(speeds) > _STILL * np.abs(speeds).max(), np.sign(speeds), 0.0)
+        yield from ((signs, heading), (-signs, -heading))
+        return
+    free = [k for k in range(len(rates)) if k not in rolls]
+    for choice in product((1.0, -1.0), repeat=len(free)):
+        signs = np.zeros(len(rates))
+        signs[free] = choice
+        yield signs, None
+
+
+def maximise_margin(
+    scene: Scene, rows: Array, bounds: Array | None = None
+) -> tuple[Array, float] | None:
+    """Torques within their limits with the largest least margin, and that margin; None if none.
+
+    Parameters
+    ----------
+    scene : Scene
+    rows : ndarray, shape (k, 3)
+        Margins are rows @ (1, tau_1, tau_2).
+    bounds : ndarray, shape (l, 3), optional
+        What has to be positive, too, without a margin.
+    """
+    limits, unit = scene.torque_limit, scene.scales.torque
+    box = [[limit, *(-side * axis)] for limit, axis in zip(limits, np.eye(2), strict=True)
+           for side in (1.0, -1.0)]  # fmt: skip
+    plain = np.vstack([box, np.zeros((0, 3)) if bounds is None else bounds])
+    sides = np.vstack([plain, rows, [[_FAR, 0.0, 0.0]]]) * [1.0, unit, unit]
+    counts = np.repeat([0.0, 1.0], [len(plain), len(rows) + 1])
+    matrix = np.column_stack([-sides[:, 1:], counts])
+    sizes = np.abs(np.column_stack([sides, counts])).max(axis=1)
+    matrix, right = matrix / sizes[:, None], sides[:, 0] / sizes
+    chosen = [0, 1, 2, 3, len(sides) - 1]
+    while True:
+        x = _find_vertex(matrix[chosen], right[chosen])
+        if x is None:
+            return None
+        missed = matrix @ x - right
+        worst = int(missed.argmax())
+        if missed[worst] <= _SMALL * max(1.0, float(np.abs(x).max())) or worst in chosen:
+            return unit * x[:2], float(x[2])
+        chosen.append(worst)
+
+
+def _find_vertex(matrix: Array, right: Array) -> Array | None:
+    """The vertex of matrix @ x <= right with the largest last entry, shape (3,); None if none."""
+    three = np.array(list(combinations(range(len(matrix)), 3)))
+    corners = matrix[three]
+    three = three[np.abs(np.linalg.det(corners)) > _SMALL]
+    x = np.linalg.solve(matrix[three], right[three][..., None])[..., 0]
+    slack = right - x @ matrix.T
+    kept = x[(slack >= -_SMALL * np.maximum(1.0, np.abs(x).max(axis=1))[:, None]).all(axis=1)]
+    return kept[kept[:, 2].argmax()] if len(kept) else None

@@ -1,0 +1,107 @@
+"""What holds the ends of phases, so that contacts close that are still open."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..common.arrays import Array
+from .torque import TorqueProfile
+from .trajectory import Motion, Samples
+
+
+class Settling(NamedTuple):
+    """How the end of a phase is held.
+
+    Attributes
+    ----------
+    phase : int
+        Its number.
+    duration : float, [s]
+        Zero where no torques hold it.
+    tau : tuple of two floats, [N m]
+    margin : float
+        The least margin of balance, normal forces and accelerations, over what is ample.
+    contact : str
+        What closes if it is still open; empty if nothing is gained there.
+    gap : float, [m]
+        From which on it does.
+    closes : float, [s]
+        How long that takes from rest; zero where nothing has to close.
+    speed : float, [m/s]
+        At most, with which it closes.
+    parts : tuple of str
+        Contacts that would have to pull in the impact of that, and part for a moment.
+    warning : str
+        What the torques do not do; empty if nothing.
+    """
+
+    phase: int
+    duration: float
+    tau: tuple[float, float]
+    margin: float
+    contact: str
+    gap: float
+    closes: float
+    speed: float
+    parts: tuple[str, ...]
+    warning: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return self._asdict() | {"tau": list(self.tau), "parts": list(self.parts)}
+
+    @staticmethod
+    def of(given: Mapping[str, Any]) -> Settling:
+        """What `to_dict` has written."""
+        values: dict[str, Any] = dict(given)
+        first, second = map(float, values["tau"])
+        return Settling(**values | {"tau": (first, second), "parts": tuple(values["parts"])})
+
+
+@dataclass(frozen=True, eq=False)
+class SettledMotion:
+    """A phase whose end is held at rest by constant torques; contact forces are not known there."""
+
+    motion: Motion
+    held: float
+    tau: Array
+
+    @property
+    def duration(self) -> float:
+        """How long the phase lasts, its end included [s]."""
+        return self.motion.duration + self.held
+
+    @property
+    def contacts(self) -> tuple[str, ...]:
+        """Names of the phase's contacts."""
+        return self.motion.contacts
+
+    @property
+    def torque(self) -> TorqueProfile:
+        """The torques of the end alone, from 0 on."""
+        return TorqueProfile(np.array([0.0, self.held]), self.tau[None, :, None])
+
+    def evaluate(self, t: Array) -> Samples:
+        """Samples at times `t` from the start of the phase, shape (n,) [s]."""
+        moves = np.minimum(t, self.motion.duration)
+        return _stop(self.motion.evaluate(moves), np.asarray(t > self.motion.duration), self.tau)
+
+    def sample(self, count: int) -> tuple[Array, Samples]:
+        """`count` even rows of the motion, and the two ends of the time in which it is held."""
+        end = self.motion.duration
+        t = np.append(np.linspace(0.0, end, count), [end, self.duration])
+        samples = self.motion.evaluate(np.minimum(t, end))
+        return t, _stop(samples, np.asarray(np.arange(len(t)) >= count), self.tau)
+
+
+def _stop(samples: Samples, held: NDArray[np.bool_], tau: Array) -> Samples:
+    """The samples with those at rest that are held."""
+    rows = held[:, None]
+    z_dot, z_ddot = (np.where(rows, 0.0, part) for part in (samples.z_dot, samples.z_ddot))
+    forces = (np.where(rows, np.nan, part) for part in (samples.c_n, samples.c_t))
+    return Samples(samples.z, z_dot, z_ddot, np.where(rows, tau, samples.tau), *forces)

@@ -1,0 +1,195 @@
+"""Ends of phases held by constant torques, so that contacts close that are still open."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+from once import once
+from shipped import HEPTAGON, problem_of, solved
+from wholearm.cli.summary import summarise
+from wholearm.common.arrays import Array
+from wholearm.common.errors import InputError
+from wholearm.contacts.formation import Formation
+from wholearm.free_simulation.simulate import simulate_free
+from wholearm.mechanics.arrival import Standstill, find_hold, maximise_margin
+from wholearm.planning.phase_plan import PhasePlan
+from wholearm.planning.result import Plan
+from wholearm.planning.saved import load_plan, write_meta
+from wholearm.planning.settling import list_touching, settle_plans
+from wholearm.problem.definition import Problem
+from wholearm.results.torque import TorqueProfile
+from wholearm.results.trajectory import assemble
+from wholearm.simulation.closing import close_contacts
+from wholearm.simulation.sticking import find_rest
+from wholearm.verification.verify import verify
+
+HELD = 0.012
+"""For how long ends are held here [s]."""
+
+
+@once
+def settled() -> Plan:
+    """The plan of the four contacts with its ends held, without planning it again."""
+    plain = solved(HEPTAGON)
+    problem, trajectory = plain.problem.with_(settle=HELD), plain.trajectory
+    starts = trajectory.phase_starts
+    cuts = [trajectory.torque.cut(*ends) for ends in pairwise(starts.tolist())]
+    parts = [TorqueProfile(own.breaks - own.breaks[0], own.coefficients) for own in cuts]
+    pairs = zip(trajectory.motions, parts, strict=True)
+    found = settle_plans(problem, [PhasePlan(motion, torque, 0.0) for motion, torque in pairs])
+    torque = TorqueProfile.chain([plan.torque for plan in found.plans])
+    motion = assemble([plan.motion for plan in found.plans], torque, trajectory.meta, 201)
+    both = zip(plain.phases, found.settlings, strict=True)
+    phases = tuple(phase._replace(settling=own) for phase, own in both)
+    plan = replace(plain, problem=problem, trajectory=motion, phases=phases)
+    return replace(plan, trajectory=replace(motion, meta=write_meta(plan)))
+
+
+def balance(touching: Formation, z: Array, tau: Array, least: float) -> bool:
+    """Whether forces with c_n >= least and |c_t| <= mu (c_n - least) balance everything."""
+    scene, count = touching.scene, touching.n_contacts
+    at = touching.evaluate(z[None], np.zeros((1, 5)))
+    joints = np.eye(5)[:, 3:]
+    dry = zip(-scene.dry[3:], scene.dry[3:], strict=True)
+    cone, one, none = np.diag(touching.friction), np.eye(count), np.zeros((count, 2))
+    answer = linprog(
+        np.zeros(2 * count + 2),
+        A_ub=np.vstack([np.hstack([-cone, way * one, none]) for way in (1.0, -1.0)]),
+        b_ub=np.tile(-touching.friction * least, 2),
+        A_eq=np.hstack([at.A[0].T, at.A_t[0].T, -joints]),
+        b_eq=-(scene.applied_force + joints @ tau),
+        bounds=[*[(least, None)] * count, *[(None, None)] * count, *dry],
+    )
+    return bool(answer.status == 0)
+
+
+def test_held_ends_balance_with_all_that_touches() -> None:
+    plan = settled()
+    problem, motion = plan.problem, plan.trajectory
+    for phase, own in zip(problem.phases, plan.phases, strict=True):
+        assert own.settling is not None and own.settling.duration == HELD
+        z = motion.z[np.flatnonzero(motion.phase == phase.index)[-1]]
+        touching, tau = list_touching(problem, phase), np.array(own.settling.tau)
+        assert balance(touching, z, tau, problem.epsilon)
+        assert (np.abs(tau) <= problem.scene.torque_limit * (1 + 1e-9)).all()
+
+
+def test_they_close_what_is_still_open() -> None:
+    """By the simulator's rows at rest, which are set up on their own, from the largest gap on."""
+    plan = settled()
+    problem, motion = plan.problem, plan.trajectory
+    for phase, own in zip(problem.phases, plan.phases, strict=True):
+        settling = own.settling
+        if phase.until.contact is None or settling is None:
+            continue
+        z = motion.z[np.flatnonzero(motion.phase == phase.index)[-1]]
+        gained = Formation(problem.scene, (phase.until.contact,))
+        normal = gained.evaluate(z[None], np.zeros((1, 5))).A[0][0]
+        heading = find_rest(phase.formation, z).ways[0].heading
+        back = settling.gap / (normal @ heading) * heading
+        z = close_contacts(phase.formation, z + back)
+        gap = float(gained.evaluate(z[None], np.zeros((1, 5))).C[0, 0])
+        assert gap == pytest.approx(settling.gap, rel=0.02)
+        tau = np.array(settling.tau)
+        moving = [way for way in find_rest(phase.formation, z).ways if way.moves(tau)]
+        assert len(moving) == 1
+        assert (moving[0].force_limits @ [1.0, *tau]).min() >= problem.epsilon
+        closing = -float(normal @ moving[0].heading) * moving[0].drive(tau)
+        assert settling.closes == pytest.approx(np.sqrt(2 * gap / closing), rel=0.02)
+        assert settling.speed == pytest.approx(2 * gap / settling.closes, rel=0.02)
+
+
+def test_the_whole_ends_where_it_was_planned_to() -> None:
+    plan = settled()
+    problem, motion = plan.problem, plan.trajectory
+    report = verify(problem, plan)
+    assert report.ok and not report.warnings
+    run = simulate_free(problem, plan)
+    away = np.abs(run.z[-1] - motion.z[-1])
+    assert away[:2].max() < 1e-7 and away[2:].max() < 1e-6
+    assert motion.duration == pytest.approx(solved(HEPTAGON).duration + 5 * HELD, rel=1e-12)
+    assert f"held for {5 * HELD:.6g} s in all" in summarise(plan, "plan.npz")
+
+
+def test_held_ends_are_written_and_read(tmp_path: Path) -> None:
+    plan = settled()
+    plan.save(tmp_path / "plan.npz")
+    read = load_plan(tmp_path / "plan.npz")
+    assert [own.settling for own in read.phases] == [own.settling for own in plan.phases]
+    assert read.problem.settle == HELD and read.problem.gap == plan.problem.gap
+    starts = plan.trajectory.phase_starts
+    for t in (*(starts[1:] - HELD / 3), *(starts[1:] - 1.5 * HELD)):
+        one, two = read.trajectory.at(t), plan.trajectory.at(t)
+        np.testing.assert_allclose(one.z, two.z, atol=1e-7)
+        np.testing.assert_allclose(one.tau, two.tau, atol=1e-3)
+        np.testing.assert_array_equal(np.isnan(one.c_n), np.isnan(two.c_n))
+    held = read.trajectory.at(starts[1:] - HELD / 3)
+    assert not held.z_dot.any() and np.isnan(held.c_n).all()
+
+
+def test_margins_are_those_of_the_linear_programme() -> None:
+    scene, rng = problem_of(HEPTAGON).scene, np.random.default_rng(3)
+    unit = scene.scales.torque
+    for _ in range(40):
+        rows = rng.normal(size=(12, 3)) / [1.0, unit, unit]
+        bounds = rng.normal(size=(2, 3)) / [1.0, unit, unit]
+        sides = np.vstack([rows, bounds])
+        count = np.repeat([1.0, 0.0], [12, 2])
+        answer = linprog(
+            [0.0, 0.0, -1.0],
+            A_ub=np.column_stack([-sides[:, 1:] * unit, count]),
+            b_ub=sides[:, 0],
+            bounds=[*((-most / unit, most / unit) for most in scene.torque_limit), (None, 1e3)],
+        )
+        found = maximise_margin(scene, rows, bounds)
+        assert (found is None) == (answer.status != 0)
+        if found is not None:
+            assert found[1] == pytest.approx(answer.x[2], abs=1e-6)
+            assert (rows @ [1.0, *found[0]]).min() == pytest.approx(found[1], abs=1e-6)
+
+
+def test_without_friction_nothing_holds_where_no_contact_stops_the_motion() -> None:
+    problem = problem_of(HEPTAGON).with_(friction=0.0, dry=0.0)
+    formation = problem.phases[0].formation
+    place = Standstill(problem.start, formation, None, formation)
+    assert find_hold(place, problem.epsilon, problem.gap, HELD) is None
+
+
+def test_keys_are_checked_and_kept() -> None:
+    plain = problem_of(HEPTAGON)
+    assert plain.settle == 0 and plain.settles(plain.phases[0]) == 0
+    assert 9e-5 < plain.gap < 1.1e-4
+    problem = plain.with_({"settle": 0.01, "settle_gap": 5e-5, "phases[2].settle": 0})
+    assert [problem.settles(phase) for phase in problem.phases] == [0.01, 0, 0.01, 0.01, 0.01]
+    assert problem.gap == 5e-5 and problem.table["phases"][1]["settle"] == 0
+    again = replace(problem, settle=0.02)
+    assert again.table["settle"] == 0.02 and again.table["phases"][1]["settle"] == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "key", "allowed"),
+    [
+        ({"settle": -1}, "settle", ">= 0"),
+        ({"settle": 1e9}, "settle", "allowed are"),
+        ({"settle_gap": 1.0}, "settle_gap", "allowed are"),
+        ({"phases[1].settle": "x"}, "phases[1].settle", ">= 0"),
+        ({"phases[1].settle": 0.01, "phases[1].end": "smooth"}, "phases[1].settle", "smooth"),
+    ],
+)
+def test_wrong_keys_are_named(changes: dict[str, object], key: str, allowed: str) -> None:
+    with pytest.raises(InputError, match=allowed) as raised:
+        problem_of(HEPTAGON).with_(changes)
+    assert raised.value.key == key
+
+
+def test_a_problem_without_the_key_is_planned_as_always() -> None:
+    plan = solved(HEPTAGON)
+    assert all(phase.settling is None for phase in plan.phases)
+    assert isinstance(plan.problem, Problem) and "settle" not in plan.problem.table
+    assert plan.meta["settling"] == [None] * 5
