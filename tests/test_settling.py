@@ -26,6 +26,7 @@ from wholearm.problem.definition import Problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import assemble
 from wholearm.simulation.closing import close_contacts
+from wholearm.simulation.starting import RestDirection
 from wholearm.simulation.sticking import find_rest
 from wholearm.verification.verify import verify
 
@@ -91,14 +92,16 @@ def test_they_close_what_is_still_open() -> None:
         z = motion.z[np.flatnonzero(motion.phase == phase.index)[-1]]
         gained = Formation(problem.scene, (phase.until.contact,))
         normal = gained.evaluate(z[None], np.zeros((1, 5))).A[0][0]
-        heading = find_rest(phase.formation, z).ways[0].heading
+        first = find_rest(phase.formation, z).ways[0]
+        assert isinstance(first, RestDirection)
+        heading = first.heading
         back = settling.gap / (normal @ heading) * heading
         z = close_contacts(phase.formation, z + back)
         gap = float(gained.evaluate(z[None], np.zeros((1, 5))).C[0, 0])
         assert gap == pytest.approx(settling.gap, rel=0.02)
         tau = np.array(settling.tau)
         moving = [way for way in find_rest(phase.formation, z).ways if way.moves(tau)]
-        assert len(moving) == 1
+        assert len(moving) == 1 and isinstance(moving[0], RestDirection)
         assert (moving[0].force_limits @ [1.0, *tau]).min() >= problem.epsilon
         closing = -float(normal @ moving[0].heading) * moving[0].drive(tau)
         assert settling.closes == pytest.approx(np.sqrt(2 * gap / closing), rel=0.02)
