@@ -1,0 +1,53 @@
+"""A policy in a simulation: sampled and held, late, and with torques of the wrong size."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ..common.arrays import Array
+from .policy import Policy
+
+ROOM = 0.5
+"""Time that a simulation goes on after the policy's own, over that."""
+
+
+class ClosedLoop:
+    """What a simulation asks for torques; see `free_simulation.feedback.Law`.
+
+    Parameters
+    ----------
+    policy : Policy
+        It is copied: many may be under way.
+    phase : int
+        Number of the phase to begin with.
+    delay : float, optional, [s]
+        Of the torques; the policy's if left out.
+    gains : tuple of two float
+        What the torques are over those that are asked for.
+
+    Attributes
+    ----------
+    began : dict of int to float
+        When each phase began, by its number [s].
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        phase: int = 1,
+        delay: float | None = None,
+        gains: tuple[float, float] = (1.0, 1.0),
+    ) -> None:
+        self.policy, self.gains = policy.with_(), gains
+        self.period = policy.pace.period
+        self.delay = policy.pace.delay if delay is None else delay
+        self.began: dict[int, float] = {}
+        self.policy.reset(phase)
+
+    def held(
+        self, t: float, theta: Array, theta_dot: Array, forces: Mapping[str, float]
+    ) -> tuple[float, float]:
+        """The torques that follow from a state; as `free_simulation.feedback.Law`."""
+        one, two = self.policy.step(theta.tolist(), theta_dot.tolist())
+        self.began.setdefault(self.policy.phase, t)
+        return one * self.gains[0], two * self.gains[1]
