@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from .planning.plan import solve
     from .planning.result import Plan, Status
     from .planning.saved import load_plan
+    from .policy.make import make_policy
+    from .policy.policy import Policy
     from .problem.definition import End, Phase, Problem, Until
     from .problem.read import place_start, read_formation, read_until
     from .quasistatic.predict import predict
@@ -52,6 +54,7 @@ if TYPE_CHECKING:
     from .tuning.tune import tune
     from .verification.free import verify_free
     from .verification.free_report import FreeReport
+    from .verification.policy import verify_policy
     from .verification.verify import verify
 
 __version__ = "0.1.0"
@@ -73,6 +76,7 @@ _HOMES = {
     "Phase": "problem.definition",
     "Plan": "planning.result",
     "PlanOptions": "planning.options",
+    "Policy": "policy.policy",
     "Polygon": "scene.polygon",
     "Problem": "problem.definition",
     "ReplayError": "common.errors",
@@ -92,6 +96,7 @@ _HOMES = {
     "load": "geometry.path_guess",
     "load_plan": "planning.saved",
     "load_trajectory": "results.trajectory_file",
+    "make_policy": "policy.make",
     "place_start": "problem.read",
     "predict": "quasistatic.predict",
     "read_formation": "problem.read",
@@ -104,6 +109,7 @@ _HOMES = {
     "tune": "tuning.tune",
     "verify": "verification.verify",
     "verify_free": "verification.free",
+    "verify_policy": "verification.policy",
 }
 
 __all__ = [
@@ -123,6 +129,7 @@ __all__ = [
     "Phase",
     "Plan",
     "PlanOptions",
+    "Policy",
     "Polygon",
     "Problem",
     "ReplayError",
@@ -143,6 +150,7 @@ __all__ = [
     "load",
     "load_plan",
     "load_trajectory",
+    "make_policy",
     "place_start",
     "plots",
     "predict",
@@ -156,6 +164,7 @@ __all__ = [
     "tune",
     "verify",
     "verify_free",
+    "verify_policy",
 ]
 
 

@@ -33,6 +33,7 @@ from .engines import add_export, add_replay
 from .map import draw, protect
 from .new import add_new, add_schema
 from .overlay import overlay
+from .policy import add_policy
 from .predict import predict
 from .progress import clear_progress, show_progress
 from .robustness import add_robustness
@@ -42,6 +43,7 @@ from .viewer import add_animate, add_report
 if TYPE_CHECKING:
     from ..planning.result import Plan
     from ..planning.table_check import Table
+    from ..problem.definition import Problem
     from ..results.report import Report
     from ..results.torque import TorqueProfile
     from ..results.trajectory import Trajectory
@@ -116,6 +118,7 @@ def build_parser() -> argparse.ArgumentParser:
             None,
             "replay a plan in MuJoCo or Drake and compare it with the plan",
         ),
+        ("policy", add_policy, None, "make torques a function of the joints, by feedback"),
         ("robustness", add_robustness, None, "see how much error a plan bears"),
         ("animate", add_animate, None, "make a movie of a plan, or a page that plays it"),
         ("report", add_report, None, "put a problem and its plans into one page to open anywhere"),
@@ -236,10 +239,8 @@ def _verify(options: argparse.Namespace) -> int:
 
         check_phases(problem)
     if options.free:
-        from ..verification.free import verify_free
-
         rate = {} if options.restitution is None else {"restitution": options.restitution}
-        report: Report | FreeReport = verify_free(problem, torques, **given, **rate)
+        report: Report | FreeReport = _simulate_free(options, problem, torques, {**given, **rate})
     else:
         report = verify(problem, torques, reduced=options.reduced, **given)
     clear_progress()
@@ -251,14 +252,35 @@ def _verify(options: argparse.Namespace) -> int:
     return report.exit_status
 
 
+def _simulate_free(
+    options: argparse.Namespace,
+    problem: Problem,
+    torques: Trajectory | TorqueProfile,
+    given: dict[str, float],
+) -> FreeReport:
+    """The report of torques, or of a policy, with no contacts told."""
+    if options.policy is None:
+        from ..verification.free import verify_free
+
+        return verify_free(problem, torques, **given)
+    from ..policy.policy import Policy
+    from ..results.torque import TorqueProfile
+    from ..verification.policy import verify_policy
+
+    if isinstance(torques, TorqueProfile):
+        raise InputError(options.torques, "", "torques alone given; --policy needs the plan (.npz)")
+    return verify_policy(problem, torques, Policy.load(options.policy), **given)
+
+
 def _check_free(options: argparse.Namespace) -> None:
     """Check that nothing is asked for that the other simulator does."""
     others = {"--reduced": options.reduced, "--rest-speed": options.rest_speed}
     for key, value in others.items() if options.free else ():
         if value:
             raise InputError("", key, "does not go with --free")
-    if options.restitution is not None and not options.free:
-        raise InputError("", "--restitution", "needs --free")
+    for key, value in {"--restitution": options.restitution, "--policy": options.policy}.items():
+        if value is not None and not options.free:
+            raise InputError("", key, "needs --free")
 
 
 def _read_torques(path: str) -> Trajectory | TorqueProfile:

@@ -153,7 +153,7 @@ def _doubt(
     cases += [(own, tau * (1 + GAIN * np.eye(2)[k])) for k in range(2)]
     cases.append((own, delayed))
     plain = measure(own, tau)
-    return np.sqrt(np.sum([(measure(*case) - plain) ** 2 for case in cases], axis=0))
+    return np.asarray(np.sqrt(np.sum([(measure(*case) - plain) ** 2 for case in cases], axis=0)))
 
 
 def _change(scene: Scene, name: str, width: float) -> Scene:

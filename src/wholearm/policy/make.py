@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..common.errors import InputError
@@ -28,7 +29,7 @@ PLACES = 400
 NEWTON = 4
 AUTHORITY = 2.0
 """Reserve of torques along the way, in those of `curve_rows`: feedback adds to the motion."""
-TOUCH, STILL = 0.01, 3e-3
+TOUCH, STILL = 3e-3, 1e-3
 """Speeds along curves at which contacts are made, and that count as none, over the scene's."""
 DWELL = 3e-3
 """How long joints stand still before the next phase begins [s]."""
@@ -39,11 +40,15 @@ MOST = 0.5
 
 
 class Piece(NamedTuple):
-    """A phase along a curve: what it is made of, and the reference's b at the rows' places."""
+    """A phase along a curve.
+
+    Its rows, the reference's b at their places, and the least part of the reserve that it keeps.
+    """
 
     curve: Curve
     rows: Rows
     b: Array
+    share: float
 
 
 def make_policy(
@@ -99,8 +104,18 @@ def make_policy(
         MOST * scales.acceleration,
         (one, two),
     )
-    durations = [_time(own) + DWELL + delay for own in pieces]
-    return Policy(tables, pace, {"name": problem.name, "duration": sum(durations)})
+    starts = plan.phase_starts
+    about = [
+        {
+            "number": phase.number,
+            "plan": float(starts[phase.number] - starts[phase.index]),
+            "duration": _time(own) + DWELL + delay,
+            "share": own.share,
+        }
+        for phase, own in zip(problem.phases, pieces, strict=True)
+    ]
+    whole = sum(own["duration"] for own in about)
+    return Policy(tables, pace, {"name": problem.name, "duration": whole, "phases": about})
 
 
 def _time(piece: Piece) -> float:
@@ -138,10 +153,13 @@ def _trace(problem: Problem, phase: Phase, plan: Trajectory, reserve: float) -> 
     rows = make_rows(curve, s, (a, b, squeeze))
     wanted = reserve * rows.unit
     wanted[:, rows.presses :] = AUTHORITY * rows.unit[:, rows.presses :]
-    return Piece(curve, rows, retime(s, rows.slack, wanted, b).b)
+    motion = retime(s, rows.slack, wanted, b)
+    return Piece(curve, rows, motion.b, float(motion.share.min()))
 
 
-def _follow(curve: Curve, plan: Trajectory, own: Array) -> tuple[Array, Array, Array, Array]:
+def _follow(
+    curve: Curve, plan: Trajectory, own: NDArray[np.int64]
+) -> tuple[Array, Array, Array, Array]:
     """Places s, a, b and squeeze of a plan's rows along a curve."""
     formation, metric = curve.formation, metric_weights(curve.formation.scene)
     z, grid = plan.z[own], np.linspace(0.0, curve.length, PLACES)

@@ -14,7 +14,7 @@ from ..mechanics.sides import SideTerms
 from .curve_law import choose_squeeze
 from .curve_rows import Rows
 
-ENOUGH = 3.0
+ENOUGH = 5.0
 """Reserves beyond which more normal force is not asked for."""
 LEAST = 0.3
 """Fewest reserves with which a contact counts as pressed."""
@@ -72,7 +72,7 @@ def find_push(curve: Curve, gained: Contact, rows: Rows, after: Rows | None) -> 
     efforts[:, 4] = 1.0
     table = np.vstack([table, efforts])
     bounds = [*((-most, most) for most in limit), (LEAST, ENOUGH), (0.0, 1.0)]
-    answer = linprog([0, 0, -1, ENOUGH], A_ub=-table[:, 1:], b_ub=table[:, 0], bounds=bounds)
+    answer = linprog([0, 0, -1, 1], A_ub=-table[:, 1:], b_ub=table[:, 0], bounds=bounds)
     return np.asarray(answer.x[:2]) if answer.status == 0 else None
 
 

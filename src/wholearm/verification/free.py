@@ -67,7 +67,7 @@ def verify_free(
         raise InputError("", "contacts", f"trajectory and problem differ in {odd}")
     options: dict[str, Any] = {"tolerance": tolerance, "restitution": restitution}
     whole = simulate_free(problem, torque if plan is None else plan, **options)
-    warnings = _warn("whole", whole)
+    warnings = warn("whole", whole)
     if plan is None:
         phases, failures = _follow(problem, whole, allowed)
         return FreeReport(problem.name, whole, (), phases, tuple(failures), tuple(warnings))
@@ -77,7 +77,7 @@ def verify_free(
         found = _compare(problem, plan, part.simulation, own, allowed)
         alone += found
         title = f"phases {found[0].number} to {found[-1].number}" if found[1:] else ""
-        warnings += _warn(f"{title or f'phase {found[0].number}'} alone", part.simulation)
+        warnings += warn(f"{title or f'phase {found[0].number}'} alone", part.simulation)
         failures += _fail(problem, part.simulation, found, allowed)
     every = range(len(plan.phase_starts) - 1)
     by_clock = _compare(problem, plan, whole, every, allowed)
@@ -107,7 +107,7 @@ def _fail(
     return texts
 
 
-def _warn(title: str, simulation: FreeSimulation) -> list[str]:
+def warn(title: str, simulation: FreeSimulation) -> list[str]:
     """What was not decided by the laws of contact alone."""
     return [f"{title}: {event.text}" for event in simulation.events if event.kind in _TOLD]
 
@@ -124,7 +124,7 @@ def _compare(
     for index in indices:
         phase = problem.phases[index]
         start, stop = float(starts[index]), float(starts[index + 1])
-        losses = _find_losses(problem, simulation, phase, start, stop, allowed)
+        losses = find_losses(problem, simulation, phase, start, stop, allowed)
         row = int(np.searchsorted(simulation.t, stop, side="right")) - 1
         last = int(np.flatnonzero(plan.phase == index)[-1])
         away = np.abs(simulation.z[row] - plan.z[last])
@@ -145,7 +145,7 @@ def _follow(
     for phase, after in zip(problem.phases, following, strict=True):
         stop = _find_end(simulation, phase, after, start)
         last = float(simulation.t[-1]) if stop is None else stop
-        losses = _find_losses(problem, simulation, phase, start, last, allowed)
+        losses = find_losses(problem, simulation, phase, start, last, allowed)
         found.append(FreePhase(phase.number, start, last, stop is not None, tuple(losses), None))
         failures += [
             f"{loss.contact} is lost at t = {loss.time:.5g} s, phase {phase.number}, and opens by "
@@ -182,7 +182,7 @@ def _find_end(
     return min(times, default=None)
 
 
-def _find_losses(
+def find_losses(
     problem: Problem,
     simulation: FreeSimulation,
     phase: Phase,

@@ -1,0 +1,55 @@
+"""The command ``wholearm policy``: torques as a function of the joints."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+
+from ..common.errors import name_source
+
+
+def add_policy(parser: argparse.ArgumentParser) -> None:
+    """Add what `policy` takes."""
+    parser.add_argument("plan", help="trajectory file (.npz)")
+    text = "policy to write (.npz; default: NAME_policy.npz)"
+    parser.add_argument("-o", "--output", metavar="FILE", help=text)
+    text = "normal force that is kept in reserve along the way, over what usual errors of masses, "
+    text += "friction and torques take away (2); 0 is as fast as the plan"
+    parser.add_argument("--reserve", type=float, default=2.0, help=text)
+    text = "of the control loop [s] (1e-3)"
+    parser.add_argument("--period", type=float, default=1e-3, help=text)
+    text = "time from measuring to when torques take effect [s] (5e-4)"
+    parser.add_argument("--delay", type=float, default=5e-4, help=text)
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    parser.set_defaults(run=_policy)
+
+
+def _policy(options: argparse.Namespace) -> int:
+    from ..common.files import require_ending, require_writable
+    from ..policy.make import make_policy
+    from ..problem.read import read_own_problem
+    from ..results.report_text import align
+    from ..results.trajectory_file import load_trajectory
+
+    stem = os.path.splitext(os.path.basename(options.plan))[0]
+    output = options.output or f"{stem}_policy.npz"
+    require_writable(output)
+    require_ending(output, ".npz")
+    plan = load_trajectory(options.plan)
+    problem = read_own_problem(plan.meta, options.plan)
+    given = {key: getattr(options, key) for key in ("reserve", "period", "delay")}
+    with name_source(options.plan):
+        policy = make_policy(problem, plan, **given)
+    policy.save(output)
+    if options.json:
+        print(json.dumps(policy.about, indent=2))
+        return 0
+    rows = [
+        [str(own["number"]), f"{own['plan']:.6f}", f"{own['duration']:.6f}", f"{own['share']:.2f}"]
+        for own in policy.about["phases"]
+    ]
+    header = ["phase", "plan [s]", "policy [s]", "least part of the reserve"]
+    print("\n".join(align(header, rows, set())))
+    print(f"{policy.duration:.6f} s in all, the plan {plan.duration:.6f} s; wrote {output}")
+    return 0

@@ -1,0 +1,143 @@
+"""Torques as a function of the joints."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import linprog
+
+import wholearm
+from shipped import HEPTAGON, problem_of
+from wholearm.cli.command import main
+from wholearm.common.errors import InputError
+from wholearm.planning.result import Plan
+from wholearm.policy.curve_law import choose_squeeze
+from wholearm.policy.make import make_policy
+from wholearm.policy.policy import Policy
+from wholearm.policy.retime import eliminate, retime
+from wholearm.problem.definition import Problem
+from wholearm.verification.policy import verify_policy
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    """The first two slides of the heptagon."""
+    whole = problem_of(HEPTAGON)
+    return whole.with_({"phases": list(whole.table["phases"][:2]), "epsilon": 0.2})
+
+
+@pytest.fixture(scope="module")
+def plan(problem: Problem) -> Plan:
+    return wholearm.solve(problem, replay=False)
+
+
+@pytest.fixture(scope="module")
+def policy(problem: Problem, plan: Plan) -> Policy:
+    return make_policy(problem, plan.trajectory)
+
+
+def test_the_squeeze_has_the_largest_least_level() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        base, rates, press = rng.normal(size=(3, 8))
+        level, squeeze = choose_squeeze(base.tolist(), rates.tolist(), press.tolist(), 0.3)
+        values = base + 0.3 * rates
+        assert level == pytest.approx((values + press * squeeze).min(), abs=1e-12)
+        rows = np.column_stack([np.ones(8), -press])
+        best = linprog([-1, 0], A_ub=rows, b_ub=values, bounds=[(None, None)] * 2)
+        assert level == pytest.approx(-best.fun, abs=1e-9)
+
+
+def test_what_is_eliminated_is_still_possible() -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        rows = rng.normal(size=(6, 3))
+        x = rng.normal()
+        left = (eliminate(rows) @ [1.0, x] >= 0).all()
+        fixed = rows[:, 0] + rows[:, 1] * x
+        found = linprog([0], A_ub=-rows[:, 2:], b_ub=fixed, bounds=[(None, None)])
+        assert left == (found.status == 0)
+
+
+def test_the_fastest_motion_between_limits_of_the_acceleration() -> None:
+    # |s''| <= 2 from rest to rest over a length of 1: halfway 2 sqrt(1 / 2) long, peak b = 2.
+    s = np.linspace(0.0, 1.0, 21)
+    limits = np.array([[2.0, 0, 0, -1.0, 0], [2.0, 0, 0, 1.0, 0]])
+    slack = np.tile(limits, (21, 1, 1))
+    cap = np.full(21, 9.0)
+    cap[[0, -1]] = 0.0
+    found = retime(s, slack, np.zeros((21, 2)), cap)
+    assert found.b == pytest.approx(4 * np.minimum(s, 1 - s), abs=1e-9)
+    # Half of it is kept in reserve.
+    found = retime(s, slack, np.ones((21, 2)), found.b)
+    assert found.b == pytest.approx(2 * np.minimum(s, 1 - s), abs=1e-9)
+
+
+def test_without_a_reserve_it_is_as_fast_as_the_plan(problem: Problem, plan: Plan) -> None:
+    own = make_policy(problem, plan.trajectory, reserve=0.0).about["phases"]
+    safe = make_policy(problem, plan.trajectory).about["phases"]
+    for phase, with_reserve in zip(own, safe, strict=True):
+        assert phase["plan"] <= phase["duration"] < with_reserve["duration"]
+        assert with_reserve["duration"] < 1.3 * phase["plan"]
+
+
+def test_joints_say_where_the_hand_is(policy: Policy, plan: Plan) -> None:
+    law = policy.laws[0]
+    law.begin()
+    motion = plan.trajectory.motions[0]
+    t = np.linspace(0.0, motion.duration, 41)
+    rows = motion.evaluate(t)
+    for z, z_dot in zip(rows.z, rows.z_dot, strict=True):
+        # A hand that is off the curve by 0.1 mrad is where the nearest one on it is.
+        theta = z[3:] + 1e-4 * np.array([-z_dot[4], z_dot[3]]) / (np.hypot(*z_dot[3:]) + 1e-9)
+        law.step(theta.tolist(), z_dot[3:].tolist(), None)
+        known = np.array([np.interp(law.s, law.nodes, column) for column in np.array(law.theta).T])
+        assert known == pytest.approx(z[3:], abs=2e-5)
+    assert law.s == pytest.approx(law.length, rel=1e-3)
+
+
+@pytest.mark.parametrize("off", [{}, {"mass": 0.21, "friction": 0.09}])
+def test_a_policy_keeps_contacts_where_numbers_are_off(
+    problem: Problem, plan: Plan, policy: Policy, off: dict[str, float]
+) -> None:
+    report = verify_policy(problem.with_(off), plan.trajectory, policy)
+    assert report.ok, report.reason
+    assert [phase.number for phase in report.phases] == [1, 2]
+    end = report.phases[-1].deviation
+    assert end is not None and end.position < 1e-3
+
+
+def test_files(tmp_path: Path, problem: Problem, plan: Plan, policy: Policy) -> None:
+    path = tmp_path / "policy.npz"
+    plan.save(tmp_path / "plan.npz")
+    assert main(["policy", str(tmp_path / "plan.npz"), "-o", str(path)]) == 0
+    loaded = Policy.load(path)
+    theta, rates = problem.start[3:].tolist(), [0.0, 0.0]
+    loaded.reset()
+    policy.reset()
+    assert loaded.step(theta, rates) == policy.step(theta, rates)
+    # The loop needs neither CasADi nor SciPy.
+    code = (
+        "import sys; from wholearm.policy.policy import Policy; "
+        f"p = Policy.load({str(path)!r}); p.reset(); p.step({theta}, {rates}); "
+        "assert not {'casadi', 'scipy'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    with pytest.raises(InputError, match="phase: 3 given"):
+        policy.reset(3)
+
+
+def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str], plan: Plan) -> None:
+    file = tmp_path / "plan.npz"
+    plan.save(file)
+    assert main(["verify", str(HEPTAGON), str(file), "--policy", str(file)]) == 2
+    assert "--policy: needs --free" in capsys.readouterr().err
+    assert main(["verify", str(HEPTAGON), str(file), "--free", "--policy", str(file)]) == 2
+    assert "meta: is not that of a policy" in capsys.readouterr().err
+    assert main(["policy", str(file), "--reserve", "-1", "-o", str(tmp_path / "p.npz")]) == 2
+    assert "reserve: -1.0 is not a number >= 0" in capsys.readouterr().err
+    assert not (tmp_path / "p.npz").exists()
