@@ -16,6 +16,7 @@ from PIL import Image
 from shipped import HEPTAGON, LANDING, chart, plan_of, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
+from wholearm.mapping.template import write_template
 from wholearm.viewer import page
 from wholearm.viewer.chart import describe_map
 from wholearm.viewer.motion import describe_motion, place_pushes
@@ -165,6 +166,19 @@ def test_slider_plots_and_map_respond_in_a_browser(tmp_path: Path) -> None:
         assert float(said[key][0].split()[0]) == pytest.approx(t, abs=1e-3 * plan.duration)
         assert float(said[key][1]) == pytest.approx(x, abs=1.0)
     assert said["border"] == places[1]["borders"][0]["text"]
+
+
+def test_a_gallery_shows_every_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    problem = tmp_path / "slide.toml"
+    problem.write_text(write_template("slide", 4, 0.05), encoding="utf-8")
+    page = tmp_path / "gallery.md"
+    assert main(["gallery", str(problem), "-o", str(page)]) == 0
+    text = page.read_text(encoding="utf-8")
+    (row,) = re.findall(r"^\| slide \|.*$", text, re.M)
+    assert row.endswith("| ok |")
+    for name in re.findall(r"\]\((.*?)\)", text):
+        assert (tmp_path / name).stat().st_size < 1_000_000
+    assert len(list((tmp_path / "gallery").iterdir())) == 2
 
 
 def test_a_report_holds_what_was_given(tmp_path: Path) -> None:

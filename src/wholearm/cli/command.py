@@ -38,7 +38,7 @@ from .predict import predict
 from .progress import clear_progress, show_progress
 from .robustness import add_robustness
 from .tune import tune
-from .viewer import add_animate, add_report
+from .viewer import add_animate, add_gallery, add_report
 
 if TYPE_CHECKING:
     from ..planning.result import Plan
@@ -122,6 +122,7 @@ def build_parser() -> argparse.ArgumentParser:
         ("robustness", add_robustness, None, "see how much error a plan bears"),
         ("animate", add_animate, None, "make a movie of a plan, or a page that plays it"),
         ("report", add_report, None, "put a problem and its plans into one page to open anywhere"),
+        ("gallery", add_gallery, None, "plan problems and show them all on one page"),
         ("completion", add_completion, None, "print what makes a shell complete all this"),
         ("bench", add_bench, None, "measure run time against error, or run the stress study"),
     ):

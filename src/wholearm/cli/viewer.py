@@ -32,6 +32,26 @@ def add_report(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=_report)
 
 
+def add_gallery(parser: argparse.ArgumentParser) -> None:
+    """Add what `gallery` takes."""
+    parser.add_argument("files", nargs="+", metavar="PROBLEM", help="problem files (TOML)")
+    text = "page to write (.md); figures and movies go to a folder beside it (results/gallery.md)"
+    parser.add_argument("-o", "--output", metavar="FILE", default="results/gallery.md", help=text)
+    parser.set_defaults(run=_gallery)
+
+
+def _gallery(options: argparse.Namespace) -> int:
+    from ..common.files import require_ending, require_writable
+    from ..viewer.gallery import write_gallery
+
+    require_ending(options.output, ".md")
+    require_writable(options.output)
+    write_gallery(options.files, options.output, show_progress() or (lambda text: None))
+    clear_progress()
+    print(f"wrote {options.output}")
+    return 0
+
+
 def _animate(options: argparse.Namespace) -> int:
     from ..common.errors import name_source
     from ..common.files import require_ending, require_writable, write_text

@@ -35,7 +35,9 @@ FRAMES = 25
 """Frames in a second of the movie."""
 _MOST = 3000
 """Frames of a movie: two minutes."""
-_SIZE, _DPI = (8.0, 7.4), 90
+_SIZE = (8.0, 7.4)
+RESOLUTION = 90
+"""Dots per inch of a movie that is 8 inches wide."""
 _REACH = 0.3
 """Length of the largest force's arrow, over the picture's."""
 _TURN = 1.5 * math.pi
@@ -190,6 +192,8 @@ class Movie:
         A replay, drawn behind.
     speed : float
         How fast the motion passes, over real time.
+    resolution : int
+        Dots per inch; it is 8 inches wide.
 
     Raises
     ------
@@ -203,6 +207,7 @@ class Movie:
         trajectory: Trajectory,
         ghost: Trajectory | None = None,
         speed: float = 0.1,
+        resolution: int = RESOLUTION,
     ) -> None:
         if not 0 < speed < math.inf:
             raise InputError("", "--speed", f"{speed:g} given; a positive number is needed")
@@ -214,13 +219,14 @@ class Movie:
             )
         self.times = np.linspace(0.0, trajectory.duration, max(2, frames))
         self._problem, self._trajectory, self._ghost = problem, trajectory, ghost
+        self._resolution = resolution
 
     @exclusive
     def draw(self) -> Iterator[Array]:
         """Pictures one by one, shape (height, width, 4), uint8."""
         problem, own = self._problem, self._trajectory
         with matplotlib.rc_context(STYLE):
-            figure = Figure(figsize=_SIZE, dpi=_DPI)
+            figure = Figure(figsize=_SIZE, dpi=self._resolution)
             canvas: Any = FigureCanvasAgg(figure)
             scene = _Scene(figure.add_axes((0.02, 0.47, 0.96, 0.49)), problem, own, self._ghost)
             margins = figure.add_axes((0.09, 0.225, 0.74, 0.215))
@@ -266,7 +272,7 @@ def write_movie(
     if str(path).lower().endswith(".gif"):
         images = [Image.fromarray(picture[..., :3]) for picture in pictures]
         # One palette for all, so that what stays the same is stored once.
-        palette = images[len(images) // 2].quantize(128)
+        palette = images[len(images) // 2].quantize(64)
         frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
         options: Any = {"format": "GIF", "save_all": True, "loop": 0, "optimize": False}
         options |= {"append_images": frames[1:], "duration": 1000 // FRAMES}

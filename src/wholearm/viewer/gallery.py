@@ -1,0 +1,70 @@
+"""A gallery of problems: figure, movie and a line of figures for each."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+
+from ..common.files import make_folder, write_text
+from ..figures import plots
+from ..geometry.path_guess import load
+from ..planning.plan import solve
+from ..planning.result import Plan
+from ..verification.verify import verify
+from .movie import Movie, write_movie
+
+_WIDTH = 8.0
+"""Of figures [in]."""
+_SPEED, _RESOLUTION = 0.3, 50
+"""Of movies: over real time, and dots per inch."""
+_HEADS = "| problem | phases | least time [s] | least c_n [N] | finger gap [mm] | replayed |"
+
+
+def write_gallery(
+    paths: Sequence[str], page: str, progress: Callable[[str], None] = lambda text: None
+) -> None:
+    """Plan the least time of problems and write them to a page of Markdown.
+
+    Figures and movies go to a folder beside the page that has its name.
+
+    Raises
+    ------
+    WholearmError
+        If a problem cannot be read or planned; the page is written only if all are.
+    """
+    folder = os.path.splitext(page)[0]
+    make_folder(folder)
+    rows, pictures = [_HEADS, "|---|---|---|---|---|---|"], []
+    for path in paths:
+        name = os.path.splitext(os.path.basename(path))[0]
+        progress(name)
+        plan = solve(load(path))
+        _draw(plan, os.path.join(folder, name))
+        rows.append(_list_figures(name, plan))
+        place = f"{os.path.basename(folder)}/{name}"
+        links = f"![{name} in motion]({place}.gif)\n\n![{name}]({place}.png)"
+        pictures.append(f"## {plan.problem.name}\n\n{links}")
+    slower = f"{1 / _SPEED:.2g} times slower than real"
+    text = (
+        f"Least-time plans, {slower}: contact forces in their friction cones, and torques as arcs "
+        "at the joints."
+    )
+    write_text(page, "\n\n".join(["# Gallery", text, "\n".join(rows), *pictures]) + "\n")
+
+
+def _draw(plan: Plan, stem: str) -> None:
+    """Write the figure and the movie of a plan."""
+    plots.save(plots.force_margins(plan, width=_WIDTH), f"{stem}.png")
+    movie = Movie(plan.problem, plan.trajectory, speed=_SPEED, resolution=_RESOLUTION)
+    write_movie(movie, f"{stem}.gif")
+
+
+def _list_figures(name: str, plan: Plan) -> str:
+    """A row of the table: what the plan comes to, and what a replay says."""
+    report = verify(plan.problem, plan)
+    gap = "" if report.finger_gap is None else f"{1e3 * report.finger_gap.least:.1f}"
+    least = min(
+        own.least for phase in report.phases for own in phase.contacts if own.least == own.least
+    )
+    verdict = "ok" if report.ok else "FAILED"
+    return f"| {name} | {len(plan.phases)} | {plan.value:.6f} | {least:.4f} | {gap} | {verdict} |"
