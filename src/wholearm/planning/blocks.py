@@ -255,8 +255,6 @@ def _plan_block(
     if not runs_along_curves(block, options):
         from .time_domain.impacts import plan_with_impacts
 
-        _require_no_ranges(block, options)
-
         with charge(block[0].number):
             pinned = planning.pinned or leads_on(problem, block, options)
             given = (problem, block, z, options, add_up(block, allowed))
@@ -272,14 +270,6 @@ def _plan_block(
         with charge(part.phases[0].number):
             plans += plan_sequence(part, problem.epsilon, options, add_up(part.phases, allowed))
     return plans, chain
-
-
-def _require_no_ranges(block: Sequence[Phase], options: PlanOptions) -> None:
-    """Refuse what is planned over time within ranges."""
-    if options.ranges:
-        numbers = " and ".join(str(phase.number) for phase in block)
-        text = f"phases {numbers} are planned over time, where ranges are not kept yet"
-        raise InputError("", "robust", text)
 
 
 def _look_ahead(

@@ -94,19 +94,11 @@ class Spread(NamedTuple):
         slopes = find_force_slopes(formation, point, directions, forces, self.names)
         swings = np.einsum("mi,nipq->nmpq", self.rows, slopes)
         c = _stack(forces)
-        normal = np.arange(self.rows.shape[1]) < formation.n_contacts
         for k, name in enumerate(self.names):
-            if not name.startswith("friction"):
-                continue
-            part = {"palm": None, "finger1": 0, "finger2": 1}[name.partition("_")[2]]
-            mine = np.array([contact.finger == part for contact in formation.contacts])
-            # A cone's own edge is mu (c_n - epsilon); c_n >= epsilon knows no friction.
-            edges = np.where(normal, self.rows, 0.0) * (~normal & (self.rows != 0)).any(
-                axis=1, keepdims=True
-            )
-            edges[:, : formation.n_contacts] *= mine
-            swings[:, :, k] += np.einsum("mi,niq->nmq", edges, c)
-            swings[:, :, k, 0] -= epsilon * edges.sum(axis=1)
+            edges = find_edges(formation, self.rows, name)
+            if edges is not None:
+                swings[:, :, k] += np.einsum("mi,niq->nmq", edges, c)
+                swings[:, :, k, 0] -= epsilon * edges.sum(axis=1)
         return np.asarray(swings * self.radii[:, None])
 
     def pick_signs(self, s: Array, segment: NDArray[np.int64]) -> NDArray[np.int8]:
@@ -136,6 +128,30 @@ class Spread(NamedTuple):
         """The left sides of the limits, with their bars, shape (n, m) [N]."""
         own = forces.c(*motion)[:, : self.rows.shape[1]] @ self.rows.T
         return np.asarray(own - np.abs(measure(swings, motion)).sum(axis=2))
+
+
+def find_edges(formation: Formation, rows: Array, name: str) -> Array | None:
+    """The part of force limits that is in proportion to a friction; None if there is none.
+
+    A cone's edge is mu (c_n - epsilon); c_n >= epsilon knows no friction.
+
+    Parameters
+    ----------
+    formation : Formation
+    rows : ndarray, shape (m, n_c + R)
+        Of the limits.
+    name : str
+        Of the number that is off.
+    """
+    if not name.startswith("friction") or not formation.rolling:
+        return None
+    part = {"palm": None, "finger1": 0, "finger2": 1}[name.partition("_")[2]]
+    count = formation.n_contacts
+    cones = (rows[:, count:] != 0).any(axis=1)
+    edges = np.where(cones[:, None], rows, 0.0)
+    edges[:, count:] = 0.0
+    edges[:, :count] *= [contact.finger == part for contact in formation.contacts]
+    return edges
 
 
 def measure(swings: Array, motion: tuple[Array, Array, Array]) -> Array:

@@ -1,4 +1,4 @@
-"""How contact forces along a curve change with numbers that are off, at one state and torques.
+"""How contact forces change with numbers that are off, at one state and torques.
 
 With z, z' and tau given, the equations of motion (`mechanics.dynamics`)
 
@@ -12,9 +12,10 @@ same matrices:
 Along a curve z'' = z_s a + z_ss b, and c and tau are affine in a = s'', b = s'^2, the squeeze and
 s'. So dc/dp is affine in them too.
 
-Where geometry is off the curve is another one. Its place with the same s is the nearest one, and
-so is its tangent: dz and dz_s are at right angles to z_s. Contacts of a finger depend on where the
-object is from the finger's joint, so that a joint that moves is like an object that moves back.
+Where geometry is off other places are possible. The nearest one counts as the same, and so does
+the nearest velocity: along a curve these have the same s and s'. Contacts of a finger depend on
+where the object is from the finger's joint, so that a joint that moves is like an object that moves
+back.
 """
 
 from __future__ import annotations
@@ -27,14 +28,17 @@ import numpy as np
 
 from ...common.arrays import Array
 from ...contacts.formation import Formation, Kinematics
-from ...geometry.curve import CurvePoint, border
+from ...geometry.curve import CurvePoint
 from ...mechanics.dynamics import Directions, PathForces, force_rows
 from ...mechanics.metric import metric_weights
+from ...results.trajectory import Samples
 
 COUNT = 5
 """Number of coefficients: of 1, a, b, the squeeze and s'."""
 _STEP = 1e-5
 """Step of the differences of kinematics, over the scene's length."""
+_LOOSE = 1e-6
+"""Weight of the fingers' angles where they follow the object."""
 
 
 class _Change(NamedTuple):
@@ -73,42 +77,77 @@ def find_force_slopes(
     ndarray, shape (n, n_c + R, len(names), COUNT)
         dc/dp = sum of coefficients times (1, a, b, squeeze, s') [N per unit of p].
     """
-    state = _State.of(formation, point, directions, forces)
-    count = len(point.z), len(names), COUNT
-    load, bend = np.zeros((5, *count)), np.zeros((forces.C0.shape[1], *count))
-    for k, name in enumerate(names):
-        change = state.change(name)
-        load[:, :, k], bend[:, :, k] = (part.transpose(1, 0, 2) for part in change)
-    load, bend = (part.transpose(1, 0, 2, 3) for part in (load, bend))
-    P, inverse_mass = point.kinematics.P, 1 / formation.scene.mass_diagonal
-    K = (P * inverse_mass) @ state.G.transpose(0, 2, 1)
-    right = bend - np.einsum("nij,njpq->nipq", P * inverse_mass, load)
-    flat = np.linalg.solve(K, right.reshape(*right.shape[:2], -1))
-    return np.asarray(flat.reshape(right.shape))
+    none = np.zeros_like(forces.C0)
+    c = np.stack([forces.C0, forces.Ca, forces.Cb, forces.Cl, none], axis=-1)
+    tau = np.stack([forces.T0, forces.Ta, forces.Tb, forces.Tl, forces.Tv], axis=-1)
+    acceleration = np.zeros((*point.z.shape, COUNT))
+    acceleration[..., 1], acceleration[..., 2] = point.z_s, point.z_ss
+    size = np.sqrt(point.z_s[:, :3] ** 2 @ metric_weights(formation.scene)[:3])[:, None]
+    along = point.z_s / size, point.z_ss / size
+    given = point.z, point.z_s, point.kinematics, directions, c, tau, acceleration
+    return _State(formation, *given, along).find_slopes(names)
+
+
+def find_slopes_at(
+    formation: Formation, samples: Samples, directions: Directions, names: Sequence[str]
+) -> Array:
+    """The same at n instants of a motion, shape (n, n_c + R, len(names)) [N per unit].
+
+    `start_x` is how far the object is along x, or as far as the contacts let it.
+    """
+    z, v = samples.z, samples.z_dot
+    kinematics = formation.evaluate(z, v)
+    c_t = samples.c_t[:, list(formation.rolling_rows)]
+    c = np.hstack([samples.c_n, c_t])[..., None] * np.eye(COUNT)[0]
+    tau = samples.tau[..., None] * np.eye(COUNT)[0]
+    acceleration = samples.z_ddot[..., None] * np.eye(COUNT)[0]
+    # Fingers follow the object, however far.
+    metric = metric_weights(formation.scene) * np.array([1, 1, 1, *[_LOOSE] * 2])
+    unit = np.broadcast_to(np.eye(5)[0], z.shape)
+    dz = unit + _move_least(kinematics.P, -kinematics.P[..., 0], metric)
+    given = z, v, kinematics, directions, c, tau, acceleration
+    state = _State(formation, *given, (dz, np.zeros_like(dz)))
+    state = state._replace(along=(dz, state.turn("", dz)))
+    slopes = state.find_slopes(names)
+    # The velocity is that of the motion: s' = 1 along a tangent that is z'.
+    return np.asarray(slopes @ np.array([1.0, 0.0, 1.0, 0.0, 1.0]))
 
 
 class _State(NamedTuple):
-    """A formation at n places of a curve, with coefficients (..., COUNT) of its motion."""
+    """A formation at n places, with coefficients (..., COUNT) of its motion.
+
+    Attributes
+    ----------
+    formation : Formation
+    z, z_s : ndarray, shape (n, 5)
+        Places and tangents, z' = z_s s'.
+    kinematics : Kinematics
+    directions : Directions
+    c, tau, acceleration : ndarray, shape (n, ..., COUNT)
+    along : tuple of ndarray, shape (n, 5) each
+        By how much places and tangents change with `start_x`.
+    """
 
     formation: Formation
-    point: CurvePoint
+    z: Array
+    z_s: Array
+    kinematics: Kinematics
     directions: Directions
-    G: Array
     c: Array
     tau: Array
     acceleration: Array
+    along: tuple[Array, Array]
 
-    @staticmethod
-    def of(
-        formation: Formation, point: CurvePoint, directions: Directions, forces: PathForces
-    ) -> _State:
-        none = np.zeros_like(forces.C0)
-        c = np.stack([forces.C0, forces.Ca, forces.Cb, forces.Cl, none], axis=-1)
-        tau = np.stack([forces.T0, forces.Ta, forces.Tb, forces.Tl, forces.Tv], axis=-1)
-        acceleration = np.zeros((*point.z.shape, COUNT))
-        acceleration[..., 1], acceleration[..., 2] = point.z_s, point.z_ss
-        G = force_rows(formation, point.kinematics, directions)
-        return _State(formation, point, directions, G, c, tau, acceleration)
+    def find_slopes(self, names: Sequence[str]) -> Array:
+        """Derivatives of the contact forces, shape (n, n_c + R, len(names), COUNT)."""
+        changes = [self.change(name) for name in names]
+        load = np.stack([own.load for own in changes], axis=2)
+        bend = np.stack([own.bend for own in changes], axis=2)
+        over = self.kinematics.P / self.formation.scene.mass_diagonal
+        G = force_rows(self.formation, self.kinematics, self.directions)
+        right = bend - np.einsum("nij,njpq->nipq", over, load)
+        flat = np.linalg.solve(over @ G.transpose(0, 2, 1), right.reshape(*right.shape[:2], -1))
+        return np.asarray(flat.reshape(right.shape))
 
     def change(self, name: str) -> _Change:
         """What one number changes of the equations."""
@@ -122,45 +161,49 @@ class _State(NamedTuple):
             part = {"palm": None, "finger1": 0, "finger2": 1}[name.partition("_")[2]]
             mine = np.array([contact.finger == part for contact in self.formation.contacts])
             slip = mine * self.formation.sliding_friction * self.directions.Xi
-            rows = -slip[..., None] * self.point.kinematics.A_t
+            rows = -slip[..., None] * self.kinematics.A_t
             load += np.einsum("nij,niq->njq", rows, self.c[:, : rows.shape[1]])
         elif name.startswith("gain"):
             finger = int(name[-1]) - 1
             load[:, 3 + finger] = self.tau[:, finger]
         elif name == "start_x":
-            metric = metric_weights(scene)[:3]
-            size = np.sqrt(self.point.z_s[:, :3] ** 2 @ metric)[:, None]
-            return self._move(self.point.z_s / size, self.point.z_ss / size)
+            return self._move("", *self.along)
         elif name.startswith(("base", "length")):
             return self._deform(name)
         return _Change(load, bend)
 
     def _deform(self, name: str) -> _Change:
         """What moving a joint, or a longer link, changes."""
-        step = _STEP * self.formation.scene.scales.length
-        z, z_s, _, kinematics = self.point
-        here, there = (self._evaluate(name, way * step, z) for way in (-1, 1))
-        gap = np.zeros(kinematics.P.shape[:2])
-        gap[:, : self.formation.n_contacts] = (there.C - here.C) / (2 * step)
+        step, count = self._step, self.formation.n_contacts
+        here, there = (self._evaluate(name, way * step, self.z) for way in (-1, 1))
+        gap = np.zeros(self.kinematics.P.shape[:2])
+        gap[:, :count] = (there.C - here.C) / (2 * step)
         if self.formation.rolling and name.startswith("base"):
-            count, axis = self.formation.n_contacts, "xy".index(name[-1])
-            rows = self._rows_of(name)[count:]
-            gap[:, count:] = -(rows * kinematics.P[:, count:, axis])
-        metric = metric_weights(self.formation.scene)
-        matrix = border(kinematics.P, z_s * metric)
-        dz = _solve(matrix, -gap)
-        before, after = (self._evaluate(name, way * step, z + way * step * dz) for way in (-1, 1))
-        turned = np.einsum("nij,nj->ni", (after.P - before.P) / (2 * step), z_s)
-        return self._move(dz, _solve(matrix, -turned), name)
+            axis = "xy".index(name[-1])
+            gap[:, count:] = -(self._rows_of(name) * self.kinematics.P[..., axis])[:, count:]
+        dz = _move_least(self.kinematics.P, -gap, metric_weights(self.formation.scene))
+        return self._move(name, dz, self.turn(name, dz))
 
-    def _move(self, dz: Array, dz_s: Array, name: str = "") -> _Change:
+    @property
+    def _step(self) -> float:
+        return _STEP * self.formation.scene.scales.length
+
+    def _difference(self, name: str, dz: Array) -> Kinematics:
+        """Derivative of the kinematics by a length that is off, where places move with it."""
+        step = self._step
+        ends = [self._evaluate(name, way * step, self.z + way * step * dz) for way in (-1, 1)]
+        return Kinematics(*((b - a) / (2 * step) for a, b in zip(*ends, strict=True)))
+
+    def turn(self, name: str, dz: Array) -> Array:
+        """By how much the tangent changes."""
+        turned = np.einsum("nij,nj->ni", self._difference(name, dz).P, self.z_s)
+        return _move_least(self.kinematics.P, -turned, metric_weights(self.formation.scene))
+
+    def _move(self, name: str, dz: Array, dz_s: Array) -> _Change:
         """What another place and tangent change, with geometry that is off by as much."""
-        step = _STEP * self.formation.scene.scales.length
-        z, z_s = self.point[:2]
-        ends = [self._evaluate(name, way * step, z + way * step * dz) for way in (-1, 1)]
-        slopes = Kinematics(*((b - a) / (2 * step) for a, b in zip(*ends, strict=True)))
+        slopes = self._difference(name, dz)
         # P' z' is a quadratic form of the velocity.
-        turns = [self.formation.evaluate(z, z_s + way * dz_s).P_dot_v for way in (-1, 1)]
+        turns = [self.formation.evaluate(self.z, self.z_s + way * dz_s).P_dot_v for way in (-1, 1)]
         bend = -np.einsum("nij,njq->niq", slopes.P, self.acceleration)
         bend[..., 2] -= slopes.P_dot_v + (turns[1] - turns[0]) / 2
         dG = force_rows(self.formation, slopes, self.directions)
@@ -176,7 +219,7 @@ class _State(NamedTuple):
 
     def _evaluate(self, name: str, change: float, z: Array) -> Kinematics:
         """The formation at other places, with one length that is off."""
-        formation, v = self.formation, self.point.z_s
+        formation, v = self.formation, self.z_s
         if name.startswith("length"):
             finger, fingers = int(name[-1]) - 1, list(formation.scene.fingers)
             if any(c.surface == "tip" and c.finger == finger for c in formation.contacts):
@@ -199,7 +242,8 @@ class _State(NamedTuple):
         return Kinematics(*map(choose, found, moved))
 
 
-def _solve(matrix: Array, right: Array) -> Array:
-    """Solve for a displacement at right angles to the tangent, shape (n, 5)."""
-    whole = np.concatenate([right, np.zeros((len(right), 1))], axis=1)
-    return np.asarray(np.linalg.solve(matrix, whole[..., None])[..., 0])
+def _move_least(P: Array, right: Array, metric: Array) -> Array:
+    """The least displacement with P dz = right, shape (n, 5)."""
+    over = P / metric
+    amounts = np.linalg.solve(over @ P.transpose(0, 2, 1), right[..., None])[..., 0]
+    return np.asarray(np.einsum("nij,ni->nj", over, amounts))

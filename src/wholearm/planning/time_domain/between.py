@@ -134,13 +134,21 @@ def check_between(stage: Stage, motion: StageMotion) -> CheckPlaces:
     return CheckPlaces(places, samples, stage.formation.evaluate_limits(samples.z))
 
 
-def find_misses(stage: Stage, check: CheckPlaces, epsilon: float, margin: float = 0.0) -> Limits:
+def find_misses(
+    stage: Stage,
+    check: CheckPlaces,
+    epsilon: float,
+    margin: float = 0.0,
+    swings: Array | float = 0.0,
+) -> Limits:
     """By how much limits are missed in each interval, at worst.
 
     Parameters
     ----------
     epsilon, margin : float
         Least c_n, and what c_n but no friction cone has to exceed it by.
+    swings : ndarray, shape (K CHECKS, n_sides), optional
+        What each side has to exceed its bound by too, over what is much for it.
     """
     samples, limits = check.samples, make_limits(stage.formation, epsilon)
     clear = stage.list_clearances(check.places, after=1 / 2) / 2
@@ -148,7 +156,7 @@ def find_misses(stage: Stage, check: CheckPlaces, epsilon: float, margin: float 
     values = check.limits[:, list(stage.monitored)]
     values = values - np.minimum(values[:1], 0.0)
     tables = (
-        _find_slack(stage, limits, samples, margin),
+        _find_slack(stage, limits, samples, margin) - swings,
         values - clear,
         _measure_senses(stage, samples) - 0.5 * least_senses(stage, check.places),
     )

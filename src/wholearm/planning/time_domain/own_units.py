@@ -15,6 +15,7 @@ import numpy as np
 from ...common.arrays import Array
 from ...contacts.formation import Formation
 from ...problem.definition import Phase, Problem
+from ...problem.uncertainty import PARAMETERS
 from ...scene.model import Finger, Scales, Scene
 from ...scene.polygon import Polygon
 from ..options import Objective, PlanOptions
@@ -71,7 +72,12 @@ def scale_state(z: Array, scales: Scales) -> Array:
 
 def scale_options(options: PlanOptions, scales: Scales) -> PlanOptions:
     """Options in own units."""
-    return replace(options, time_weight=options.time_weight / scales.torque**2)
+    lengths = {own.name for own in PARAMETERS if own.unit == "m"}
+    ranges = {
+        name: radius / scales.length if name in lengths else radius
+        for name, radius in options.ranges.items()
+    }
+    return replace(options, time_weight=options.time_weight / scales.torque**2, ranges=ranges)
 
 
 def unit_of(goal: Objective, scales: Scales) -> float:

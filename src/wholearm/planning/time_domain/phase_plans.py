@@ -15,7 +15,14 @@ from .search import Search, Solution
 def list_plans(
     problem: Problem, search: Search, phases: Sequence[Phase], solution: Solution, attempt: str
 ) -> list[PhasePlan[TimeMotion]]:
-    """The plan of each phase; the sequences of modes that were tried count for the first."""
+    """The plan of each phase; the sequences of modes that were tried count for the first.
+
+    Where there are ranges, one that keeps its limits within them: see `widening`.
+    """
+    if search.options.ranges and not search.only_begins:
+        from .widening import keep_within
+
+        solution = keep_within(search, solution, phases)
     plans, tried = [], search.tried
     unit, margin = unit_of(search.goal, problem.scene.scales), solution.margin
     weight = search.options.time_weight * problem.scene.scales.torque**2
