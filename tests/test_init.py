@@ -27,8 +27,8 @@ def test_every_name_is_there(name: str) -> None:
 
 def test_names_come_from_their_modules() -> None:
     from wholearm.geometry.path_guess import load
-    from wholearm.planning.plan import solve
     from wholearm.results.trajectory import Trajectory
+    from wholearm.search.solve import solve
 
     assert wholearm.load is load and wholearm.solve is solve
     assert wholearm.Trajectory is Trajectory

@@ -33,12 +33,12 @@ if TYPE_CHECKING:
     from .free_simulation.simulate import simulate_free
     from .geometry.path_guess import load
     from .planning.options import Objective, PlanOptions
-    from .planning.plan import solve
     from .planning.result import Plan, Status
     from .planning.saved import load_plan
     from .policy.make import make_policy
     from .policy.policy import Policy
     from .problem.definition import End, Phase, Problem, Until
+    from .problem.goal import Goal
     from .problem.read import place_start, read_formation, read_until
     from .quasistatic.predict import predict
     from .results.narrow import save
@@ -48,6 +48,9 @@ if TYPE_CHECKING:
     from .results.trajectory_file import load_trajectory
     from .scene.model import Finger, Friction, Scene
     from .scene.polygon import Polygon
+    from .search.result import Answer
+    from .search.route import find_route
+    from .search.solve import solve
     from .simulation.events import Simulation
     from .simulation.simulate import simulate
     from .tuning.result import Tuning
@@ -60,6 +63,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
+    "Answer": "search.result",
     "Change": "common.shortfalls",
     "Contact": "contacts.elemental",
     "End": "problem.definition",
@@ -68,6 +72,7 @@ _HOMES = {
     "Friction": "scene.model",
     "FreeReport": "verification.free_report",
     "FreeSimulation": "free_simulation.result",
+    "Goal": "problem.goal",
     "InfeasibleError": "common.errors",
     "InputError": "common.errors",
     "AmbiguityError": "common.errors",
@@ -93,6 +98,7 @@ _HOMES = {
     "Until": "problem.definition",
     "WholearmError": "common.errors",
     "compare": "comparison.compare",
+    "find_route": "search.route",
     "load": "geometry.path_guess",
     "load_plan": "planning.saved",
     "load_trajectory": "results.trajectory_file",
@@ -105,7 +111,7 @@ _HOMES = {
     "save": "results.narrow",
     "simulate": "simulation.simulate",
     "simulate_free": "free_simulation.simulate",
-    "solve": "planning.plan",
+    "solve": "search.solve",
     "tune": "tuning.tune",
     "verify": "verification.verify",
     "verify_free": "verification.free",
@@ -114,6 +120,7 @@ _HOMES = {
 
 __all__ = [
     "AmbiguityError",
+    "Answer",
     "Change",
     "Contact",
     "End",
@@ -122,6 +129,7 @@ __all__ = [
     "FreeReport",
     "FreeSimulation",
     "Friction",
+    "Goal",
     "InfeasibleError",
     "InputError",
     "JammingError",
@@ -147,6 +155,7 @@ __all__ = [
     "WholearmError",
     "__version__",
     "compare",
+    "find_route",
     "load",
     "load_plan",
     "load_trajectory",

@@ -12,6 +12,7 @@ import json
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, NoReturn
 
 from ..common.errors import InputError, WholearmError, name_source
@@ -37,6 +38,7 @@ from .policy import add_policy
 from .predict import predict
 from .progress import clear_progress, show_progress
 from .robustness import add_robustness
+from .route import add_route, find, route
 from .tune import tune
 from .viewer import add_animate, add_gallery, add_report
 
@@ -110,6 +112,7 @@ def build_parser() -> argparse.ArgumentParser:
         ("predict", add_predict, predict, "see up to which speed slow motions keep every contact"),
         ("tune", add_tune, tune, "tune torques from quasistatic ones by steps of 10 percent"),
         ("compare", add_compare, compare, "put plans and torques for a problem side by side"),
+        ("route", add_route, route, "find the contact formations that lead to a goal, and plan"),
         ("map", add_map, draw, "draw the contact formations over (x, phi)"),
         ("export", add_export, None, "write scene and plan for a physics engine"),
         (
@@ -164,7 +167,11 @@ def _solve(options: argparse.Namespace) -> int:
     _check_sampling(options)
     problem = load(options.problem)
     try:
-        plan = solve_with(problem, plan_options, show_progress())
+        if problem.goals:
+            answer = find(problem, plan_options)
+            plan, found = answer.plan, answer.to_text()
+        else:
+            plan, found = solve_with(problem, plan_options, show_progress()), ""
         table = None if options.torques is None else _make_table(options, plan)
     except WholearmError:
         clear_progress()
@@ -182,7 +189,7 @@ def _solve(options: argparse.Namespace) -> int:
         extra = {} if figures is None else {"torques": figures}
         print(json.dumps({**plan.meta, **extra}, indent=2))
     else:
-        print(summarise(plan, output, figures))
+        print(found + summarise(plan, output, figures))
     return 0
 
 
@@ -218,7 +225,8 @@ def _stem(path: str) -> str:
 def _verify(options: argparse.Namespace) -> int:
     from ..common.files import require_ending, require_writable
     from ..common.require import require_number
-    from ..problem.read import read_problem
+    from ..problem.read import read_own_problem, read_problem
+    from ..results.trajectory import Trajectory
     from ..verification.verify import verify
 
     if options.output is not None:
@@ -234,6 +242,10 @@ def _verify(options: argparse.Namespace) -> int:
         given["least_minor"] = options.least_minor
     problem = read_problem(options.problem)
     torques = _read_torques(options.torques)
+    if problem.goals and isinstance(torques, Trajectory):
+        # Which formations lead to the goals the plan has found out.
+        phases = read_own_problem(torques.meta, options.torques).phases
+        problem = replace(problem, phases=phases, goals=())
     if getattr(torques, "meta", {}).get("problem") != problem.table:
         # What has been planned or replayed can be carried out.
         from ..geometry.path_guess import check_phases

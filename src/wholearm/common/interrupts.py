@@ -28,6 +28,7 @@ ENDED = tuple(128 + number for number in _WORDS)
 _guarded = False
 _received: int | None = None
 _holding = False
+_yielding = _pardoned = False
 _ending = threading.RLock()
 """Held while something is done that may not be left half done, ending the process included."""
 _cleanups: list[Callable[[], object]] = []
@@ -90,6 +91,22 @@ def held() -> Iterator[None]:
     check()
 
 
+@contextmanager
+def yielding() -> Iterator[None]:
+    """Have the first SIGINT only raise KeyboardInterrupt: what is done has an answer to give then.
+
+    Where somebody swallows it, it is raised at the end.
+    """
+    global _yielding
+    _yielding = True
+    try:
+        yield
+        if not _yielding:
+            raise KeyboardInterrupt
+    finally:
+        _yielding = False
+
+
 def on_end(cleanup: Callable[[], object]) -> None:
     """Register what has to be cleaned up when a command is ended by force."""
     _cleanups.append(cleanup)
@@ -109,12 +126,22 @@ def _handlers() -> Iterator[None]:
 
 def _interrupt(number: int, _: FrameType | None) -> None:
     """Handle a signal: the first one raises KeyboardInterrupt."""
-    global _received
+    global _received, _yielding, _pardoned
+    if _yielding and number == signal.SIGINT:
+        _yielding, _pardoned = False, True
+        raise KeyboardInterrupt
     first, _received = _received is None, _received or number
     # Whoever swallows the exception writes about it; one line is to be there, ours.
     sys.stderr = io.StringIO()
     if first and not _holding:
         raise KeyboardInterrupt
+
+
+def _is_pardoned(number: int) -> bool:
+    """Whether a signal is one that does not end the command; handlers run before or after this."""
+    global _pardoned
+    pardoned, _pardoned = number == signal.SIGINT and (_yielding or _pardoned), False
+    return pardoned
 
 
 @contextmanager
@@ -131,6 +158,8 @@ def _watcher() -> Iterator[None]:
     def watch() -> None:
         while not over.is_set():
             number = os.read(source, 1)[0]
+            if _is_pardoned(number):
+                continue
             if number in _WORDS and not over.wait(PATIENCE):
                 with _ending:
                     if not over.is_set():

@@ -68,16 +68,19 @@ def _single_contacts(scene: Scene) -> dict[int, Formation]:
     return {}
 
 
-def evaluate_contacts(scene: Scene, label: Sequence[int], z: Array) -> Kinematics:
-    """Rows of some contacts of `contact_table` at n configurations, with A' v for z as velocity.
+def evaluate_contacts(
+    scene: Scene, label: Sequence[int], z: Array, v: Array | None = None
+) -> Kinematics:
+    """Rows of some contacts of `contact_table` at n configurations, with A' v for v, or else z.
 
     Many formations have few contacts in common, but each contact is in many of them.
     """
+    v = z if v is None else v
     single, parts = _single_contacts(scene), []
     for index in label:
         if index not in single:
             single[index] = Formation(scene, (contact_table(scene)[index],))
-        parts.append(single[index].evaluate(z, z))
+        parts.append(single[index].evaluate(z, v))
     return Kinematics(*(np.concatenate(part, axis=1) for part in zip(*parts, strict=True)))
 
 

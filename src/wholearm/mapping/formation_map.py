@@ -243,6 +243,7 @@ def _cover_phases(problem: Problem) -> tuple[float, float]:
     for phase in problem.phases:
         if phase.until.coordinate == "phi" and phase.until.value is not None:
             angles.append(phase.until.value)
+    angles += [goal.find_angle(problem.scene, angles[-1]) for goal in problem.goals]
     low, high = min(angles), max(angles)
     around = Window((0.0, 0.0), (low - 2 * np.pi, high + 2 * np.pi)).flush_angles(problem.scene)
     flush = np.array([angle for angle, _ in around])

@@ -25,6 +25,7 @@ from ..scene.ranges import (
     check_settle_gap,
 )
 from .definition import End, Phase, Problem, Until
+from .goal import check_goal, name_goal
 from .uncertainty import spread_widths
 
 
@@ -58,6 +59,11 @@ def check_problem(problem: Problem) -> None:
         _check_settle(problem.scene, phase, f"phases[{index + 1}].settle")
     for phase, following in zip_longest(problem.phases, problem.phases[1:]):
         _check_end(phase, following)
+    for index, goal in enumerate(problem.goals):
+        key = name_goal(problem.goals, index, problem.table)
+        check_goal(problem.scene, goal, key)
+        if problem.phases:
+            raise InputError("", key, "given with [[phases]]; allowed is one of the two")
     _check_fingers(problem)
     _check_first_formation(problem)
 
@@ -72,6 +78,8 @@ def require_phases(problem: Problem) -> None:
     """
     if not problem.phases:
         text = "is missing; `wholearm map FILE --list X,PHI ...` lists [[phases]] along a route"
+        if problem.goals:
+            text = "is missing; `wholearm route FILE` finds the [[phases]] that lead to the goal"
         raise InputError(problem.source, "phases", text)
 
 

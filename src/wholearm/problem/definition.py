@@ -13,6 +13,7 @@ from ..common.errors import InputError, name_source
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..scene.model import Scene
+from .goal import Goal
 from .table import change_table, match_table, write_table
 
 SETTLE_GAP = 3e-3
@@ -114,7 +115,7 @@ class Problem:
     start : ndarray, shape (5,)
         Configuration z at the start, with the fingers closed; see `place_start`.
     phases : tuple of Phase
-        None of them for a map; planning and replays need one or more.
+        None of them for a map, or where there are goals; replays need one or more.
     source : str
         The file this was read from.
     table : mapping
@@ -130,6 +131,8 @@ class Problem:
         By how much they may be open; `SETTLE_GAP` of the scene's length if left out.
     checked : bool
         Whether it is known to be like one from a file; otherwise it is checked when it is made.
+    goals : tuple of Goal
+        Where the object shall come to lie, one after the other, in place of phases.
 
     Raises
     ------
@@ -153,6 +156,7 @@ class Problem:
     checked: bool = field(default=False, repr=False)
     settle: float = 0.0
     settle_gap: float | None = None
+    goals: tuple[Goal, ...] = ()
 
     def __post_init__(self) -> None:
         phases = tuple(phase.move_to(self.scene) for phase in self.phases)

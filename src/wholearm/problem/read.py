@@ -24,6 +24,7 @@ from ..scene.model import Finger, Friction, Scene
 from ..scene.polygon import Polygon
 from ..scene.ranges import TURN, check_place, check_ranges
 from .definition import End, Phase, Problem, Until
+from .goal import read_goals
 from .table import name_keys
 from .uncertainty import GROUPS as PARAMETER_GROUPS
 from .uncertainty import NAMES as PARAMETER_NAMES
@@ -34,7 +35,7 @@ ROLLING = " rolling"
 """Follows the name of a contact that rolls in a phase's `contacts`."""
 
 _OPTIONAL = {
-    "name", "gravity", "fingers_collide", "phases", "settle", "settle_gap", "uncertainty",
+    "name", "gravity", "fingers_collide", "phases", "goal", "settle", "settle_gap", "uncertainty",
 }  # fmt: skip
 _TOP = _OPTIONAL | {"epsilon", "object", "fingers", "friction", "start"}
 _OBJECT = {"vertices", "mass", "inertia"}
@@ -104,6 +105,7 @@ def _build_problem(table: Mapping[str, Any], source: str) -> Problem:
         ranges,
         settle=table.get("settle", 0.0),
         settle_gap=table.get("settle_gap"),
+        goals=read_goals(table),
     )
 
 

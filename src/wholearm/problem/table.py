@@ -16,6 +16,7 @@ from ..common.errors import InputError
 from ..contacts.closing import close_finger, place_flush
 from ..scene.model import Scene
 from ..scene.polygon import Polygon
+from .goal import match_goals
 
 if TYPE_CHECKING:
     from .definition import Phase, Problem
@@ -144,9 +145,12 @@ def match_table(problem: Problem) -> Mapping[str, Any]:
     if start is None:
         return {}
     phases = [_match_phase(table.get("phases", []), phase) for phase in problem.phases]
-    if not differing and start is table["start"] and phases == table.get("phases", []):
+    goals = match_goals(problem.goals, table) if problem.goals else None
+    same = start is table["start"] and phases == table.get("phases", [])
+    if not differing and same and goals == table.get("goal"):
         return table
     changed = copy.deepcopy({**table, "start": start, "phases": phases})
+    _set(changed, "goal", goals)
     for key, value in differing.items():
         _set(changed, key, value)
     return changed
@@ -170,6 +174,8 @@ def write_table(problem: Problem) -> Mapping[str, Any]:
     }
     if problem.uncertainty is not None:
         table["uncertainty"] = _to_plain(problem.uncertainty)
+    if problem.goals:
+        table["goal"] = match_goals(problem.goals, {})
     for key, value in describe_scene(problem.scene).items():
         _set(table, key, value)
     return table

@@ -52,6 +52,20 @@ class LowerBound(NamedTuple):
     error: float
 
 
+class Outlook(NamedTuple):
+    """About how long the fastest motion along curves takes, and a lower bound of it.
+
+    Attributes
+    ----------
+    duration : float, [s]
+        Of a motion that keeps the limits at one place of each interval of a coarse grid.
+    bound : float, [s]
+    """
+
+    duration: float
+    bound: float
+
+
 class _Round(NamedTuple):
     """The bound on a grid, what each interval may lose, (N,) [s], and the motion it is from."""
 
@@ -77,6 +91,22 @@ def bound_least_time(curves: Sequence[Curve], epsilon: float) -> LowerBound | No
         except NoMotionError:
             continue
     return None
+
+
+def look_along(curves: Sequence[Curve], epsilon: float, intervals: int) -> Outlook:
+    """Look at the fastest motion along curves on one coarse grid; see `bound_least_time`.
+
+    Raises
+    ------
+    NoMotionError
+        If there is no motion on that grid.
+    """
+    way = Way(curves, epsilon)
+    grid = way.make_grid(intervals)
+    found = _bound(way, grid, None)
+    speeds = np.sqrt(np.maximum(found.motion.b, 0.0))
+    steps = np.diff(way.place(grid.angles))
+    return Outlook(float((2 * steps / (speeds[1:] + speeds[:-1])).sum()), found.bound.value)
 
 
 def _refine(way: Way, grid: Grid) -> LowerBound:

@@ -115,6 +115,16 @@ def plan_phases(
     return _look_further(search, attempts, problem, phases, first, explained)
 
 
+def try_phases(
+    problem: Problem, phases: Sequence[Phase], z: Array, options: PlanOptions
+) -> list[PhasePlan[TimeMotion]] | None:
+    """Plan phases from the first guess alone; None where that leads nowhere. See `plan_phases`."""
+    search = Search.of(problem, options, None, None, math.inf, False)
+    attempts = Attempts(problem, phases, z, search, None, False)
+    first, name = _begin(search, attempts.first, (), False)
+    return list_plans(problem, search, phases, first, name) if first.success else None
+
+
 def _look_further(
     search: Search,
     attempts: Attempts,

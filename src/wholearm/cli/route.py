@@ -1,0 +1,77 @@
+"""The command ``wholearm route``: the contact formations that lead to a goal."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from typing import TYPE_CHECKING
+
+from .progress import clear_progress, show_progress
+
+if TYPE_CHECKING:
+    from ..planning.options import PlanOptions
+    from ..problem.definition import Problem
+    from ..search.result import Answer
+
+
+def add_route(parser: argparse.ArgumentParser) -> None:
+    """Add what `route` takes."""
+    parser.add_argument("problem", help="problem file (TOML) with [goal] in place of [[phases]]")
+    text = "figure to write (.png, .pdf, .svg) of the route over the map"
+    parser.add_argument("-o", "--output", metavar="FILE", help=text)
+    text = "how many routes of other formations are listed beside the best one (0)"
+    parser.add_argument("--alternatives", metavar="N", type=int, default=0, help=text)
+    text = "of the plans: time, effort or margin (time); routes are looked for by time"
+    parser.add_argument("--objective", default="time", help=text)
+    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+
+
+def route(options: argparse.Namespace) -> int:
+    """Find a route, print its phases, and draw it if that is asked for."""
+    from ..common.errors import InputError
+    from ..common.files import require_writable
+    from ..planning.options import PlanOptions
+    from ..problem.read import read_problem
+
+    if options.alternatives < 0:
+        given = f"{options.alternatives} given; allowed is 0 or more"
+        raise InputError("", "--alternatives", given)
+    if options.output is not None:
+        from ..figures import plots
+
+        plots.require_format(options.output)
+        require_writable(options.output)
+    problem = read_problem(options.problem)
+    answer = find(problem, PlanOptions(objective=options.objective), options.alternatives)
+    clear_progress()
+    print(json.dumps(answer.to_dict(), indent=2) if options.json else answer.to_text(), end="")
+    if options.json:
+        print()
+    if options.output is not None:
+        _draw(answer, options.output)
+        print(f"wrote {options.output}", file=sys.stderr)
+    return 0
+
+
+def find(problem: Problem, options: PlanOptions, alternatives: int = 0) -> Answer:
+    """Find a route, with a progress line."""
+    from ..common.errors import WholearmError
+    from ..search.route import find_route_with
+
+    try:
+        return find_route_with(problem, options, alternatives, show_progress())
+    except WholearmError:
+        clear_progress()
+        raise
+
+
+def _draw(answer: Answer, output: str) -> None:
+    from ..figures import plots
+    from ..figures.formation_map import draw_map
+    from ..mapping.formation_map import build_map, choose_window
+
+    problem = answer.problem
+    chart = build_map(problem, window=choose_window(problem), progress=show_progress())
+    plots.save(draw_map(chart, answer.plan.trajectory), output)
+    clear_progress()

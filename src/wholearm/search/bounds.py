@@ -1,0 +1,53 @@
+"""How much longer a plan may take than the best one along borders."""
+
+from __future__ import annotations
+
+import heapq
+from itertools import count
+from typing import NamedTuple
+
+from .find import Search
+from .goals import is_at
+from .links import Link
+from .places import Key, Place
+
+MOST = 60
+"""Most places that are settled to bound routes from below."""
+
+
+class BorderBound(NamedTuple):
+    """A lower bound of what routes take that follow borders and stop where these meet.
+
+    Attributes
+    ----------
+    value : float, [s]
+        No such route takes less.
+    complete : bool
+        Whether it is that of a route, or larger than what was asked for; otherwise more would
+        have had to be looked at.
+    """
+
+    value: float
+    complete: bool
+
+
+def bound_borders(search: Search, enough: float) -> BorderBound:
+    """Bound every route along borders from below, up to `enough` [s]."""
+    number, settled = count(), set[Key]()
+    queue: list[tuple[float, int, Place, bool]] = [(0.0, next(number), search.start, False)]
+    while queue:
+        cost, _, place, arrived = heapq.heappop(queue)
+        if cost >= enough:
+            return BorderBound(enough, True)
+        if arrived or (cost > 0 and is_at(place, search.goal)):
+            return BorderBound(cost, True)
+        if place.key in settled:
+            continue
+        if len(settled) >= MOST:
+            return BorderBound(cost, False)
+        settled.add(place.key)
+        for border, link in search.chart.follow(place):
+            for own, ends in ((link, False), (search.chart.end_at(border, search.goal), True)):
+                if isinstance(own, Link):
+                    heapq.heappush(queue, (cost + own.bound, next(number), own.stop, ends))
+    return BorderBound(enough, True)

@@ -1,0 +1,158 @@
+"""What is known of a scene's borders and cells: followed when they are first asked for, then kept.
+
+The graph depends on the scene and on epsilon alone, so that searches from any start to any goal
+share it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ..contacts.formation import Formation
+from ..planning.result import Plan
+from ..problem.definition import Problem, Until
+from ..problem.goal import Goal
+from .cells import Crossing, cross, go_to
+from .goals import list_poses, measure_along
+from .links import (
+    Blocked,
+    Border,
+    Link,
+    Measured,
+    Step,
+    cut_curve,
+    follow_borders,
+    link_border,
+    look_at,
+    point_out,
+)
+from .places import Key, Place, list_formations_at, make_place, settle
+
+RELEASES = (0.1, 0.25, 0.4, 0.55, 0.7, 0.85)
+"""Shares of a border at which contacts may be let go."""
+
+Found = list[Link | Blocked]
+
+
+class Chart:
+    """Places, borders and cells of a scene, as far as searches have looked at them.
+
+    Parameters
+    ----------
+    problem : Problem
+        Whose scene and epsilon it is for.
+    least_minor : float
+        See `PlanOptions`.
+
+    Attributes
+    ----------
+    plans : dict
+        Plans of routes through it, or why there are none; see `candidates`.
+    polished : set of Link
+        Those that were planned with borders left in motion, too.
+    measured : dict
+        Links through cells that were planned for themselves, or why they have no plan.
+    """
+
+    def __init__(self, problem: Problem, least_minor: float) -> None:
+        self.scene, self.epsilon, self.least_minor = problem.scene, problem.epsilon, least_minor
+        self.polished: set[Link] = set()
+        self._links: dict[Key, list[tuple[Border, Link | Blocked | None]]] = {}
+        self._cells: dict[Key, Found] = {}
+        self.plans: dict[object, Plan | str] = {}
+        self.measured: dict[Link, Measured | str] = {}
+        self._releases: dict[tuple[Key, int], Found] = {}
+
+    def follow(self, place: Place) -> list[tuple[Border, Link | Blocked | None]]:
+        """Borders that lead on from a place, with the link along the whole of each."""
+        key = place.key
+        if key not in self._links:
+            settled = settle(place) if place.landed else place
+            self._links[key] = [
+                (border, link_border(border, self.epsilon, self.least_minor))
+                for border in (follow_borders(settled) if settled else [])
+            ]
+        return self._links[key]
+
+    def cross_cells(self, place: Place) -> Found:
+        """Links from rest at a place through the cells around it."""
+        if place.key not in self._cells:
+            found: Found = []
+            for formation in list_formations_at(place, 3):
+                for way in cross(formation, place.z[None], self.epsilon):
+                    found.append(self._link_cell(place, (), formation, way, 0.0))
+            self._cells[place.key] = found
+        return self._cells[place.key]
+
+    def release(self, border: Border, number: int) -> Found:
+        """Links that leave a border for a cell, somewhere on the way along it."""
+        key = border.start.key, number
+        if key in self._releases:
+            return self._releases[key]
+        curves, times = [], []
+        for share in RELEASES:
+            curve = cut_curve(border.curve, share * border.curve.length)
+            ahead = look_at((curve,), self.epsilon, self.least_minor)
+            if isinstance(ahead, str):
+                break
+            curves.append(curve)
+            times.append(ahead.duration)
+        best: dict[tuple[Formation, str], Link] = {}
+        if curves:
+            z = np.array([curve.end for curve in curves])
+            held = border.formation.contacts
+            middle = make_place(self.scene, z[0])
+            for formation in list_formations_at(middle, 3):
+                for way in cross(formation, z, self.epsilon):
+                    first = Step(held, point_out(held, z[way.source]))
+                    link = self._link_cell(
+                        border.start, (first,), formation, way, times[way.source]
+                    )
+                    own = formation, str(link.steps[-1].until)
+                    if own not in best or link.duration < best[own].duration:
+                        best[own] = link
+        self._releases[key] = list(best.values())
+        return self._releases[key]
+
+    def _link_cell(
+        self,
+        start: Place,
+        before: tuple[Step, ...],
+        formation: Formation,
+        way: Crossing,
+        spent: float,
+    ) -> Link:
+        steps = (*before, Step(formation.contacts, Until(contact=way.gained)))
+        assert way.gained is not None
+        stop = Place(self.scene, way.z, (*formation.contacts, way.gained), landed=True)
+        return Link(start, stop, steps, spent + way.duration, 0.0, True)
+
+    def end_at(self, border: Border, goal: Goal) -> Link | Blocked | None:
+        """The link along a border to where it meets a goal; None if it does not."""
+        found = measure_along(border.curve, goal)
+        if found is None:
+            return None
+        s, until = found
+        curve = cut_curve(border.curve, s)
+        steps = (Step(border.formation.contacts, until),)
+        ahead = look_at((curve,), self.epsilon, self.least_minor)
+        if isinstance(ahead, str):
+            return Blocked(border.start, steps, ahead)
+        stop = make_place(self.scene, curve.end)
+        return Link(border.start, stop, steps, ahead.duration, ahead.bound)
+
+    def end_in_cell(self, place: Place, goal: Goal) -> Iterator[Link]:
+        """Links from a place straight to a goal inside a cell around it."""
+        poses = list_poses(self.scene, place.z, goal)
+        if not len(poses):
+            return
+        for formation in list_formations_at(place, 3):
+            way = go_to(formation, place.z, poses, self.epsilon)
+            if way is not None:
+                assert goal.phi is not None
+                until = Until(coordinate="phi", value=goal.phi)
+                steps = (Step(formation.contacts, until),)
+                stop = Place(self.scene, way.z, formation.contacts, landed=True)
+                yield Link(place, stop, steps, way.duration, 0.0, True)

@@ -1,0 +1,156 @@
+"""The search: routes from a place to a goal, the shortest first.
+
+Places are settled in the order of what it costs to get there and at least, by a rule of thumb, from
+there on. Borders that lead on from a place are looked at when it is settled; cells, which take
+longer, are put off by what motions through them cost at least, by the same rule.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import count
+
+from ..problem.goal import Goal
+from .chart import Chart
+from .goals import is_at, measure_turn
+from .links import Blocked, Border, Link
+from .places import Place
+
+TURNING = 4.0
+"""Least time that turning by a radian takes, by a rule of thumb, in the scene's time."""
+SETTING_OUT = 0.5
+"""The same of a motion through a cell."""
+OFTEN = 3
+"""How often a place is settled, on different ways."""
+MOST = 4000
+"""Most entries of the queue that are looked at."""
+
+
+@dataclass(frozen=True, eq=False)
+class Route:
+    """A way from a start, as links one after the other.
+
+    Attributes
+    ----------
+    links : tuple of Link
+    """
+
+    links: tuple[Link, ...]
+
+    @property
+    def duration(self) -> float:
+        """About how long it takes [s]."""
+        return sum(link.duration for link in self.links)
+
+    @property
+    def bound(self) -> float:
+        """How long it takes at least [s], with a stop at each place."""
+        return sum(link.bound for link in self.links)
+
+    @property
+    def in_cells(self) -> bool:
+        """Whether it leads through cells, which nothing bounds from below."""
+        return any(link.in_cell for link in self.links)
+
+    @property
+    def signature(self) -> tuple[object, ...]:
+        """By which routes differ."""
+        return tuple(part for link in self.links for part in link.signature)
+
+
+@dataclass(eq=False)
+class Search:
+    """Routes from a start to a goal.
+
+    Attributes
+    ----------
+    chart : Chart
+    start : Place
+    goal : Goal
+    blocked : list of Blocked
+        Links that no motion can take, as they are met.
+    settled : int
+        Places that have been settled.
+    limit : float
+        Cost from which on nothing is of interest [s].
+    """
+
+    chart: Chart
+    start: Place
+    goal: Goal
+    blocked: list[Blocked] = field(default_factory=list)
+    settled: int = 0
+    limit: float = math.inf
+
+    def measure(self, place: Place) -> float:
+        """About the least time from a place to the goal [s]."""
+        return TURNING * self.chart.scene.scales.time * measure_turn(place, self.goal)
+
+    def run(self) -> Iterator[Route]:
+        """Find routes, about in the order of their durations."""
+        time = self.chart.scene.scales.time
+        number, queue = count(), list[tuple[float, int, float, Route, Place, object]]()
+        times: Counter[object] = Counter()
+        found: set[object] = set()
+
+        def put(route: Route, place: Place, work: object, more: float = 0.0) -> None:
+            cost = route.duration
+            heapq.heappush(
+                queue, (cost + self.measure(place) + more, next(number), cost, route, place, work)
+            )
+
+        put(Route(()), self.start, None)
+        for _ in range(MOST):
+            if not queue:
+                return
+            cost, _, _, route, place, work = heapq.heappop(queue)
+            if cost > self.limit:
+                return
+            if work is None:
+                if route.links and is_at(place, self.goal):
+                    if route.signature not in found:
+                        found.add(route.signature)
+                        yield route
+                    continue
+                key = place.key
+                if times[key] >= (1 if place.landed else OFTEN):
+                    continue
+                times[key] += 1
+                if times[key] == 1:
+                    self.settled += 1
+                links = self._follow(route, place, put, times[key] == 1)
+                put(route, place, "cells", SETTING_OUT * time) if not place.landed else None
+            elif isinstance(work, tuple):
+                border, index = work
+                links = self.chart.release(border, index)
+            else:
+                links = [*self.chart.cross_cells(place), *self.chart.end_in_cell(place, self.goal)]
+            for link in links:
+                if isinstance(link, Blocked):
+                    self.blocked.append(link)
+                else:
+                    put(Route((*route.links, link)), link.stop, None)
+
+    def _follow(self, route: Route, place: Place, put: object, first: bool) -> list[Link | Blocked]:
+        """Links along borders, whole or to a goal; releases on the way are put off."""
+        time, links = self.chart.scene.scales.time, list[Link | Blocked]()
+        for index, (border, link) in enumerate(self.chart.follow(place)):
+            if self._is_back(route, border):
+                continue
+            ending = self.chart.end_at(border, self.goal)
+            links += [own for own in (link, ending) if own is not None]
+            if not place.landed:
+                put(route, place, (border, index), 2 * SETTING_OUT * time)  # type: ignore[operator]
+        return links if first else [own for own in links if isinstance(own, Link)]
+
+    @staticmethod
+    def _is_back(route: Route, border: Border) -> bool:
+        """Whether a border is the one that a route has just come along."""
+        if not route.links or route.links[-1].in_cell:
+            return False
+        last = route.links[-1].steps[-1].contacts
+        return set(last) == set(border.formation.contacts)

@@ -1,0 +1,96 @@
+"""Where goals are: at places, along curves and inside cells."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..geometry.curve import Curve, find_root, refine
+from ..geometry.tracing import HELD
+from ..problem.definition import Until
+from ..problem.goal import Goal
+from ..scene.model import Scene
+from .places import Place, unit_steps
+
+ACROSS = np.linspace(-1.5, 1.5, 13)
+"""Where a goal that leaves x open is looked for inside a cell, in radii of gyration."""
+
+
+def is_flush(place: Place, edge: int) -> bool:
+    """Whether an edge lies on the palm."""
+    count = place.scene.polygon.n_vertices
+    palm = {c.index for c in place.contacts if c.finger is None}
+    return {edge, (edge + 1) % count} <= palm
+
+
+def is_at(place: Place, goal: Goal) -> bool:
+    """Whether a place is a goal."""
+    scene = place.scene
+    if goal.x is not None and abs(place.z[0] - goal.x) > HELD * scene.scales.length:
+        return False
+    if goal.flush is not None:
+        return is_flush(place, goal.flush)
+    assert goal.phi is not None
+    return bool(abs(place.z[2] - goal.phi) < HELD)
+
+
+def measure_along(curve: Curve, goal: Goal) -> tuple[float, Until] | None:
+    """Where along a curve a goal is first met inside it [m], and what ends the phase there.
+
+    A flush goal without x is met where the edge comes to lie on the palm: at an end of the curve.
+    """
+    scene = curve.formation.scene
+    if goal.flush is not None:
+        palm = {c.index for c in curve.formation.contacts if c.finger is None}
+        count = scene.polygon.n_vertices
+        if goal.x is None or {goal.flush, (goal.flush + 1) % count} != palm:
+            return None
+        s = _find_first(curve, 0, goal.x)
+        return None if s is None else (s, Until(coordinate="x", value=goal.x))
+    assert goal.phi is not None
+    s = _find_first(curve, 2, goal.phi)
+    if s is None:
+        return None
+    x = float(curve.evaluate(np.array([s])).z[0, 0])
+    if goal.x is not None and abs(x - goal.x) > HELD * scene.scales.length:
+        return None
+    return s, Until(coordinate="phi", value=goal.phi)
+
+
+def _find_first(curve: Curve, row: int, value: float) -> float | None:
+    """First place along a curve at which a coordinate takes a value, beyond its start."""
+    grid = np.concatenate([refine(panel.s, curve.length) for panel in curve.panels])
+    grid = np.unique(grid[grid <= curve.length])
+    off = curve.evaluate(grid).z[:, row] - value
+    least = HELD * (curve.formation.scene.scales.length if row == 0 else 1.0)
+    if abs(off[0]) < least:
+        return None
+    changes = np.flatnonzero(off[:-1] * off[1:] <= 0)
+    if not len(changes):
+        return None
+    k = int(changes[0])
+    if off[k + 1] == 0:
+        return float(grid[k + 1])
+
+    def miss(s: float) -> float:
+        return float(curve.evaluate(np.array([s])).z[0, row]) - value
+
+    return find_root(miss, float(grid[k]), float(grid[k + 1]))
+
+
+def list_poses(scene: Scene, z: Array, goal: Goal) -> Array:
+    """Poses (x, phi) where a goal may be met in a cell near a configuration, shape (n, 2)."""
+    if goal.phi is None:
+        return np.zeros((0, 2))
+    if goal.x is not None:
+        return np.array([[goal.x, goal.phi]])
+    x = float(z[0]) + ACROSS * float(unit_steps(scene)[0])
+    return np.column_stack([x, np.full(len(x), goal.phi)])
+
+
+def measure_turn(place: Place, goal: Goal) -> float:
+    """How far the object has still to turn, at least [rad]."""
+    angle = goal.find_angle(place.scene, float(place.z[2]))
+    return math.fabs(angle - float(place.z[2]))

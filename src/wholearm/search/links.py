@@ -1,0 +1,223 @@
+"""Links between places: phases along borders, and through cells, with about how long they take."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..contacts.elemental import Contact
+from ..contacts.formation import Formation
+from ..geometry.curve import Curve, describe_pose
+from ..geometry.tracing import HELD, trace_curve
+from ..mechanics.dynamics import Directions, reduced_inertia
+from ..mechanics.metric import metric_weights
+from ..mechanics.uniqueness import find_minors
+from ..planning.lower_bound.lower_bound import Outlook, look_along
+from ..planning.lower_bound.sweep import NoMotionError
+from ..problem.definition import End, Until
+from .places import Place, list_formations_at, make_place
+
+INTERVALS = 24
+"""Intervals of the grid on which the fastest motion along curves is looked for."""
+CHECKED = 12
+"""Places of a segment at which jamming and ambiguous forces are looked for."""
+
+
+class Step(NamedTuple):
+    """One phase of a link."""
+
+    contacts: tuple[Contact, ...]
+    until: Until
+    end: End = End.REST
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """A way from one place to another, from rest to rest.
+
+    Attributes
+    ----------
+    start, stop : Place
+    steps : tuple of Step
+    duration, bound : float, [s]
+        About how long it takes, and at least.
+    in_cell : bool
+        Whether it leads through a cell. Then the planner chooses where it ends, the duration is
+        that of straight ways, and nothing bounds it from below.
+    """
+
+    start: Place
+    stop: Place
+    steps: tuple[Step, ...]
+    duration: float
+    bound: float
+    in_cell: bool = False
+
+    @property
+    def signature(self) -> tuple[tuple[str, ...], ...]:
+        """The contacts of its phases, by which routes differ."""
+        return tuple(tuple(sorted(c.name for c in step.contacts)) for step in self.steps)
+
+
+class Measured(NamedTuple):
+    """What came of planning a link for itself.
+
+    Attributes
+    ----------
+    duration : float, [s]
+    steps : tuple of Step
+        Its phases, in the way that was planned.
+    """
+
+    duration: float
+    steps: tuple[Step, ...]
+
+
+class Blocked(NamedTuple):
+    """A link that no motion can take.
+
+    Attributes
+    ----------
+    start : Place
+    steps : tuple of Step
+    reason : str
+    """
+
+    start: Place
+    steps: tuple[Step, ...]
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Border:
+    """A border followed one way from a place, as far as its formation holds.
+
+    Attributes
+    ----------
+    start : Place
+    curve : Curve
+    gained : Contact or None
+        What is gained at its end; None where it ends at an obstacle.
+    """
+
+    start: Place
+    curve: Curve
+    gained: Contact | None
+
+    @property
+    def formation(self) -> Formation:
+        """The contacts that touch along it."""
+        return self.curve.formation
+
+
+def follow_borders(place: Place) -> list[Border]:
+    """Every border that leads on from a place, one way or the other."""
+    scene, found = place.scene, []
+    least = HELD * scene.scales.length
+    for formation in list_formations_at(place, 4):
+        for heading in find_headings(formation, place.z):
+            curve = trace_curve(formation, place.z, heading, Until())
+            if curve.length > least and _is_regular(curve):
+                found.append(Border(place, curve, _find_gained(curve)))
+    return found
+
+
+def find_headings(formation: Formation, z: Array) -> tuple[Array, ...]:
+    """Both unit tangents of a formation's curve at `z`; none where it has more than one."""
+    metric = np.sqrt(metric_weights(formation.scene))
+    P = formation.evaluate(z[None], np.zeros((1, 5))).P[0] / metric
+    _, values, right = np.linalg.svd(P)
+    if values[-1] < 1e-7 * values[0]:
+        return ()
+    null = right[-1] / metric
+    return null, -null
+
+
+def _is_regular(curve: Curve) -> bool:
+    try:
+        return bool(curve.segments)
+    except np.linalg.LinAlgError:
+        return False
+
+
+def _find_gained(curve: Curve) -> Contact | None:
+    """The contact that is gained at the end of a curve."""
+    formation = curve.formation
+    values = np.abs(formation.evaluate_limits(np.array([curve.start, curve.end])))
+    met = values[1] < formation.scene.touching
+    # What is closed from the start, such as the end of a flush edge, is not what is waited for.
+    opened = values[0] > HELD * formation.scene.scales.length
+    for rows in (met & opened, met):
+        for k in np.flatnonzero(rows):
+            if formation.limits[k].gained is not None:
+                return formation.limits[k].gained
+    return None
+
+
+def point_out(contacts: Sequence[Contact], z: Array) -> Until:
+    """A place on a border by the coordinate that changes along it."""
+    if sum(contact.finger is None for contact in contacts) == 2:
+        return Until(coordinate="x", value=float(z[0]))
+    return Until(coordinate="phi", value=float(z[2]))
+
+
+def describe_steps(steps: Sequence[Step]) -> str:
+    """Phases of a link in words."""
+    return ", then ".join(
+        f"{' '.join(c.name for c in step.contacts)} until {step.until}" for step in steps
+    )
+
+
+def cut_curve(curve: Curve, length: float) -> Curve:
+    """The first part of a curve."""
+    return replace(curve, length=length, ending="", reached=True)
+
+
+def look_at(curves: Sequence[Curve], epsilon: float, least_minor: float) -> Outlook | str:
+    """About how long motions along curves take, or why there are none, in words."""
+    for curve in curves:
+        reason = _find_ambiguity(curve, least_minor)
+        if reason:
+            return reason
+    try:
+        return look_along(curves, epsilon, INTERVALS)
+    except NoMotionError as error:
+        part = (error.interval + 0.5) / INTERVALS
+        length = sum(curve.length for curve in curves)
+        s = length * (1 - np.cos(np.pi * min(part, 1.0))) / 2
+        for curve in curves:
+            if s <= curve.length:
+                break
+            s -= curve.length
+        place = curve.evaluate(np.array([min(s, curve.length)])).z[0]
+        return f"no motion keeps its limits at {describe_pose(place)}"
+
+
+def _find_ambiguity(curve: Curve, least: float) -> str:
+    """Why contact forces along a curve are not the only ones; empty where they are."""
+    formation = curve.formation
+    for part in curve.segments:
+        s = np.linspace(part.start, min(part.stop, curve.length), CHECKED)
+        at = curve.evaluate(s)
+        if reduced_inertia(formation, at.kinematics, Directions(part.Xi, part.sigma)).min() <= 0:
+            return "friction jams it"
+        ratio, names, row = find_minors(formation, at.kinematics, part.Xi).find_least()
+        if ratio < least:
+            return f"{names} ambiguous: minor {ratio:.2f} at {describe_pose(at.z[row])}"
+    return ""
+
+
+def link_border(border: Border, epsilon: float, least_minor: float) -> Link | Blocked | None:
+    """The link along the whole of a border; None where it ends at an obstacle."""
+    if border.gained is None:
+        return None
+    steps = (Step(border.formation.contacts, Until(contact=border.gained)),)
+    found = look_at((border.curve,), epsilon, least_minor)
+    if isinstance(found, str):
+        return Blocked(border.start, steps, found)
+    stop = make_place(border.formation.scene, border.curve.end)
+    return Link(border.start, stop, steps, found.duration, found.bound)

@@ -1,0 +1,98 @@
+"""Places at which a motion may stop, and the borders that lead on from them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations, product
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..contacts.elemental import Contact
+from ..contacts.formation import Formation, find_touching
+from ..geometry.curve import describe_pose
+from ..geometry.explore import close_contacts
+from ..scene.model import Scene
+
+FINE = 1e-4
+"""Grid on which places with the same contacts are one, in radii of gyration and radians."""
+COARSE = 0.25
+"""The same of places where a motion through a cell lands, which the planner chooses anew."""
+
+Key = tuple[tuple[str, ...], int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A configuration at rest.
+
+    Attributes
+    ----------
+    scene : Scene
+    z : ndarray, shape (5,)
+    contacts : tuple of Contact
+        All that touch.
+    landed : bool
+        Whether it is about where a motion through a cell lands: not a crossing.
+    """
+
+    scene: Scene
+    z: Array
+    contacts: tuple[Contact, ...]
+    landed: bool = False
+
+    @property
+    def key(self) -> Key:
+        """The same for places that are one."""
+        step = COARSE if self.landed else FINE
+        x = round(float(self.z[0]) / self.scene.scales.length / step)
+        return tuple(c.name for c in self.contacts), x, round(float(self.z[2]) / step)
+
+    def __str__(self) -> str:
+        return describe_pose(self.z)
+
+
+def make_place(scene: Scene, z: Array, landed: bool = False) -> Place:
+    """The place of a configuration, with what touches there."""
+    return Place(scene, z, find_touching(scene, z), landed)
+
+
+def settle(place: Place) -> Place | None:
+    """A place with all of its contacts closed exactly; None where they do not close."""
+    formation = Formation(place.scene, place.contacts)
+    z = close_contacts(formation, place.z, np.zeros(0))
+    return None if z is None else replace(place, z=z)
+
+
+def list_formations_at(place: Place, count: int) -> Iterator[Formation]:
+    """Formations of three or four contacts that touch at a place: palm and both fingers are there.
+
+    Of four, two are the ends of an edge that lies flush; two names of one contact are none.
+    """
+    parts = [[c for c in place.contacts if c.finger == own] for own in (None, 0, 1)]
+    vertices = place.scene.polygon.n_vertices
+    for sizes in ((1, 1, 1),) if count == 3 else ((2, 1, 1), (1, 2, 1), (1, 1, 2)):
+        chosen = [combinations(own, size) for own, size in zip(parts, sizes, strict=True)]
+        for groups in product(*chosen):
+            pair = next((group for group in groups if len(group) == 2), None)
+            if pair is None or _is_flush(pair, vertices):
+                yield Formation(place.scene, tuple(c for group in groups for c in group))
+
+
+def _is_flush(pair: tuple[Contact, ...], vertices: int) -> bool:
+    """Whether two contacts with one part of the hand are those of an edge that lies flush."""
+    sides = [c for c in pair if c.surface != "tip"]
+    if len(sides) == 2:
+        return abs(pair[0].index - pair[1].index) in (1, vertices - 1)
+    if len(sides) == 1:
+        # The edge on the tip leads from the vertex on the side to beyond the link.
+        (side,), (tip,) = sides, [c for c in pair if c.surface == "tip"]
+        ahead = (side.index - (side.finger or 0)) % vertices
+        return tip.feature == "e" and tip.index == ahead
+    return False
+
+
+def unit_steps(scene: Scene) -> Array:
+    """One unit of (x, phi): a radius of gyration and a radian, shape (2,)."""
+    return np.array([scene.scales.length, 1.0])

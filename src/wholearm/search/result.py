@@ -1,0 +1,166 @@
+"""What a search for a route has found, in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from ..contacts.formation import describe
+from ..mapping.walk import format_until
+from ..planning.result import Plan
+from ..problem.definition import End, Problem
+from .bounds import BorderBound
+from .candidates import Failure
+from .find import Route, Search
+from .links import Blocked, describe_steps
+
+LISTED = 6
+"""Most reasons that a message names."""
+NOT_CONSIDERED = (
+    "not considered: rolling contacts, formations without the palm or without one of the fingers, "
+    "impacts, and motions that pass crossings without a stop; through cells, motions that leave a "
+    "border in motion or from rest and that a straight way shows to be possible"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Alternative:
+    """Another route with its plan.
+
+    Attributes
+    ----------
+    plan : Plan
+    problem : Problem
+        Its phases are the route.
+    """
+
+    plan: Plan
+    problem: Problem
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """The best route that was found, with its plan.
+
+    Attributes
+    ----------
+    plan : Plan
+    problem : Problem
+        The problem with phases in place of its goals.
+    route : Route
+        To the last goal.
+    bound : BorderBound or None
+        What every route along borders takes at least; None with several goals, and where the
+        search was interrupted.
+    alternatives : tuple of Alternative
+    failures : tuple of Failure
+        Routes that were planned, or tried, in vain.
+    blocked : tuple of Blocked
+        Borders that no motion can follow.
+    settled : int
+        Places that were looked at.
+    complete : bool
+        Whether the search ended by itself.
+    """
+
+    plan: Plan
+    problem: Problem
+    route: Route
+    bound: BorderBound | None
+    alternatives: tuple[Alternative, ...]
+    failures: tuple[Failure, ...]
+    blocked: tuple[Blocked, ...]
+    settled: int
+    complete: bool
+
+    @property
+    def gap(self) -> float | None:
+        """How much longer the plan takes than the bound, over the bound; None without a bound."""
+        if self.bound is None or self.bound.value <= 0:
+            return None
+        return max(0.0, self.plan.duration / self.bound.value - 1.0)
+
+    def to_text(self) -> str:
+        """The route as ``[[phases]]``, and how good it is, as comments."""
+        lines = [f"# {line}" for line in self._describe()]
+        lines += ["", format_phases(self.problem)]
+        for number, other in enumerate(self.alternatives, start=2):
+            lines += [
+                f"# alternative {number}: {other.plan.value:.6f} {other.plan.unit}, "
+                f"{other.plan.duration:.6f} s",
+                *(f"# {line}".rstrip() for line in format_phases(other.problem).splitlines()),
+            ]
+        return "\n".join(lines).rstrip() + "\n"
+
+    def _describe(self) -> list[str]:
+        plan = self.plan
+        lines = [
+            f"{len(self.problem.phases)} phases, {plan.options.goal.value} = {plan.value:.6f} "
+            f"{plan.unit}, {plan.duration:.6f} s in all"
+        ]
+        if not self.complete:
+            lines.append("interrupted: the best route so far")
+        if self.bound is not None and self.gap is not None:
+            text = (
+                f"along borders, with a stop where they meet, no route takes less than "
+                f"{self.bound.value:.6f} s: gap {100 * self.gap:.2g} %"
+            )
+            lines.append(text if self.bound.complete else f"{text} (the search for it ended early)")
+        if self.route.in_cells:
+            lines.append("the route leads through cells, where nothing bounds times from below")
+        tried = f"{self.settled} places looked at, {len(self.blocked)} ways blocked"
+        lines.append(f"{tried}, {len(self.failures)} routes without a plan")
+        return [*lines, NOT_CONSIDERED]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything as plain values."""
+        return {
+            "value": self.plan.value,
+            "unit": self.plan.unit,
+            "duration": self.plan.duration,
+            "phases": list(self.problem.table.get("phases", [])),
+            "bound": None if self.bound is None else self.bound.value,
+            "gap": self.gap,
+            "complete": self.complete,
+            "in_cells": self.route.in_cells,
+            "alternatives": [
+                {
+                    "value": other.plan.value,
+                    "duration": other.plan.duration,
+                    "phases": list(other.problem.table.get("phases", [])),
+                }
+                for other in self.alternatives
+            ],
+            "failures": [failure.reason for failure in self.failures],
+            "blocked": [_describe_blocked(own) for own in self.blocked],
+            "not_considered": NOT_CONSIDERED,
+        }
+
+
+def format_phases(problem: Problem) -> str:
+    """The phases of a problem as its file has them."""
+    lines = []
+    for phase in problem.phases:
+        names = ", ".join(f'"{name}"' for name in phase.formation.names)
+        lines += ["[[phases]]", f"contacts = [{names}]"]
+        lines += [] if phase.until.is_release else [f"until = {format_until(phase.until)}"]
+        lines += [] if phase.end is End.REST else [f'end = "{phase.end.value}"']
+        lines.append("")
+    return "\n".join(lines)
+
+
+def describe_block(search: Search, failures: list[Failure]) -> str:
+    """Why nothing leads to a goal: the ways that no motion can take, nearest to the goal first."""
+    blocked = {(own.start.key, own.steps): own for own in search.blocked}
+    nearest = sorted(blocked.values(), key=lambda own: search.measure(own.start))
+    reasons = [_describe_blocked(own) for own in nearest[:LISTED]]
+    reasons = [failure.reason for failure in failures[:2]] + reasons
+    text = f"nothing leads from {search.start} to {search.goal}: {search.settled} places reached"
+    if not reasons:
+        return f"{text}, touching {describe(search.start.contacts)} at the start"
+    more = len(blocked) - LISTED
+    return f"{text}; blocked are " + "; ".join(reasons) + (f"; and {more} more" if more > 0 else "")
+
+
+def _describe_blocked(own: Blocked) -> str:
+    return f"{describe_steps(own.steps)} from {own.start}: {own.reason}"

@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+import math
+import tomllib
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from shipped import HEPTAGON, problem_of
+from wholearm.common.errors import InputError
+from wholearm.mapping.formation_map import choose_window
+from wholearm.problem.definition import Problem
+from wholearm.problem.goal import Goal
+from wholearm.problem.read import build_problem
+
+TABLE = {k: v for k, v in tomllib.loads(HEPTAGON.read_text()).items() if k != "phases"}
+
+
+def read(goal: object) -> Problem:
+    return build_problem({**TABLE, "goal": goal})
+
+
+@pytest.mark.parametrize(
+    ("given", "goals"),
+    [
+        ({"flush": 6}, (Goal(flush=6),)),
+        ({"phi_deg": -50.0, "x": 0.02}, (Goal(phi=math.radians(-50.0), x=0.02),)),
+        ([{"flush": 6, "x": 0.0}, {"flush": 0}], (Goal(flush=6, x=0.0), Goal(flush=0))),
+    ],
+)
+def test_goals_are_read_and_written(given: object, goals: tuple[Goal, ...]) -> None:
+    problem = read(given)
+    assert problem.goals == goals and not problem.phases
+    assert replace(problem, epsilon=0.1).table["goal"] == given
+    other = replace(problem, goals=(Goal(flush=1, x=0.01),))
+    assert other.table["goal"] == {"flush": 1, "x": 0.01}
+    assert build_problem(other.table).goals == other.goals
+    # What a search finds takes the place of goals.
+    found = replace(problem, goals=(), phases=problem_of(HEPTAGON).phases)
+    assert "goal" not in found.table and len(found.table["phases"]) == 5
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"x": 0.0}, "goal: neither flush nor phi_deg given"),
+        ({"flush": 1, "phi_deg": 3.0}, "goal: flush and phi_deg are both given"),
+        ({"flush": 7}, "goal.flush: 7 is not an edge; allowed are 0 to 6"),
+        ({"flush": 1.5}, "goal.flush: 1.5 is not an edge"),
+        ([{"flush": 1}, {"flush": 2, "x": 1e6}], r"goal\[2\].x: 1e+"),
+        ({"flush": 1, "y": 0.0}, "goal.y: unknown key"),
+        ("edge 6", "goal: 'edge 6' given"),
+    ],
+)
+def test_other_goals_are_refused(given: Any, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        read(given)
+
+
+def test_phases_and_goals_exclude_each_other() -> None:
+    table = tomllib.loads(HEPTAGON.read_text())
+    with pytest.raises(InputError, match=r"goal: given with \[\[phases\]\]"):
+        build_problem({**table, "goal": {"flush": 6}})
+
+
+def test_the_map_covers_goals() -> None:
+    scene = problem_of(HEPTAGON).scene
+    low, high = choose_window(read({"flush": 6})).phi
+    assert low < scene.polygon.flush_angle(0) < scene.polygon.flush_angle(6) < high

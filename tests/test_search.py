@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+import tomllib
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from shipped import HEPTAGON, problem_of
+from wholearm.common.errors import InfeasibleError, InputError
+from wholearm.contacts.formation import Formation
+from wholearm.geometry.tracing import trace_phase
+from wholearm.planning.lower_bound.lower_bound import bound_least_time
+from wholearm.problem.definition import Phase, Problem
+from wholearm.problem.goal import Goal
+from wholearm.problem.read import build_problem
+from wholearm.search.bounds import bound_borders
+from wholearm.search.cells import cross, time_ways
+from wholearm.search.chart import Chart
+from wholearm.search.find import Route, Search
+from wholearm.search.places import make_place
+from wholearm.search.route import find_route
+from wholearm.verification.verify import verify
+
+TABLE = {k: v for k, v in tomllib.loads(HEPTAGON.read_text()).items() if k != "phases"}
+
+
+def read(goal: dict[str, Any], **changes: Any) -> Problem:
+    return build_problem({**TABLE, "goal": goal}).with_(**changes)
+
+
+@cache
+def chart() -> Chart:
+    return Chart(problem_of(HEPTAGON), 0.1)
+
+
+def search(goal: Goal) -> Search:
+    problem = problem_of(HEPTAGON)
+    return Search(chart(), make_place(problem.scene, problem.start), goal)
+
+
+@cache
+def to_edge_6() -> tuple[Search, Route]:
+    own = search(Goal(flush=6))
+    return own, next(own.run())
+
+
+def test_the_first_route_is_about_as_fast_as_its_certified_bounds() -> None:
+    _, route = to_edge_6()
+    z, total = problem_of(HEPTAGON).start, 0.0
+    for link in route.links:
+        for step in link.steps:
+            formation = Formation(chart().scene, step.contacts)
+            curve = trace_phase(Phase(0, formation, step.until, step.end), z)
+            bound = bound_least_time((curve,), chart().epsilon)
+            assert bound is not None
+            total, z = total + bound.value, curve.end
+        assert np.allclose(z, link.stop.z, atol=1e-9)
+    # A plan as stored takes 0.2105 s at most.
+    assert total < 0.2105
+    assert route.bound <= total * (1 + 1e-9)
+    assert route.duration == pytest.approx(total, rel=5e-3)
+    assert {c.name for c in route.links[-1].stop.contacts} >= {"v6-palm", "v0-palm"}
+
+
+def test_no_route_along_borders_is_faster() -> None:
+    own, route = to_edge_6()
+    bound = bound_borders(own, 1.0)
+    assert bound.complete and 0.99 * route.duration < bound.value <= route.bound * (1 + 1e-12)
+    assert bound_borders(own, 0.05).value == 0.05
+
+
+def test_a_place_along_a_border_is_a_goal() -> None:
+    route = next(search(Goal(flush=0, x=0.03)).run())
+    (link,) = route.links
+    assert abs(link.stop.z[0] - 0.03) < 1e-9 and link.steps[0].until.value == 0.03
+
+
+def test_straight_ways_keep_their_limits_and_end_where_a_contact_is_gained() -> None:
+    scene, epsilon = chart().scene, chart().epsilon
+    _, route = to_edge_6()
+    start = route.links[1].stop
+    formation = Formation(scene, tuple(c for c in start.contacts if c.name in CELL))
+    assert formation.n_contacts == 3
+    ways = cross(formation, start.z[None], epsilon)
+    assert ways
+    for way in ways:
+        assert way.gained is not None
+        ending = Formation(scene, (*formation.contacts, way.gained))
+        gaps = ending.evaluate(way.z[None], way.z[None]).C
+        assert np.abs(gaps).max() < 0.02 * scene.scales.length
+        again = time_ways(formation, start.z[None], way.z[None], epsilon)
+        assert again[0] == pytest.approx(way.duration)
+        # With more to press, or less torque, no way is faster.
+        harder = time_ways(formation, start.z[None], way.z[None], 4 * epsilon)
+        assert harder[0] >= way.duration
+
+
+CELL = ("v0-palm", "v2-finger1", "v5-finger2")
+
+
+def test_a_problem_with_a_goal_is_planned() -> None:
+    problem = read({"flush": 0, "x": 0.03})
+    answer = find_route(problem)
+    assert answer.bound is not None and answer.gap is not None and answer.gap < 0.02
+    assert [phase.formation.names for phase in answer.problem.phases] == [
+        ("v0-palm", "v1-palm", "v2-finger1", "v5-finger2")
+    ]
+    assert verify(answer.problem, answer.plan).exit_status == 0
+    phases = tomllib.loads(answer.to_text())["phases"]
+    again = build_problem({**TABLE, "phases": phases})
+    assert again.phases[0].until == answer.problem.phases[0].until
+
+
+def test_what_blocks_is_said() -> None:
+    # With next to no torque nothing moves.
+    with pytest.raises(InfeasibleError, match=r"nothing leads .* blocked are v0-palm v1-palm"):
+        find_route(read({"flush": 6}, torque_limit=0.02))
+
+
+def test_a_goal_that_holds_is_no_goal() -> None:
+    with pytest.raises(InputError, match="goal: edge 0 on the palm holds already"):
+        find_route(read({"flush": 0}))
