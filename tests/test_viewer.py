@@ -139,11 +139,12 @@ def open_in_browser(text: str, folder: Path, fragment: str = "") -> str:
 def test_slider_plots_and_map_respond_in_a_browser(tmp_path: Path) -> None:
     problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
     places: Any = describe_map(chart(), plan)
-    parts = [page.write_player(describe_motion(plan, problem, plan)), page.write_chart(*places)]
+    motion = describe_motion(plan, problem, plan) | {"speed": 0.25}
+    parts = [page.write_player(motion), page.write_chart(*places)]
     acts = """<script>
       const said = {}, output = document.querySelector("output");
       const read = () => [output.textContent, document.querySelector(".cursor").getAttribute("x1")];
-      said.first = read();
+      said.first = read(); said.speed = document.querySelector("select").value;
       const slider = document.querySelector("input[type=range]");
       slider.value = 500; slider.dispatchEvent(new Event("input")); said.slid = read();
       const plot = document.querySelector(".plot"), box = plot.getBoundingClientRect();
@@ -165,6 +166,7 @@ def test_slider_plots_and_map_respond_in_a_browser(tmp_path: Path) -> None:
         assert said[key][0] == f"{float(said[key][0].split()[0]):.4f} s, phase {own + 1}"
         assert float(said[key][0].split()[0]) == pytest.approx(t, abs=1e-3 * plan.duration)
         assert float(said[key][1]) == pytest.approx(x, abs=1.0)
+    assert said["speed"] == "0.25"
     assert said["border"] == places[1]["borders"][0]["text"]
 
 

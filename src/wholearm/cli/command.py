@@ -257,11 +257,11 @@ def _verify(options: argparse.Namespace) -> int:
     else:
         report = verify(problem, torques, reduced=options.reduced, **given)
     clear_progress()
-    print(json.dumps(report.to_dict(), indent=2) if options.json else report.to_text())
     if options.output is not None:
         report.trajectory.save(options.output)
-        if not options.json:
-            print(f"wrote {options.output}")
+    print(json.dumps(report.to_dict(), indent=2) if options.json else report.to_text())
+    if options.output is not None and not options.json:
+        print(f"wrote {options.output}")
     return report.exit_status
 
 

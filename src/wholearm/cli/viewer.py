@@ -15,7 +15,7 @@ def add_animate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("trajectory", help="trajectory file (.npz)")
     text = "what to write: .gif, .mp4 (needs ffmpeg), or .html, which plays in any browser"
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help=text)
-    text = "speed over real time, of movies (0.1: ten times slower than real)"
+    text = "speed over real time (0.1: ten times slower)"
     parser.add_argument("--speed", type=float, default=0.1, help=text)
     text = "draw the simulated motion behind; free: simulated without telling which contacts hold"
     parser.add_argument("--simulate", choices=SIMULATORS, metavar="[free]", help=text)
@@ -65,10 +65,13 @@ def _animate(options: argparse.Namespace) -> int:
         problem = read_own_problem(trajectory.meta)
         ghost = overlay(options.simulate, trajectory).trajectory if options.simulate else None
         if ending == ".html":
+            from ..common.require import require_number
             from ..viewer import page
             from ..viewer.motion import describe_motion
 
-            player = page.write_player(describe_motion(trajectory, problem, ghost))
+            speed = require_number(options.speed, "--speed", positive=True)
+            motion = describe_motion(trajectory, problem, ghost) | {"speed": speed}
+            player = page.write_player(motion)
             write_text(options.output, page.build_page(problem.name, [player]))
         else:
             from ..viewer.movie import Movie, write_movie

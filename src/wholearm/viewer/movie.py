@@ -22,6 +22,7 @@ from PIL import Image
 from ..common.arrays import Array
 from ..common.errors import InputError
 from ..common.files import write_whole
+from ..common.require import require_number
 from ..common.sharing import exclusive
 from ..contacts.elemental import parse_contact
 from ..figures.curves import draw_margins, draw_phases, draw_torques
@@ -209,8 +210,7 @@ class Movie:
         speed: float = 0.1,
         resolution: int = RESOLUTION,
     ) -> None:
-        if not 0 < speed < math.inf:
-            raise InputError("", "--speed", f"{speed:g} given; a positive number is needed")
+        speed = require_number(speed, "--speed", positive=True)
         frames = math.ceil(trajectory.duration / speed * FRAMES) + 1
         if frames > _MOST:
             least = trajectory.duration * FRAMES / _MOST

@@ -280,6 +280,9 @@ function makePlayer(parent, motion) {
     '<option value="0.2">5 times slower</option><option value="0.1" selected>10 times slower</option>' +
     '<option value="0.02">50 times slower</option></select><output></output>';
   const [button, slider, speed, output] = bar.children;
+  if (motion.speed && ![...speed.options].some((own) => Number(own.value) === motion.speed))
+    speed.add(new Option(`${motion.speed} of real speed`, motion.speed));
+  if (motion.speed) speed.value = motion.speed;
   const updates = [];
   let now = 0, last = null;
   const show = (t) => {
