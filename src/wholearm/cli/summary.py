@@ -186,14 +186,15 @@ def _list_settlings(plan: Plan) -> list[str]:
     known = [phase.settling for phase in plan.phases if phase.settling is not None]
     if not known:
         return []
-    header = "phase  held [ms]  tau [N m]          closes         from [mm]  in [ms]  at [mm/s]"
-    lines = ["", f"{header}  parts for a moment"]
+    header = "phase  held [ms]  tau [N m]          closes         from [mm]  in [ms]  left [mm]"
+    lines = ["", f"{header}  at [mm/s]  parts for a moment"]
     for own in known:
         tau = " ".join(f"{value:8.4f}" for value in own.tau)
         row = f"{own.phase:>5}  {1e3 * own.duration:>9.3g}  {tau}  {own.contact or '-':<13}"
-        if own.closes:
-            row += f"  {1e3 * own.gap:>9.3g}  {1e3 * own.closes:>7.3g}  {1e3 * own.speed:>9.3g}"
-            row += f"  {', '.join(own.parts) or '-'}"
+        if own.contact:
+            closes = "-" if own.closes is None else f"{1e3 * own.closes:.3g}"
+            row += f"  {1e3 * own.gap:>9.3g}  {closes:>7}  {1e3 * own.left:>9.2g}"
+            row += f"  {1e3 * own.speed:>9.3g}  {', '.join(own.parts) or '-'}"
         lines.append(row)
     held = sum(own.duration for own in known)
     cost = held / (plan.duration - held)

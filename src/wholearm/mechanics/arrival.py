@@ -2,13 +2,16 @@
 
 A motion that is to stop at a contact may end a little short of it. Torques are looked for that
 
-* from rest, with the contact still open by a gap, drive the formation on until it closes, in one of
-  the ways in which it can begin to move, with every c_n at least epsilon;
-* are in static balance with all that touches once it has closed, every c_n at least epsilon and
-  |c_t| <= mu (c_n - epsilon), and set off in no way that gives one of these contacts up.
+* are in static balance with all that touches at the contact, every c_n at least epsilon and
+  |c_t| <= mu (c_n - epsilon), and set off in no way that gives one of these contacts up;
+* from rest, with the contact still open by a gap, drive the formation on towards it, beyond what
+  friction can hold.
 
-At rest all of this is affine in the two torques. The best ones have the largest least margin, each
-over what is ample for it: a linear programme in three unknowns, solved by its vertices.
+At rest all of this is affine in the two torques. The firmest ones have the largest least margin of
+what holds, each over what is ample for it: a linear programme in three unknowns, solved by its
+vertices. Contacts of the formation may open on the way, as what presses them all together
+afterwards need not do so before: torques that keep them closed on the way are so weak that impacts
+on arrival go on for longer than the way takes.
 """
 
 from __future__ import annotations
@@ -32,9 +35,8 @@ LEAST = 1e-2
 """Margin over what is ample below which torques do not hold, or close, for sure."""
 AMPLE = 0.1
 """Margin that is ample: of a normal force, a torque or an acceleration, over the scene's."""
-SWIFT = 2.0
-"""Largest acceleration towards a contact, over that which closes its gap in the given time: what
-arrives faster is thrown back farther."""
+DRIVE = 0.05
+"""Least acceleration towards a contact that is still open, over the scene's."""
 _CREEP = 0.02
 """Ample acceleration of what slides and turns where the directions of sliding are assumed, over the
 scene's."""
@@ -98,23 +100,23 @@ class Hold(NamedTuple):
     tau : ndarray, shape (2,), [N m]
     margin : float
         The least of the margins, over what is ample.
-    acceleration : float, [m/s^2]
-        With which the contact closes from rest; zero where nothing has to close.
     speed : float, [m/s]
-        At most, on its arrival.
+        At most, with which the contact is reached from rest, if all others stay closed till then;
+        zero where nothing has to close, or no torques would drive the formation on.
     parts : tuple of str
         Contacts that would have to pull in the impact of that arrival: they part for a moment.
     """
 
     tau: Array
     margin: float
-    acceleration: float = 0.0
     speed: float = 0.0
     parts: tuple[str, ...] = ()
 
 
-def find_hold(place: Standstill, epsilon: float, gap: float, time: float) -> Hold | None:
-    """The best torques for a standstill; those that only hold where none would close its contact.
+def find_hold(place: Standstill, epsilon: float, gap: float) -> Hold | None:
+    """The firmest torques for a standstill, with the largest margin of what holds.
+
+    Where a contact is gained, they drive the formation on from `gap` before it, too, if any do.
 
     Parameters
     ----------
@@ -123,28 +125,19 @@ def find_hold(place: Standstill, epsilon: float, gap: float, time: float) -> Hol
         Least normal force.
     gap : float, [m]
         By how much the contact may be open.
-    time : float, [s]
-        In which it is to close from there.
 
     Returns
     -------
     Hold or None
-        With zero `acceleration` if no torques would close the contact; None if none would hold.
+        None if no torques hold.
     """
-    scene = place.formation.scene
     rest = _list_holding(place, epsilon)
-    opening = _find_opening(place)
-    if opening is not None:
-        closing = _find_closing(place, rest, opening, epsilon, gap, time)
-        if closing is not None:
-            return closing
-    best = maximise_margin(scene, rest)
+    opening = find_opening(place)
+    closing = None if opening is None else _find_closing(place, rest, opening, gap)
+    if closing is not None:
+        return closing
+    best = maximise_margin(place.formation.scene, rest)
     return None if best is None or best[1] < LEAST else Hold(*best)
-
-
-def needs_closing(place: Standstill) -> bool:
-    """Whether the motion stops at a contact that it could stop short of."""
-    return _find_opening(place) is not None
 
 
 def _list_holding(place: Standstill, epsilon: float) -> Array:
@@ -174,7 +167,7 @@ def _drive(scene: Scene, way: Way) -> Array:
     return np.asarray(drive / (AMPLE * math.sqrt(scene.scales.mass) * scene.scales.acceleration))
 
 
-def _find_opening(place: Standstill) -> Array | None:
+def find_opening(place: Standstill) -> Array | None:
     """By how z changes as the gained contact opens, per metre of its gap, shape (5,).
 
     None if there is no such contact, or if nothing opens it: one that goes on as another feature.
@@ -193,27 +186,18 @@ def _find_opening(place: Standstill) -> Array | None:
     return np.asarray(free / root / rate)
 
 
-def _find_closing(
-    place: Standstill, rest: Array, opening: Array, epsilon: float, gap: float, time: float
-) -> Hold | None:
-    """The best torques that drive the formation on, `gap` before the contact is closed."""
+def _find_closing(place: Standstill, rest: Array, opening: Array, gap: float) -> Hold | None:
+    """The firmest torques that drive the formation on, `gap` before the contact is closed."""
     assert place.gained is not None
-    scene, scales = place.formation.scene, place.formation.scene.scales
-    z = place.z + gap * opening
+    scene, z = place.formation.scene, place.z + gap * opening
     normal = Formation(scene, (place.gained,)).evaluate(z[None], np.zeros((1, 5))).A[0][0]
-    swift = 2 * gap / time**2
+    least = np.array([DRIVE * scene.scales.acceleration, 0.0, 0.0])
     best: Hold | None = None
     for way in list_ways(place.formation, z):
         if way.heading is not None and normal @ way.heading >= 0:
             continue
-        closing = -normal @ way.acceleration
-        presses = (way.c_n - [epsilon, 0.0, 0.0]) / (AMPLE * scales.force)
-        speedy, rows = closing / swift, np.vstack([rest, presses, way.consistent])
-        window = np.array([speedy - [1.0, 0.0, 0.0], [SWIFT, 0.0, 0.0] - speedy])
-        found = maximise_margin(scene, rows, window)
-        if found is None or found[1] < LEAST:
-            # Slower than asked for is better than not at all.
-            found = maximise_margin(scene, np.vstack([rows, speedy]))
+        closing, rows = -normal @ way.acceleration, np.vstack([rest, way.consistent])
+        found = maximise_margin(scene, rows, closing[None] - least)
         if found is None or found[1] < max(LEAST, best.margin if best else 0.0):
             continue
         tau = found[0]
@@ -221,7 +205,7 @@ def _find_closing(
             continue
         a = float(closing @ [1.0, *tau])
         v = way.acceleration @ [1.0, *tau] * math.sqrt(2 * gap / a)
-        best = Hold(tau, found[1], a, math.sqrt(2 * a * gap), find_parting(place, v))
+        best = Hold(tau, found[1], math.sqrt(2 * a * gap), find_parting(place, v))
     return best
 
 

@@ -2,23 +2,47 @@
 
 Where a phase stops, its plan is only as good as the place where it does: a little short of the
 contact that is gained there, the next phase's torques set off in another formation. Held for a
-while by torques that push on (`mechanics.arrival`), the contact closes first.
+while by torques that push everything together (`mechanics.arrival`), the contact closes first. How
+soon it does hangs on the impacts on the way: that is simulated from where the contact is still
+open, without telling which contacts hold.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import numpy as np
+
+from ..common.errors import SimulationError
 from ..contacts.formation import Formation
-from ..mechanics.arrival import Standstill, find_hold, needs_closing
+from ..free_simulation.simulate import simulate_free
+from ..mechanics.arrival import Hold, Standstill, find_hold, find_opening
 from ..problem.definition import Phase, Problem
 from ..results.settling import SettledMotion, Settling
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion
+from ..simulation.closing import close_contacts
 from ..simulation.tolerances import SLOW, is_slower
 from .phase_plan import PhasePlan, Settled
 from .stops import Plans, end_of
 
-SLACK = 1 + 1e-6
-"""Share of the time that a contact may take to close: it may be just that time."""
+CLOSED = 0.01
+"""What is left of a gap that counts as closed, over the gap."""
+
+
+class _Trial(NamedTuple):
+    """What torques do from where the contact is still open.
+
+    Attributes
+    ----------
+    closes : float or None, [s]
+        From when on everything is closed; None if something is open at the end.
+    left : float, [m]
+        Largest gap at the end.
+    """
+
+    closes: float | None
+    left: float
 
 
 def settle_plans(problem: Problem, plans: Plans) -> Settled:
@@ -37,29 +61,49 @@ def _settle(
     if not is_slower(problem.scene, v, SLOW):
         return plan, None
     place = Standstill(z, phase.formation, phase.until.contact, list_touching(problem, phase))
-    hold = find_hold(place, problem.epsilon, problem.gap, time)
-    gained = phase.until.contact.name if needs_closing(place) and phase.until.contact else ""
+    hold = find_hold(place, problem.epsilon, problem.gap)
     if hold is None:
         text = f"no torques hold {' '.join(place.touching.names)} at the end of phase"
         warning = f"{text} {phase.number} with c_n >= epsilon"
-        none = Settling(phase.number, 0.0, (0.0, 0.0), 0.0, gained, 0.0, 0.0, 0.0, (), warning)
-        return plan, none
-    a, gap = hold.acceleration, problem.gap if hold.acceleration else 0.0
-    warning = ""
-    if gained and not a:
-        warning = f"no torques that hold the end of phase {phase.number} would close {gained}"
-    closes = (2 * gap / a) ** 0.5 if a else 0.0
-    if closes > SLACK * time:
-        warning = (
-            f"from {1e3 * gap:.3g} mm {gained} takes {1e3 * closes:.3g} ms to close at the end of "
-            f"phase {phase.number}, which is held for {1e3 * time:.3g} ms"
+        return plan, Settling(phase.number, 0.0, (0.0, 0.0), 0.0, warning=warning)
+    first, second = hold.tau.tolist()
+    settling = Settling(phase.number, time, (first, second), hold.margin)
+    trial = _close(problem, place, hold, time)
+    if trial is not None and place.gained is not None:
+        name, text = place.gained.name, f"that hold the end of phase {phase.number}"
+        settling = settling._replace(
+            contact=name,
+            gap=problem.gap,
+            closes=trial.closes,
+            left=trial.left,
+            speed=hold.speed,
+            parts=hold.parts,
+            warning="" if hold.speed else f"no torques {text} would drive it on to {name}",
         )
     motion = SettledMotion(plan.motion, time, hold.tau)
     torque = TorqueProfile.chain([plan.torque, motion.torque])
-    first, second = hold.tau.tolist()
-    shown = (hold.margin, gained, gap, closes, hold.speed, hold.parts, warning)
-    settling = Settling(phase.number, time, (first, second), *shown)
     return plan._replace(motion=motion, torque=torque), settling
+
+
+def _close(problem: Problem, place: Standstill, hold: Hold, time: float) -> _Trial | None:
+    """Simulate torques from rest where the contact is still open, free of assumptions, if any is.
+
+    None if there is none, or if nothing can be said.
+    """
+    opening = find_opening(place)
+    if opening is None:
+        return None
+    torque = TorqueProfile(np.array([0.0, time]), hold.tau[None, :, None])
+    try:
+        z = close_contacts(place.formation, place.z + problem.gap * opening)
+        run = simulate_free(problem, torque, start=z)
+    except (SimulationError, ArithmeticError):
+        return None
+    at = place.touching.evaluate(run.z, run.z_dot)
+    gaps = np.abs(at.C).max(axis=1)
+    still = np.flatnonzero(gaps > CLOSED * problem.gap)
+    last = int(still[-1]) + 1 if len(still) else 0
+    return _Trial(float(run.t[last]) if last < len(run.t) else None, float(gaps[-1]))
 
 
 def list_touching(problem: Problem, phase: Phase) -> Formation:

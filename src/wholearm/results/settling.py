@@ -29,11 +29,13 @@ class Settling(NamedTuple):
     contact : str
         What closes if it is still open; empty if nothing is gained there.
     gap : float, [m]
-        From which on it does.
-    closes : float, [s]
-        How long that takes from rest; zero where nothing has to close.
+        From which on that was simulated.
+    closes : float or None, [s]
+        From when on everything was closed then, but for a hundredth of the gap; None if it was not.
+    left : float, [m]
+        Largest gap at the end.
     speed : float, [m/s]
-        At most, with which it closes.
+        At most, with which the contact is reached, if all others stay closed till then; else zero.
     parts : tuple of str
         Contacts that would have to pull in the impact of that, and part for a moment.
     warning : str
@@ -44,12 +46,13 @@ class Settling(NamedTuple):
     duration: float
     tau: tuple[float, float]
     margin: float
-    contact: str
-    gap: float
-    closes: float
-    speed: float
-    parts: tuple[str, ...]
-    warning: str
+    contact: str = ""
+    gap: float = 0.0
+    closes: float | None = None
+    left: float = 0.0
+    speed: float = 0.0
+    parts: tuple[str, ...] = ()
+    warning: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
