@@ -25,6 +25,12 @@ from .report import stamp
 
 LONGER = 0.099
 """By how much plans are made longer, over their duration, where no `--settle` is given."""
+FIRST = 2.0
+"""Time for the first contact that is gained, over that for those after it."""
+STOP = 0.25
+"""Time for an end where none is gained, over that for a contact."""
+RESTS = 1e-3
+"""Speed that is rest, over the largest of the plan."""
 OFF = 1e-4
 """By how much starts are moved [m]."""
 HEAD = (
@@ -35,9 +41,9 @@ HEAD = (
     "Distance of the object's pose from the plan's at the end of the whole, simulated by the clock",
     "without telling which contacts hold; `short` and `ahead` start 0.1 mm off.",
     "",
-    "| problem | settle [ms] | time [s] | longer | exact [mm] | [deg] | short [mm] | [deg] "
+    "| problem | settle of each phase [ms] | time [s] | longer | exact [mm] | [deg] | short [mm] | [deg] "
     "| ahead [mm] | [deg] |",
-    "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
+    "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|",
 )
 
 
@@ -57,24 +63,36 @@ def measure_end(plan: Plan, off: float) -> End:
     return End(1e3 * float(np.hypot(away[0], away[1])), float(np.degrees(abs(away[2]))))
 
 
-def choose_settle(plan: Plan) -> float:
-    """For how long ends may be held for the whole to be longer by `LONGER` [s]."""
+def choose_settle(plan: Plan) -> dict[str, float]:
+    """For how long ends may be held for the whole to be longer by `LONGER`, as changes [s].
+
+    The first contact that is gained is as far off as the start, and has twice the time of those
+    after it; where none is gained nothing has to close.
+    """
+    shares: dict[int, float] = {}
     trajectory = plan.trajectory
-    ends = np.append(np.flatnonzero(np.diff(trajectory.phase)), len(trajectory.t) - 1)
-    rests = np.abs(trajectory.z_dot[ends]).max(axis=1) < 1e-3 * np.abs(trajectory.z_dot).max()
-    return LONGER * plan.duration / max(int(rests.sum()), 1)
+    fast = RESTS * float(np.abs(trajectory.z_dot).max())
+    for phase in plan.problem.phases:
+        last = int(np.flatnonzero(trajectory.phase == phase.index)[-1])
+        if np.abs(trajectory.z_dot[last]).max() < fast:
+            first = FIRST not in shares.values()
+            shares[phase.number] = (FIRST if first else 1.0) if phase.until.contact else STOP
+    unit = LONGER * plan.duration / sum(shares.values())
+    return {f"phases[{number}].settle": share * unit for number, share in shares.items()}
 
 
 def list_rows(problem: Problem, settle: float | None) -> list[str]:
     """The rows of a problem in the table: without and with `settle`."""
     plain = solve(problem)
-    held = choose_settle(plain) if settle is None else settle
+    changes = choose_settle(plain) if settle is None else {"settle": settle}
     way = np.sign(plain.trajectory.q[len(plain.trajectory.t) // 50, 0] - problem.start[0])
     rows = []
-    for plan, time in ((plain, 0.0), (solve(problem.with_(settle=held)), held)):
+    for plan in (plain, solve(problem.with_(changes))):
         ends = [measure_end(plan, off) for off in (0.0, -way * OFF, way * OFF)]
         longer = plan.duration / plain.duration - 1
-        cells = [f"{1e3 * time:.3g}", f"{plan.duration:.4f}", f"{longer:.1%}"]
+        times = [own.settling.duration if own.settling else 0.0 for own in plan.phases]
+        cells = [", ".join(f"{1e3 * time:.3g}" for time in times) if any(times) else "-"]
+        cells += [f"{plan.duration:.4f}", f"{longer:.1%}"]
         cells += [f"{value:.1e}" for end in ends for value in end]
         rows.append(f"| {problem.name} | {' | '.join(cells)} |")
     return rows

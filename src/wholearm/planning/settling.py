@@ -88,7 +88,7 @@ def _settle(
 def _close(problem: Problem, place: Standstill, hold: Hold, time: float) -> _Trial | None:
     """Simulate torques from rest where the contact is still open, free of assumptions, if any is.
 
-    None if there is none, or if nothing can be said.
+    None if there is none.
     """
     opening = find_opening(place)
     if opening is None:
@@ -98,7 +98,7 @@ def _close(problem: Problem, place: Standstill, hold: Hold, time: float) -> _Tri
         z = close_contacts(place.formation, place.z + problem.gap * opening)
         run = simulate_free(problem, torque, start=z)
     except (SimulationError, ArithmeticError):
-        return None
+        return _Trial(None, problem.gap)
     at = place.touching.evaluate(run.z, run.z_dot)
     gaps = np.abs(at.C).max(axis=1)
     still = np.flatnonzero(gaps > CLOSED * problem.gap)
