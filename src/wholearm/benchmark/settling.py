@@ -41,8 +41,8 @@ HEAD = (
     "Distance of the object's pose from the plan's at the end of the whole, simulated by the clock",
     "without telling which contacts hold; `short` and `ahead` start 0.1 mm off.",
     "",
-    "| problem | settle of each phase [ms] | time [s] | longer | exact [mm] | [deg] | short [mm] | [deg] "
-    "| ahead [mm] | [deg] |",
+    "| problem | settle of each phase [ms] | time [s] | longer | exact [mm] | [deg] "
+    "| short [mm] | [deg] | ahead [mm] | [deg] |",
     "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|",
 )
 
