@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -8,10 +9,14 @@ import numpy as np
 import pytest
 
 import wholearm
+from shipped import FOLDER, HEXAGON, LANDING, problem_of
 from wholearm.cli.command import main
+from wholearm.common.errors import InputError
 from wholearm.results.torque import read_notes
+from wholearm.simulation.events import Event, EventKind
+from wholearm.tuning.passage import split_passages
 from wholearm.tuning.rule import FACTOR
-from wholearm.tuning.trial import Outcome, Step, make_rows
+from wholearm.tuning.trial import Bench, Outcome, Step, make_rows
 
 
 def build_box() -> wholearm.Problem:
@@ -94,3 +99,71 @@ def test_only_csv_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     given = ["tune", "problems/heptagon.toml", "-o", str(tmp_path / "tuned.npz")]
     assert main(given) == 2
     assert "tuned.npz" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("given", "wrong"),
+    [
+        ({"stops": 8, "brake": True}, "stops: 8 given; allowed are 0 to 7"),
+        ({"stops": -1, "brake": True}, "allowed are 0 to 7"),
+        ({"stops": 1.5, "brake": True}, "allowed are 0 to 7"),
+        ({"stops": 1}, "without a brake"),
+        ({"share": 2.0}, "share: 2.0 given; allowed are 0 to 1"),
+    ],
+)
+def test_options_out_of_range_are_refused(given: dict[str, Any], wrong: str) -> None:
+    with pytest.raises(InputError, match=wrong):
+        wholearm.tune(build_box(), **given)
+
+
+def test_stops_are_no_more_than_allowed() -> None:
+    """Fingers too weak to move the box: each part is tried once, none is carried."""
+    stuck = build_box().with_(friction_palm=0.9, torque_limit=0.05)
+    alone = wholearm.tune(stuck, brake=True)
+    found = wholearm.tune(stuck, brake=True, stops=3)
+    assert not alone.ok and not found.ok and "phase 1" in found.reason
+    parts = 3  # whole, its first half, and the first half of that
+    assert found.simulations == parts * alone.simulations
+
+
+def test_a_contact_that_never_presses_is_lost() -> None:
+    problem = build_box()
+    (passage,) = split_passages(problem)
+    bench = Bench(problem, passage, problem.start)
+    # The left finger is pulled away.
+    trial = bench.run([Step(0.0, (0.1, 0.2))])
+    assert trial.outcome is Outcome.LOSES and trial.contact == "v3-finger2"
+    assert trial.time == 0.0
+
+
+def test_phases_that_nothing_stops_are_tuned_as_one() -> None:
+    assert [p.title for p in split_passages(problem_of(LANDING))] == ["1", "2", "3", "4", "5-6"]
+    found = split_passages(problem_of(HEXAGON))
+    assert [p.title for p in found][-2:] == ["8", "9-11"] and len(found) == 9
+    assert not any(p.passed for p in found), "each of them ends by closing a gap"
+    first, second = found[-1].phases[:2]
+    alone = dataclasses.replace(found[-1], phases=(first,), after=second)
+    assert alone.passed == "e3-tip1"
+
+
+def test_a_passage_follows_what_happens_from_phase_to_phase() -> None:
+    passage = split_passages(problem_of(LANDING))[-1]
+    release = Event(0.1, 0, EventKind.CONTACT_LOST, "", "v3-finger1")
+    lands = Event(0.2, 0, EventKind.IMPACT, "", "v2-palm")
+    gone = Event(0.15, 0, EventKind.CONTACT_LOST, "", "v4-finger1")
+    assert passage.follow([release, lands]) == ([0.1, 0.2], None)
+    assert passage.follow([release, gone, lands]) == ([0.1], gone)
+    assert passage.follow([gone]) == ([], gone)
+    assert "v3-finger1" not in passage.list_pressed(0)
+
+
+@pytest.mark.parametrize("name", ["heptagon_four_contacts", "hexagon"])
+def test_shipped_torques_hold_every_contact(name: str) -> None:
+    path = FOLDER / "torques" / f"{name.split('_')[0]}_tuned.csv"
+    problem = problem_of(FOLDER / f"{name}.toml")
+    report = wholearm.verify_free(problem, wholearm.read_torque_csv(str(path)))
+    assert report.ok, report.reason
+    assert [phase.reached for phase in report.phases] == [True] * len(problem.phases)
+    assert not any(phase.losses for phase in report.phases)
+    assert np.nanmin(report.whole.c_n) > 0
+    assert not report.whole.z_dot[-1].any()

@@ -134,8 +134,8 @@ def add_tune(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", metavar="FILE", help="torques to write (.csv)")
     text = "let each phase have one more step of its torques, which stops it at its end"
     parser.add_argument("--brake", action="store_true", help=text)
-    text = "with --brake: let a phase that fails stop halfway, and again in both halves"
-    parser.add_argument("--stops", action="store_true", help=text)
+    text = "with --brake: let a phase that fails stop up to N times on its way, 0 to 7 (0)"
+    parser.add_argument("--stops", metavar="N", type=int, default=0, help=text)
     text = "how hard quasistatic torques squeeze: 0 as little as needed, 1 as hard as helps (0.5)"
     parser.add_argument("--squeeze", type=float, default=0.5, help=text)
     text = "raises beyond the first that reaches the end: 0 none, 1 all that keep contacts (1)"

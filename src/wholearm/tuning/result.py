@@ -12,16 +12,18 @@ from ..results.report_text import align, show
 from ..results.torque import TorqueProfile
 from ..results.torque_table import format_rows, read_rows
 from ..verification.free_report import FreeReport
+from .passage import name_numbers
 from .trial import Step, Trial
 
 
 @dataclass(frozen=True, eq=False)
 class PhaseTuning:
-    """One phase.
+    """One phase, or several that are carried in one motion.
 
     Attributes
     ----------
-    number : int
+    number, last : int
+        The first phase's and the last one's.
     until : str
     acting : int
         Number of the finger behind the motion; 0 if the phase was not tuned.
@@ -32,7 +34,7 @@ class PhaseTuning:
     braked : int or None
         Likewise while braking, lowered if negative; None without a brake.
     supported : int
-        How many times the supporting torque is raised while braking.
+        How many times the supporting torque is raised while braking, lowered if negative.
     steps : tuple of Step
         The torques, since the start of the phase, the last ones holding the object at its end.
     duration : float, [s]
@@ -47,6 +49,7 @@ class PhaseTuning:
     """
 
     number: int
+    last: int
     until: str
     acting: int = 0
     quasistatic: tuple[float, float] = (math.nan, math.nan)
@@ -60,6 +63,11 @@ class PhaseTuning:
     weakest: str = ""
     trials: tuple[Trial, ...] = field(default=(), repr=False)
     simulations: int = 0
+
+    @property
+    def title(self) -> str:
+        """Its numbers, for people."""
+        return name_numbers(self.number, self.last)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +131,7 @@ class Tuning:
                 text += f", brake {phase.braked:+d}"
             if phase.supported:
                 text += f", support {phase.supported:+d}"
-            notes.append(f"# phase {phase.number} = {text}")
+            notes.append(f"# phase {phase.title} = {text}")
         return "\n".join([*notes, format_rows(self.rows)])
 
     def to_dict(self) -> dict[str, Any]:
@@ -171,7 +179,7 @@ def _list_values(phase: PhaseTuning) -> dict[str, Any]:
 def _make_row(phase: PhaseTuning) -> list[str]:
     start = " ".join(f"{tau:.4f}" for tau in phase.quasistatic)
     return [
-        str(phase.number),
+        phase.title,
         phase.until,
         f"finger {phase.acting}",
         start,

@@ -1,9 +1,9 @@
-"""The 10 % rule for one phase: a torque that drives it to its end, and one that brakes it there.
+"""The 10 % rule for one passage: a torque that drives it to its end, and one that brakes it there.
 
 The finger behind the motion acts: the one whose torque works most in the quasistatic motion. Its
-torque alone is tuned, from the quasistatic one at the start of the phase. The other finger supports
-and keeps its torque there; where no drive reaches the end with that, the one with which it presses
-most along the phase; and where no brake holds it is raised while braking.
+torque alone is tuned, from the quasistatic one at the start. The other finger supports and keeps
+its torque there; where that does not serve, the one with which it presses most on the way, or
+between the two; and where no brake holds it is that of the end while braking, or raised.
 """
 
 from __future__ import annotations
@@ -26,14 +26,21 @@ _RAISED = 60
 """Most times a torque is raised or lowered: a factor of 300."""
 _SUPPORT = 3
 """So many times the supporting torque is raised at once, by a third, as each needs a search."""
-_ENOUGH = 250
-"""Simulations of a phase after which no further drive or support is tried."""
+ENOUGH = 600
+"""Simulations from one start after which no further drive, brake or support is tried."""
 _SUPPORTED = 13
 """It is raised fewer times than this."""
 _SOONER = 0.02
 """Share of the time by which another 10 % has to bring the end sooner."""
+_COARSE = 2
+"""So many times the acting torque is lowered at once while it brakes too little."""
 _SEARCH = 24
 """Most trials that look for the instant to brake."""
+_NARROW = 1e-3
+"""Share of the time in which the end is either reached at speed or not at all: what starts the
+motion again, or lets it turn back, is not a matter of when to brake."""
+_FAR, _FAST = 0.02, 0.1
+"""Shares of the way and of the drive's speed that are much for that."""
 _SOON = 1e-3
 """Share of a drive's time: where the end is reached with a brake that early it is none."""
 _LOSSES = 4
@@ -62,7 +69,7 @@ class Brake(NamedTuple):
     raised : int
         How many times the acting torque is raised from the quasistatic one; lowered if negative.
     supported : int
-        How many times the supporting torque is raised.
+        How many times the supporting torque is raised; lowered if negative.
     trial : Trial
     """
 
@@ -97,6 +104,11 @@ class Rule:
         self.slow = SLOW * scales.speed / (scales.length if bench.is_angle else 1.0)
         self.time = scales.time
 
+    @property
+    def is_enough(self) -> bool:
+        """Whether there have been so many simulations that no other torques are tried."""
+        return self.bench.simulations > ENOUGH
+
     def scale(self, acting: int, supporting: int = 0) -> tuple[float, float]:
         """The torques raised so many times, lowered where negative."""
         powers = [supporting, supporting]
@@ -112,6 +124,8 @@ class Rule:
         found = []
         for raised in range(_RAISED):
             tau = self.scale(raised)
+            if self.is_enough:
+                break
             if abs(tau[self.acting]) > self.limit[self.acting]:
                 break
             trial = self._run([Step(0.0, tau)], f"raised {raised} times")
@@ -126,37 +140,44 @@ class Rule:
 
         The acting torque is lowered to less than the slowest drive's and than balances the object
         at the end. Where no such torque stops any drive there without losing a contact the
-        supporting one is raised, too.
+        supporting one becomes that of the end, and then is raised, too.
         """
         count = len(drives)
         chosen = [drives[k] for k in sorted({count - 1, count // 2, count // 4, 0}, reverse=True)]
-        share = float(self.last[self.acting] / self.tau[self.acting])
-        balance = math.floor(math.log(max(share, FACTOR**-_RAISED)) / math.log(FACTOR))
-        first = min(drives[0].raised - 1, balance)
-        for supported in range(0, _SUPPORTED, _SUPPORT):
+        first = min(drives[0].raised - 1, self._count_steps(self.acting))
+        last = self._count_steps(1 - self.acting)
+        for supported in dict.fromkeys([0, last, *range(_SUPPORT, _SUPPORTED, _SUPPORT)]):
             if abs(self.scale(0, supported)[1 - self.acting]) > self.limit[1 - self.acting]:
-                break
+                continue
             for drive in chosen:
-                if self.bench.simulations > _ENOUGH:
+                if self.is_enough:
                     return None
                 found = self._lower(drive.trial, first, supported)
                 if found is not None:
                     return drive, found
         return None
 
+    def _count_steps(self, finger: int) -> int:
+        """How many times a torque is raised, lowered if negative, until it is that of the end."""
+        share = float(self.last[finger] / self.tau[finger]) if self.tau[finger] else 1.0
+        return math.floor(math.log(max(share, FACTOR**-_RAISED)) / math.log(FACTOR))
+
     def _lower(self, drive: Trial, first: int, supported: int) -> Brake | None:
         """Lower the acting torque while that brings the end sooner; None if nothing stops there."""
         best: Brake | None = None
-        for raised in range(first, -_RAISED, -1):
+        raised = first
+        while raised > -_RAISED and not self.is_enough:
             steps = [*drive.steps, Step(0.0, self.scale(raised, supported))]
             trial = self._place(steps, drive, best and best.trial, _ROUGH * self.slow)
             if trial is None:
                 if best or self.bench.trials[-1].outcome is Outcome.LOSES:
                     break
-            elif best and trial.time > (1 - _SOONER) * best.trial.time:
+                raised -= _COARSE
+                continue
+            if best and trial.time > (1 - _SOONER) * best.trial.time:
                 break
-            else:
-                best = Brake(raised, supported, trial)
+            best = Brake(raised, supported, trial)
+            raised -= 1
         if best is None:
             return None
         last = self._place(list(best.trial.steps), drive, best.trial, self.slow)
@@ -172,6 +193,7 @@ class Rule:
         low, high = 0.0, drive.time
         below, above = self.bench.way, self._overshoot(drive, slow)
         at, side, losses = 0.5 * high, 0, 0
+        short, rate = self.bench.way, drive.rate
         if near is not None and slow == self.slow:
             at, high, above = (
                 near.steps[-1].time * (1 - 1e-4),
@@ -188,16 +210,22 @@ class Rule:
                     return trial
                 if at < _SOON * drive.time:
                     return None
-                high, above = at, self._overshoot(trial, slow)
+                high, above, rate = at, self._overshoot(trial, slow), trial.rate
                 below /= 2 if side < 0 else 1
                 side = -1
             else:
-                losses += trial.outcome is Outcome.LOSES
+                # What is lost on the way back says no more than that it turned back.
+                losses += trial.outcome is Outcome.LOSES and trial.rate > 0
                 if losses > _LOSSES:
                     return None
-                low, below = at, max(trial.short, 1e-12 * self.bench.way)
+                low, short = at, trial.short
+                # How far it is through several phases is not known.
+                below = above if short == math.inf else max(short, 1e-12 * self.bench.way)
                 above /= 2 if side > 0 else 1
                 side = 1
+            jumps = short > _FAR * self.bench.way and rate > _FAST * drive.rate
+            if jumps and high - low < _NARROW * high:
+                return None
             share = below / (below + above) if count % 4 != 3 else 0.5
             at = low + (high - low) * min(max(share, 0.02), 0.98)
             if high - low < 1e-12 * high:

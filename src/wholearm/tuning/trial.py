@@ -1,4 +1,4 @@
-"""One trial: torques of one phase, simulated without telling which contacts hold."""
+"""One trial: torques from rest to rest, simulated without telling which contacts hold."""
 
 from __future__ import annotations
 
@@ -14,14 +14,18 @@ from ..free_simulation.hand import build_system
 from ..free_simulation.result import FreeSimulation, list_pauses
 from ..free_simulation.simulate import simulate_free
 from ..free_simulation.state import Run
-from ..problem.definition import Phase, Problem
+from ..problem.definition import Problem
 from ..results.torque_table import read_rows
-from ..simulation.events import Event, EventKind
+from ..verification.free import find_losses
+from ..verification.verdict import DEPARTURE
+from .passage import Passage
 
 LASTS = 40.0
 """How long a trial goes on after its last step of the torques, relative to the scene's time."""
 _BACK = 1e-6
 """Share of the way by which the end is farther away than before once the motion has turned back."""
+_NUDGE = 1e-6
+"""Time over which a rate is a difference, relative to the scene's."""
 
 
 class Outcome(Enum):
@@ -68,7 +72,7 @@ class Trial(NamedTuple):
     slowing : float, [m/s^2 or rad/s^2]
         By how much that becomes less then.
     short : float, [m or rad]
-        How far away the end was when it was nearest.
+        How far away the end was when it was nearest; infinite before the last of several phases.
     least : float, [N]
         The least normal force until then, of `weakest`; infinite if nothing moved.
     weakest : str
@@ -94,6 +98,8 @@ class Trial(NamedTuple):
             return f"{text} {self.contact} at t = {self.time:.5g} s"
         if self.outcome is Outcome.ARRIVES:
             return f"{text} at t = {self.time:.5g} s, closing at {self.rate:.3g}"
+        if self.short == math.inf:
+            return f"{text} before the last of these phases"
         return f"{text}, {abs(self.short):.3g} away from it"
 
 
@@ -125,14 +131,14 @@ def make_rows(steps: Sequence[Step], end: float) -> Array:
 
 
 class Bench:
-    """Makes trials of one phase from one start, and counts them.
+    """Makes trials of one passage from one start, and counts them.
 
     Parameters
     ----------
     problem : Problem
-    phase : Phase
+    passage : Passage
     z : ndarray, shape (5,)
-        Where the phase starts, at rest.
+        Where it starts, at rest.
 
     Attributes
     ----------
@@ -140,14 +146,13 @@ class Bench:
     simulations : int
         Trials, and landings.
     way : float, [m or rad]
-        How far away the end of the phase is.
+        How far away the end is.
     """
 
-    def __init__(self, problem: Problem, phase: Phase, z: Array) -> None:
-        self.problem, self.phase, self.z = problem, phase, z
+    def __init__(self, problem: Problem, passage: Passage, z: Array) -> None:
+        self.problem, self.passage, self.z = problem, passage, z
         self.system = build_system(problem.scene)
-        self.names = phase.formation.names
-        until = phase.until
+        until = passage.until
         self.until = "" if until.contact is None else until.contact.name
         self.pair = self.system.names.index(self.until) if self.until else None
         self.column = 0 if until.coordinate == "x" else 2
@@ -159,17 +164,21 @@ class Bench:
 
     @property
     def is_angle(self) -> bool:
-        """Whether the end of the phase is one of phi."""
+        """Whether the end of the passage is one of phi."""
         return self.pair is None and self.column == 2
 
     def measure(self, z: Array) -> Array:
-        """How far away the end of the phase is, from (n, 5) to (n,) [m or rad]."""
+        """How far away the end of the passage is, from (n, 5) to (n,) [m or rad].
+
+        Where a contact goes on as that of a neighbouring feature it is how far it has to slide.
+        """
         if self.pair is None:
             return self.sign * (z[:, self.column] - self.value)
-        return np.asarray(self.system.measure(z)[0][:, self.pair])
+        gaps, ranges = self.system.measure(z)
+        return np.asarray(-ranges[:, self.pair] if self.passage.passed else gaps[:, self.pair])
 
     def run(self, steps: Sequence[Step]) -> Trial:
-        """Simulate torques until the end of the phase, or what keeps it from coming."""
+        """Simulate torques until the end of the passage, or what keeps it from coming."""
         end = steps[-1].time + LASTS * self.problem.scene.scales.time
         found = simulate_free(
             self.problem, read_rows(make_rows(steps, end)), start=self.z, halt=self._is_over
@@ -178,10 +187,8 @@ class Bench:
         self.trials.append(self._judge(tuple(steps), found))
         return self.trials[-1]
 
-    def land(
-        self, steps: Sequence[Step], arrival: float, pause: float, after: Phase | None
-    ) -> Landing:
-        """Simulate torques that hold the object at the end of the phase.
+    def land(self, steps: Sequence[Step], arrival: float, pause: float) -> Landing:
+        """Simulate torques that hold the object at the end of the passage.
 
         Parameters
         ----------
@@ -190,14 +197,20 @@ class Bench:
             When the end is reached.
         pause : float, [s]
             How long it is held.
-        after : Phase or None
-            The next one.
         """
         self.simulations += 1
-        end = arrival + pause
+        end, passage = arrival + pause, self.passage
         found = simulate_free(self.problem, read_rows(make_rows(steps, end)), start=self.z)
-        names = set(self.names) if after is None else set(after.formation.names)
-        pauses = {name: list_pauses(found.stretches, name, arrival, end) for name in names}
+        stretches = found.stretches
+        if passage.passed:
+            # Whichever of the two presses where they meet.
+            stretches = tuple(
+                own._replace(contact=passage.passed) if own.contact == self.until else own
+                for own in stretches
+            )
+        later = passage.after or passage.phases[-1]
+        names = later.formation.names
+        pauses = {name: list_pauses(stretches, name, arrival, end) for name in names}
         parted = {name: max((b - a for a, b in own), default=0.0) for name, own in pauses.items()}
         worst = max(parted, key=parted.__getitem__)
         rests = not found.z_dot[-1].any() and found.t[-1] == end
@@ -206,42 +219,74 @@ class Bench:
     def _is_over(self, run: Run) -> bool:
         if run.t == 0:
             return False
-        if run.resting or any(self._is_lost(e) or self._is_end(e) for e in run.events):
+        ends, loss = self.passage.follow(run.events)
+        if run.resting or loss is not None or len(ends) == len(self.passage.phases):
             return True
+        if len(self.passage.phases) > 1:
+            return False
         gap = float(self.measure(run.z[None])[0])
         return gap > (1 + _BACK) * self.way or (self.pair is None and gap <= 0)
 
-    def _is_lost(self, event: Event) -> bool:
-        return event.kind is EventKind.CONTACT_LOST and event.contact in self.names
-
-    def _is_end(self, event: Event) -> bool:
-        return bool(self.until) and event.contact == self.until
-
     def _judge(self, steps: tuple[Step, ...], found: FreeSimulation) -> Trial:
         gaps = self.measure(found.z)
-        arrival = min((e.time for e in found.events if self._is_end(e)), default=math.inf)
+        ends, lost = self.passage.follow(found.events)
+        arrival = ends[-1] if len(ends) == len(self.passage.phases) else math.inf
         if self.pair is None and gaps.min() <= 0:
             arrival = self._find_passing(found, int(np.flatnonzero(gaps <= 0)[0]))
-        losses = [e for e in found.events if self._is_lost(e) and e.time < arrival]
-        time = min(arrival, losses[0].time if losses else math.inf, float(found.t[-1]))
+        losses = [] if lost is None else [(lost.time, lost.contact)]
+        stop = min(arrival, float(found.t[-1]))
+        losses = [loss for loss in losses + self._list_losses(found, ends, stop) if loss[0] < stop]
+        time, contact = min(losses, default=(stop, ""))
         at = int(np.searchsorted(found.t, time))
-        own = [found.contacts.index(name) for name in self.names]
-        c_n = np.nan_to_num(found.c_n[: at + 1, own], nan=math.inf)
-        row, column = np.unravel_index(int(c_n.argmin()), c_n.shape)
-        least, weakest, contact = float(c_n[row, column]), self.names[int(column)], ""
-        short = float(gaps[: at + 1].min())
-        if losses and losses[0].time == time:
-            outcome, contact = Outcome.LOSES, losses[0].contact
+        least, weakest, row = self._find_least(found, ends, at)
+        begun = found.t[: at + 1] >= self._find_last(ends)
+        short = float(gaps[: at + 1][begun].min(initial=math.inf))
+        if losses:
+            outcome = Outcome.LOSES
         elif least < self.problem.epsilon:
             outcome, contact, time = Outcome.LOSES, weakest, float(found.t[row])
         elif arrival < math.inf:
             outcome = Outcome.ARRIVES
         else:
-            turned = gaps[at] > short + _BACK * self.way
+            turned = gaps[at] > short + _BACK * abs(self.way)
             rests = turned or not found.z_dot[at].any()
             outcome = Outcome.RESTS if rests else Outcome.LASTS
         rate, slowing, z = self._close(found, time, at)
         return Trial(steps, outcome, time, contact, rate, slowing, short, least, weakest, z)
+
+    def _find_last(self, ends: Sequence[float]) -> float:
+        """When the last phase begins [s], infinite if it does not."""
+        before = len(self.passage.phases) - 1
+        return [0.0, *ends][before] if len(ends) >= before else math.inf
+
+    def _list_losses(
+        self, found: FreeSimulation, ends: Sequence[float], stop: float
+    ) -> list[tuple[float, str]]:
+        """When contacts of its phases part, also those that never press; and which."""
+        starts = [0.0, *ends][: len(self.passage.phases)]
+        stops = [*starts[1:], stop]
+        return [
+            (loss.time, loss.contact)
+            for phase, first, last in zip(self.passage.phases, starts, stops, strict=False)
+            for loss in find_losses(self.problem, found, phase, first, last, DEPARTURE)
+        ]
+
+    def _find_least(
+        self, found: FreeSimulation, ends: Sequence[float], at: int
+    ) -> tuple[float, str, int]:
+        """The least normal force up to a row, of which contact, and in which row."""
+        phases = self.passage.phases
+        of = np.minimum(np.searchsorted(ends, found.t[: at + 1], side="left"), len(phases) - 1)
+        best = (math.inf, phases[0].formation.names[0], 0)
+        for index in range(len(phases)):
+            rows = np.flatnonzero(of == index)
+            names = self.passage.list_pressed(index)
+            own = [found.contacts.index(name) for name in names]
+            c_n = np.nan_to_num(found.c_n[rows][:, own], nan=math.inf)
+            if c_n.min(initial=math.inf) < best[0]:
+                row, column = np.unravel_index(int(c_n.argmin()), c_n.shape)
+                best = (float(c_n[row, column]), names[int(column)], int(rows[row]))
+        return best
 
     def _find_passing(self, found: FreeSimulation, row: int) -> float:
         """When a coordinate passes its value, before a row [s]."""
@@ -260,5 +305,9 @@ class Bench:
         z, v, a = found.z[at], found.z_dot[at], found.z_ddot[at]
         if self.pair is None:
             return -self.sign * float(v[self.column]), self.sign * float(a[self.column]), z
+        if self.passage.passed:
+            step = _NUDGE * self.problem.scene.scales.time
+            back, _, on = (float(x) for x in self.measure(z + np.outer([-step, 0, step], v)))
+            return (back - on) / (2 * step), 0.0, z
         rows = self.system.evaluate(z, v, [self.pair])
         return -float(rows.A[0] @ v), float(rows.A[0] @ a + rows.bend[0]), z
