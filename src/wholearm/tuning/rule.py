@@ -34,6 +34,8 @@ _SOONER = 0.02
 """Share of the time by which another 10 % has to bring the end sooner."""
 _COARSE = 2
 """So many times the acting torque is lowered at once while it brakes too little."""
+_MISSES = 2
+"""So many torques that stop nothing end that, once one has."""
 _SEARCH = 24
 """Most trials that look for the instant to brake."""
 _NARROW = 1e-3
@@ -146,7 +148,10 @@ class Rule:
         chosen = [drives[k] for k in sorted({count - 1, count // 2, count // 4, 0}, reverse=True)]
         first = min(drives[0].raised - 1, self._count_steps(self.acting))
         last = self._count_steps(1 - self.acting)
-        for supported in dict.fromkeys([0, last, *range(_SUPPORT, _SUPPORTED, _SUPPORT)]):
+        # With two freedoms either torque sets the object in motion again, if it is too much there.
+        free = self.bench.passage.phases[-1].formation.n_constraints < 4
+        likely = [last, 0] if free else [0, last]
+        for supported in dict.fromkeys([*likely, *range(_SUPPORT, _SUPPORTED, _SUPPORT)]):
             if abs(self.scale(0, supported)[1 - self.acting]) > self.limit[1 - self.acting]:
                 continue
             for drive in chosen:
@@ -165,13 +170,14 @@ class Rule:
     def _lower(self, drive: Trial, first: int, supported: int) -> Brake | None:
         """Lower the acting torque while that brings the end sooner; None if nothing stops there."""
         best: Brake | None = None
-        raised = first
-        while raised > -_RAISED and not self.is_enough:
+        raised, missed = first, 0
+        while raised > -_RAISED and missed < _MISSES and not self.is_enough:
             steps = [*drive.steps, Step(0.0, self.scale(raised, supported))]
             trial = self._place(steps, drive, best and best.trial, _ROUGH * self.slow)
             if trial is None:
-                if best or self.bench.trials[-1].outcome is Outcome.LOSES:
+                if best is None and self.bench.trials[-1].outcome is Outcome.LOSES:
                     break
+                missed += best is not None
                 raised -= _COARSE
                 continue
             if best and trial.time > (1 - _SOONER) * best.trial.time:
