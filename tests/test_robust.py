@@ -16,11 +16,15 @@ from wholearm.geometry.path_guess import load
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions, build_forward, inverse
 from wholearm.mechanics.metric import metric_weights
+from wholearm.mechanics.wedging import find_static_torques
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.motion import directions_of
 from wholearm.planning.path_domain.plan import plan_path
+from wholearm.planning.path_domain.widest import find_widest
 from wholearm.planning.phase_plan import PhasePlan
+from wholearm.planning.robust.rows import Guide
 from wholearm.planning.robust.sensitivities import find_force_slopes, find_slopes_at
+from wholearm.planning.robust.start import list_holds, measure_holds
 from wholearm.planning.time_domain.plan import plan_phases
 from wholearm.problem.definition import Problem
 from wholearm.problem.uncertainty import NAMES, PARAMETERS
@@ -195,3 +199,32 @@ def test_no_ranges_cost_nothing(curve: Curve) -> None:
 def test_options_that_make_no_sense_are_refused(given: dict[str, float], text: str) -> None:
     with pytest.raises(InputError, match=re.escape(text)):
         PlanOptions(**given).scale_ranges({})  # type: ignore[arg-type]
+
+
+def test_what_friction_may_hold_grows_with_the_ranges(problem: Problem) -> None:
+    formation, tau = problem.phases[0].formation, np.array([0.05, -0.02])
+    ranges = {"friction_palm": 0.3, "friction_finger1": 0.3, "mass": 0.1, "gain2": 0.05}
+    exact = find_static_torques([formation], problem.start).measure(tau[None])[0]
+    assert measure_holds(list_holds(formation, problem.start, {}), tau) == exact
+    rng, within = np.random.default_rng(3), list_holds(formation, problem.start, ranges)
+    for tau in rng.uniform(-1.0, 1.0, (20, 2)):
+        least = measure_holds(within, tau)
+        for _ in range(5):
+            own = {name: width * rng.uniform(-1, 1) for name, width in ranges.items()}
+            scene = change_problem(problem, own).scene
+            static = find_static_torques([replace(formation, scene=scene)], problem.start)
+            assert static.measure((tau * [1.0, 1 + own["gain2"]])[None])[0] >= least - 1e-9
+
+
+def test_the_widest_ranges_are_the_same_by_whatever_they_are_measured(curve: Curve) -> None:
+    plain = plan_path(curve, EPSILON, PlanOptions(accuracy=1e-2), 1).motion
+    guides, found = [Guide(plain.grid.s, *plain.profile)], []
+    for unit in (12.0, 15.0):
+
+        def scale(factor: float, unit: float = unit) -> PlanOptions:
+            ranges = {name: unit * factor * radius for name, radius in RADII.items()}
+            return PlanOptions(ranges=ranges, accuracy=1e-2)
+
+        found.append(unit * find_widest([curve], EPSILON, scale, [1], guides, 45.0 / unit))
+    assert 2.0 < found[0] < 45.0
+    assert found[1] == pytest.approx(found[0], rel=0.03)

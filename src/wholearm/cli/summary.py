@@ -96,6 +96,9 @@ def _describe_ranges(plan: Plan, ranges: RangeFigures) -> list[str]:
         f"{more:+.1f} % of the {plan.options.goal.value} without ranges, {ranges.nominal:.6f} "
         f"{plan.unit}",
     ]
+    if ranges.held:
+        numbers = " and ".join(map(str, ranges.held))
+        lines.append(f"friction within the ranges may hold the start of phase {numbers}")
     if ranges.largest is not None:
         each = ", ".join("-" if own is None else f"{own:.3g}" for own in ranges.phases)
         text = f"a plan exists for ranges {ranges.largest:.3g} times as wide as the problem's"

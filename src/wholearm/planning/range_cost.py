@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
-from ..common.errors import InfeasibleError, SolverError
+import numpy as np
+
+from ..mechanics.metric import measure_speed
+from ..mechanics.wedging import SURE
 from ..problem.uncertainty import PARAMETERS
 from ..results.range_figures import RangeFigures
 from .block_plan import Planning
 from .blocks import plan_blocks
-from .options import PlanOptions
+from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence
-from .path_domain.sequence_plan import plan_sequence
-from .phase_plan import add_up, combine
+from .path_domain.motion import PathMotion
+from .path_domain.widest import find_widest
+from .phase_plan import combine
+from .robust.rows import Guide
+from .robust.start import list_holds, measure_holds
 
 WIDEST = 0.95
 """Largest relative range that is tried."""
-_CLOSE = 0.01
-"""Error of the largest factor, relatively."""
-_ROUGH = 1e-2
-"""Accuracy of plans that are made to see whether there are any."""
+_STILL = 1e-9
+"""Speed of a plan that is rest but for rounding, relative to the scene's."""
+_MOST = 1e3
+"""Largest factor that is tried."""
 
 
 def assess_ranges(planning: Planning, report: Callable[[str], None]) -> RangeFigures:
@@ -29,18 +35,23 @@ def assess_ranges(planning: Planning, report: Callable[[str], None]) -> RangeFig
     report("planning without ranges")
     bare = plan_blocks(problem, planning.curves, replace(options, ranges={}), report)
     nominal = combine(options.goal, [plan.value for plan in bare.plans])
-    figures = RangeFigures(dict(options.ranges), nominal)
+    figures = RangeFigures(dict(options.ranges), nominal, held=tuple(_list_held(planning)))
     if not options.largest:
         return figures
     unit = options.scale_ranges(problem.uncertainty or {}, 1.0).ranges
     relative = [unit[own.name] for own in PARAMETERS if not own.unit]
-    most = WIDEST / max(max(relative), 1e-12)
+    most = WIDEST / max(max(relative), WIDEST / _MOST)
+
+    def scale(factor: float) -> PlanOptions:
+        wider = options.scale_ranges(problem.uncertainty or {}, factor)
+        return replace(wider, objective=Objective.TIME, duration=None)
+
     found: dict[int, float] = {}
-    for numbers, part, duration in _list_parts(planning):
+    for numbers, part, motions in _list_parts(planning):
         report(f"looking for the widest ranges of phase {numbers[0]}")
-        widest = _find_widest(
-            part, problem.epsilon, options, problem.uncertainty or {}, duration, most
-        )
+        curves = part.continuous_curves
+        guides = [Guide(own.grid.s, *own.profile) for own in motions]
+        widest = find_widest(curves, problem.epsilon, scale, numbers, guides, most)
         found |= dict.fromkeys(numbers, widest)
     each = tuple(found.get(phase.number) for phase in problem.phases)
     if not found:
@@ -50,41 +61,24 @@ def assess_ranges(planning: Planning, report: Callable[[str], None]) -> RangeFig
     )
 
 
+def _list_held(planning: Planning) -> Iterator[int]:
+    """Numbers of phases that begin at rest, where friction within the ranges may hold them."""
+    scales, ranges = planning.problem.scene.scales, planning.options.ranges
+    for phase, plan in zip(planning.problem.phases, planning.plans, strict=True):
+        first = plan.motion.evaluate(np.zeros(1))
+        if measure_speed(planning.problem.scene, first.z_dot[0]) > _STILL * scales.speed:
+            continue
+        holds = list_holds(phase.formation, first.z[0], ranges)
+        if measure_holds(holds, first.tau[0]) < SURE * scales.torque:
+            yield phase.number
+
+
 def _list_parts(
     planning: Planning,
-) -> Iterator[tuple[Sequence[int], ImpactSequence, float | None]]:
-    """What is planned along curves from rest to rest: phases, curves and duration."""
+) -> Iterator[tuple[Sequence[int], ImpactSequence, list[PathMotion]]]:
+    """What is planned along curves from rest to rest: phases, curves and motions."""
     for block in planning.blocks:
         for part in block.chain.split() if block.chain is not None else ():
             numbers = [phase.number for phase in part.phases]
-            yield numbers, part, add_up(part.phases, planning.allowed)
-
-
-def _find_widest(
-    part: ImpactSequence,
-    epsilon: float,
-    options: PlanOptions,
-    ranges: Mapping[str, float],
-    duration: float | None,
-    most: float,
-) -> float:
-    """The largest factor on ranges with which phases have a plan, by bisection."""
-    rough = replace(options, accuracy=max(options.accuracy, _ROUGH))
-
-    def exists(factor: float) -> bool:
-        try:
-            plan_sequence(part, epsilon, rough.scale_ranges(ranges, factor), duration, False)
-        except (InfeasibleError, SolverError):
-            return False
-        return True
-
-    low, high = 0.0, options.robust
-    low, high = (high, min(2 * high, most))
-    while high < most and exists(high):
-        low, high = high, min(2 * high, most)
-    if high >= most and exists(most):
-        return most
-    while high - low > _CLOSE * high:
-        middle = (low + high) / 2
-        low, high = (middle, high) if exists(middle) else (low, middle)
-    return low
+            motions = [planning.plans[number - 1].motion for number in numbers]
+            yield numbers, part, [own for own in motions if isinstance(own, PathMotion)]

@@ -23,6 +23,8 @@ class RangeFigures(NamedTuple):
     capped : bool
         Whether the factor is as large as ranges make sense, and no limit stands against a larger
         one.
+    held : tuple of int
+        Numbers of phases whose start friction may hold, somewhere within the ranges.
     """
 
     radii: Mapping[str, float]
@@ -30,3 +32,4 @@ class RangeFigures(NamedTuple):
     largest: float | None = None
     phases: tuple[float | None, ...] = ()
     capped: bool = False
+    held: tuple[int, ...] = ()

@@ -13,6 +13,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
+
 from ...common.errors import InfeasibleError, JammingError, SolverError, WholearmError
 from ...common.shortfalls import Parameter
 from ...geometry.curve import Curve
@@ -145,7 +147,8 @@ def plan_curves(
     if options.goal is Objective.MARGIN and found.plans[0].value < task.lost:
         least = SolverError(f"{task.name}: the margin found is below epsilon")
         raise _explain_duration(task) or least
-    return found.plans if options.goal is Objective.TIME else _leave_rest(found)
+    surely = options.goal is Objective.TIME and not options.ranges
+    return found.plans if surely else _leave_rest(found)
 
 
 def _plan_within(task: Task) -> tuple[_Solved | _Stuck, tuple[Guide, ...]]:
@@ -175,13 +178,14 @@ def _plan_within(task: Task) -> tuple[_Solved | _Stuck, tuple[Guide, ...]]:
 def _leave_rest(found: _Solved) -> Plans:
     """The plans, or others with a start that friction cannot hold, if it can hold theirs.
 
-    Those of least time push off as hard as limits allow.
+    Those of least time push off as hard as limits allow, but not as if friction were larger.
     """
     plans, task = found.plans, found.round_.task
     data, margin = found.round_.parts[0], 0.0
     if task.options.goal is Objective.MARGIN:
         margin = plans[0].value - task.epsilon
-    start = find_sure_start(data, plans[0].motion.profile, margin)
+    ranges = task.options.ranges
+    start = find_sure_start(data, plans[0].motion.profile, margin, ranges)
     if start is None:
         return plans
     bounded = replace(found.round_, task=replace(task, start=start)).solve()
@@ -191,7 +195,8 @@ def _leave_rest(found: _Solved) -> Plans:
     loss = sum(own.value for own in plans) - sum(own.value for own in other.plans)
     if task.options.goal is Objective.EFFORT:
         loss = -loss
-    return other.plans if loss <= WORTH * sum(own.value for own in plans) else plans
+    most = np.inf if ranges else WORTH * sum(own.value for own in plans)
+    return other.plans if loss <= most else plans
 
 
 def _explain_duration(task: Task) -> InfeasibleError | None:

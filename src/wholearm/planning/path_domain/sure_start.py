@@ -8,13 +8,15 @@ every limit, or farther from that side.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from ...common.arrays import Array
 from ...mechanics.limits import PRESS
-from ...mechanics.wedging import SURE, find_static_torques
+from ...mechanics.wedging import SURE
+from ..robust.start import Hold, list_holds, measure_holds
 from .data import PhaseData
 from .elements import Profile
 
@@ -36,7 +38,9 @@ class SureStart(NamedTuple):
     high: float
 
 
-def find_sure_start(data: PhaseData, profile: Profile, margin: float) -> SureStart | None:
+def find_sure_start(
+    data: PhaseData, profile: Profile, margin: float, ranges: Mapping[str, float]
+) -> SureStart | None:
     """Bounds with which a motion surely leaves rest; None if it does, or if nothing helps.
 
     Parameters
@@ -45,13 +49,15 @@ def find_sure_start(data: PhaseData, profile: Profile, margin: float) -> SureSta
     profile : Profile
     margin : float, [N]
         By which normal forces are above epsilon.
+    ranges : mapping of str to float
+        Of numbers, within all of which it is to be sure.
     """
     formation, forces = data.curve.formation, data.nodes.forces
-    static = find_static_torques([formation], data.curve.start)
+    holds = list_holds(formation, data.curve.start, ranges)
     here = np.array([profile.a[0], profile.squeeze[0]])
     T0, T = forces.T0[0], np.column_stack([forces.Ta[0], forces.Tl[0]])
     unit = formation.scene.scales.torque
-    if static.measure((T0 + T @ here)[None])[0] > SURE * unit:
+    if measure_holds(holds, T0 + T @ here) > SURE * unit:
         return None
     rows, signs, bounds = data.limits.sides
     presses = np.isin(rows, data.limits.of(PRESS)) & (signs > 0)
@@ -62,12 +68,13 @@ def find_sure_start(data: PhaseData, profile: Profile, margin: float) -> SureSta
     for share in _SHARES if margin > 0 else _SHARES[:1]:
         offsets = signs * (terms.constant[0, rows] - bounds) - (1 - share) * margin * presses
         best, found = np.inf, None
-        for side, bound in zip(static.normals, static.bounds + BEYOND * SURE * unit, strict=True):
+        for side, bound in _list_sides(holds, BEYOND * SURE * unit):
             normal = side @ T
             if normal[0] <= 0:
                 continue
             for place in _list_places(normal, bound - side @ T0, slopes, offsets, here, units):
                 kept = ((offsets + slopes @ place) / data.spans).min() >= -_KEPT and place[0] > 0
+                kept = kept and measure_holds(holds, T0 + T @ place) > SURE * unit
                 away = float(np.abs(T @ (place - here)).max())
                 if kept and away < best:
                     ends = (place[1], np.inf) if normal[1] > 0 else (-np.inf, place[1])
@@ -75,6 +82,13 @@ def find_sure_start(data: PhaseData, profile: Profile, margin: float) -> SureSta
         if found is not None:
             return found
     return None
+
+
+def _list_sides(holds: Sequence[Hold], beyond: float) -> Iterator[tuple[Array, float]]:
+    """Sides of what can be held, each with its bound, as far beyond [N m]."""
+    for static, gains in holds:
+        for normal, bound in zip(static.normals, static.bounds, strict=True):
+            yield normal * gains, float(bound) + beyond
 
 
 def _list_places(
