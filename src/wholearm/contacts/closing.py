@@ -37,6 +37,10 @@ LEVEL = 1e-12
 """How far below a joint the object is still level with it, over the link's length."""
 
 
+CHUNK = 4096
+"""Poses that are closed at a time, so that they stay in the cache."""
+
+
 class Closed(NamedTuple):
     """Hand and object closed at n poses.
 
@@ -110,6 +114,14 @@ def lower(scene: Scene, phi: Array) -> tuple[Array, Numbers]:
 
 def close_fingers(scene: Scene, x: Array, phi: Array) -> Closed:
     """Lower the object and close both fingers at n poses, `x` [m] and `phi` [rad] of shape (n,)."""
+    if len(x) <= CHUNK:
+        return _close_fingers(scene, x, phi)
+    cuts = range(0, len(x), CHUNK)
+    parts = [_close_fingers(scene, x[k : k + CHUNK], phi[k : k + CHUNK]) for k in cuts]
+    return Closed(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+def _close_fingers(scene: Scene, x: Array, phi: Array) -> Closed:
     y, _ = lower(scene, phi)
     z = np.column_stack([x, y, phi, np.empty((len(x), 2))])
     touched = np.empty((len(x), 2), dtype=np.int64)

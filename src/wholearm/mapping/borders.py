@@ -84,9 +84,9 @@ class Track:
     pose : callable
         Parameter of shape (n,) to (x, phi), each of shape (n,), NaN where there is none.
     label : callable
-        (x, phi) to labels, shape (n, 6): indices of two contacts each with palm, finger 1 and
-        finger 2, `NOWHERE` for the second where there is one contact only, and for all six where
-        the place is no border.
+        (x, phi) and the hand closed there to labels, shape (n, 6): indices of two contacts each
+        with palm, finger 1 and finger 2, `NOWHERE` for the second where there is one contact only,
+        and for all six where the place is no border.
     places : ndarray, shape (n,)
         Parameters to sample at, increasing.
     step : float, [m]
@@ -97,7 +97,7 @@ class Track:
     """
 
     pose: Callable[[Array], tuple[Array, Array]]
-    label: Callable[[Array, Array], Numbers]
+    label: Callable[[Array, Array, Closed], Numbers]
     places: Array
     step: float
     flush: tuple[int | None, int] | None = None
@@ -154,8 +154,8 @@ def palm_track(scene: Scene, edge: int, phi: float, places: Array) -> Track:
     def pose(x: Array) -> tuple[Array, Array]:
         return x, np.full_like(x, phi)
 
-    def label(x: Array, phi: Array) -> Numbers:
-        labels = label_closed(close_fingers(scene, x, phi), edge)
+    def label(x: Array, phi: Array, closed: Closed) -> Numbers:
+        labels = label_closed(closed, edge)
         labels[labels[:, 0] != NOWHERE, 1] = after
         return labels
 
@@ -176,13 +176,12 @@ def flush_track(scene: Scene, finger: int, edge: int, vertex: int, places: Array
             across = (link.radius - m[:, 1] * (base[1] - corner[:, 1])) / m[:, 0]
         return base[0] - corner[:, 0] - across, phi
 
-    def label(x: Array, phi: Array) -> Numbers:
+    def label(x: Array, phi: Array, closed: Closed) -> Numbers:
         corners, m = _corners_at(scene, phi, vertex, near, far), _outward(scene, edge, phi)
         corners[..., 0] += x
         sign = 1.0 if finger == 0 else -1.0
         axis = sign * np.column_stack([-m[:, 1], m[:, 0]])
         near_run, far_run = ((corners - base) * axis).sum(axis=2)
-        closed = close_fingers(scene, x, phi)
         labels = label_closed(closed, vertex)
         within = (near_run > 0) & (near_run <= link.length)
         # The edge lies on the link up to its far vertex or up to the tip.
@@ -238,8 +237,7 @@ def _circle_track(
             across = np.sqrt(distance**2 - (place[:, 1] - base[1]) ** 2)
         return base[0] - place[:, 0] + branch * across, phi
 
-    def label(x: Array, phi: Array) -> Numbers:
-        closed = close_fingers(scene, x, phi)
+    def label(x: Array, phi: Array, closed: Closed) -> Numbers:
         labels = label_closed(closed, vertex)
         place = centre(phi) + np.column_stack([x, np.zeros_like(x)]) - base
         angle = np.arctan2(place[:, 1], place[:, 0])

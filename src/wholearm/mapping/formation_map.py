@@ -32,8 +32,6 @@ from .route import Stretch, list_formations, trace_problem
 
 Flush = tuple[int | None, int]
 """A finger (None for the palm) and an edge that lies flush on it."""
-CHUNK = 4096
-"""Poses that are closed at a time."""
 SAMPLES = 100
 """Places per radian of the window, and least across it, at which borders are looked for."""
 ARROWS = 24
@@ -187,10 +185,9 @@ def build_map(
     cells[obstacle == 0] = cell.ravel()
     table = contact_table(scene)
     report("map: borders")
-    borders: list[Border] = []
     samples = round(SAMPLES * max(1.0, window.phi[1] - window.phi[0]))
-    for track in list_tracks(scene, window, samples):
-        borders += [_build_border(problem, piece) for piece in cut(track, window)]
+    tracks = list(list_tracks(scene, window, samples))
+    borders = [_build_border(problem, piece) for piece in cut(scene, tracks, window)]
     report("map: crossings and directions")
     directions = _check_cells(problem, window)
     return FormationMap(
@@ -257,16 +254,13 @@ def _cover_phases(problem: Problem) -> tuple[float, float]:
 def _label_grid(scene: Scene, x: Array, phi: Array) -> tuple[Numbers, Numbers]:
     """Labels (n_phi, n_x, 6) and obstacles (n_phi, n_x), 0 or as in `FormationMap.cell`."""
     x, phi = (part.ravel() for part in np.meshgrid(x, phi))
-    labels, obstacles = [], []
-    for start in range(0, len(x), CHUNK):
-        part = slice(start, start + CHUNK)
-        closed = close_fingers(scene, x[part], phi[part])
-        labels.append(label_closed(closed, lower(scene, phi[part])[1]))
-        both = closed.obstacle
-        codes = np.where(both > 0, 2 * both - 1 + np.array([0, 1]), 0)
-        obstacles.append(np.where(codes[:, 0] > 0, codes[:, 0], codes[:, 1]))
+    closed = close_fingers(scene, x, phi)
+    labels = label_closed(closed, lower(scene, phi)[1])
+    both = closed.obstacle
+    codes = np.where(both > 0, 2 * both - 1 + np.array([0, 1]), 0)
+    obstacle = np.where(codes[:, 0] > 0, codes[:, 0], codes[:, 1])
     shape = (len(np.unique(phi)), -1)
-    return np.concatenate(labels).reshape(*shape, 6), np.concatenate(obstacles).reshape(shape)
+    return labels.reshape(*shape, 6), obstacle.reshape(shape)
 
 
 def _build_border(problem: Problem, piece: Piece) -> Border:

@@ -89,7 +89,7 @@ def split_leg(scene: Scene, start: Array, stop: Array) -> list[Part]:
     margins = (AT_START * near, near)[:: int(way)]
     kept = [
         piece
-        for piece in cut(leg.track)
+        for piece in cut(scene, [leg.track])
         if piece.places[-1] > low + margins[0] and piece.places[0] < high - margins[1]
     ]
     _require_reached(scene, leg, kept, [low + near, high - near])

@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.arrays import Array
+from ..contacts.closing import Closed, Numbers, lower
 from ..scene.model import Scene
-from .borders import Piece, Track, Window, flush_track, label_cells
+from .borders import Piece, Track, Window, flush_track, label_closed
 from .borders import palm_track as track_palm
 from .pieces import cut
 
@@ -68,7 +69,7 @@ def choose_leg(scene: Scene, start: Array, stop: Array) -> Leg:
         if max(off_a, off_b) < 1 and abs(a - b) > near[1]:
             ends = np.clip([min(a, b) - near[1], max(a, b) + near[1]], *reach)
             own = replace(track, places=np.linspace(ends[0], ends[1], PLACES))
-            if _covers(cut(own), a, b, near[1]):
+            if _covers(cut(scene, [own]), a, b, near[1]):
                 found.append((max(off_a, off_b), own, a, b))
     if found:
         _, track, a, b = min(found, key=lambda entry: entry[0])
@@ -78,9 +79,12 @@ def choose_leg(scene: Scene, start: Array, stop: Array) -> Leg:
         points = start + s[:, None] * (stop - start)
         return points[:, 0], points[:, 1]
 
+    def label(_: Array, phi: Array, closed: Closed) -> Numbers:
+        return label_closed(closed, lower(scene, phi)[1])
+
     share = float(1 / (np.abs(stop - start) / near).max())
     places = np.linspace(-share, 1.0 + share, PLACES)
-    track = Track(pose, lambda x, phi: label_cells(scene, x, phi), places, np.inf)
+    track = Track(pose, label, places, np.inf)
     return Leg(track, 0.0, 1.0, share)
 
 
@@ -155,7 +159,7 @@ def find_miss(scene: Scene, start: Array, stop: Array) -> Miss | None:
     misses = []
     if abs(stop[0] - start[0]) > near[0]:
         for track, off in _list_palm(scene, start, stop):
-            if off < MISSED and cut(track):
+            if off < MISSED and cut(scene, [track]):
                 ends = [
                     abs(float(track.pose(np.zeros(1))[1][0]) - pose[1]) for pose in (start, stop)
                 ]
@@ -164,7 +168,7 @@ def find_miss(scene: Scene, start: Array, stop: Array) -> Miss | None:
     for track, _ in _list_fingers(scene, start, stop):
         located = [_locate(track, pose, near) for pose in (start, stop)]
         off = max(distance for _, distance in located)
-        if off < MISSED and abs(located[0][0] - located[1][0]) > near[1] and cut(track):
+        if off < MISSED and abs(located[0][0] - located[1][0]) > near[1] and cut(scene, [track]):
             gaps = [
                 np.abs(np.array(track.pose(np.array([place]))).ravel() - pose)
                 for (place, _), pose in zip(located, (start, stop), strict=True)

@@ -160,7 +160,7 @@ def _find_pieces(problem: Problem) -> list[Piece]:
             for edge in range(scene.polygon.n_vertices):
                 places = np.linspace(first, last, PLACES)
                 tracks.append(flush_track(scene, finger, edge, vertex, places))
-    return [piece for track in tracks for piece in cut(track, window)]
+    return cut(scene, tracks, window)
 
 
 def _draw_leg(
