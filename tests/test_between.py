@@ -17,6 +17,7 @@ from wholearm.mechanics.dynamics import Directions
 from wholearm.mechanics.limits import CONE, PRESS, make_limits
 from wholearm.planning.options import CLEARANCE, PlanOptions
 from wholearm.planning.plan import solve
+from wholearm.planning.time_domain import enforcing
 from wholearm.planning.time_domain.between import (
     GRAZE,
     MISS,
@@ -176,6 +177,43 @@ def test_tightening_holds_limits_that_points_alone_do_not() -> None:
     assert worst[0] > 100 * allowed and worst[1] < 2 * allowed
     # Limits cost little, about as much as halved intervals gain.
     assert held.cost == pytest.approx(loose.cost, rel=0.03)
+
+
+class Creeping(Search):
+    """Tightening that makes what the first interval misses a tenth less, however often."""
+
+    rounds = 0
+
+    def run(self, *given: Any) -> Solution:
+        self.rounds += 1
+        return solve_at_points()
+
+    def solve(self, stages: list[Stage], before: Solution | None = None, most: int = 0) -> Solution:
+        return solve_at_points()._replace(stages=stages)
+
+    def miss(self, _: Search, solution: Solution, __: object) -> list[Limits]:
+        missed = [Limits.none(stage) for stage in solution.stages]
+        if solution.stages[0].intervals == solve_at_points().stages[0].intervals:
+            missed[0].held[0, 0] = 100 * MISS * 0.9**self.rounds
+        return missed
+
+
+def test_tightening_that_creeps_gives_way_to_finer_intervals(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where limits are missed, and nowhere else."""
+    loose = solve_at_points()
+    search = Creeping(**vars(Search.of(landing(), PlanOptions(time_intervals=6))))
+    monkeypatch.setattr(enforcing, "_list_misses", search.miss)
+    for name in ("price_misses", "list_gains"):
+        monkeypatch.setattr(enforcing, name, lambda *_: [np.zeros(1)])
+    monkeypatch.setattr(enforcing, "_choose_halvings", lambda *_: [])
+    held = enforce_between(search, loose)
+    assert held.success, held.status
+    first, *others = zip(loose.stages, held.stages, strict=True)
+    assert first[1].intervals == first[0].intervals + 1
+    assert first[1].guess.fractions[:2].sum() == pytest.approx(first[0].guess.fractions[0])
+    assert all(one.intervals == other.intervals for one, other in others)
 
 
 @lru_cache(maxsize=1)

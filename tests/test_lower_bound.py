@@ -68,6 +68,21 @@ def test_two_halves_are_one_whole() -> None:
     assert joined.value == pytest.approx(bound(Toy(half.law, length=2.0)).value, rel=1e-7)
 
 
+@pytest.mark.parametrize("largest", [True, False])
+def test_rows_that_say_the_same_are_told_apart_by_their_order(largest: bool) -> None:
+    """Not by rounding: where a limit has no squeeze, all its pairs are one."""
+    rng, sign = np.random.default_rng(0), 1.0 if largest else -1.0
+    rows = Rows(*(np.tile(rng.uniform(1, 2, (50, 1)), 3) for _ in range(4)), np.full(50, np.inf))
+    noise = 1 + 1e-14 * rng.uniform(-1, 1, rows.one.shape)
+    # The last one is farther away by a millionth.
+    farther = np.array([1.0, 1.0, 1.0 + 1e-6])
+    rows = rows._replace(a=-sign * rows.a, b=-rows.b, one=rows.one * noise + 5.0)
+    found = rows._replace(one=rows.one * farther).extreme(np.ones(50), largest)
+    np.testing.assert_array_equal(found.row, 0)
+    nearer = rows._replace(one=rows.one * (2 - farther)).extreme(np.ones(50), largest)
+    np.testing.assert_array_equal(nearer.row, 2)
+
+
 def test_no_motion_has_no_bound() -> None:
     # The squeeze alone, 0.05 N at a lever of 50 m, takes more torque than there is.
     toy = Toy(constant(1.0, 50.0))

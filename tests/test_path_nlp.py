@@ -143,6 +143,20 @@ def test_constraints_are_the_limits(
         assert late == pytest.approx(0.5 - motion.duration, rel=0.02)
 
 
+def test_a_slow_start_is_within_bounds_on_any_grid(curves: tuple[Curve, ...]) -> None:
+    """However near to rest the first nodes are: along it b = 2 a s grows from nothing."""
+    for elements in (ELEMENTS, 5 * ELEMENTS):
+        fine = prepare(curves[0], EPSILON, Mesh().make_grid(curves[0], elements), 1)
+        intervals, s = elements * (DEGREE + 1) - 1, fine.grid.s
+        nlp = build_path_nlp(SHAPE, intervals, Objective.MARGIN)
+        units = UNITS._replace(length=s[-1])
+        slow = 1e-8 * units.profile[1] * np.ones_like(s)
+        b = 2 * slow * np.minimum(s, s[-1] - s)
+        rest = Profile(np.where(s < s[-1] / 2, slow, -slow), b, 0 * s)
+        bounds = make_bounds(nlp, fine, units, Tightening.none(fine, 1.0))
+        assert (pack(nlp, rest, units, 0.0) >= bounds["lbx"]).all()
+
+
 def test_elastic_constraints_give_way(data: PhaseData, profile: Profile) -> None:
     nlp = build_path_nlp(SHAPE, INTERVALS, Objective.ELASTIC)
     short = np.random.default_rng(4).uniform(0, 1, (len(data.grid.s), 6))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from plane import measure_slip, place_corners, unbalance
-from tipping import tip
+from tipping import box, tip
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, SolverError
 from wholearm.contacts.formation import Formation
@@ -22,7 +22,7 @@ from wholearm.results.trajectory import Samples
 from wholearm.scene.model import Friction, Scene
 
 EPSILON = 0.05
-LIMIT = 2.0
+LIMIT = float(box().scene.torque_limit.max())
 ANY = -1.0
 """Least minor that cones are looked at with, unique or not."""
 OBJECTIVES = ["time", "effort", "margin"]

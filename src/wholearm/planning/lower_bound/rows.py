@@ -20,6 +20,9 @@ from ...mechanics.sides import SideTerms
 
 GIVE = 2.5e-7
 """By how much limits give way, over what is much for each: a plan may miss as much of them."""
+TIED = 1e-9
+"""Difference of two bounds below which they are one, over the largest of their terms: where a limit
+has no squeeze, all its pairs say the same but for rounding."""
 
 
 class Extreme(NamedTuple):
@@ -52,13 +55,14 @@ class Rows(NamedTuple):
         return np.asarray(self.b * b + self.v * np.sqrt(b) + self.one)
 
     def extreme(self, b: Array, largest: bool) -> Extreme:
-        """The largest or least a at n places for some b, shape (n,)."""
+        """The largest or least a at n places for some b, shape (n,): of tied rows by the first."""
+        sign = -1.0 if largest else 1.0
         with np.errstate(divide="ignore", invalid="ignore"):
             bounds = -self.rest(b) / self.a
-            if largest:
-                row = np.where(self.a < 0, bounds, np.inf).argmin(axis=1)
-            else:
-                row = np.where(self.a > 0, bounds, -np.inf).argmax(axis=1)
+            slack = TIED * (np.abs(self.one / self.a) + np.abs(bounds))
+            lead = np.where(sign * self.a > 0, sign * bounds, -np.inf)
+            reach = np.where(sign * self.a > 0, lead + slack, -np.inf)
+            row = (reach >= lead.max(axis=1, keepdims=True)).argmax(axis=1)
             k = np.arange(len(b))
             slope = -(self.b[k, row] + self.v[k, row] / (2 * np.sqrt(b))) / self.a[k, row]
         return Extreme(bounds[k, row], slope, row)

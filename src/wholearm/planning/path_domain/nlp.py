@@ -216,7 +216,9 @@ def make_bounds(
     n, node = len(data.grid.s), nlp.columns.node
     low, high = np.full((n, node.count), -np.inf), np.full((n, node.count), np.inf)
     b_max = data.largest_b(data.nodes, relaxation.parameter if relaxation else None)
-    low[:, node["b"]] = LEAST_B
+    # Next to rest b goes with the way: of the least s'' it is twice as much.
+    s, length = data.grid.s, data.grid.s[-1]
+    low[:, 0] = LEAST_B * np.minimum(s, length - s) / length
     high[:, 0] = np.maximum(b_max * speed_share / units.profile[0], 2 * LEAST_B)
     # From rest and to rest, with no way back.
     low[0, node["a"]], high[-1, node["a"]] = LEAST_B, -LEAST_B

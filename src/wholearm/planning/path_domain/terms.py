@@ -32,7 +32,8 @@ CHAINED = (Objective.MARGIN, Objective.RELAX)
 SOFT = (Objective.ELASTIC, Objective.RELAX)
 """Objectives for which limits give way, so that each side of a limit has a row of its own."""
 LEAST_B = 1e-8
-"""Least b away from rest, in units of the typical one; keeps the square root differentiable."""
+"""Least s'' at rest, in units of the typical one, and least b far away from it; next to rest b goes
+with the way. Keeps the square root differentiable."""
 _CALM = 1e-6
 """Weight of the squeeze against the objective: picks one among equally good ones."""
 _ROUGH = 0.1
