@@ -72,11 +72,11 @@ def test_two_halves_are_one_whole() -> None:
 def test_rows_that_say_the_same_are_told_apart_by_their_order(largest: bool) -> None:
     """Not by rounding: where a limit has no squeeze, all its pairs are one."""
     rng, sign = np.random.default_rng(0), 1.0 if largest else -1.0
-    rows = Rows(*(np.tile(rng.uniform(1, 2, (50, 1)), 3) for _ in range(4)), np.full(50, np.inf))
-    noise = 1 + 1e-14 * rng.uniform(-1, 1, rows.one.shape)
+    a, b, v, one = (np.tile(rng.uniform(1, 2, (50, 1)), 3) for _ in range(4))
+    noise = 1 + 1e-14 * rng.uniform(-1, 1, one.shape)
     # The last one is farther away by a millionth.
     farther = np.array([1.0, 1.0, 1.0 + 1e-6])
-    rows = rows._replace(a=-sign * rows.a, b=-rows.b, one=rows.one * noise + 5.0)
+    rows = Rows(-sign * a, -b, v, one * noise + 5.0, np.full(50, np.inf))
     found = rows._replace(one=rows.one * farther).extreme(np.ones(50), largest)
     np.testing.assert_array_equal(found.row, 0)
     nearer = rows._replace(one=rows.one * (2 - farther)).extreme(np.ones(50), largest)
