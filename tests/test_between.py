@@ -204,10 +204,10 @@ def test_tightening_that_creeps_gives_way_to_finer_intervals(
     """Where limits are missed, and nowhere else."""
     loose = solve_at_points()
     search = Creeping(**vars(Search.of(landing(), PlanOptions(time_intervals=6))))
-    monkeypatch.setattr(enforcing, "_list_misses", search.miss)
+    monkeypatch.setattr(enforcing, "list_misses", search.miss)
     for name in ("price_misses", "list_gains"):
         monkeypatch.setattr(enforcing, name, lambda *_: [np.zeros(1)])
-    monkeypatch.setattr(enforcing, "_choose_halvings", lambda *_: [])
+    monkeypatch.setattr(enforcing, "REFINEMENTS", 0)
     held = enforce_between(search, loose)
     assert held.success, held.status
     first, *others = zip(loose.stages, held.stages, strict=True)

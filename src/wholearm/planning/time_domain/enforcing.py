@@ -65,7 +65,7 @@ def enforce_between(search: Search, solution: Solution) -> Solution:
                 return solution
             raised = [Raised.none(stage) for stage in solution.stages]
             continue
-        misses = _list_misses(search, solution, checks)
+        misses = list_misses(search, solution, checks)
         worst = max(miss.worst for miss in misses)
         if sum(price.sum() for price in price_misses(solution, misses)) > _HOPELESS:
             return solution._replace(status=DEARER, success=False)
@@ -113,11 +113,11 @@ def is_hopeless(search: Search, solution: Solution) -> bool:
     """Whether limits are missed between points by so much that finer intervals are of no use."""
     motions = make_motions(solution.stages, search.scheme)
     checks = [check_between(*pair) for pair in zip(solution.stages, motions, strict=True)]
-    prices = price_misses(solution, _list_misses(search, solution, checks))
+    prices = price_misses(solution, list_misses(search, solution, checks))
     return bool(sum(price.sum() for price in prices) > _HOPELESS)
 
 
-def _list_misses(search: Search, solution: Solution, checks: Sequence[CheckPlaces]) -> list[Limits]:
+def list_misses(search: Search, solution: Solution, checks: Sequence[CheckPlaces]) -> list[Limits]:
     """What each stage misses between its points."""
     return [
         find_misses(stage, check, search.problem.epsilon, solution.margin)
