@@ -173,7 +173,7 @@ def test_without_friction_nothing_holds_where_no_contact_stops_the_motion() -> N
     problem = problem_of(HEPTAGON).with_(friction=0.0, dry=0.0)
     formation = problem.phases[0].formation
     place = Standstill(problem.start, formation, None, formation)
-    assert find_hold(place, problem.epsilon, problem.gap) is None
+    assert find_hold(place, problem.epsilon, problem.gap, 0.01) is None
 
 
 def test_keys_are_checked_and_kept() -> None:

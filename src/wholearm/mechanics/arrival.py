@@ -37,6 +37,8 @@ AMPLE = 0.1
 """Margin that is ample: of a normal force, a torque or an acceleration, over the scene's."""
 DRIVE = 0.05
 """Least acceleration towards a contact that is still open, over the scene's."""
+SLOW = 0.2
+"""Least margin of torques that close a contact more slowly, over that of torques that only hold."""
 _CREEP = 0.02
 """Ample acceleration of what slides and turns where the directions of sliding are assumed, over the
 scene's."""
@@ -113,10 +115,11 @@ class Hold(NamedTuple):
     parts: tuple[str, ...] = ()
 
 
-def find_hold(place: Standstill, epsilon: float, gap: float) -> Hold | None:
+def find_hold(place: Standstill, epsilon: float, gap: float, time: float) -> Hold | None:
     """The firmest torques for a standstill, with the largest margin of what holds.
 
-    Where a contact is gained, they drive the formation on from `gap` before it, too, if any do.
+    Where a contact is gained, they drive the formation on from `gap` before it, too, if any do: as
+    fast as is sure, or else as much as it takes to close it in `time`, or less.
 
     Parameters
     ----------
@@ -125,6 +128,8 @@ def find_hold(place: Standstill, epsilon: float, gap: float) -> Hold | None:
         Least normal force.
     gap : float, [m]
         By how much the contact may be open.
+    time : float, [s]
+        For how long it is held.
 
     Returns
     -------
@@ -132,12 +137,18 @@ def find_hold(place: Standstill, epsilon: float, gap: float) -> Hold | None:
         None if no torques hold.
     """
     rest = _list_holding(place, epsilon)
-    opening = find_opening(place)
-    closing = None if opening is None else _find_closing(place, rest, opening, gap)
-    if closing is not None:
-        return closing
     best = maximise_margin(place.formation.scene, rest)
-    return None if best is None or best[1] < LEAST else Hold(*best)
+    if best is None or best[1] < LEAST:
+        return None
+    opening, firm = find_opening(place), Hold(*best)
+    if opening is None:
+        return firm
+    swift = 2 * gap / time**2
+    closing = _find_closing(place, rest, opening, gap)
+    slow = _find_closing(place, rest, opening, gap, swift) if closing is None else None
+    if slow is not None and slow.margin > SLOW * firm.margin:
+        return slow
+    return closing or firm
 
 
 def _list_holding(place: Standstill, epsilon: float) -> Array:
@@ -186,8 +197,14 @@ def find_opening(place: Standstill) -> Array | None:
     return np.asarray(free / root / rate)
 
 
-def _find_closing(place: Standstill, rest: Array, opening: Array, gap: float) -> Hold | None:
-    """The firmest torques that drive the formation on, `gap` before the contact is closed."""
+def _find_closing(
+    place: Standstill, rest: Array, opening: Array, gap: float, ample: float | None = None
+) -> Hold | None:
+    """The firmest torques that drive the formation on, `gap` before the contact is closed.
+
+    If it is said which acceleration towards the contact is `ample` [m/s^2], it may be less, and is
+    one more margin.
+    """
     assert place.gained is not None
     scene, z = place.formation.scene, place.z + gap * opening
     normal = Formation(scene, (place.gained,)).evaluate(z[None], np.zeros((1, 5))).A[0][0]
@@ -197,7 +214,10 @@ def _find_closing(place: Standstill, rest: Array, opening: Array, gap: float) ->
         if way.heading is not None and normal @ way.heading >= 0:
             continue
         closing, rows = -normal @ way.acceleration, np.vstack([rest, way.consistent])
-        found = maximise_margin(scene, rows, closing[None] - least)
+        if ample is None:
+            found = maximise_margin(scene, rows, closing[None] - least)
+        else:
+            found = maximise_margin(scene, np.vstack([rows, closing / ample]))
         if found is None or found[1] < max(LEAST, best.margin if best else 0.0):
             continue
         tau = found[0]

@@ -61,7 +61,7 @@ def _settle(
     if not is_slower(problem.scene, v, SLOW):
         return plan, None
     place = Standstill(z, phase.formation, phase.until.contact, list_touching(problem, phase))
-    hold = find_hold(place, problem.epsilon, problem.gap)
+    hold = find_hold(place, problem.epsilon, problem.gap, time)
     if hold is None:
         text = f"no torques hold {' '.join(place.touching.names)} at the end of phase"
         warning = f"{text} {phase.number} with c_n >= epsilon"
