@@ -228,7 +228,7 @@ def find_residual(problem: Problem, trajectory: Trajectory) -> Residual:
     worst = Residual(0.0, 1, "")
     for phase in problem.phases:
         # Where it is held at its end forces are not determined.
-        rows = (trajectory.phase == phase.index) & ~np.isnan(trajectory.c_n).all(axis=1)
+        rows = (trajectory.phase == phase.index) & ~trajectory.held
         formation, motion = phase.formation, trajectory.motions[phase.index]
         columns = [trajectory.contacts.index(name) for name in motion.contacts]
         contacts = {contact.name: contact for contact in formation.contacts}

@@ -142,7 +142,7 @@ def _trace(problem: Problem, phase: Phase, plan: Trajectory, reserve: float) -> 
     if not runs_on_curve(phase):
         text = "does not run along a curve; policies are for phases with one freedom"
         raise InputError(problem.source, f"phases[{phase.number}]", text)
-    own = np.flatnonzero(plan.phase == phase.index)
+    own = np.flatnonzero((plan.phase == phase.index) & ~plan.held)
     curve = trace_phase(phase, plan.z[own[0]], problem.phases[phase.index + 1 :])
     places, *values = _follow(curve, plan, own)
     s = _place_nodes(curve)

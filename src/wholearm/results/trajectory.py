@@ -111,6 +111,11 @@ class Trajectory:
         return np.append(self.t[first], self.t[-1])
 
     @property
+    def held(self) -> NDArray[np.bool_]:
+        """Where everything waits at rest, and no forces are known, shape (n,)."""
+        return np.asarray(np.isnan(self.c_n).all(axis=1))
+
+    @property
     def rolling(self) -> NDArray[np.bool_]:
         """Which contacts roll, shape (n, m), as `meta` names them by phases and modes."""
         mask = np.zeros(self.c_t.shape, dtype=bool)
