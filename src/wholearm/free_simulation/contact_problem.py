@@ -234,31 +234,35 @@ def try_modes(problem: ContactProblem, choice: Sequence[int]) -> Answer | None:
 
 def _try(p: ContactProblem, choices: NDArray[np.int64]) -> list[Answer]:
     """Solve with each row's modes, and return what is consistent, each motion once."""
-    scaled = s_n, s_t, K, q = p.scaled
-    k, s = len(s_n), len(s_t)
+    s_n, s_t, K, q = p.scaled
+    k, s, held = len(s_n), len(s_t), np.flatnonzero(p.owner >= 0)
+    modes = np.empty((len(choices), s), dtype=int)
+    modes[:, held], modes[:, p.owner < 0] = choices[:, p.owner[held]], choices[:, k:]
+    ways = np.where(modes == FORTH, 1.0, np.where(modes == BACK, -1.0, 0.0))
+    share, bound = np.zeros(s), p.bound / s_t
+    share[held] = p.mu[held] * s_n[p.owner[held]] / s_t[held]
+    # A contact that slides brings its friction with it, what turns has a given one.
     matrices = np.broadcast_to(K, (len(choices), k + s, k + s)).copy()
-    right = np.broadcast_to(-q, (len(choices), k + s)).copy()
-    unit = np.eye(k + s)
-    for i in range(k):
-        apart = choices[:, i] == APART
-        matrices[apart, i], right[apart, i] = unit[i], 0.0
-    column = k
-    for j, own in enumerate(p.owner):
-        row, unit_row = k + j, unit[k + j]
-        mode = choices[:, own] if own >= 0 else choices[:, column]
-        column += own < 0
-        matrices[mode == APART, row], right[mode == APART, row] = unit_row, 0.0
-        for which, way in ((FORTH, 1.0), (BACK, -1.0)):
-            slides = unit_row.copy()
-            if own >= 0:
-                slides[own] = way * p.mu[j] * s_n[own] / s_t[j]
-            matrices[mode == which, row] = slides
-            right[mode == which, row] = -way * p.bound[j] / s_t[j]
-    sound = np.abs(np.linalg.det(matrices)) > SINGULAR
-    if not sound.any():
-        return []
-    forces = np.linalg.solve(matrices[sound], right[sound][:, :, None])[:, :, 0]
-    return _pick(p, forces, scaled, float(np.abs(q).max(initial=0.0)) or 1.0)
+    for j in held.tolist():
+        matrices[:, :, p.owner[j]] -= (share[j] * ways[:, j])[:, None] * K[:, k + j]
+    right = (ways * bound) @ K[:, k:].T - q
+    forces = np.zeros((len(choices), k + s))
+    active = np.hstack([choices[:, :k] != APART, modes == STICKS])
+    counts = active.sum(axis=1)
+    # More conditions than coordinates are no conditions of their own.
+    sound = counts <= len(p.lift)
+    for count in range(1, int(counts[sound].max(initial=0)) + 1):
+        rows = np.flatnonzero(counts == count)
+        at = np.nonzero(active[rows])[1].reshape(len(rows), count)
+        own = matrices[rows[:, None, None], at[:, :, None], at[:, None, :]]
+        fine = np.abs(np.linalg.det(own)) > SINGULAR
+        sound[rows[~fine]] = False
+        rows, at = rows[fine], at[fine]
+        known = np.linalg.solve(own[fine], right[rows[:, None], at][:, :, None])[:, :, 0]
+        forces[rows[:, None], at] = known
+    forces[:, k:] -= ways * bound
+    forces[:, k + held] -= ways[:, held] * share[held] * forces[:, p.owner[held]]
+    return _pick(p, forces[sound], p.scaled, float(np.abs(q).max(initial=0.0)) or 1.0)
 
 
 def _pick(
