@@ -210,6 +210,13 @@ def read(problem: ContactProblem, c_n: Array, f: Array, residual: float = 0.0) -
     return Answer(c_n, f, p.b_n + p.A @ change, r_t, shares, way, change, residual)
 
 
+def is_clear(problem: ContactProblem, answer: Answer, least: float) -> bool:
+    """Whether each contact presses or parts by more than a share of the largest rate."""
+    s_n, _, _, q = problem.scaled
+    most = least * float(np.abs(q).max(initial=0.0))
+    return bool((np.maximum(answer.c_n / s_n, answer.r_n * s_n) > most).all())
+
+
 def list_answers(problem: ContactProblem) -> list[Answer] | None:
     """Every solution with other rates than the others; None where that is too much to look through.
 

@@ -21,6 +21,7 @@ from .contact_problem import (
     STICKS,
     Answer,
     ContactProblem,
+    is_clear,
     list_answers,
     solve,
     try_modes,
@@ -30,6 +31,8 @@ from .stepper import Modes
 from .system import Rows
 from .telling import tell_ambiguity, tell_changes
 
+CLEAR = 1e-3
+"""Forces and rates, relative to the largest, that a moment does not make zero: it is `AHEAD`."""
 DEPENDENT = 1e-7
 """Share of a row that others leave, below which it is no constraint of its own."""
 ROUNDED = 1e-15
@@ -147,15 +150,18 @@ def decide(run: Run, found: Closed | None = None) -> bool | None:
     system, lift = run.system, 1 / run.system.mass
     pattern = Pattern(run, _end_chatter(run, found or find_closed(run)))
     later = AHEAD * system.scales.time
-    free = lift * system.push(run.v, run.tau(run.t), pattern.sigma)
-    first = _answer(run, pattern.pose(free, pattern.rows), pattern.recall(run.modes))
+    coming = free = lift * system.push(run.v, run.tau(run.t), pattern.sigma)
+    problem, rows = pattern.pose(free, pattern.rows), pattern.rows
+    answer = first = _answer(run, problem, pattern.recall(run.modes))
     if first is None:
         return None
     acceleration = free + first.change
-    v = run.v + later * acceleration
-    rows = system.evaluate(run.z + later * (run.v + v) / 2, v, pattern.closed)
-    coming = lift * system.push(v, run.tau(run.t + later), pattern.sigma)
-    answer = _choose(run, pattern, pattern.pose(coming, rows), coming)
+    run.unique = problem.is_unique
+    if not run.unique or not is_clear(problem, first, CLEAR):
+        v = run.v + later * acceleration
+        rows = system.evaluate(run.z + later * (run.v + v) / 2, v, pattern.closed)
+        coming = lift * system.push(v, run.tau(run.t + later), pattern.sigma)
+        answer = _choose(run, pattern, pattern.pose(coming, rows), coming)
     if answer is None:
         return None
     # What rests leaves its last modes by rounding, before it takes others in which it rests.
@@ -213,6 +219,11 @@ def _make_modes(run: Run, pattern: Pattern, answer: Answer, rows: Rows) -> Modes
     still = SAME * max(float(np.abs(answer.r_n).max(initial=0.0)), system.scales.acceleration)
     still *= 1e-3
     presses = answer.c_n > 0
+    if run.unique and (presses | (answer.r_n > still)).all():
+        # What presses is independent then, and nothing stands.
+        own = np.flatnonzero(presses).tolist()
+        slides, turns = tuple(pattern.Xi[own].tolist()), tuple(pattern.sigma.tolist())
+        return Modes(tuple(closed[k] for k in own), (), (), slides, turns)
     order = sorted(range(len(closed)), key=lambda k: -answer.c_n[k])
     root = np.sqrt(system.mass)
     basis: list[Array] = []

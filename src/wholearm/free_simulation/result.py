@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from itertools import groupby
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from ..common.errors import InputError
 from ..contacts.elemental import parse_contact
 from ..problem.definition import Problem
 from ..simulation.events import Energies, EventKind, Outcome, OutcomeKind, Simulation
-from .state import Run
+from .state import Record, Run
 
 
 class Stretch(NamedTuple):
@@ -87,17 +88,23 @@ def collect(run: Run, problem: Problem, starts: Sequence[float]) -> FreeSimulati
     rows, n, names = run.records, run.system.n, run.system.names
     y, t = np.array([row.y for row in rows]), np.array([row.t for row in rows])
     planned = [contact.name for contact in problem.contacts]
-    used = dict.fromkeys(names[pair] for row in rows for pair in row.kept)
+    used = dict.fromkeys(
+        names[pair] for kept in dict.fromkeys(row.kept for row in rows) for pair in kept
+    )
     contacts = (
         *planned,
         *(name for name in used if name not in planned and _is_named(name, problem)),
     )
     columns = {name: column for column, name in enumerate(contacts)}
     forces = np.full((2, len(rows), len(contacts)), np.nan)
-    for index, row in enumerate(rows):
-        for pair, c_n, c_t in zip(row.kept, row.c_n, row.c_t, strict=True):
-            if names[pair] in columns:
-                forces[:, index, columns[names[pair]]] = c_n, c_t
+    groups = [list(group) for _, group in groupby(rows, lambda row: row.kept)]
+    first = 0
+    for group in groups:
+        own = [k for k, pair in enumerate(group[0].kept) if names[pair] in columns]
+        at = [columns[names[group[0].kept[k]]] for k in own]
+        known = np.array([(row.c_n, row.c_t) for row in group])
+        forces[:, first : first + len(group), at] = known[:, :, own].transpose(1, 0, 2)
+        first += len(group)
     given_up = next((e for e in run.events if e.kind is EventKind.GIVEN_UP), None)
     outcome = Outcome(OutcomeKind.ENDED, f"the simulation ends at t = {run.t:.5g} s")
     if given_up is not None:
@@ -122,7 +129,7 @@ def collect(run: Run, problem: Problem, starts: Sequence[float]) -> FreeSimulati
             event._replace(phase=max(int(owner), 0))
             for event, owner in zip(run.events, owners, strict=True)
         ),
-        stretches=_list_stretches(run),
+        stretches=_list_stretches(groups, names),
         energies=Energies(stored, y[:, 10], y[:, 11], y[:, 12], y[:, 13], impact),
         outcome=outcome,
         missed_by=math.nan,
@@ -148,18 +155,18 @@ def _is_named(name: str, problem: Problem) -> bool:
     return True
 
 
-def _list_stretches(run: Run) -> tuple[Stretch, ...]:
-    """When each pair pressed, without a pause."""
+def _list_stretches(
+    groups: Sequence[Sequence[Record]], names: Sequence[str]
+) -> tuple[Stretch, ...]:
+    """When each pair pressed, without a pause; each group of records has the same pairs."""
     found: list[Stretch] = []
-    names, rows = run.system.names, run.records
-    for pair in dict.fromkeys(pair for row in rows for pair in row.kept):
-        here = np.array([pair in row.kept for row in rows])
-        edges = np.flatnonzero(np.diff(here, prepend=False, append=False))
-        for first, after in edges.reshape(-1, 2):
-            own = rows[first:after]
-            c_n = np.array([row.c_n[row.kept.index(pair)] for row in own])
-            known = np.flatnonzero(c_n == c_n)
-            at = int(known[c_n[known].argmin()]) if len(known) else 0
-            least: Any = float(c_n[at])
-            found.append(Stretch(names[pair], own[0].t, own[-1].t, least, own[at].t))
+    for pair in dict.fromkeys(pair for group in groups for pair in group[0].kept):
+        for presses, own in groupby(groups, lambda group: pair in group[0].kept):  # noqa: B023
+            if presses:
+                rows = [row for group in own for row in group]
+                c_n = np.array([row.c_n[row.kept.index(pair)] for row in rows])
+                known = np.flatnonzero(c_n == c_n)
+                at = int(known[c_n[known].argmin()]) if len(known) else 0
+                ends = rows[0].t, rows[-1].t
+                found.append(Stretch(names[pair], *ends, float(c_n[at]), rows[at].t))
     return tuple(sorted(found, key=lambda stretch: (stretch.start, stretch.contact)))
