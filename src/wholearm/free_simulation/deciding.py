@@ -272,8 +272,11 @@ def _make_modes(run: Run, pattern: Pattern, answer: Answer, rows: Rows) -> Modes
 def _snap(run: Run, pattern: Pattern) -> None:
     """Take away what rounding leaves of speeds that are zero."""
     kept = [k for k, pair in enumerate(pattern.closed) if pair in run.modes.kept]
-    rows = [pattern.rows.A[kept], pattern.rows.A_t[pattern.standing]]
-    _settle(run, np.vstack([*rows, np.eye(run.system.n)[pattern.joints]]))
+    rows = pattern.rows.A[kept]
+    if len(pattern.standing) or len(pattern.joints):
+        joints = np.eye(run.system.n)[pattern.joints]
+        rows = np.vstack([rows, pattern.rows.A_t[pattern.standing], joints])
+    _settle(run, rows)
 
 
 def _end_chatter(run: Run, found: Closed) -> Closed:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from operator import mul
 from typing import NamedTuple
 
 import numpy as np
@@ -126,8 +127,9 @@ class _Motion:
         run, s = self.run, self.s
         inputs, outputs, at, to = s.inputs, s.outputs, s.at, s.to
         n, remaining = run.system.n, run.stop - run.t
-        speed = float((np.abs(start.out[n : 2 * n]) * self.per_unit).max())
-        push = float((np.abs(start.out[to.acceleration]) * self.per_unit).max())
+        per_unit, out = self.per_unit.tolist(), start.out
+        speed = max(map(abs, map(mul, out[n : 2 * n].tolist(), per_unit)))
+        push = max(map(abs, map(mul, out[to.acceleration].tolist(), per_unit)))
         reach = 2 * REACH / (speed + math.sqrt(speed**2 + 2 * push * REACH) + 1e-300)
         least = SHORTEST * max(run.system.scales.time, abs(run.t))
         while True:

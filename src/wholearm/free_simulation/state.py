@@ -27,7 +27,7 @@ STANDING = 1e-9
 CHATTER = 1e-6
 """Speed of impacts below which they count as the last one, relative to the scene's: what is closed
 and parts more slowly is pressed together again before it is apart by more than rounding."""
-COARSE = 100.0
+COARSE = 1e3
 """The same over the tolerance, where that is coarser than impacts need."""
 BURST = 3e-4
 """Time, relative to the scene's, in which `MANY` impacts raise `CHATTER` tenfold, and twice as many
@@ -58,6 +58,12 @@ class Record(NamedTuple):
     c_n: Array
     c_t: Array
     impact: float
+
+
+def _find_steps(before: Array, after: Array, unit: float) -> NDArray[np.bool_]:
+    """Whether torques step between two pieces, for n pairs of pieces, shape (n, 2, d + 1) each."""
+    jumps = after @ (-1.0) ** np.arange(after.shape[2]) - before.sum(axis=2)
+    return np.asarray(np.abs(jumps).max(axis=1) > TORQUE_STEP * unit)
 
 
 class Run:
@@ -105,6 +111,8 @@ class Run:
         self.records: list[Record] = []
         self.events: list[Event] = []
         self.watches: dict[Modes, Any] = {}
+        known = self.torque.coefficients
+        self._steps = _find_steps(known[:-1], known[1:], system.scales.torque).tolist()
         self._begin_piece()
 
     @property
@@ -167,9 +175,10 @@ class Run:
 
     def torque_steps(self) -> bool:
         """Whether the torques step at the start of the present piece."""
-        before, after = self.torque.coefficients[self.piece - 1 : self.piece + 1]
-        jump = after[:, ::2].sum(axis=1) - after[:, 1::2].sum(axis=1) - before.sum(axis=1)
-        return bool(np.abs(jump).max() > TORQUE_STEP * self.system.scales.torque)
+        if self.feedback is not None:
+            before, after = self.torque.coefficients[self.piece - 1 : self.piece + 1]
+            return bool(_find_steps(before[None], after[None], self.system.scales.torque)[0])
+        return bool(self._steps[self.piece - 1])
 
     def face(self, z: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Gaps of all pairs at a state, and which of them face each other, shape (N,) each."""
