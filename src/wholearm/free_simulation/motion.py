@@ -54,6 +54,15 @@ class View(NamedTuple):
     ranges: Array
 
 
+class Closing(NamedTuple):
+    """A pair whose gap falls below a level [m] between two instants since a step's start [s]."""
+
+    pair: int
+    level: float
+    left: float
+    right: float
+
+
 def move(run: Run) -> None:
     """Integrate until something happens or the torques step or end."""
     _Motion(run).move()
@@ -188,9 +197,9 @@ class _Motion:
             if not len(low) and closing is None:
                 return found, end
             shares = first[low] / (first[low] - values[low])
-            if closing is not None and (not len(low) or closing[1] <= h * shares.min()):
-                root = self._find_contact(start, h, *closing)
-                passed.add(closing[0])
+            if closing is not None and (not len(low) or closing.left <= h * shares.min()):
+                root = self._find_contact(start, h, closing)
+                passed.add(closing.pair)
                 h, found = (h, found) if root is None else (root, True)
             else:
                 row = int(low[np.argmin(shares)])
@@ -211,11 +220,9 @@ class _Motion:
 
         return find_root(value, h, first, last, self.near, 1e-3 * floor)
 
-    def _find_contact(
-        self, start: View, h: float, pair: int, left: float, right: float
-    ) -> float | None:
+    def _find_contact(self, start: View, h: float, closing: Closing) -> float | None:
         """When a pair closes within a step; None if it does not, or where the two do not face."""
-        level = 0.0 if self.run.armed[pair] else float(self.level[pair])
+        pair, level, left, right = closing
         s, place, n = self.s, self.s.to.gaps.start + pair, self.run.system.n
 
         def look(step: float) -> tuple[float, float]:
@@ -241,25 +248,27 @@ class _Motion:
         v = out[n : 2 * n]
         return float(self.run.system.evaluate(out[:n], v, (pair,)).A[0] @ v)
 
-    def _find_closing(
-        self, start: View, end: View, passed: set[int]
-    ) -> tuple[int, float, float] | None:
+    def _find_closing(self, start: View, end: View, passed: set[int]) -> Closing | None:
         """The first pair that closes within the step, and a bracket of when."""
-        level = np.where(self.run.armed, 0.0, self.level)
-        below = end.gaps < level
-        below &= self.watched
+        armed = self.run.armed[None]
+        if len(end.times) > 1:
+            # What comes apart within the step may close again within it.
+            apart = end.gaps[:-1] > ARMED * self.unit
+            armed = np.logical_or.accumulate(np.vstack([armed, apart]), axis=0)
+        level = np.where(armed, 0.0, self.level)
+        below = (end.gaps < level) & self.watched
         if not below.any():
             return None
-        crosses = below & ~np.vstack([start.gaps[-1:] < level, below[:-1]])
+        crosses = below & (np.vstack([start.gaps[-1:], end.gaps[:-1]]) >= level)
         ranges = np.vstack([start.ranges[-1:], end.ranges])
         crosses &= np.maximum(ranges[1:], ranges[:-1]) > -1e-3 * self.unit
         crosses[:, list(passed)] = False
         rows, pairs = np.nonzero(crosses)
         if not len(rows):
             return None
-        row = int(rows[0])
+        row, pair = int(rows[0]), int(pairs[0])
         left = 0.0 if row == 0 else float(end.times[row - 1])
-        return int(pairs[0]), left, float(end.times[row])
+        return Closing(pair, float(level[row, pair]), left, float(end.times[row]))
 
     def _time_to_return(self, start: View) -> float:
         """Half the time in which the nearest pair that has just parted would close again [s]."""
