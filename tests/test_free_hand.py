@@ -13,7 +13,7 @@ import pytest
 
 from plane import finger_gap, make_scene
 from planned import change, plan
-from shipped import HEPTAGON
+from shipped import HEPTAGON, HEXAGON
 from wholearm.benchmark.free_runs import draw_run, judge_run, run_draw
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
@@ -23,6 +23,7 @@ from wholearm.contacts.formation import Formation
 from wholearm.free_simulation.hand import build_system, measure_gaps
 from wholearm.free_simulation.simulate import simulate_free, simulate_phases
 from wholearm.problem.definition import Problem
+from wholearm.problem.read import read_problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Trajectory, assemble
 from wholearm.scene.model import Finger, Friction, Scene
@@ -148,6 +149,20 @@ def test_random_runs_gain_no_energy_and_overlap_nowhere(seed: int) -> None:
     for finger in range(2):
         q, theta = run.z[::5, :3], run.z[::5, 3 + finger]
         assert finger_gap(scene, q, finger, theta).min() > -1e-7 * scene.scales.length
+
+
+def test_what_is_held_at_the_limit_of_friction_rests() -> None:
+    # Five contacts and two joints give way at once, so that forces are redundant, and none is left.
+    problem = read_problem(HEXAGON)
+    z = np.array([-0.055000127022182474, 0.0433, 0.0, 2.386803231534441, 2.0944078045648657])
+    tau = np.array([0.14447658672160446, 0.006945556702579097])
+    rng = np.random.default_rng(0)
+    for _ in range(6):
+        near = tau * (1 + 1e-15 * rng.normal(size=2))
+        profile = TorqueProfile(np.array([0.0, 0.002]), near.reshape(1, 2, 1))
+        run = simulate_free(problem, profile, start=z + 1e-16 * rng.normal(size=5))
+        assert run.outcome.kind is OutcomeKind.ENDED and run.residual < 1e-9
+        assert run.z[-1] == pytest.approx(z, abs=1e-12)
 
 
 @lru_cache

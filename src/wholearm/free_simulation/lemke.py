@@ -18,8 +18,11 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 
-PIVOT = 1e-11
-"""Least pivot, for rows of M of the size of one."""
+PIVOTS = (1e-8, 1e-11)
+"""Least pivot, for rows of M of the size of one: rounding of redundant rows is below the first, and
+what is not solved with it is tried with the other."""
+GOOD = 1e-10
+"""Residual with which an attempt is the last one, relative to the largest entry of q."""
 TIE = 1e-12
 """Difference of ratios that counts as none, relative to the largest entry of q."""
 TURNS = 60
@@ -54,6 +57,17 @@ def solve_lcp(M: Array, q: Array) -> Solution:
     size = float(np.abs(q).max(initial=0.0))
     if n == 0 or (q >= 0).all():
         return Solution(np.zeros(n), q.copy(), 0.0)
+    found = []
+    for least in PIVOTS:
+        found.append(_pivot(M, q, size, least))
+        if found[-1].residual <= GOOD * size:
+            break
+    return min(found, key=lambda one: one.residual)
+
+
+def _pivot(M: Array, q: Array, size: float, least: float) -> Solution:
+    """Go from basis to basis until the artificial unknown is out."""
+    n = len(q)
     # Columns: the right-hand side, w, z and the artificial z_0.
     table = np.empty((n, 2 * n + 2))
     table[:, 0], table[:, 1 : n + 1], table[:, n + 1 : -1] = q / size, np.eye(n), -M
@@ -71,7 +85,7 @@ def solve_lcp(M: Array, q: Array) -> Solution:
             return _read(M, q, basis)
         entering = leaving + n if leaving <= n else leaving - n
         column = table[:, entering]
-        rising = np.flatnonzero(column > PIVOT)
+        rising = np.flatnonzero(column > least)
         if not len(rising):
             break
         # The artificial unknown goes as soon as it may: its level is what is missing.
