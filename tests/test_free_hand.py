@@ -153,7 +153,7 @@ def test_random_runs_gain_no_energy_and_overlap_nowhere(seed: int) -> None:
 
 def test_what_is_held_at_the_limit_of_friction_rests() -> None:
     # Five contacts and two joints give way at once, so that forces are redundant, and none is left.
-    problem = read_problem(HEXAGON)
+    problem = read_problem(str(HEXAGON))
     z = np.array([-0.055000127022182474, 0.0433, 0.0, 2.386803231534441, 2.0944078045648657])
     tau = np.array([0.14447658672160446, 0.006945556702579097])
     rng = np.random.default_rng(0)
