@@ -120,7 +120,8 @@ def test_constraints_are_the_limits(
     _, g = evaluate(nlp, data, pack(nlp, profile, UNITS, margin))
     rng = np.random.default_rng(3)
     tight = rng.uniform(0, 0.1, (len(data.grid.s), 8))
-    tightening = Tightening(tight, np.ones(len(data.grid.s)), 0.5, tight)
+    count = len(data.grid.s)
+    tightening = Tightening(tight, np.ones(count), 0.5, tight, np.ones((count, 2, 2)))
     bounds = make_bounds(nlp, data, UNITS, tightening)
     assert len(bounds["lbx"]) == len(bounds["ubx"]) == nlp.solver.function.size1_in("x0")
     assert len(bounds["lbg"]) == len(bounds["ubg"]) == len(g)
@@ -193,11 +194,13 @@ def test_tightening_reaches_what_is_slack(data: PhaseData) -> None:
     assert none.limits.shape == (nodes, 8) and not none.limits.any()
     reach, limits = np.zeros((nodes, 8)), np.zeros((nodes, 8))
     reach[3, 2], limits[3, 2], limits[4, 2] = 0.5, 0.1, 0.2
-    tight = none.by(reach, limits, np.full(nodes, 0.1), 0.01)
+    slow = np.full((nodes, 2, 2), 0.2)
+    tight = none.by(reach, limits, np.full(nodes, 0.1), 0.01, slow)
     assert tight.limits[3, 2] == pytest.approx(0.6) and tight.limits[4, 2] == pytest.approx(0.2)
     assert np.count_nonzero(tight.limits) == 2 and tight.duration == pytest.approx(1.98)
     np.testing.assert_allclose(tight.speed_share, 0.9)
-    again = tight.by(reach, limits, np.zeros(nodes), 0.0)
+    np.testing.assert_allclose(tight.motors, 0.8)
+    again = tight.by(reach, limits, np.zeros(nodes), 0.0, slow)
     assert again.limits[3, 2] == pytest.approx(0.7) and again.limits[4, 2] == pytest.approx(0.4)
 
 

@@ -143,7 +143,10 @@ def test_another_shape_closes_the_fingers_anew(heptagon: Problem) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"fricton": 0.2}, "fricton: unknown name; did you mean 'friction'? allowed are base1, "),
+        (
+            {"fricton": 0.2},
+            "fricton: unknown name; did you mean 'friction'? allowed are actuator_lag, ",
+        ),
         ({"friction": -1}, "friction.palm: -1 is not a number >= 0"),
         ({"mass": "a"}, "object.mass: 'a' is not a positive number"),
         ({"torque_limit": None}, "fingers.1.torque_limit: is missing"),

@@ -49,6 +49,8 @@ class Toy:
     limit: tuple[float, float] = (LIMIT, LIMIT)
     speed_limit: tuple[float, float] = (np.inf, np.inf)
     epsilon: float = 0.05
+    rate_limit: tuple[float, float] = (np.inf, np.inf)
+    lag: tuple[float, float] = (0.0, 0.0)
 
     @property
     def curve(self) -> Curve:
@@ -58,6 +60,9 @@ class Toy:
             scales=Scales(1.0, 2.0, 2.0),
             torque_limit=np.array(self.limit),
             speed_limit=np.array(self.speed_limit),
+            torque_rate_limit=np.array(self.rate_limit),
+            actuator_lag=np.array(self.lag),
+            has_slow_motors=bool(np.isfinite(self.rate_limit).any() or any(self.lag)),
         )
         segments = [
             Segment(start, stop, np.ones(1), np.full(2, float(index)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -128,3 +129,14 @@ class Planning:
         """Index of the block with the phase of a number, counted from 1."""
         ends = [block.phases[-1].number for block in self.blocks]
         return next(k for k, end in enumerate(ends) if number <= end)
+
+    def find_curve_before(self, phases: Sequence[Phase]) -> Curve | None:
+        """The curve that ends at rest where some phases begin, if there is one."""
+        known = [block for block in self.blocks if block.phases[-1].index + 1 == phases[0].index]
+        chain = known[0].chain if known else None
+        return chain.curves[-1] if chain else None
+
+    def find_curve_after(self, phases: Sequence[Phase]) -> Curve | None:
+        """The curve that begins at rest where some phases end, if that is known."""
+        index = phases[-1].index + 1
+        return self.curves[index] if index < len(self.curves) else None

@@ -31,9 +31,10 @@ from ..scene.model import Scene
 from ..solvers.statistics import charge
 from .block_plan import BEGUN, FINEST, PLAIN, BlockPlan, Planning
 from .durations import share_again, share_duration
+from .motors import require_quick_motors
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence
-from .path_domain.sequence_plan import plan_sequence
+from .path_domain.sequence_plan import plan_sequence, plan_slowly
 from .phase_plan import add_up
 from .splitting import leads_on, runs_along_curves, split_blocks
 from .stops import Plans
@@ -74,6 +75,8 @@ def plan_blocks(
     InputError, InfeasibleError, JammingError, SolverError
         If there is no plan.
     """
+    with name_source(problem.source):
+        require_quick_motors(problem, options)
     finer, none = [0] * len(split_blocks(problem)), list[float | None]([None] * len(problem.phases))
     planning = Planning(problem, curves, options, (), none, none)
     if options.goal is Objective.MARGIN:
@@ -266,7 +269,12 @@ def _plan_block(
         curves.append(known[phase.index] if traced else trace_phase(phase, z, later))
         z = curves[-1].end
     chain = make_sequence(block, curves)
-    for part in chain.split():
+    parts = chain.split()
+    if problem.scene.has_slow_motors:
+        beside = planning.find_curve_before(block), planning.find_curve_after(block)
+        longest = [add_up(part.phases, allowed) for part in parts]
+        return plan_slowly(parts, beside, problem.epsilon, options, longest), chain
+    for part in parts:
         with charge(part.phases[0].number):
             plans += plan_sequence(part, problem.epsilon, options, add_up(part.phases, allowed))
     return plans, chain

@@ -187,8 +187,9 @@ class Problem:
             `name`, `epsilon`, `gravity` and the other keys at the top of a problem file; `mass`,
             `inertia`, `vertices` of the object; `friction` of all parts, or `friction_palm`,
             `friction_finger1`, `friction_finger2`; `flush`, `x` of the start; `length`, `radius`,
-            `finger_inertia`, `viscous`, `dry`, `torque_limit`, `speed_limit` of both fingers, or of
-            one as in `torque_limit1`; `base1`, `base2`. None leaves out what is optional.
+            `finger_inertia`, `viscous`, `dry`, `torque_limit`, `speed_limit`, `torque_rate_limit`,
+            `actuator_lag` of both fingers, or of one as in `torque_limit1`; `base1`, `base2`. None
+            leaves out what is optional.
 
         Raises
         ------

@@ -205,9 +205,14 @@ def describe_scene(scene: Scene) -> dict[str, Any]:
     return values
 
 
-_DEFAULTS = {"name": "unnamed", "settle": 0.0, "radius": 0.0, "viscous": 0.0, "dry": 0.0} | {
-    field.name: field.default for field in fields(Scene)
-}
+_DEFAULTS = {
+    "name": "unnamed",
+    "settle": 0.0,
+    "radius": 0.0,
+    "viscous": 0.0,
+    "dry": 0.0,
+    "actuator_lag": 0.0,
+} | {field.name: field.default for field in fields(Scene)}
 
 
 def _agrees(table: Mapping[str, Any], key: str, value: object) -> bool:

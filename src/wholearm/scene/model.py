@@ -69,6 +69,10 @@ class Finger:
     torque_limit : float, [N m]
     speed_limit : float, optional, [rad/s]
         Infinite when left out.
+    torque_rate_limit : float, optional, [N m/s]
+        Largest rate at which the torque changes; infinite when left out, and then it may step.
+    actuator_lag : float, [s]
+        Time constant with which the torque follows its command.
     name : str
         Key of this finger in messages.
 
@@ -85,6 +89,8 @@ class Finger:
     dry: float = field(metadata={"unit": "torque"})
     torque_limit: float = field(metadata={"unit": "torque"})
     speed_limit: float = field(default=math.inf, metadata={"unit": "rate"})
+    torque_rate_limit: float = field(default=math.inf, metadata={"unit": "torque_rate"})
+    actuator_lag: float = field(default=0.0, metadata={"unit": "time"})
     name: str = "fingers"
 
     def __post_init__(self) -> None:
@@ -92,13 +98,13 @@ class Finger:
         for key in ("length", "inertia", "torque_limit"):
             value = require_number(getattr(self, key), f"{self.name}.{key}", positive=True)
             object.__setattr__(self, key, value)
-        for key in ("radius", "viscous", "dry"):
+        for key in ("radius", "viscous", "dry", "actuator_lag"):
             value = require_number(getattr(self, key), f"{self.name}.{key}", nonnegative=True)
             object.__setattr__(self, key, value)
-        if self.speed_limit != math.inf:
-            key = f"{self.name}.speed_limit"
-            value = require_number(self.speed_limit, key, positive=True)
-            object.__setattr__(self, "speed_limit", value)
+        for key in ("speed_limit", "torque_rate_limit"):
+            if getattr(self, key) != math.inf:
+                value = require_number(getattr(self, key), f"{self.name}.{key}", positive=True)
+                object.__setattr__(self, key, value)
 
 
 @dataclass(frozen=True)
@@ -156,6 +162,11 @@ class Scales(NamedTuple):
     def rate(self) -> float:
         """One over time [rad/s]."""
         return 1 / self.time
+
+    @property
+    def torque_rate(self) -> float:
+        """Torque over time [N m/s]."""
+        return self.torque / self.time
 
     @property
     def time(self) -> float:
@@ -282,3 +293,18 @@ class Scene:
     def speed_limit(self) -> Array:
         """Joint speed limits, shape (2,) [rad/s], infinite where there is none."""
         return np.array([finger.speed_limit for finger in self.fingers])
+
+    @property
+    def torque_rate_limit(self) -> Array:
+        """Limits of the torques' rates, shape (2,) [N m/s], infinite where there is none."""
+        return np.array([finger.torque_rate_limit for finger in self.fingers])
+
+    @property
+    def actuator_lag(self) -> Array:
+        """Time constants of the motors, shape (2,) [s]."""
+        return np.array([finger.actuator_lag for finger in self.fingers])
+
+    @property
+    def has_slow_motors(self) -> bool:
+        """Whether torques may not step."""
+        return bool(np.isfinite(self.torque_rate_limit).any() or self.actuator_lag.any())

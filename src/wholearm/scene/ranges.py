@@ -63,6 +63,10 @@ SETTLE = Range(1e-4, 1e3)
 """Time for which the end of a phase is held, over the scene's, unless it is zero."""
 SETTLE_GAP = Range(1e-6, 0.1)
 """Gap that is to close in it, over the scene's length."""
+TORQUE_RATE = Range(1e-4, 1e9)
+"""Limit of the torque's rate, over the torque limit in the scene's time."""
+LAG = Range(0.0, 1e2)
+"""Time constant of a motor, over the scene's time."""
 EPSILON = Range(0.0, 1e3)
 """Least normal force, over the weight or what the stronger finger can press with."""
 
@@ -147,3 +151,9 @@ def _check_friction(scene: Scene, finger: Finger) -> None:
     DRY.check(f"{finger.name}.dry", finger.dry, "N m", much, of)
     if finger.speed_limit < float("inf"):
         SPEED.check(f"{finger.name}.speed_limit", finger.speed_limit, "rad/s", 1 / time)
+    if finger.torque_rate_limit < float("inf"):
+        key, much = f"{finger.name}.torque_rate_limit", finger.torque_limit / time
+        TORQUE_RATE.check(
+            key, finger.torque_rate_limit, "N m/s", much, f"torque limits in {time:.3g} s"
+        )
+    LAG.check(f"{finger.name}.actuator_lag", finger.actuator_lag, "s", time, f"x {time:.3g} s")

@@ -37,6 +37,7 @@ from .margins import (
     list_contact_margins,
     list_slip_margins,
 )
+from .motors import describe_motors
 from .sureness import find_least_minor, find_wedged
 from .verdict import (
     DEPARTURE,
@@ -189,6 +190,12 @@ def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Rep
     for phase in problem.phases[: len(phases)]:
         rows = np.flatnonzero(simulation.phase == phase.index)
         warnings += describe_misses(phase, simulation, rows, seen.torque)
+    for time, text in describe_motors(problem, seen.torque):
+        number = sum(phase.start <= time for phase in phases)
+        if seen.plan is None:
+            warnings.append(text)
+        else:
+            failures.append(Failure(max(number, 1), text))
     if seen.plan is not None:
         failures += thin + describe_departures(problem, phases, allowance)
     else:

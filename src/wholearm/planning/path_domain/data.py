@@ -85,6 +85,8 @@ class PhaseData(NamedTuple):
         At the checks of every solid interval, interval by interval.
     spread : Spread or None
         What ranges make of the force limits, if there are any.
+    rate_limit : ndarray, shape (2,), [N m/s]
+        Of torques, infinite where they may step.
     """
 
     curve: Curve
@@ -96,6 +98,7 @@ class PhaseData(NamedTuple):
     sampling: Sampling
     knots: Places
     checks: Places
+    rate_limit: Array
     spread: Spread | None = None
 
     @property
@@ -203,11 +206,17 @@ class PhaseData(NamedTuple):
 
 
 def prepare(
-    curve: Curve, epsilon: float, grid: Grid, phase: int, spread: Spread | None = None
+    curve: Curve,
+    epsilon: float,
+    grid: Grid,
+    phase: int,
+    spread: Spread | None = None,
+    quickness: float = 1.0,
 ) -> PhaseData:
     """Evaluate a curve's forces at the nodes of a grid and between them.
 
-    With a `spread`, force limits are those for all ranges.
+    With a `spread`, force limits are those for all ranges. Rates of torques are limited to that
+    part of their limits which `quickness` is.
 
     Raises
     ------
@@ -258,7 +267,8 @@ def prepare(
         nodes = _widen(spread, nodes, grid.s, grid.segment)
         checks = _widen(spread, checks, inside, owners)
     kept = limits.without(SPEED), limits.only(SPEED)
-    return PhaseData(curve, epsilon, *kept, grid, nodes, sampling, knots, checks, spread)
+    rates = quickness * formation.scene.torque_rate_limit
+    return PhaseData(curve, epsilon, *kept, grid, nodes, sampling, knots, checks, rates, spread)
 
 
 def _widen(spread: Spread, places: Places, s: Array, segment: NDArray[np.int64]) -> Places:
@@ -294,6 +304,7 @@ def join(parts: Sequence[PhaseData]) -> PhaseData:
             chain((part.grid.s for part in parts), starts),
             chain((part.grid.segment for part in parts), segments),
             (parts[0].grid.rests[0], parts[-1].grid.rests[1]),
+            parts[0].grid.held,
         ),
         nodes=stack([part.nodes for part in parts]),
         knots=stack([part.knots for part in parts]),

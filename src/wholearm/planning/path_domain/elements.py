@@ -3,6 +3,7 @@
 An element has `DEGREE` + 1 nodes, the Lobatto points of a local variable y from 0 to 1. Inside a
 motion s is linear in y. Next to rest s is quadratic in it, measured from where the motion rests:
 there the speed, and with it viscous friction, goes with the root of the way, and is smooth in y.
+Where torques may not step the motion starts and ends without acceleration, and s is cubic in y.
 With b = s'^2 and b' = 2 s'' (dash: d/ds), b is a polynomial in y too.
 """
 
@@ -19,8 +20,12 @@ from ...common.arrays import Array
 
 DEGREE = 4
 """Degree of the polynomials."""
-INSIDE, FROM_REST, TO_REST = 0, 1, 2
-"""Kinds of elements: amid a motion, at its start and at its end."""
+INSIDE, FROM_REST, TO_REST, FROM_HOLD, TO_HOLD = 0, 1, 2, 3, 4
+"""Kinds of elements: amid a motion, at its start and at its end, and there without acceleration."""
+POWERS = np.array([1, 2, 2, 3, 3])
+"""Power of y that s goes with in each kind."""
+SIGNS = np.array([1.0, 1.0, -1.0, 1.0, -1.0])
+"""Whether y grows or falls with time in each kind."""
 
 
 class Basis(NamedTuple):
@@ -28,11 +33,11 @@ class Basis(NamedTuple):
 
     Attributes
     ----------
-    y : ndarray, shape (3, p + 1)
-        The nodes, from 0 to 1; for `TO_REST` from 1 to 0.
-    to_powers : ndarray, shape (3, p + 1, p + 1)
+    y : ndarray, shape (5, p + 1)
+        The nodes, from 0 to 1; for `TO_REST` and `TO_HOLD` from 1 to 0.
+    to_powers : ndarray, shape (5, p + 1, p + 1)
         Coefficients of the powers of y of a polynomial from its values at the nodes.
-    links : ndarray, shape (3, p, p + 1)
+    links : ndarray, shape (5, p, p + 1)
         By how much b rises from each node to the next, over the element's length, for s'' at the
         nodes.
     weights : ndarray, shape (p + 1,)
@@ -53,12 +58,13 @@ def find_basis(degree: int = DEGREE) -> Basis:
     """The basis of elements of a degree."""
     inner = legendre.legroots(legendre.legder([0.0] * degree + [1.0]))
     x = (np.concatenate([[-1.0], inner, [1.0]]) + 1) / 2
-    y = np.stack([x, x, 1 - x])
+    y = np.stack([x, x, 1 - x, x, 1 - x])
     powers = np.arange(degree + 1)
     to_powers = np.linalg.inv(y[..., None] ** powers)
     plain = 2 * np.diff(y[0][:, None] ** (powers + 1), axis=0) / (powers + 1)
-    rooted = 4 * np.diff(y[1:, :, None] ** (powers + 2), axis=1) / (powers + 2)
-    rises = np.stack([plain, rooted[0], -rooted[1]])
+    rooted = 4 * np.diff(y[1:3, :, None] ** (powers + 2), axis=1) / (powers + 2)
+    cubic = 6 * np.diff(y[3:, :, None] ** (powers + 3), axis=1) / (powers + 3)
+    rises = np.stack([plain, rooted[0], -rooted[1], cubic[0], -cubic[1]])
     weights = (1 / (powers + 1)) @ to_powers[0]
     modes = np.linalg.inv(legendre.legvander(2 * x - 1, degree))
     links = np.asarray(rises @ to_powers, dtype=float)
@@ -78,11 +84,14 @@ class Grid(NamedTuple):
         The segment of the curve that each node's forces belong to.
     rests : tuple of bool
         Whether the motion starts and ends at rest.
+    held : bool
+        Whether it does so without acceleration.
     """
 
     s: Array
     segment: NDArray[np.int64]
     rests: tuple[bool, bool] = (True, True)
+    held: bool = False
 
     @property
     def steps(self) -> Array:
@@ -104,8 +113,9 @@ class Grid(NamedTuple):
     def kinds(self) -> NDArray[np.int64]:
         """Kind of each element, shape (E,)."""
         kinds = np.full(len(self.s) // (DEGREE + 1), INSIDE)
-        kinds[0] = FROM_REST if self.rests[0] else INSIDE
-        kinds[-1] = TO_REST if self.rests[1] else kinds[-1]
+        start, stop = (FROM_HOLD, TO_HOLD) if self.held else (FROM_REST, TO_REST)
+        kinds[0] = start if self.rests[0] else INSIDE
+        kinds[-1] = stop if self.rests[1] else kinds[-1]
         return kinds
 
     @property
@@ -135,12 +145,14 @@ class Grid(NamedTuple):
         return np.cumsum(np.hstack([np.zeros_like(lengths), rises]).ravel())
 
 
-def lay_out(edges: Array, segment: NDArray[np.int64], rests: tuple[bool, bool]) -> Grid:
+def lay_out(
+    edges: Array, segment: NDArray[np.int64], rests: tuple[bool, bool], held: bool = False
+) -> Grid:
     """The grid of elements with these edges, shape (E, 2) [m], on segments of shape (E,)."""
-    grid = Grid(np.repeat(edges[:, 0], DEGREE + 1), np.repeat(segment, DEGREE + 1), rests)
+    grid = Grid(np.repeat(edges[:, 0], DEGREE + 1), np.repeat(segment, DEGREE + 1), rests, held)
     kinds = grid.kinds[:, None]
-    y = find_basis().y[grid.kinds]
-    share = np.where(kinds == INSIDE, y, np.where(kinds == FROM_REST, y**2, 1 - y**2))
+    way = find_basis().y[grid.kinds] ** POWERS[kinds]
+    share = np.where(SIGNS[kinds] > 0, way, 1 - way)
     s = edges[:, :1] + share * np.diff(edges)
     s[:, -1] = edges[:, 1]
     return grid._replace(s=s.ravel())
@@ -168,24 +180,44 @@ class Elements:
         self.grid = grid
         basis, kinds = find_basis(), grid.kinds
         self._y = basis.y[kinds].ravel()
-        self._rooted = kinds > 0
+        self._rooted, self._power = kinds > 0, POWERS[kinds]
         table = np.stack([profile.a, profile.squeeze], axis=-1)
         table = table.reshape(len(kinds), DEGREE + 1, 2)
         self._motion = basis.to_powers[kinds] @ table
         powers = np.arange(DEGREE + 1)[:, None]
         a = np.diff(grid.edges)[:, :, None] * self._motion[..., :1]
-        sign = np.where(kinds == TO_REST, -1.0, 1.0)[:, None, None]
+        sign = SIGNS[kinds][:, None, None]
         first = profile.b.reshape(-1, DEGREE + 1)[:, :1, None]
         plain = np.concatenate([first, 2 * a / (powers + 1)], axis=1)
         rooted = np.concatenate([4 * sign * a / (powers + 2), np.zeros_like(first)], axis=1)
+        # A constant part of s'' in y would be rounding.
+        later = 6 * sign * a[:, 1:] / (powers[:-1] + 4)
+        cubic = np.concatenate([later, np.zeros_like(a[:, :2])], axis=1)
+        rooted = np.where(self._power[:, None, None] == 3, cubic, rooted)
         self._b = np.where(self._rooted[:, None, None], rooted, plain)[..., 0]
+
+    @property
+    def local(self) -> Array:
+        """The local variable at the nodes, shape (N + 1,)."""
+        return np.asarray(self._y)
 
     def find_y(self, k: NDArray[np.int64], done: Array, left: Array) -> Array:
         """Local variable where a part of an interval is done and one is left, which add up to 1."""
-        rooted = self._rooted[k // (DEGREE + 1)]
+        power = self._power[k // (DEGREE + 1)]
         y, later = self._y[k], self._y[k + 1]
         squares = np.sqrt(np.maximum(left * y**2 + done * later**2, 0.0))
-        return np.where(rooted, squares, left * y + done * later)
+        found = np.where(power == 2, squares, left * y + done * later)
+        if self.grid.held:
+            found = np.where(power == 3, np.cbrt(left * y**3 + done * later**3), found)
+        return found
+
+    def find_cubic(self, k: NDArray[np.int64], w: Array) -> tuple[NDArray[np.bool_], Array, Array]:
+        """Which intervals k are in elements cubic in y, and y and its rise where w of it is done.
+
+        w is a part of the rise of y in each interval, not of the way.
+        """
+        y, later = self._y[k], self._y[k + 1]
+        return self._power[k // (DEGREE + 1)] == 3, y + w * (later - y), later - y
 
     def evaluate(self, k: NDArray[np.int64], y: Array) -> tuple[Profile, Array]:
         """Profile and speed [m/s] at places y of intervals k."""
@@ -200,6 +232,8 @@ class Elements:
         for power in reversed(range(DEGREE + 1)):
             b = b * y + self._b[element, power]
         speed = np.sqrt(np.maximum(b, 0.0)) * np.where(self._rooted[element], y, 1.0)
+        if self.grid.held:
+            speed = speed * np.where(self._power[element] == 3, y, 1.0)
         return Profile(a, speed**2, squeeze), speed
 
     def at(self, fractions: Array) -> Profile:

@@ -7,6 +7,7 @@ import numpy as np
 from ...common.arrays import Array
 from .data import PhaseData
 from .elements import Profile
+from .motor_data import exceeds_rates
 from .nlp import Units
 
 _SLOW = -12
@@ -29,9 +30,10 @@ def guess(data: PhaseData, time_weight: float = 0.0) -> tuple[Profile, Units]:
     fall = _fall(data)
 
     def possible(height: float) -> bool:
-        low, high = _squeeze_range(data, height)
-        b = _parabola(data, height)[1]
-        return bool(((low <= high) & (low < np.inf)).all() and (b <= b_max).all())
+        low, high = find_squeeze_range(data, height)
+        a, b = _parabola(data, height)
+        kept = bool(((low <= high) & (low < np.inf)).all() and (b <= b_max).all())
+        return kept and not exceeds_rates(data, Profile(a, b, _find_middle(data, low, high)))
 
     # Bisection over heights from 2^-12 to 2^8 times that of a fall over this length.
     low_power, high_power = float(_SLOW), 8.0
@@ -71,13 +73,17 @@ def _find_median(values: Array) -> float:
 
 
 def _parabola(data: PhaseData, height: float) -> tuple[Array, Array]:
-    """The a and b of a parabola in s of this height."""
+    """The a and b of a parabola in s of this height; its power 4/3 where a is to begin at zero."""
     length = data.grid.s[-1]
     x = data.grid.s / length
+    if data.grid.held:
+        arch = np.maximum(4 * x * (1 - x), 0.0)
+        slope = 8 / 3 * (1 - 2 * x) / length
+        return height * slope * np.cbrt(arch), height * arch * np.cbrt(arch)
     return height * 2 * (1 - 2 * x) / length, height * 4 * x * (1 - x)
 
 
-def _squeeze_range(data: PhaseData, height: float) -> tuple[Array, Array]:
+def find_squeeze_range(data: PhaseData, height: float) -> tuple[Array, Array]:
     """Least and largest squeeze that limits allow at each node."""
     a, b = _parabola(data, height)
     slack = data.slack(data.nodes, Profile(a, b, np.zeros_like(a)))
@@ -92,14 +98,21 @@ def _squeeze_range(data: PhaseData, height: float) -> tuple[Array, Array]:
     return low, high
 
 
+def _find_middle(data: PhaseData, low: Array, high: Array) -> Array:
+    """The squeeze amid its range, or none where that is empty or has no end."""
+    weight = data.curve.formation.scene.scales.force
+    open_ = np.isfinite(low + high) & (low <= high)
+    # A strong hand could press far harder than any motion needs.
+    high = np.minimum(high, low + _FIRM * np.maximum(weight, np.abs(low)))
+    return np.where(open_, (low + high) / 2, 0.0)
+
+
 def _guess_at(data: PhaseData, height: float, time_weight: float = 0.0) -> tuple[Profile, Units]:
-    low, high = _squeeze_range(data, height)
+    low, high = find_squeeze_range(data, height)
     weight = data.curve.formation.scene.scales.force
     open_ = np.isfinite(low + high) & (low <= high)
     press = float(np.abs(np.where(open_, (low + high) / 2, 0.0)).mean())
-    # A strong hand could press far harder than any motion needs.
-    high = np.minimum(high, low + _FIRM * np.maximum(weight, np.abs(low)))
-    middle = np.where(open_, (low + high) / 2, 0.0)
+    middle = _find_middle(data, low, high)
     length = float(data.grid.s[-1])
     duration = np.pi / 2 * length / np.sqrt(height)
     force = max(_LIGHT * weight, data.epsilon, float(np.abs(middle).mean()))

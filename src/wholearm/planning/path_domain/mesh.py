@@ -18,20 +18,27 @@ from ...geometry.curve import Curve
 from ..options import Objective
 from .data import PhaseData
 from .elements import Grid, Profile, lay_out
+from .motor_switches import find_motor_switches
 from .switches import Switch, find_switches
 
 START, SOFT = 10, 20
 """Elements of a phase to begin with, and where plans switch more softly, for least effort."""
 MOST = 80
 """Elements of a phase from which on they are not doubled."""
+SLOW_MOST = 40
+"""The same for slow motors, unless a high accuracy is asked for."""
 SHIFTED = 0.02
 """Relative loss of an end of an element that is so far from a switch, over the curve's length."""
 _ORDER = 6
 """Power of an element's length that its price falls with."""
 _APART = 1e-5
 """Least length of an element that switches lead to, over the curve's."""
+_CLOSE = 1e-10
+"""The same for slow motors: next to rest little of the way is passed while a torque changes."""
 _NEAR = 0.02
 """Distance at which a switch is the one that a break was for, over the curve's length."""
+_ENDS = 0.1
+"""Share of elements of the first and the last stretch where s is cubic in the first and last."""
 _CHEAP = 1e-3
 """Least price of a stretch that counts, over that of all."""
 
@@ -63,15 +70,22 @@ class Mesh(NamedTuple):
         ends = find_ends(curve, self.breaks)
         angles = np.arccos(1 - 2 * np.clip(ends / curve.length, 0.0, 1.0))
         weights = np.diff(angles) if self.weights is None else self.weights
+        held = curve.formation.scene.has_slow_motors
+        if held and len(weights) > 2:
+            weights = weights * np.array([_ENDS, *[1.0] * (len(weights) - 2), _ENDS])
         counts = _share_out(elements, weights)
         places = np.repeat(np.arange(len(counts)), counts)
         done = np.concatenate([np.arange(count) / count for count in counts])
         starts = angles[places] + done * np.diff(angles)[places]
         edges = curve.length * (1 - np.cos(starts)) / 2
         edges[done == 0] = ends[:-1]
+        if held and len(weights) > 2:
+            # After a cubic start the speed is a root of the way, which even lengths suit better.
+            for k in {0, len(counts) - 1}:
+                edges[places == k] = ends[k] + done[places == k] * (ends[k + 1] - ends[k])
         pairs = np.stack([edges, np.append(edges[1:], ends[-1])], axis=1)
         stops = [segment.stop for segment in curve.segments]
-        return lay_out(pairs, np.searchsorted(stops[:-1], pairs.mean(axis=1)), rests)
+        return lay_out(pairs, np.searchsorted(stops[:-1], pairs.mean(axis=1)), rests, held)
 
 
 def _share_out(elements: int, weights: Array) -> NDArray[np.int64]:
@@ -132,9 +146,11 @@ def adapt(
     """
     breaks, shift = before.breaks, 0.0
     if goal in (Objective.TIME, Objective.MARGIN):
-        switches = find_switches(part, profile, margin)
-        breaks, shift = _match(before.breaks, switches, part.curve)
-    if len(breaks) != len(before.breaks):
+        if part.grid.held:
+            breaks, shift = _renew(before.breaks, find_motor_switches(part, profile), part.curve)
+        else:
+            breaks, shift = _match(before.breaks, find_switches(part, profile, margin), part.curve)
+    if len(breaks) != len(before.breaks) or part.grid.held:
         return Better(Mesh(breaks), shift, float(prices.sum()))
     ends = find_ends(part.curve, before.breaks)
     middles = part.grid.edges.mean(axis=1)
@@ -168,3 +184,14 @@ def _match(known: Array, switches: Sequence[Switch], curve: Curve) -> tuple[Arra
         if np.abs(np.append(fixed, kept) - place).min() > least:
             kept.append(place)
     return np.array(kept), shift
+
+
+def _renew(known: Array, switches: Sequence[Switch], curve: Curve) -> tuple[Array, float]:
+    """Breaks at switches alone, and how far these are from what was known."""
+    fixed, kept, shift = find_ends(curve, np.zeros(0)), list[float](), 0.0
+    for place, jumps in switches:
+        if np.abs(np.append(fixed, kept) - place).min() > _CLOSE * curve.length:
+            kept.append(place)
+            far = float(np.abs(known - place).min(initial=np.inf)) / curve.length
+            shift = max(shift, min(far, _NEAR)) if jumps else shift
+    return np.array(sorted(kept)), shift

@@ -11,6 +11,7 @@ from ...common.arrays import Array
 from .data import PhaseData
 from .elements import Profile
 from .motion import PathMotion
+from .motor_data import find_hurry
 from .nlp import PathNLP, Tightening, Units
 
 MISS = 2.5e-7
@@ -18,6 +19,8 @@ MISS = 2.5e-7
 
 Over the scene's force for contact forces, relative for torques, the square of speeds and time.
 """
+HURRIED = 1e-4
+"""Largest relative miss of the torques' rates and of commands between nodes."""
 ROUNDS = 40
 """Most times that the NLP is solved for one phase."""
 OVER = 1.05
@@ -49,12 +52,16 @@ class PathSolution(NamedTuple):
 
 
 class Misses(NamedTuple):
-    """What limits miss between nodes: see `PhaseData.misses`; and the duration, relatively."""
+    """What limits miss between nodes: see `PhaseData.misses`; and the duration, relatively.
+
+    And motors, see `find_hurry`.
+    """
 
     short: Array
     speeding: Array
     spare: Array
     late: float
+    hurry: Array
 
     @staticmethod
     def of(
@@ -67,11 +74,13 @@ class Misses(NamedTuple):
         late = 0.0
         if duration:
             late = max(0.0, sum(motion.duration for motion in motions) / duration - 1)
-        return Misses(*data.misses(solution.profile, solution.margin), late)
+        hurry = find_hurry(data, solution.profile, motions)
+        return Misses(*data.misses(solution.profile, solution.margin), late, hurry)
 
     def find_worst(self, data: PhaseData) -> float:
         """The largest, over what is much."""
-        return float(max((self.short / data.spans).max(), self.speeding.max(), self.late))
+        hurried = self.hurry.max() * (MISS / HURRIED)
+        return float(max((self.short / data.spans).max(), self.speeding.max(), self.late, hurried))
 
     def tighten(
         self, data: PhaseData, tightening: Tightening, solution: PathSolution
@@ -80,7 +89,11 @@ class Misses(NamedTuple):
         reach = data.slack_at_neighbours(solution.profile, solution.margin, self.short)
         short, speeding = data.spread_to_nodes(self.short), data.spread_to_nodes(self.speeding)
         return tightening.by(
-            data.spread_to_nodes(reach), OVER * short, OVER * speeding, OVER * self.late
+            data.spread_to_nodes(reach),
+            OVER * short,
+            OVER * speeding,
+            OVER * self.late,
+            OVER * data.spread_to_nodes(self.hurry),
         )
 
     def find_spare(self, data: PhaseData) -> Array:
@@ -96,6 +109,9 @@ class Misses(NamedTuple):
         if (self.short / data.spans).max() <= MISS:
             over = max(self.speeding.max(), self.late)
             missed = f"the speed limit or the duration is still exceeded by {over:.2g} of it"
+            if over <= MISS:
+                over = self.hurry.max()
+                missed = f"the torque rate limit is still exceeded by {over:.2g} of it"
         return f"after {ROUNDS} solves {missed}; plan with more intervals"
 
 
@@ -103,7 +119,8 @@ def anticipate(data: PhaseData, start: PathSolution, tightening: Tightening) -> 
     """Tighten by what a start misses, but for speeds and what it alone misses."""
     short, speeding, spare = data.misses(start.profile, start.margin)
     short = np.where(short < _NEAR * data.spans, short, 0.0)
-    return Misses(short, 0 * speeding, spare, 0.0).tighten(data, tightening, start)
+    hurry = np.zeros((len(short), 2, 2))
+    return Misses(short, 0 * speeding, spare, 0.0, hurry).tighten(data, tightening, start)
 
 
 def price(
@@ -111,11 +128,12 @@ def price(
     data: PhaseData,
     units: Units,
     solution: PathSolution,
-    tightened: tuple[Array, Array],
+    tightened: tuple[Array, Array, Array],
 ) -> Array:
     """What tightening costs at each node, to first order, in the NLP's units, shape (n,).
 
-    That is multipliers times by how much limits, (n, n_sides), and b, (n,), are `tightened`.
+    That is multipliers times by how much limits, (n, n_sides), b, (n,), and motors, (n, 2, 2), are
+    `tightened`.
     """
     rows, signs, _ = data.limits.sides
     on_limits = solution.multipliers["lam_g0"][nlp.columns.g["limits"]].reshape(
@@ -125,4 +143,9 @@ def price(
     on_b = np.zeros(nlp.free.shape)
     on_b[nlp.free] = solution.multipliers["lam_x0"]
     on_b = np.maximum(on_b[:, 0], 0.0) * solution.profile.b / units.profile[0]
-    return np.asarray((on_sides * tightened[0]).sum(axis=1) + on_b * tightened[1])
+    found = (on_sides * tightened[0]).sum(axis=1) + on_b * tightened[1]
+    for kind, (name, joints) in enumerate(nlp.shape.motors._asdict().items()):
+        on_rows = solution.multipliers["lam_g0"][nlp.columns.g[name]]
+        on_rows = np.abs(on_rows).reshape(len(joints), len(data.grid.s)).T
+        found += (on_rows * tightened[2][:, kind, list(joints)]).sum(axis=1)
+    return np.asarray(found)

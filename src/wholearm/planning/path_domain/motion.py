@@ -18,7 +18,7 @@ from ...common.arrays import Array
 from ...geometry.curve import Curve
 from ...mechanics.dynamics import Directions, inverse, split_forces
 from ...results.trajectory import Samples
-from .elements import Elements, Grid, Profile
+from .elements import DEGREE, Elements, Grid, Profile
 
 _POINTS = 12
 """Gauss points for the time in an interval between nodes."""
@@ -90,6 +90,13 @@ class PathMotion:
         every = np.repeat(k, len(w))
         y = self.elements.find_y(every, done.ravel(), left.ravel())
         plain = v0 * (1 - w) + v1 * w
+        if self.grid.held:
+            cubic, ahead, rise = self.elements.find_cubic(every, np.tile(w, len(k)))
+            y = np.where(cubic, ahead, y)
+            length = np.diff(self.grid.edges)[every // (DEGREE + 1), 0]
+            mean = np.repeat(self.grid.steps[k] / np.maximum(v0 + v1, _TINY)[:, 0], len(w))
+            own = 1.5 * np.abs(rise) * length * ahead**2 / mean
+            plain = np.where(cubic.reshape(done.shape), own.reshape(done.shape), plain)
         speed = self.elements.evaluate(every, y)[1].reshape(done.shape)
         return np.asarray(plain / np.maximum(speed, np.maximum(plain / _STALLED, _TINY)))
 
@@ -114,8 +121,20 @@ class PathMotion:
         v0, v1 = (speed[:, None] for speed in self._ends)
         here = np.sqrt(v0**2 * (1 - fractions) + v1**2 * fractions)
         w = fractions * (v0 + v1) / np.maximum(v0 + here, _TINY)
+        w = self._find_cubic_share(fractions, w)
         powers = legendre.legvander(2 * w - 1, _POINTS)
         return np.asarray(np.einsum("nmp,np->nm", powers, self._clock))
+
+    def _find_cubic_share(self, fractions: Array, w: Array) -> Array:
+        """`w` at fractions of every interval, but the part of y's rise where s is cubic in y."""
+        if not self.grid.held:
+            return w
+        k, count = self.grid.nonempty, len(fractions)
+        every, done = np.repeat(k, count), np.tile(fractions, len(k))
+        cubic, start, rise = self.elements.find_cubic(every, np.zeros(len(every)))
+        here = self.elements.find_y(every, done, 1 - done)
+        share = np.clip((here - start) / rise, 0.0, 1.0)
+        return np.where(cubic, share, w.ravel()).reshape(w.shape)
 
     @property
     def duration(self) -> float:
@@ -142,7 +161,13 @@ class PathMotion:
             w = np.clip(w - late / rate, 0.0, 1.0)
         v0, v1 = (speed[n] for speed in self._ends)
         done, left = _share(v0, v1, w)
-        here, _ = self.elements.evaluate(k, self.elements.find_y(k, done, left))
+        y = self.elements.find_y(k, done, left)
+        if self.grid.held:
+            cubic, ahead, rise = self.elements.find_cubic(k, w)
+            start = ahead - w * rise
+            way = (ahead**3 - start**3) / ((start + rise) ** 3 - start**3)
+            done, y = np.where(cubic, way, done), np.where(cubic, ahead, y)
+        here, _ = self.elements.evaluate(k, y)
         s = self.grid.s[k] + done * self.grid.steps[k]
         return s, self.grid.segment[k], here
 

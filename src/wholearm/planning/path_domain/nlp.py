@@ -22,7 +22,7 @@ from ...solvers.ipopt import build_solver
 from ...solvers.statistics import SolverStatistics, book
 from ..options import Objective
 from .data import PhaseData
-from .elements import Grid, Profile
+from .elements import DEGREE, Grid, Profile
 from .sure_start import SureStart
 from .terms import CHAINED, LEAST_B, SOFT, LimitShape, NLPColumns, list_columns, write_terms
 
@@ -96,34 +96,40 @@ class Tightening(NamedTuple):
         Longest duration, if there is one.
     missed : ndarray, shape (N + 1, n_sides), [N, N m]
         The part of `limits` beyond what was slack anyway.
+    motors : ndarray, shape (N + 1, 2, 2)
+        Factors on the largest rates of torques, and on the largest commands.
     """
 
     limits: Array
     speed_share: Array
     duration: float | None
     missed: Array
+    motors: Array
 
     @staticmethod
     def none(data: PhaseData, duration: float | None) -> Tightening:
         """Limits as they are."""
         count = len(data.grid.s)
         limits = np.zeros((count, len(data.spans)))
-        return Tightening(limits, np.ones(count), duration, limits)
+        return Tightening(limits, np.ones(count), duration, limits, np.ones((count, 2, 2)))
 
     def ease(self, spare: Array) -> Tightening:
         """Tighten less, by what limits are from being missed about each node."""
         eased = np.minimum(self.missed, spare)
         return self._replace(limits=self.limits - eased, missed=self.missed - eased)
 
-    def by(self, reach: Array, limits: Array, speed_share: Array, late: float) -> Tightening:
-        """Tighten further: limits by so much, b and the duration by a relative amount.
+    def by(
+        self, reach: Array, limits: Array, speed_share: Array, late: float, motors: Array
+    ) -> Tightening:
+        """Tighten further: limits by so much, b, duration and motors by a relative amount.
 
         Limits are first raised to `reach`, as what is slack already would not feel the rest.
         """
         duration = None if self.duration is None else self.duration * (1 - late)
         raised = np.maximum(self.limits, reach) + limits
         share = self.speed_share * (1 - speed_share)
-        return Tightening(raised, share, duration, self.missed + limits)
+        missed, quick = self.missed + limits, self.motors * (1 - motors)
+        return Tightening(raised, share, duration, missed, quick)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,10 +189,15 @@ def parameters(
         "squeeze": terms.squeeze * force / unit,
         "speed": (terms.speed * np.sqrt(b_unit) / unit)[:, nlp.shape.fast],
     }
-    if nlp.objective is Objective.EFFORT:
-        torque = unit[list(nlp.shape.torques)]
+    torque, motors = unit[list(nlp.shape.torques)], nlp.shape.motors
+    if nlp.objective is Objective.EFFORT or motors.slow:
         blocks["torque"] = data.nodes.forces.T0 / torque
+    if nlp.objective is Objective.EFFORT:
         blocks["joints"] = torque**2 / units.power
+    if motors.slow:
+        scene, (rates, commands) = data.curve.formation.scene, map(list, motors)
+        blocks["quick"] = (torque / units.time / data.rate_limit)[rates]
+        blocks["lags"] = scene.actuator_lag[commands] / units.time
     if relaxation is not None:
         parameter, step = relaxation
         gives = data.limits.weigh(parameter) * step / unit
@@ -210,22 +221,32 @@ def make_bounds(
     tightening: Tightening,
     relaxation: Relaxation | None = None,
     start: SureStart | None = None,
+    pins: tuple[float | None, float | None] = (None, None),
 ) -> dict[str, Array]:
     """Bounds of the NLP, with every limit tightened."""
-    tight, speed_share, duration, _ = tightening
+    tight, speed_share, duration, *_ = tightening
     n, node = len(data.grid.s), nlp.columns.node
     low, high = np.full((n, node.count), -np.inf), np.full((n, node.count), np.inf)
     b_max = data.largest_b(data.nodes, relaxation.parameter if relaxation else None)
     # Next to rest b goes with the way: of the least s'' it is twice as much.
     s, length = data.grid.s, data.grid.s[-1]
     low[:, 0] = LEAST_B * np.minimum(s, length - s) / length
+    if data.grid.held:
+        # There b goes with the fourth power of y.
+        low[: DEGREE + 1, 0] = low[-DEGREE - 1 :, 0] = LEAST_B**2
     high[:, 0] = np.maximum(b_max * speed_share / units.profile[0], 2 * LEAST_B)
     # From rest and to rest, with no way back.
-    low[0, node["a"]], high[-1, node["a"]] = LEAST_B, -LEAST_B
+    if nlp.shape.motors.slow:
+        low[[0, -1], node["a"]] = high[[0, -1], node["a"]] = 0.0
+    else:
+        low[0, node["a"]], high[-1, node["a"]] = LEAST_B, -LEAST_B
     if start is not None:
         _, a_unit, force = units.profile
         low[0, node["a"]] = max(start.least_a / a_unit, LEAST_B)
         low[0, node["squeeze"]], high[0, node["squeeze"]] = start.low / force, start.high / force
+    for place, pin in zip((0, -1), pins, strict=True):
+        if pin is not None:
+            low[place, node["squeeze"]] = high[place, node["squeeze"]] = pin / units.profile[2]
     low[:, node["extra"]] = -np.inf if nlp.objective is Objective.MARGIN else 0.0
     rows, signs, bounds = data.limits.sides
     # The constant part of what limits are of is on this side.
@@ -241,14 +262,27 @@ def make_bounds(
         rows_high[:, -1] = 1.0
     late = nlp.columns.g.sizes["duration"]
     equal = np.zeros(nlp.columns.g["limits"].start)
+    longest = np.full(late, (duration or np.inf) / units.time)
+    quick_low, quick_high = _bound_motors(nlp, data, units, tightening.motors)
     return {
         "lbx": low[nlp.free],
         "ubx": high[nlp.free],
-        "lbg": np.concatenate([equal, rows_low.ravel(), np.full(late, -np.inf)]),
-        "ubg": np.concatenate(
-            [equal, rows_high.ravel(), np.full(late, (duration or np.inf) / units.time)]
-        ),
+        "lbg": np.concatenate([equal, rows_low.ravel(), np.full(late, -np.inf), quick_low]),
+        "ubg": np.concatenate([equal, rows_high.ravel(), longest, quick_high]),
     }
+
+
+def _bound_motors(
+    nlp: PathNLP, data: PhaseData, units: Units, shares: Array
+) -> tuple[Array, Array]:
+    """Bounds of the rows of `motor_terms`."""
+    rates, commands = map(list, nlp.shape.motors)
+    sizes, torque = nlp.columns.g.sizes, units.of(data.limits)[list(nlp.shape.torques)]
+    most = shares[:, 1] * data.torque_limit / torque
+    within = np.concatenate([shares[:, 0, rates].ravel("F"), most[:, commands].ravel("F")])
+    joins, begins = np.zeros(sizes["joins"]), np.full(sizes["begins"] // 2, LEAST_B)
+    low = np.concatenate([-within, joins, begins, -np.inf * begins])
+    return low, np.concatenate([within, joins, np.inf * begins, -begins])
 
 
 def pack(nlp: PathNLP, profile: Profile, units: Units, extra: float | Array) -> Array:
@@ -274,7 +308,10 @@ def unpack(nlp: PathNLP, grid: Grid, x: Array, units: Units) -> tuple[Profile, f
     table = np.zeros(nlp.free.shape)
     table[nlp.free] = x
     a, squeeze = table[:, 1] * units.profile[1], table[:, 2] * units.profile[2]
-    a = a - grid.integrate(a)[-1] / (2 * grid.s[-1])
+    spread = np.ones_like(a)
+    if grid.held:
+        spread = np.cbrt(np.maximum(grid.s * (grid.s[-1] - grid.s), 0.0))
+    a = a - grid.integrate(a)[-1] / grid.integrate(spread)[-1] * spread
     b = grid.integrate(a)
     # Where phases are joined at next to no speed, rounding can take b below zero.
     b = np.maximum(b, 0.0)
@@ -303,5 +340,12 @@ def move_multipliers(
             blocks[name] = interpolate(np.append(blocks[name], 0.0)[:, None])[:-1, 0]
     limits = blocks["limits"].reshape(len(old.s), -1)
     blocks["limits"] = interpolate(limits, weights).ravel()
+    for name in ("rates", "commands"):
+        if rows.sizes[name]:
+            blocks[name] = interpolate(blocks[name].reshape(-1, len(old.s)).T, weights).ravel("F")
+    if rows.sizes["joins"]:
+        joins = blocks["joins"].reshape(-1, len(old.edges) - 1)
+        places = new.edges[1:, 0], old.edges[1:, 0]
+        blocks["joins"] = np.concatenate([np.interp(*places, own) for own in joins])
     table = interpolate(table, weights)
     return {"lam_x0": table[after.free], "lam_g0": after.columns.g.join(**blocks)}

@@ -9,7 +9,7 @@ the untightened solution is too good about as much as the tightened one is too b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -28,12 +28,15 @@ from .first_guess import guess_slowly
 from .fitting import StalledError
 from .misses import MISS, ROUNDS
 from .motion import PathMotion
+from .motor_data import list_quicknesses
 from .rounds import Plans, Round
 from .sure_start import WORTH, find_sure_start
-from .task import Task
+from .task import Pins, Task
 
 _MESHES = 6
 """Most times that the mesh is changed before limits are tightened."""
+_SLOW_MESHES = 3
+"""The same with slow motors, whose switches matter less the more there are."""
 _AGAIN = 3
 """Most times that limits are tightened, each on a mesh that is finer than the one before."""
 _FINER = (1, 2, 4)
@@ -94,6 +97,7 @@ def plan_curves(
     phases: Sequence[int],
     duration: float | None = None,
     explained: bool = True,
+    pins: Pins = (None, None),
 ) -> list[PhasePlan[PathMotion]]:
     """Plan phases along curves that are run through one after the other, from rest to rest.
 
@@ -110,6 +114,8 @@ def plan_curves(
         Longest duration of all, for the objective `margin`.
     explained : bool
         Whether to find out why there is no plan, which takes longer than planning.
+    pins : tuple of float or None, [N]
+        The squeeze at both ends, where it is given.
 
     Raises
     ------
@@ -121,7 +127,8 @@ def plan_curves(
     SolverError
         If the solver stops without an answer.
     """
-    task, guides = Task(curves, epsilon, options, phases, duration), tuple[Guide, ...]()
+    task = Task(curves, epsilon, options, phases, duration, pins=pins)
+    guides = tuple[Guide, ...]()
 
     def replan(changed: Sequence[Curve], least: float) -> object:
         changes = replace(task, curves=changed, epsilon=least, options=_roughen(options))
@@ -139,16 +146,34 @@ def plan_curves(
     if isinstance(found, _Stuck):
         if not explained:
             raise SolverError(found.reason)
-        from .explain import explain
-
-        slow = guess_slowly(join(found.parts))
-        late = _explain_duration(task)
-        raise late or explain(found.parts, *slow, phases, found.reason, replan)
+        raise _explain_motors(task, found) or _explain(task, found, replan)
     if options.goal is Objective.MARGIN and found.plans[0].value < task.lost:
         least = SolverError(f"{task.name}: the margin found is below epsilon")
         raise _explain_duration(task) or least
+    # Slow motors begin a motion as they leave what holds the object.
     surely = options.goal is Objective.TIME and not options.ranges
+    surely = surely or found.round_.data.grid.held
     return found.plans if surely else _leave_rest(found)
+
+
+def _explain_motors(task: Task, found: _Stuck) -> WholearmError | None:
+    """Why there is no plan with slow motors, if there are any."""
+    if not found.parts[0].grid.held:
+        return None
+    from .motor_explain import explain_motors
+
+    return explain_motors(task, found.parts, found.reason, plan_curves)
+
+
+def _explain(
+    task: Task, found: _Stuck, replan: Callable[[Sequence[Curve], float], object]
+) -> WholearmError:
+    """Why there is no plan: the duration, or what is short."""
+    from .explain import explain
+
+    slow = guess_slowly(join(found.parts))
+    late = _explain_duration(task)
+    return late or explain(found.parts, *slow, task.phases, found.reason, replan)
 
 
 def _plan_within(task: Task) -> tuple[_Solved | _Stuck, tuple[Guide, ...]]:
@@ -266,12 +291,20 @@ def _plan(task: Task, finer: int = 1, insist: bool = True) -> _Solved | _Stuck:
 
     If that is not insisted on, only where a sweep has found a motion.
     """
-    round_ = Round.begin(task, finer)
+    round_, quicker = Round.begin(task, finer), list[float]()
+    if round_.data.grid.held:
+        lasts = sum(motion.duration for motion in round_.motions)
+        first, *quicker = list_quicknesses(round_.data, lasts)
+        round_ = round_.quicken(first)
     if not round_.is_kept and (not insist or is_hopeless(round_.data)):
         return _Stuck(round_.parts, f"{task.name}: no motion keeps the limits", between=False)
     found = round_.solve()
     if isinstance(found, str):
         return _Stuck(round_.parts, f"{task.name}: {found}", between=False)
+    for quickness in quicker:
+        found = _suit(found).quicken(quickness).solve()
+        if isinstance(found, str):
+            return _Stuck(round_.parts, f"{task.name}: {found}", between=False)
     best: _Solved | _Stuck | None = None
     for _ in range(_AGAIN):
         found = _suit(found)
@@ -282,6 +315,8 @@ def _plan(task: Task, finer: int = 1, insist: bool = True) -> _Solved | _Stuck:
         if isinstance(kept, _Stuck) or kept.plans[0].error <= task.options.accuracy:
             break
         better = found.adapt(dearer=True)[1]
+        if better is not None and better.elements == found.elements and found.data.grid.held:
+            break
         refined = better.solve() if better else ""
         if isinstance(refined, str):
             break
@@ -292,7 +327,7 @@ def _plan(task: Task, finer: int = 1, insist: bool = True) -> _Solved | _Stuck:
 
 def _suit(found: Round) -> Round:
     """Change the mesh until switches stay where they are and little is missed between nodes."""
-    for _ in range(_MESHES):
+    for _ in range(_SLOW_MESHES if found.data.grid.held else _MESHES):
         found, better = found.adapt()
         if better is None:
             break

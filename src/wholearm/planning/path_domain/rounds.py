@@ -15,7 +15,7 @@ from .elements import Elements
 from .fastest import Fastest, find_fastest
 from .first_guess import guess
 from .fitting import fit_torque
-from .mesh import MOST, SHIFTED, Mesh, adapt
+from .mesh import MOST, SHIFTED, SLOW_MOST, Mesh, adapt
 from .misses import Misses, PathSolution, anticipate, price
 from .motion import PathMotion
 from .nlp import (
@@ -29,7 +29,6 @@ from .nlp import (
     unpack,
 )
 from .start import balance, start_at
-from .sure_start import SureStart
 from .task import EARLY, Task
 
 _SHARE = 0.5
@@ -92,7 +91,8 @@ class Round:
         meshes = tuple(Mesh() for _ in task.curves)
         elements, parts, data, nlp = task.lay_out(meshes, finer * task.elements)
         profile, units = guess(data, task.options.time_weight)
-        found = None if task.options.goal is Objective.EFFORT else find_fastest(data, task.duration)
+        sought = task.options.goal is not Objective.EFFORT and not data.grid.held
+        found = find_fastest(data, task.duration) if sought else None
         fastest = found if isinstance(found, Fastest) else None
         multipliers = balance(nlp, data, units, profile)
         start, none = PathSolution(profile, 0.0, multipliers), Tightening.none(data, task.duration)
@@ -124,6 +124,11 @@ class Round:
         known = elements, meshes, parts, data, nlp, self.units, start, tightening
         return Round(task, *known, self.fastest, allowed, shift)
 
+    def quicken(self, quickness: float) -> Round:
+        """The round on its mesh, with torques that may change at other rates."""
+        task = replace(self.task, quickness=quickness)
+        return replace(self, task=task)._restart(self.meshes, self.elements, np.inf)
+
     @cached_property
     def motions(self) -> list[PathMotion]:
         """The motion of each phase."""
@@ -145,22 +150,23 @@ class Round:
     @cached_property
     def due(self) -> Array:
         """What tightening limits by what they miss would cost at each node, relatively."""
-        missed = self.misses.short, self.misses.speeding
-        short, speeding = (self.data.spread_to_nodes(part) for part in missed)
-        return self._price((short, speeding))
+        missed = self.misses.short, self.misses.speeding, self.misses.hurry
+        short, speeding, hurry = (self.data.spread_to_nodes(part) for part in missed)
+        return self._price((short, speeding, hurry))
 
     @cached_property
     def paid(self) -> Array:
         """What having tightened them costs at each node, relatively."""
-        return self._price((self.tightening.missed, 1 - self.tightening.speed_share))
+        tight = self.tightening
+        return self._price((tight.missed, 1 - tight.speed_share, 1 - tight.motors))
 
     @cached_property
     def wasted(self) -> Array:
         """What it costs at each node that limits are tightened more than they need, relatively."""
         spare = np.minimum(self.tightening.missed, self.misses.find_spare(self.data))
-        return self._price((spare, np.zeros(len(spare))))
+        return self._price((spare, np.zeros(len(spare)), np.zeros((len(spare), 2, 2))))
 
-    def _price(self, tightened: tuple[Array, Array]) -> Array:
+    def _price(self, tightened: tuple[Array, Array, Array]) -> Array:
         found = price(self.nlp, self.data, self.units, self.solution, tightened)
         return np.asarray(found / self.value)
 
@@ -203,7 +209,7 @@ class Round:
         """Solve on this mesh; in words how the solver ended if there is no solution."""
         weight = self.task.options.time_weight
         given = self.nlp, self.data, self.units, self.tightening, self.solution, weight
-        found = _solve(*given, self.task.start)
+        found = _solve(*given, self.task)
         return found if isinstance(found, str) else replace(self, solution=found)
 
     def tighten(self, ease: bool) -> Round:
@@ -223,7 +229,8 @@ class Round:
         task, most = self.task, self.task.options.accuracy
         prices = self.due + self.paid - self.wasted
         shares = np.split(prices, np.cumsum([len(part.grid.s) for part in self.parts])[:-1])
-        coarse = self.elements < MOST and task.options.intervals is None
+        most_elements = SLOW_MOST if self.data.grid.held and most >= EARLY else MOST
+        coarse = self.elements < most_elements and task.options.intervals is None
         enough = _DEAR[task.options.goal] * most
         dear = dearer or bool(prices.sum() > enough)
         # Once switches have settled they need not be looked for, and where much is missed they are
@@ -247,7 +254,9 @@ class Round:
                 return replace(self, shift=shift), None
             longer = self.tightening._replace(duration=self.allowed)
             return self, replace(self, tightening=longer, duration=self.allowed, shift=shift)
-        more = dearer or (dear and sum(better.price for better in found) > _LIKELY * enough)
+        more = (dearer and coarse) or (
+            dear and sum(better.price for better in found) > _LIKELY * enough
+        )
         meshes = tuple(better.mesh for better in found)
         return self, self._restart(meshes, self.elements * (2 if more else 1), shift)
 
@@ -274,10 +283,10 @@ def _solve(
     tightening: Tightening,
     start: PathSolution,
     time_weight: float,
-    sure: SureStart | None,
+    task: Task,
 ) -> PathSolution | str:
     """Solve once; the solution, or in words how the solver ended."""
-    bounds = make_bounds(nlp, data, units, tightening, start=sure)
+    bounds = make_bounds(nlp, data, units, tightening, start=task.start, pins=task.pins)
     if (bounds["lbg"] > bounds["ubg"]).any():
         return "limits that hold between the nodes too leave nothing"
     result = nlp.solver(

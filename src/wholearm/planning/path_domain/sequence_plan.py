@@ -5,16 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ...common.arrays import Array
+from ...geometry.curve import Curve
 from ...mechanics.metric import measure_speed
 from ...problem.definition import End
 from ...results.trajectory import Motion
+from ...solvers.statistics import charge
 from ..impacts import BlockImpact
 from ..options import PlanOptions
 from ..phase_plan import PhasePlan
 from ..stops import PlanPart, Plans, end_of
 from .impact_sequence import ImpactSequence
+from .joint import add_pause, choose_joint
 from .motion import PathMotion
 from .plan import plan_curves
+from .task import Pins
 
 
 def plan_sequence(
@@ -23,6 +27,7 @@ def plan_sequence(
     options: PlanOptions,
     duration: float | None = None,
     explained: bool = True,
+    pins: Pins = (None, None),
 ) -> list[PhasePlan[PathMotion]]:
     """Plan phases that possible impacts join, from rest to rest.
 
@@ -35,9 +40,52 @@ def plan_sequence(
         Longest duration of all, for the objective `margin`; the phases share it as is best.
     explained : bool
         Whether to find out why there is no plan.
+    pins : tuple of float or None, [N]
+        The squeeze at both ends, where it is given.
     """
     phases = [phase.number for phase in sequence.phases]
-    return plan_curves(sequence.continuous_curves, epsilon, options, phases, duration, explained)
+    curves = sequence.continuous_curves
+    return plan_curves(curves, epsilon, options, phases, duration, explained, pins)
+
+
+def plan_slowly(
+    parts: Sequence[ImpactSequence],
+    beside: tuple[Curve | None, Curve | None],
+    epsilon: float,
+    options: PlanOptions,
+    durations: Sequence[float | None],
+) -> Plans:
+    """Plan sequences one after the other whose torques may not step, with pauses between them.
+
+    Parameters
+    ----------
+    parts : sequence of ImpactSequence
+    beside : tuple of Curve or None
+        The curves before and after all of them, where there are any.
+    epsilon : float, [N]
+    options : PlanOptions
+    durations : sequence of float or None, [s]
+        The longest duration of each, for the objective `margin`.
+    """
+    plans: Plans = []
+    firsts = [*(part.curves[0] for part in parts[1:]), beside[1]]
+    joint, before = None, beside[0]
+    for part, after, duration in zip(parts, firsts, durations, strict=True):
+        number = part.phases[0].number
+        if before is not None and joint is None:
+            joint = choose_joint(before, part.curves[0], epsilon, number)
+        last = part.curves[-1]
+        coming = choose_joint(last, after, epsilon, part.phases[-1].number + 1) if after else None
+        pins = joint.begins if joint else None, coming.ends if coming else None
+        if duration is not None and joint is not None:
+            duration -= joint.pause
+        with charge(number):
+            own: Plans = [*plan_sequence(part, epsilon, options, duration, pins=pins)]
+        if joint is not None:
+            own[0] = add_pause(own[0], joint, part.curves[0], options)  # type: ignore[arg-type]
+        plans += own
+        joint, before = coming, last
+    return plans
 
 
 def plan_parts_of(sequence: ImpactSequence, epsilon: float) -> PlanPart:

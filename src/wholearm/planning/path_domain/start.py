@@ -96,6 +96,7 @@ def _join(
         chain=chain[: sizes["chain"]],
         limits=on_rows.ravel(),
         duration=np.full(sizes["duration"], rate),
+        **{name: np.zeros(sizes[name]) for name in ("rates", "commands", "joins", "begins")},
     )
     return {"lam_x0": on_x[nlp.free], "lam_g0": on_g}
 

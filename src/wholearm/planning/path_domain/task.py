@@ -16,19 +16,26 @@ from .data import PhaseData, join, prepare
 from .elements import DEGREE
 from .mesh import SOFT, START, Mesh, find_ends
 from .misses import MISS
+from .motor_terms import MotorShape
 from .nlp import PathNLP, build_path_nlp
 from .sure_start import SureStart
 from .switches import Switch
 from .terms import LimitShape
 from .unique import require_unique
 
+Pins = tuple[float | None, float | None]
+"""Squeezes at the start and the end of a motion, where they are given [N]."""
 EARLY = 1e-5
 """Accuracy from which on few elements will do, and limits are tightened before all solves."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """What is planned: see `plan_curves`; with ranges, near `guides`, one for each curve."""
+    """What is planned: see `plan_curves`; with ranges, near `guides`, one for each curve.
+
+    On the way to quick motors rates of torques are limited to a part, the `quickness`, of theirs.
+    The squeeze at both ends is as `pins` say [N], where they do.
+    """
 
     curves: Sequence[Curve]
     epsilon: float
@@ -37,6 +44,8 @@ class Task:
     duration: float | None
     start: SureStart | None = None
     guides: tuple[Guide, ...] = ()
+    quickness: float = 1.0
+    pins: Pins = (None, None)
 
     @cached_property
     def spreads(self) -> list[Spread | None]:
@@ -62,7 +71,8 @@ class Task:
         intervals = self.options.intervals
         if intervals is None:
             few = START if self.options.accuracy >= EARLY else 2 * START
-            return max(few, SOFT) if self.options.goal is Objective.EFFORT else few
+            slow = self.curves[0].formation.scene.has_slow_motors
+            return max(few, SOFT) if slow or self.options.goal is Objective.EFFORT else few
         return max(-(-intervals // DEGREE), 3)
 
     def require_unique(self) -> None:
@@ -81,7 +91,7 @@ class Task:
         elements = max(wanted, *(len(find_ends(curve, mesh.breaks)) for curve, mesh in pairs))
         parts = self.prepare(meshes, elements)
         data = join(parts)
-        shape = LimitShape.of(data.limits)
+        shape = LimitShape.of(data.limits, MotorShape.of(self.curves[0].formation.scene))
         nlp = build_path_nlp(shape, len(data.grid.steps), self.options.goal)
         return elements, parts, data, nlp
 
@@ -107,5 +117,6 @@ class Task:
         found, last = [], len(meshes) - 1
         for k, (curve, mesh) in enumerate(zip(self.curves, meshes, strict=True)):
             grid = mesh.make_grid(curve, elements, (k == 0, k == last))
-            found.append(prepare(curve, self.epsilon, grid, self.phases[k], self.spreads[k]))
+            given = self.phases[k], self.spreads[k], self.quickness
+            found.append(prepare(curve, self.epsilon, grid, *given))
         return found

@@ -6,9 +6,10 @@ of `elements`: inside each, a and lambda are polynomials, and b' = 2 a (dash: d/
 
     b_k+1 = b_k + h sum of links_kj a_j over the nodes j of the element of length h,
     low <= rows (c, tau, theta') <= high at every node (`mechanics.limits`),
-    T = sum of h weights_k / sqrt(b_k) (next to rest as said in `_write_times`).
+    T = sum of h weights_k / sqrt(b_k) (next to rest as said in `_find_paces`).
 
-Where two elements meet, b is the same and a and lambda may jump.
+Where two elements meet, b is the same and a and lambda may jump, unless motors are slow
+(`motor_terms`).
 
 The least margin, and the relaxation of a limit, have an unknown at every node with m_k+1 = m_k. A
 column through all rows would make building the Jacobian quadratic in the number of nodes.
@@ -25,7 +26,8 @@ from ...common.arrays import Expression
 from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ..columns import Columns, Symbols
 from ..options import Objective
-from .elements import DEGREE, FROM_REST, INSIDE, TO_REST, find_basis
+from .elements import DEGREE, POWERS, SIGNS, find_basis
+from .motor_terms import QUICK, MotorShape, find_first_slopes, list_kinds, write_motor_rows
 
 CHAINED = (Objective.MARGIN, Objective.RELAX)
 """Objectives with one more unknown, which every node has a copy of."""
@@ -57,6 +59,7 @@ class LimitShape(NamedTuple):
         Row and sign of each side, in the order of `LimitSet.sides`.
     presses, torques, fast : tuple of int
         Rows of the least normal forces and of the torques, and those that know of the speed.
+    motors : MotorShape
     """
 
     rows: int
@@ -64,9 +67,10 @@ class LimitShape(NamedTuple):
     presses: tuple[int, ...]
     torques: tuple[int, ...]
     fast: tuple[int, ...]
+    motors: MotorShape = QUICK
 
     @staticmethod
-    def of(limits: LimitSet) -> LimitShape:
+    def of(limits: LimitSet, motors: MotorShape = QUICK) -> LimitShape:
         """The shape of a set of limits."""
         rows, signs, _ = limits.sides
         known = [part.any(axis=1) for part in limits.columns[1:]]
@@ -77,6 +81,7 @@ class LimitShape(NamedTuple):
             tuple(limits.of(PRESS).tolist()),
             tuple(limits.of(TORQUE).tolist()),
             tuple(np.flatnonzero(known[0] | known[1] | drags).tolist()),
+            motors,
         )
 
 
@@ -91,13 +96,14 @@ class NLPColumns(NamedTuple):
     p : Columns
         The speeds at the `ends`; the `steps`; the `weight` of time; what the unit of squeeze counts
         for where it is kept `calm`; column by column, coefficients of the limits at the nodes but
-        for the constant ones, which are part of the bounds; for `effort` the constant torques and
-        the weight of each joint, for `relax` by how much each limit gives way with the relaxation,
-        and b's coefficients in the speed limit.
+        for the constant ones, which are part of the bounds; for `effort` and slow motors the
+        constant torques; for `effort` the weight of each joint; for `relax` by how much each limit
+        gives way with the relaxation, and b's coefficients in the speed limit; for slow motors one
+        over their largest rates, and their lags.
     g : Columns
         The N of b' = 2 a; those that `chain` the margin or the relaxation; node by node the
         `limits`, side by side where they
-        are soft, and the speed for `relax`; the `duration` for `margin`.
+        are soft, and the speed for `relax`; the `duration` for `margin`; the rows of motors.
     """
 
     node: Columns
@@ -112,13 +118,17 @@ def list_columns(shape: LimitShape, intervals: int, objective: Objective) -> NLP
     extra = m if objective is Objective.ELASTIC else int(chained)
     p = {"ends": 2, "steps": intervals, "weight": 1, "calm": 1, "a": n * m, "b": n * m}
     p |= {"squeeze": n * m, "speed": n * fast}
+    if objective is Objective.EFFORT or shape.motors.slow:
+        p |= {"torque": n * 2}
     if objective is Objective.EFFORT:
-        p |= {"torque": n * 2, "joints": 2}
+        p |= {"joints": 2}
     elif relax:
         p |= {"gives": m + 1, "rates": n}
+    if shape.motors.slow:
+        p |= {"quick": len(shape.motors.rates), "lags": len(shape.motors.commands)}
     rows = (len(shape.sides) if objective in SOFT else m) + relax
     g = {"links": intervals, "chain": intervals * chained, "limits": n * rows}
-    g |= {"duration": int(objective is Objective.MARGIN)}
+    g |= {"duration": int(objective is Objective.MARGIN)} | shape.motors.list_sizes(intervals)
     return NLPColumns(Columns(b=1, a=1, squeeze=1, extra=extra), Columns(**p), Columns(**g))
 
 
@@ -140,8 +150,12 @@ def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict
     )
     b = ca.vertcat(ends[0] ** 2, b_inner, ends[1] ** 2)
     speed = ca.vertcat(ends[0], ca.sqrt(b_inner), ends[1])
-    times = _write_times(a, speed, h)
+    lengths, paces = _find_lengths(h), _find_paces(a, speed, h, bool(shape.motors.slow))
+    times = ca.vec(ca.DM(find_basis().weights) @ lengths / paces)
     values = _write_values(shape, given, (a, b, squeeze, speed))
+    torques = values[:, list(shape.torques)]
+    if objective is Objective.EFFORT or shape.motors.slow:
+        torques += ca.reshape(given.torque, n, 2)
     # What is relaxed has to be as little as possible, whatever the motion is like.
     share = 1e-3 if objective is Objective.RELAX else 1.0
     squeezed, node_weights = given.calm * squeeze, ca.vertcat(0, h) + ca.vertcat(h, 0)
@@ -152,11 +166,10 @@ def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict
         slopes, bends = _find_bends(a, 1), _find_bends(a, 2)
         rough += _STIFF * ca.horzcat(slopes[0], bends[1:-1], slopes[-1])
         node_costs[:-1] += _EVEN * (a[1:] - a[:-1]) ** 2
-    node_costs[0] += share * _ROUGH * ca.sum2(_find_lengths(h) * rough)
+    node_costs[0] += share * _ROUGH * ca.sum2(lengths * rough)
     if objective is Objective.TIME:
         node_costs += times
     elif objective is Objective.EFFORT:
-        torques = values[:, list(shape.torques)] + ca.reshape(given.torque, n, 2)
         node_costs += times * (torques**2 @ given.joints + given.weight)
     elif objective is Objective.MARGIN:
         node_costs[0] -= extra[0]
@@ -175,10 +188,11 @@ def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict
         "p": given.every,
         "f": ca.sum1(node_costs),
         "g": columns.g.write(
-            links=b[1:] - b[:-1] - _write_rises(a, h),
+            links=b[1:] - b[:-1] - _write_rises(a, h, bool(shape.motors.slow)),
             chain=extra[1:] - extra[:-1] if chained else ca.SX(0, 1),
             limits=rows.T,
             duration=ca.sum1(times) if late else ca.SX(0, 1),
+            **write_motor_rows(shape.motors, given, torques, a, paces, lengths),
         ),
     }
 
@@ -188,29 +202,33 @@ def _find_lengths(h: Expression) -> Expression:
     return ca.sum1(ca.reshape(ca.vertcat(h, 0), DEGREE + 1, -1))
 
 
-def _write_rises(a: Expression, h: Expression) -> Expression:
+def _write_rises(a: Expression, h: Expression, held: bool) -> Expression:
     """By how much b rises from each node to the next, shape (N,)."""
     table, lengths = ca.reshape(a, DEGREE + 1, -1), _find_lengths(h)
     count = lengths.numel()
-    kinds = [FROM_REST, *[INSIDE] * (count - 2), TO_REST]
     links = [ca.DM(link) for link in find_basis().links]
-    rises = ca.horzcat(*(links[kind] @ table[:, k] for k, kind in enumerate(kinds)))
+    rises = ca.horzcat(
+        *(links[kind] @ table[:, k] for k, kind in enumerate(list_kinds(count, held)))
+    )
     rises = rises * ca.repmat(lengths, DEGREE, 1)
     return ca.vec(ca.vertcat(rises, ca.SX(1, count)))[:-1]
 
 
-def _write_times(a: Expression, speed: Expression, h: Expression) -> Expression:
-    """What each node's share of the duration is, shape (N + 1,), by Lobatto's quadrature."""
+def _find_paces(a: Expression, speed: Expression, h: Expression, held: bool) -> Expression:
+    """How fast the local variable is at each node, times the element's length, (p + 1, E)."""
     basis = find_basis()
     lengths = _find_lengths(h)
-    rates = ca.reshape(speed, DEGREE + 1, -1)
-    # Next to rest the speed is linear in the local variable but for a factor that is smooth.
-    for kind, e in ((FROM_REST, 0), (TO_REST, lengths.numel() - 1)):
-        rest = 0 if kind == FROM_REST else DEGREE
+    count = lengths.numel()
+    paces = ca.reshape(speed, DEGREE + 1, -1)
+    slopes = find_first_slopes(a) if held else (a[0], a[-1])
+    # Next to rest the speed is a power of the local variable but for a factor that is smooth.
+    for e, kind in ((0, list_kinds(count, held)[0]), (count - 1, list_kinds(count, held)[-1])):
+        rest, power = 0 if SIGNS[kind] > 0 else DEGREE, int(POWERS[kind])
         for j, y in enumerate(basis.y[kind].tolist()):
-            start = ca.sqrt(2 * lengths[e] * (a[0] if kind == FROM_REST else -a[-1]))
-            rates[j, e] = (start if j == rest else rates[j, e] / y) / 2
-    return ca.vec(ca.DM(basis.weights) @ lengths / rates)
+            growth = SIGNS[kind] * slopes[0 if e == 0 else 1]
+            start = ca.sqrt((1.5 if held else 2) * lengths[e] * growth)
+            paces[j, e] = (start if j == rest else paces[j, e] / y ** (power - 1)) / power
+    return paces
 
 
 def _find_bends(values: Expression, degree: int) -> Expression:

@@ -1,0 +1,202 @@
+"""Torques where one phase ends at rest and the next one begins, for motors that are not quick.
+
+A motion begins and ends with torques that hold the object on the verge of it: with no acceleration
+and the friction of its directions. There the squeeze is free, so these torques are a line for the
+phase that ends and another one for the phase that begins. Those nearest to each other in time are
+taken, and torques change from the ones to the others at constant rates while everything rests. The
+former have to hold the object in the formation that begins, too; then so do all in between, as
+forces that balance and are within their cones make a convex set.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ...common.arrays import Array
+from ...common.errors import InfeasibleError
+from ...contacts.formation import Formation
+from ...geometry.curve import Curve
+from ...mechanics.wedging import find_static_torques
+from ...results.torque import TorqueProfile
+from ...results.trajectory import Samples
+from ..options import Objective, PlanOptions
+from ..phase_plan import PhasePlan
+from .data import PhaseData, prepare
+from .first_guess import find_squeeze_range
+from .mesh import Mesh
+from .motion import PathMotion
+
+_PLACES = 129
+"""Squeezes that are looked at on each side of a joint."""
+_WIDEST = 40.0
+"""Largest range of them, over the scene's force."""
+_INSIDE = 0.01
+"""Part of the range at both of its ends that is left out."""
+_ELEMENTS = 3
+"""Elements of a grid of which only the ends count."""
+_BRIEF = 1e-6
+"""Pause that is none, over the scene's time."""
+_SHARE = 0.5
+"""Part of a torque limit that a command may be beyond its torque in a pause."""
+
+
+class Joint(NamedTuple):
+    """Squeezes [N] and torques, shape (2,) [N m], of both sides, and the pause between [s]."""
+
+    ends: float
+    begins: float
+    before: Array
+    after: Array
+    pause: float
+
+
+def choose_joint(ending: Curve, beginning: Curve, epsilon: float, phase: int) -> Joint:
+    """The torques that change in the least time where phase number `phase` begins.
+
+    Raises
+    ------
+    InfeasibleError
+        If no torques hold the object there in both formations.
+    """
+    (before, ends), (after, begins) = (
+        _list_torques(curve, epsilon, number, place)
+        for curve, number, place in ((ending, phase - 1, -1), (beginning, phase, 0))
+    )
+    scene, static = (
+        beginning.formation.scene,
+        find_static_torques([beginning.formation], ending.end),
+    )
+    held = static.measure(before) <= 0
+    if not held.any():
+        raise InfeasibleError(
+            f"phase {phase}: torques may not step, and none that hold the object at rest where "
+            f"phase {phase - 1} ends hold it in the contacts of phase {phase}, too"
+        )
+    with np.errstate(divide="ignore"):
+        lagged = _SHARE * scene.torque_limit / scene.actuator_lag
+    rates = np.minimum(scene.torque_rate_limit, lagged)
+    steps = np.abs(after[None] - before[held][:, None])
+    times = (steps / rates).max(axis=2)
+    p, q = np.unravel_index(int(times.argmin()), times.shape)
+    pause = float(times[p, q])
+    pause = pause if pause > _BRIEF * scene.scales.time else 0.0
+    return Joint(float(ends[held][p]), float(begins[q]), before[held][p], after[q], pause)
+
+
+def _list_torques(curve: Curve, epsilon: float, phase: int, place: int) -> tuple[Array, Array]:
+    """Torques at an end of a curve on the verge of motion, (n, 2) [N m], and squeezes, (n,) [N]."""
+    data = prepare(curve, epsilon, Mesh().make_grid(curve, _ELEMENTS), phase)
+    low, high = require_hold(data, phase, place)
+    high = min(high, low + _WIDEST * curve.formation.scene.scales.force)
+    share = np.linspace(_INSIDE, 1 - _INSIDE, _PLACES)
+    squeezes = low + share * (high - low)
+    forces = data.nodes.forces
+    return forces.T0[place] + np.outer(squeezes, forces.Tl[place]), squeezes
+
+
+def require_hold(data: PhaseData, phase: int, place: int) -> tuple[float, float]:
+    """The range of squeezes that hold the object at an end of a phase [N].
+
+    Raises
+    ------
+    InfeasibleError
+        If there is none.
+    """
+    low, high = (float(bound[place]) for bound in find_squeeze_range(data, 0.0))
+    if low <= high:
+        return low, high
+    where = "end" if place else "start"
+    raise InfeasibleError(
+        f"phase {phase}: torques may not step, and within the limits none hold the object at rest "
+        f"at its {where}, on the verge of the motion; leave out torque_rate_limit and actuator_lag"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class PausedMotion:
+    """A motion that begins after a pause at rest, in which torques and forces change linearly.
+
+    Attributes
+    ----------
+    motion : PathMotion
+    pause : float, [s]
+    first : ndarray, shape (2,), [N m]
+        Torques at its start.
+    forces : ndarray, shape (2, n_c), [N]
+        c_n and c_t there.
+    """
+
+    motion: PathMotion
+    pause: float
+    first: Array
+    forces: Array
+
+    @property
+    def duration(self) -> float:
+        """How long the phase lasts [s]."""
+        return self.pause + self.motion.duration
+
+    @property
+    def contacts(self) -> tuple[str, ...]:
+        """Names of the phase's contacts."""
+        return self.motion.contacts
+
+    def evaluate(self, t: Array) -> Samples:
+        """Samples at times `t` from the start of the phase, shape (n,) [s]."""
+        t = np.asarray(t, dtype=float)
+        found = self.motion.evaluate(np.maximum(t - self.pause, 0.0))
+        left = np.maximum(1 - t / self.pause, 0.0)[:, None]
+        first = self.first, *self.forces
+        mixed = (left * own + (1 - left) * now for own, now in zip(first, found[3:], strict=True))
+        return Samples(*found[:3], *mixed)
+
+
+def add_pause(
+    plan: PhasePlan[PathMotion], joint: Joint, curve: Curve, options: PlanOptions
+) -> PhasePlan[PausedMotion] | PhasePlan[PathMotion]:
+    """The plan of a phase with the pause before it."""
+    if not joint.pause:
+        return plan
+    formation, z = curve.formation, curve.start
+    forces = find_static_forces(formation, z, joint.before)
+    middle, half = (joint.after + joint.before) / 2, (joint.after - joint.before) / 2
+    ramp = TorqueProfile(np.array([0.0, joint.pause]), np.stack([middle, half], axis=1)[None])
+    value = {
+        Objective.TIME: plan.value + joint.pause,
+        Objective.EFFORT: plan.value + ramp.integrate_squares() + options.time_weight * joint.pause,
+        Objective.MARGIN: min(plan.value, float(forces[0].min())),
+    }[options.goal]
+    motion = PausedMotion(plan.motion, joint.pause, joint.before, forces)
+    torque = TorqueProfile.chain([ramp, plan.torque])
+    return plan._replace(motion=motion, torque=torque, value=value)  # type: ignore[arg-type]
+
+
+def find_static_forces(formation: Formation, z: Array, tau: Array) -> Array:
+    """Contact forces that hold a formation at rest with the largest least c_n, (2, n_c) [N]."""
+    from scipy.optimize import linprog
+
+    scene, n_c = formation.scene, formation.n_contacts
+    units = np.array([1.0, 1.0, *[scene.scales.length] * 3])
+    kinematics = formation.evaluate(z[None], np.zeros((1, 5)))
+    normal, tangential = ((rows / units).T for rows in (kinematics.A[0], kinematics.A_t[0]))
+    joints = np.eye(5)[:, 3:]
+    load = (scene.applied_force + joints @ tau) / (scene.scales.force * units)
+    columns = np.hstack([normal, tangential, -joints, np.zeros((5, 1))])
+    cone, one, none = -np.diag(formation.friction), np.eye(n_c), np.zeros((n_c, 3))
+    rows = [np.hstack([cone, sign * one, none]) for sign in (1.0, -1.0)]
+    rows.append(np.hstack([-one, np.zeros((n_c, n_c + 2)), np.ones((n_c, 1))]))
+    free = [(None, None)]
+    dry = [(-d, d) for d in scene.dry[3:] / scene.scales.torque]
+    answer = linprog(
+        np.append(np.zeros(2 * n_c + 2), -1.0),
+        A_ub=np.vstack(rows),
+        b_ub=np.zeros(3 * n_c),
+        A_eq=columns,
+        b_eq=-load,
+        bounds=[*free * (2 * n_c), *dry, *free],
+        method="highs",
+    )
+    return np.asarray(scene.scales.force * answer.x[: 2 * n_c].reshape(2, n_c))

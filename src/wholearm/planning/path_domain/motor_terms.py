@@ -1,0 +1,128 @@
+"""Rows of the planning NLP for motors that are not infinitely quick.
+
+With the local variable y of an element (`elements`), d tau / dt = (d tau / dy) (dy / dt). At the
+nodes d tau / dy is that of the polynomial through the torques there, and dy / dt the pace over the
+element's length. Where two elements meet the torques are the same: there, and where a direction
+reverses, s'' and the squeeze take the steps that friction takes.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from ...common.arrays import Array, Expression
+from ...scene.model import Scene
+from .elements import DEGREE, FROM_HOLD, FROM_REST, INSIDE, SIGNS, TO_HOLD, TO_REST, find_basis
+
+if TYPE_CHECKING:
+    from ..columns import Symbols
+
+_NODES = DEGREE + 1
+
+
+class MotorShape(NamedTuple):
+    """Joints whose torques have a largest rate, and those whose torques follow a command."""
+
+    rates: tuple[int, ...] = ()
+    commands: tuple[int, ...] = ()
+
+    @staticmethod
+    def of(scene: Scene) -> MotorShape:
+        """The shape of a scene's motors."""
+        if not scene.has_slow_motors:
+            return QUICK
+        limited, lags = np.isfinite(scene.torque_rate_limit), scene.actuator_lag > 0
+        return MotorShape(*(tuple(np.flatnonzero(own).tolist()) for own in (limited, lags)))
+
+    @property
+    def slow(self) -> tuple[int, ...]:
+        """Joints whose torques may not step."""
+        return tuple(sorted({*self.rates, *self.commands}))
+
+    def list_sizes(self, intervals: int) -> dict[str, int]:
+        """Numbers of rows of each kind."""
+        n, joints = intervals + 1, len(self.slow)
+        return {
+            "rates": n * len(self.rates),
+            "commands": n * len(self.commands),
+            "joins": (n // _NODES - 1) * joints,
+            "begins": 2 * bool(joints),
+        }
+
+
+QUICK = MotorShape()
+"""Motors whose torques may step."""
+
+
+def list_kinds(count: int, held: bool) -> list[int]:
+    """Kinds of so many elements from rest to rest."""
+    start, stop = (FROM_HOLD, TO_HOLD) if held else (FROM_REST, TO_REST)
+    return [start, *[INSIDE] * (count - 2), stop]
+
+
+def find_first_slopes(a: Expression) -> tuple[Expression, Expression]:
+    """How s'' grows with y where the motion starts and where it ends, measured from there."""
+    basis = find_basis()
+    start = ca.DM(basis.to_powers[FROM_HOLD][1]).T @ a[:_NODES]
+    return start, ca.DM(basis.to_powers[TO_HOLD][1]).T @ a[-_NODES:]
+
+
+def write_motor_rows(
+    shape: MotorShape,
+    given: Symbols,
+    torques: Expression,
+    a: Expression,
+    paces: Expression,
+    lengths: Expression,
+) -> dict[str, Expression]:
+    """Rows of each kind of `MotorShape.list_sizes`.
+
+    Parameters
+    ----------
+    shape : MotorShape
+    given : Symbols
+        Of the parameters `quick`, one over each largest rate, and `lags`.
+    torques : Expression, shape (n, 2)
+    a : Expression, shape (n,)
+    paces, lengths : Expression, shape (p + 1, E), (1, E)
+        dy/dt times the element's length, and that.
+    """
+    if not shape.slow:
+        none = ca.SX(0, 1)
+        return {"rates": none, "commands": none, "joins": none, "begins": none}
+    rates = {joint: _differentiate(torques[:, joint], paces, lengths) for joint in shape.slow}
+    rows = [given.quick[k] * rates[joint] for k, joint in enumerate(shape.rates)]
+    lagged = [
+        torques[:, joint] + given.lags[k] * rates[joint] for k, joint in enumerate(shape.commands)
+    ]
+    joins = [torques[_NODES::_NODES, j] - torques[DEGREE:-1:_NODES, j] for j in shape.slow]
+    return {
+        "rates": ca.vertcat(ca.SX(0, 1), *rows),
+        "commands": ca.vertcat(ca.SX(0, 1), *lagged),
+        "joins": ca.vertcat(*joins),
+        "begins": ca.vertcat(*find_first_slopes(a)),
+    }
+
+
+def _differentiate(values: Expression, paces: Expression, lengths: Expression) -> Expression:
+    """Time derivative at the nodes of what has these values there, shape (n,)."""
+    table, count = ca.reshape(values, _NODES, -1), lengths.numel()
+    slopes = [ca.DM(slope) for slope in list_slopes()]
+    columns = [slopes[kind] @ table[:, e] for e, kind in enumerate(list_kinds(count, True))]
+    return ca.vec(ca.horzcat(*columns) * paces / ca.repmat(lengths, _NODES, 1))
+
+
+def list_slopes() -> list[Array]:
+    """What takes values at the nodes of each kind of element to their slopes over y there.
+
+    Over 1 - y where y falls with time.
+    """
+    basis, powers = find_basis(), np.arange(_NODES)
+    slopes = []
+    for sign, y, to_powers in zip(SIGNS, basis.y, basis.to_powers, strict=True):
+        rises = powers * y[:, None] ** np.maximum(powers - 1, 0)
+        slopes.append(sign * rises @ to_powers)
+    return slopes

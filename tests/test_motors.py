@@ -1,0 +1,100 @@
+"""Torques that motors can follow: their rates, their lag, and pauses where phases meet."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from shipped import HEPTAGON, LANDING, problem_of
+from toys import LIMIT, Toy, constant
+from wholearm import InputError, Problem, solve, verify
+from wholearm.problem.table import describe_scene
+from wholearm.results.torque import TorqueProfile
+from wholearm.simulation.statics import balances
+from wholearm.verification.motors import describe_motors, find_commands
+
+
+@pytest.fixture(scope="module")
+def heptagon() -> Problem:
+    problem = problem_of(HEPTAGON)
+    return replace(problem, phases=problem.phases[:2])
+
+
+def fastest(rate: float) -> float:
+    """Least time over one metre from rest to rest, for a' <= rate and a <= LIMIT."""
+    ramp = math.cbrt(1 / (2 * rate))
+    if rate * ramp <= LIMIT:
+        return 4 * ramp
+    return LIMIT / rate + math.sqrt((LIMIT / rate) ** 2 + 4 / LIMIT)
+
+
+@pytest.mark.parametrize("rate", [4.0, 20.0])
+def test_a_point_moves_in_the_least_time_that_its_torque_rate_allows(rate: float) -> None:
+    plan = Toy(constant(1.0), rate_limit=(rate, rate)).plan()
+    assert fastest(rate) * (1 - 1e-6) < plan.motion.duration < fastest(rate) * (1 + 2e-4)
+    torque = plan.torque
+    t = np.linspace(0, torque.duration, 2001)
+    rates = find_commands(torque, np.ones(2)).at(t) - torque.at(t)
+    assert np.abs(rates).max() < rate * (1 + 1e-3)
+    assert np.abs(torque.at(np.array([0.0, torque.duration]))[:, 0]).max() < 1e-6 * LIMIT
+
+
+def test_commands_of_motors_that_lag_stay_within_the_torque_limits() -> None:
+    plan = Toy(constant(1.0), lag=(0.05, 0.0)).plan()
+    commands = find_commands(plan.torque, np.array([0.05, 0.0]))
+    most = np.abs(commands.at(np.linspace(0, commands.duration, 2001))[:, 0]).max()
+    assert most < LIMIT * (1 + 1e-3)
+    inner = plan.torque.breaks[1:-1]
+    steps = plan.torque.at(inner + 1e-12) - plan.torque.at(inner - 1e-12)
+    assert np.abs(steps[:, 0]).max() < 1e-6 * LIMIT
+    assert plan.motion.duration > 2 / np.sqrt(LIMIT)
+
+
+def test_torques_of_a_plan_never_step_and_hold_the_object_between_phases(
+    heptagon: Problem,
+) -> None:
+    problem = heptagon.with_(torque_rate_limit=50.0, actuator_lag2=1e-3)
+    plan = solve(problem, replay=False)
+    torque, scene = plan.trajectory.torque, problem.scene
+    assert describe_motors(problem, torque) == []
+    start = plan.trajectory.phase_starts[1]
+    for t in (0.0, start):
+        tau, z = torque.at(np.array([t]))[0], plan.at(t).z[0]
+        contacts = problem.phases[int(t > 0)].formation.contacts
+        assert balances(scene, contacts, z, tau)
+    assert verify(problem, plan).ok
+
+
+def test_what_a_motor_cannot_follow_is_reported(heptagon: Problem) -> None:
+    rows = np.array([[0.0, 0.0], [0.1, 0.0], [0.1, 0.0], [0.1, 0.5]])
+    torque = TorqueProfile.join_rows(np.array([0.0, 0.02, 0.04, 0.04 + 1e-2]), rows)
+    assert describe_motors(heptagon, torque) == []
+    slow = heptagon.with_(torque_rate_limit1=4.0, torque_rate_limit2=60.0)
+    (t, text), *others = describe_motors(slow, torque)
+    assert not others and t < 0.02 and "tau_1 changes at 5 N m/s" in text
+    lagging = heptagon.with_(actuator_lag2=0.04)
+    assert "takes a command of 2.5 N m" in describe_motors(lagging, torque)[0][1]
+    stepping = TorqueProfile.join_rows(
+        np.array([0.0, 0.02, 0.02, 0.05]), rows * [[1], [1], [5], [5]]
+    )
+    assert "tau_1 steps by 0.4 N m at t = 0.02 s" in describe_motors(slow, stepping)[0][1]
+    assert any("steps" in text for text in verify(slow, stepping).warnings)
+
+
+def test_phases_over_time_are_refused_by_the_key() -> None:
+    problem = problem_of(LANDING).with_(torque_rate_limit1=50.0)
+    with pytest.raises(InputError, match=r"fingers\.1\.torque_rate_limit: 50 given; phase 5"):
+        solve(problem)
+
+
+@pytest.mark.parametrize(("key", "value"), [("torque_rate_limit1", -1.0), ("actuator_lag", 1e6)])
+def test_keys_are_checked_and_kept(heptagon: Problem, key: str, value: float) -> None:
+    with pytest.raises(InputError, match=key.rstrip("1")):
+        heptagon.with_({key: value})
+    other = heptagon.with_(torque_rate_limit2=30.0, actuator_lag1=0.01)
+    known = describe_scene(other.scene)
+    assert (known["fingers.2.torque_rate_limit"], known["fingers.1.actuator_lag"]) == (30.0, 0.01)
+    assert other.with_(torque_rate_limit2=None).scene.fingers[1].torque_rate_limit == np.inf
