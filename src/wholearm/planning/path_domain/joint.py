@@ -88,7 +88,7 @@ def choose_joint(ending: Curve, beginning: Curve, epsilon: float, phase: int) ->
 
 def _list_torques(curve: Curve, epsilon: float, phase: int, place: int) -> tuple[Array, Array]:
     """Torques at an end of a curve on the verge of motion, (n, 2) [N m], and squeezes, (n,) [N]."""
-    data = prepare(curve, epsilon, Mesh().make_grid(curve, _ELEMENTS), phase)
+    data = prepare(curve, epsilon, Mesh().make_grid(curve, _ELEMENTS, held=True), phase)
     low, high = require_hold(data, phase, place)
     high = min(high, low + _WIDEST * curve.formation.scene.scales.force)
     share = np.linspace(_INSIDE, 1 - _INSIDE, _PLACES)

@@ -64,13 +64,16 @@ class Mesh(NamedTuple):
         return Mesh(_match(np.zeros(0), switches, curve)[0])
 
     def make_grid(
-        self, curve: Curve, elements: int, rests: tuple[bool, bool] = (True, True)
+        self,
+        curve: Curve,
+        elements: int,
+        rests: tuple[bool, bool] = (True, True),
+        held: bool = False,
     ) -> Grid:
         """Grid of a curve, fine towards its ends (where the motion is slow)."""
         ends = find_ends(curve, self.breaks)
         angles = np.arccos(1 - 2 * np.clip(ends / curve.length, 0.0, 1.0))
         weights = np.diff(angles) if self.weights is None else self.weights
-        held = curve.formation.scene.has_slow_motors
         if held and len(weights) > 2:
             weights = weights * np.array([_ENDS, *[1.0] * (len(weights) - 2), _ENDS])
         counts = _share_out(elements, weights)

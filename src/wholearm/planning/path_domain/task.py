@@ -56,6 +56,11 @@ class Task:
         return [spread(curve, self.epsilon, self.options.ranges, own) for curve, own in pairs]
 
     @property
+    def is_held(self) -> bool:
+        """Whether motions begin and end without acceleration, as torques may not step."""
+        return self.curves[0].formation.scene.has_slow_motors
+
+    @property
     def name(self) -> str:
         """The phases, for messages."""
         return name_phases(self.phases)
@@ -71,8 +76,7 @@ class Task:
         intervals = self.options.intervals
         if intervals is None:
             few = START if self.options.accuracy >= EARLY else 2 * START
-            slow = self.curves[0].formation.scene.has_slow_motors
-            return max(few, SOFT) if slow or self.options.goal is Objective.EFFORT else few
+            return max(few, SOFT) if self.is_held or self.options.goal is Objective.EFFORT else few
         return max(-(-intervals // DEGREE), 3)
 
     def require_unique(self) -> None:
@@ -116,7 +120,7 @@ class Task:
         """What each phase gives the NLP on its grid."""
         found, last = [], len(meshes) - 1
         for k, (curve, mesh) in enumerate(zip(self.curves, meshes, strict=True)):
-            grid = mesh.make_grid(curve, elements, (k == 0, k == last))
+            grid = mesh.make_grid(curve, elements, (k == 0, k == last), self.is_held)
             given = self.phases[k], self.spreads[k], self.quickness
             found.append(prepare(curve, self.epsilon, grid, *given))
         return found
