@@ -231,8 +231,7 @@ def make_bounds(
     # Next to rest b goes with the way: of the least s'' it is twice as much.
     s, length = data.grid.s, data.grid.s[-1]
     low[:, 0] = LEAST_B * np.minimum(s, length - s) / length
-    if data.grid.held:
-        # There b goes with the fourth power of y.
+    if data.grid.held:  # There b goes with the fourth power of y.
         low[: DEGREE + 1, 0] = low[-DEGREE - 1 :, 0] = LEAST_B**2
     high[:, 0] = np.maximum(b_max * speed_share / units.profile[0], 2 * LEAST_B)
     # From rest and to rest, with no way back.

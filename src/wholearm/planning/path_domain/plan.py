@@ -146,33 +146,25 @@ def plan_curves(
     if isinstance(found, _Stuck):
         if not explained:
             raise SolverError(found.reason)
-        raise _explain_motors(task, found) or _explain(task, found, replan)
+        raise _explain(task, found, replan)
     if options.goal is Objective.MARGIN and found.plans[0].value < task.lost:
         least = SolverError(f"{task.name}: the margin found is below epsilon")
         raise _explain_duration(task) or least
     # Slow motors begin a motion as they leave what holds the object.
-    surely = options.goal is Objective.TIME and not options.ranges
-    surely = surely or found.round_.data.grid.held
+    surely = task.is_held or (options.goal is Objective.TIME and not options.ranges)
     return found.plans if surely else _leave_rest(found)
-
-
-def _explain_motors(task: Task, found: _Stuck) -> WholearmError | None:
-    """Why there is no plan with slow motors, if there are any."""
-    if not found.parts[0].grid.held:
-        return None
-    from .motor_explain import explain_motors
-
-    return explain_motors(task, found.parts, found.reason, plan_curves)
 
 
 def _explain(
     task: Task, found: _Stuck, replan: Callable[[Sequence[Curve], float], object]
 ) -> WholearmError:
-    """Why there is no plan: the duration, or what is short."""
+    """Why there is no plan: slow motors, the duration, or what is short."""
     from .explain import explain
+    from .motor_explain import explain_motors
 
-    slow = guess_slowly(join(found.parts))
-    late = _explain_duration(task)
+    if task.is_held:
+        return explain_motors(task, found.parts, found.reason, plan_curves)
+    late, slow = _explain_duration(task), guess_slowly(join(found.parts))
     return late or explain(found.parts, *slow, task.phases, found.reason, replan)
 
 
