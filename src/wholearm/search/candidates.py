@@ -142,14 +142,12 @@ def measure_link(
     return Measured(spent + sum(plan.motion.duration for plan in plans), steps)
 
 
-def list_variants(link: Link) -> list[tuple[Step, ...]]:
-    """The phases of a link that leaves a border, with the border left in motion.
+def list_variants(steps: tuple[Step, ...]) -> list[tuple[Step, ...]]:
+    """Phases that leave a border, with the border left in motion.
 
-    At a place that the planner chooses, and at the place of the link itself.
+    At a place that the planner chooses, and at that of some phases of the link.
     """
-    if len(link.steps) < 2:
-        return []
-    first, *rest = link.steps
+    first, *rest = steps
     return [
         (Step(first.contacts, Until(), End.SMOOTH), *rest),
         (first._replace(end=End.SMOOTH), *rest),

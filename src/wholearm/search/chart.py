@@ -7,6 +7,7 @@ share it.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -112,7 +113,8 @@ class Chart:
                     )
                     own = formation, str(link.steps[-1].until)
                     if own not in best or link.duration < best[own].duration:
-                        best[own] = link
+                        share = RELEASES[way.source]
+                        best[own] = replace(link, left=border.curve, share=share)
         self._releases[key] = list(best.values())
         return self._releases[key]
 

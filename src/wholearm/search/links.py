@@ -48,6 +48,10 @@ class Link:
     in_cell : bool
         Whether it leads through a cell. Then the planner chooses where it ends, the duration is
         that of straight ways, and nothing bounds it from below.
+    left : Curve or None
+        The border that it leaves for the cell.
+    share : float
+        Which part of that it follows.
     """
 
     start: Place
@@ -56,6 +60,8 @@ class Link:
     duration: float
     bound: float
     in_cell: bool = False
+    left: Curve | None = None
+    share: float = 0.0
 
     @property
     def signature(self) -> tuple[tuple[str, ...], ...]:
@@ -163,6 +169,14 @@ def point_out(contacts: Sequence[Contact], z: Array) -> Until:
     if sum(contact.finger is None for contact in contacts) == 2:
         return Until(coordinate="x", value=float(z[0]))
     return Until(coordinate="phi", value=float(z[2]))
+
+
+def leave_at(link: Link, share: float) -> tuple[Step, ...]:
+    """The phases of a link that leaves a border, with the border left somewhere else."""
+    assert link.left is not None
+    z = link.left.evaluate(np.array([share * link.left.length])).z[0]
+    first, *rest = link.steps
+    return (first._replace(until=point_out(first.contacts, z)), *rest)
 
 
 def describe_steps(steps: Sequence[Step]) -> str:

@@ -27,7 +27,7 @@ from .candidates import (
 from .chart import Chart
 from .find import Route, Search
 from .goals import is_at
-from .links import Measured, describe_steps
+from .links import Link, Measured, Step, describe_steps, leave_at
 from .places import make_place
 from .result import Alternative, Answer, describe_block
 
@@ -37,7 +37,9 @@ TRIED = 6
 """Most routes that are planned in vain, or beyond those that are asked for."""
 BEYOND = 1.1
 """Times of routes, by the search, over that of the best plan, from which on they are left out."""
-GAIN = 0.99
+MOVE = 0.12
+"""Share of a border by which the place where it is left is moved at first."""
+GAIN = 0.998
 """Largest share of a link's time that is worth another plan."""
 MEASURED, MORE = 12, 4
 """Most links through cells that are planned for themselves, until there is a plan and after it."""
@@ -137,7 +139,6 @@ class _Chooser:
         self.made: list[tuple[Plan, Route, Candidate]] = []
         self.failures: list[Failure] = []
         self.measurements = 0
-        self.polished = self.chart.polished
 
     def run(self, wanted: int, report: Callable[[str], None]) -> None:
         """Plan routes for as long as one may be better, or there are fewer than `wanted`."""
@@ -152,20 +153,42 @@ class _Chooser:
                 self._plan(route, wanted, report)
 
     def polish(self, report: Callable[[str], None]) -> None:
-        """Plan the best route again with borders left in motion, where that is faster."""
+        """Plan the best route again, with borders left elsewhere or in motion where that gains."""
         route = min(self.made, key=lambda own: own[0].duration)[1]
         changed = False
         for link in route.links:
-            for steps in list_variants(link) if link not in self.polished else ():
-                self.polished.add(link)
-                report(f"planning {describe_steps(steps)}")
-                found = measure_link(self.problem, link, steps, self.options)
-                before = self.chart.measured[link]
-                assert isinstance(before, Measured)
-                if isinstance(found, Measured) and found.duration < GAIN * before.duration:
-                    self.chart.measured[link], changed = found, True
+            if link.left is None or link in self.chart.polished:
+                continue
+            self.chart.polished.add(link)
+            report(f"planning {describe_steps(link.steps)} in other ways")
+            changed |= self._move(link)
+            before = self.chart.measured[link]
+            assert isinstance(before, Measured)
+            for steps in list_variants(before.steps):
+                changed |= self._try(link, steps)
         if changed:
             self._plan(route, 1, report)
+
+    def _move(self, link: Link) -> bool:
+        """Leave a border elsewhere for as long as that is faster; whether anything is."""
+        share, step, better = link.share, MOVE, False
+        while abs(step) > MOVE / 3:
+            moved = share + step
+            if 0.02 < moved < 0.98 and self._try(link, leave_at(link, moved)):
+                share, better = moved, True
+            else:
+                step = -step if step > 0 and not better else -step / 2
+        return better
+
+    def _try(self, link: Link, steps: tuple[Step, ...]) -> bool:
+        """Plan a link with other phases, and take them if it is faster so."""
+        found = measure_link(self.problem, link, steps, self.options)
+        before = self.chart.measured[link]
+        assert isinstance(before, Measured)
+        if isinstance(found, Measured) and found.duration < GAIN * before.duration:
+            self.chart.measured[link] = found
+            return True
+        return False
 
     @property
     def best(self) -> float:
