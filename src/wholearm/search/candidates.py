@@ -21,6 +21,8 @@ from ..problem.definition import End, Phase, Problem, Until
 from .find import Route
 from .links import INTERVALS, Link, Measured, Step, describe_steps, point_out
 
+FURTHER = 2
+"""Guesses of a phase that is planned alone, beyond the first one."""
 ROUGH = 1e-2
 """Accuracy of plans of which only matters about how long they take."""
 
@@ -132,13 +134,13 @@ def measure_link(
         if len(phases) > 1 and phases[0].end is End.REST:
             ahead = look_along((trace_phase(phases[0], z),), problem.epsilon, INTERVALS)
             spent, z, phases = ahead.duration, find_end(phases[0], z), phases[1:]
-        plans = try_phases(own, phases, z, rough)
+        plans = try_phases(own, phases, z, rough, FURTHER if len(phases) == 1 else 0)
     except NoMotionError:
         return "no motion keeps its limits along the border"
     except WholearmError as error:
         return str(error)
     if plans is None:
-        return "the first guess leads to no plan"
+        return "no guess leads to a plan"
     return Measured(spent + sum(plan.motion.duration for plan in plans), steps)
 
 

@@ -22,9 +22,11 @@ from .places import Place
 
 TURNING = 4.0
 """Least time that turning by a radian takes, by a rule of thumb, in the scene's time."""
-SETTING_OUT = 0.5
-"""The same of a motion through a cell."""
-OFTEN = 3
+CROSSING, LEAVING = 1.0, 2.5
+"""The same of a motion through a cell, from a place and from somewhere along a border."""
+SETTLED = 100
+"""Most places that are looked at."""
+OFTEN = 2
 """How often a place is settled, on different ways."""
 MOST = 4000
 """Most entries of the queue that are looked at."""
@@ -108,7 +110,7 @@ class Search:
             if not queue:
                 return
             cost, _, _, route, place, work = heapq.heappop(queue)
-            if cost > self.limit:
+            if cost > self.limit or self.settled > SETTLED:
                 return
             if work is None:
                 if route.links and is_at(place, self.goal):
@@ -123,7 +125,7 @@ class Search:
                 if times[key] == 1:
                     self.settled += 1
                 links = self._follow(route, place, put, times[key] == 1)
-                put(route, place, "cells", SETTING_OUT * time) if not place.landed else None
+                put(route, place, "cells", CROSSING * time) if not place.landed else None
             elif isinstance(work, tuple):
                 border, index = work
                 links = self.chart.release(border, index)
@@ -144,7 +146,7 @@ class Search:
             ending = self.chart.end_at(border, self.goal)
             links += [own for own in (link, ending) if own is not None]
             if not place.landed:
-                put(route, place, (border, index), 2 * SETTING_OUT * time)  # type: ignore[operator]
+                put(route, place, (border, index), LEAVING * time)  # type: ignore[operator]
         return links if first else [own for own in links if isinstance(own, Link)]
 
     @staticmethod

@@ -75,8 +75,11 @@ class Answer:
 
     @property
     def gap(self) -> float | None:
-        """How much longer the plan takes than the bound, over the bound; None without a bound."""
-        if self.bound is None or self.bound.value <= 0:
+        """How much longer the plan takes than the bound, over the bound.
+
+        None without a bound, and of a route through cells: the bound is of others.
+        """
+        if self.bound is None or self.bound.value <= 0 or self.route.in_cells:
             return None
         return max(0.0, self.plan.duration / self.bound.value - 1.0)
 
@@ -100,14 +103,13 @@ class Answer:
         ]
         if not self.complete:
             lines.append("interrupted: the best route so far")
-        if self.bound is not None and self.gap is not None:
-            text = (
-                f"along borders, with a stop where they meet, no route takes less than "
-                f"{self.bound.value:.6f} s: gap {100 * self.gap:.2g} %"
-            )
-            lines.append(text if self.bound.complete else f"{text} (the search for it ended early)")
+        if self.bound is not None:
+            text = f"no route along borders, with stops where they meet, takes less than {{}} s{{}}"
+            ended = "" if self.bound.complete else " (the search for such routes ended early)"
+            gap = "" if self.gap is None else f": gap {100 * self.gap:.2g} %"
+            lines.append(text.format(f"{self.bound.value:.6f}", gap + ended))
         if self.route.in_cells:
-            lines.append("the route leads through cells, where nothing bounds times from below")
+            lines.append("this one leads through cells, where nothing bounds times from below")
         tried = f"{self.settled} places looked at, {len(self.blocked)} ways blocked"
         lines.append(f"{tried}, {len(self.failures)} routes without a plan")
         return [*lines, NOT_CONSIDERED]

@@ -39,6 +39,8 @@ BEYOND = 1.1
 """Times of routes, by the search, over that of the best plan, from which on they are left out."""
 MOVE = 0.12
 """Share of a border by which the place where it is left is moved at first."""
+ELSEWHERE = (0.15, -0.15)
+"""The same where a way from the first place has no plan."""
 GAIN = 0.998
 """Largest share of a link's time that is worth another plan."""
 MEASURED, MORE = 12, 4
@@ -119,6 +121,11 @@ def get_chart(problem: Problem, options: PlanOptions) -> Chart:
     return chart
 
 
+def forget_charts() -> None:
+    """Forget what is known of scenes."""
+    _charts.clear()
+
+
 class _Chooser:
     """Routes of a search that are planned, those first that seem best.
 
@@ -152,25 +159,21 @@ class _Chooser:
             if len(self.made) < wanted or self._estimate(route) < self.best:
                 self._plan(route, wanted, report)
 
-    def polish(self, report: Callable[[str], None]) -> None:
-        """Plan the best route again, with borders left elsewhere or in motion where that gains."""
-        route = min(self.made, key=lambda own: own[0].duration)[1]
-        changed = False
+    def _polish(self, route: Route, report: Callable[[str], None]) -> None:
+        """Leave the borders of a route elsewhere or in motion, where that gains."""
         for link in route.links:
             if link.left is None or link in self.chart.polished:
                 continue
             self.chart.polished.add(link)
             report(f"planning {describe_steps(link.steps)} in other ways")
-            changed |= self._move(link)
+            self._move(link)
             before = self.chart.measured[link]
             assert isinstance(before, Measured)
             for steps in list_variants(before.steps):
-                changed |= self._try(link, steps)
-        if changed:
-            self._plan(route, 1, report)
+                self._try(link, steps)
 
-    def _move(self, link: Link) -> bool:
-        """Leave a border elsewhere for as long as that is faster; whether anything is."""
+    def _move(self, link: Link) -> None:
+        """Leave a border elsewhere for as long as that is faster."""
         share, step, better = link.share, MOVE, False
         while abs(step) > MOVE / 3:
             moved = share + step
@@ -178,7 +181,6 @@ class _Chooser:
                 share, better = moved, True
             else:
                 step = -step if step > 0 and not better else -step / 2
-        return better
 
     def _try(self, link: Link, steps: tuple[Step, ...]) -> bool:
         """Plan a link with other phases, and take them if it is faster so."""
@@ -206,12 +208,25 @@ class _Chooser:
                     return False
                 self.measurements += 1
                 report(f"planning {describe_steps(link.steps)}")
-                known[link] = measure_link(self.problem, link, link.steps, self.options)
+                known[link] = self._plan_link(link)
             if isinstance(known[link], str):
                 return False
         return True
 
+    def _plan_link(self, link: Link) -> Measured | str:
+        """Plan a link through a cell, from other places of its border if that fails."""
+        found = measure_link(self.problem, link, link.steps, self.options)
+        for move in ELSEWHERE if link.left is not None else ():
+            share = link.share + move
+            if not isinstance(found, str):
+                break
+            if 0.02 < share < 0.98:
+                steps = leave_at(link, share)
+                found = measure_link(self.problem, link, steps, self.options)
+        return found
+
     def _plan(self, route: Route, wanted: int, report: Callable[[str], None]) -> None:
+        self._polish(route, report)
         candidate = make_candidate(self.problem, [*self.before, route], self.chart.measured)
         if isinstance(candidate, Failure):
             self.failures.append(candidate)
@@ -251,8 +266,6 @@ def _choose(
         with yielding():
             report("looking for routes")
             chooser.run(1 + alternatives, report)
-            if chooser.made:
-                chooser.polish(report)
     except KeyboardInterrupt:
         if not chooser.made:
             raise

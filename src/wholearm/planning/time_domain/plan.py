@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import chain, islice
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -116,13 +117,19 @@ def plan_phases(
 
 
 def try_phases(
-    problem: Problem, phases: Sequence[Phase], z: Array, options: PlanOptions
+    problem: Problem, phases: Sequence[Phase], z: Array, options: PlanOptions, further: int = 0
 ) -> list[PhasePlan[TimeMotion]] | None:
-    """Plan phases from the first guess alone; None where that leads nowhere. See `plan_phases`."""
-    search = Search.of(problem, options, None, None, math.inf, False)
-    attempts = Attempts(problem, phases, z, search, None, False)
-    first, name = _begin(search, attempts.first, (), False)
-    return list_plans(problem, search, phases, first, name) if first.success else None
+    """Begin to plan phases from the first guess, and from a few further ones.
+
+    As `plan_phases` with `only_begin`; None where these lead nowhere, without looking for reasons.
+    """
+    search = Search.of(problem, options, None, None, math.inf, True)
+    attempts = Attempts(problem, phases, z, search, None, further > 0)
+    for attempt in chain([attempts.first], islice(attempts, further)):
+        solution = solve_attempt(search, attempt)
+        if solution.success:
+            return list_plans(problem, search, phases, solution, attempt.name)
+    return None
 
 
 def _look_further(

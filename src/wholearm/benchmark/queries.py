@@ -1,0 +1,209 @@
+"""Seeded queries from pose to pose: which are solved, how fast, and how near to the bound.
+
+``python -m wholearm.benchmark.queries [--queries 250] [--seed 0] [--jobs 2] [-o FILE.md]`` prints a
+line for each query and a table. A query has a start and a goal, each an edge on the palm and an x
+at which both fingers close on the object, drawn at random for the shipped scenes and for random
+polygons in the hexagon's hand. Each query is asked twice: first of a scene that nothing is known
+of, then again from the other end of the same border, with what is known.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..common.errors import InfeasibleError, InputError, WholearmError
+from ..common.files import write_whole
+from ..problem.definition import Problem
+from ..problem.goal import Goal
+from ..problem.read import build_problem, place_start, read_problem
+from ..search.route import find_route, forget_charts
+from ..verification.verify import verify
+from .stress.scenes import Table
+from .stress.workers import run_tasks
+
+SHIPPED = ("heptagon", "hexagon", "square", "triangle")
+POLYGONS = 5
+"""Random polygons, in the hexagon's hand."""
+RADIUS = 0.05
+"""Of the circle that their vertices are near [m]."""
+ACROSS = 3.0
+"""Largest x of a start or a goal, over the radius of gyration."""
+BOUND = 90.0
+"""Most processor time of a query [s]."""
+SECOND = 0.1
+"""How far the second query starts from the first one, over the radius of gyration."""
+
+
+class Query(NamedTuple):
+    """A query by its number and the folder of the shipped problems."""
+
+    seed: int
+    number: int
+    folder: Path
+
+
+class Outcome(NamedTuple):
+    """What came of a query.
+
+    Attributes
+    ----------
+    scene : str
+    kind : {"solved", "blocked", "no answer", "plan that fails"}
+    seconds, second : float
+        Processor time of the query, and of the second one; NaN where it is not asked.
+    gap : float
+        Of routes along borders alone, NaN for others.
+    text : str
+    """
+
+    scene: str
+    kind: str
+    seconds: float
+    second: float
+    gap: float
+    text: str
+
+
+def draw_scene(seed: int, number: int, folder: Path) -> Table:
+    """The table of the scene of a query, without start or phases of its own."""
+    kinds = len(SHIPPED) + POLYGONS
+    kind = number % kinds
+    name = SHIPPED[kind] if kind < len(SHIPPED) else "hexagon"
+    table = dict(read_problem(str(folder / f"{name}.toml")).table)
+    table.pop("phases")
+    if kind >= len(SHIPPED):
+        rng = np.random.default_rng([seed, 1000 + kind])
+        count = int(rng.integers(3, 8))
+        angles = 2 * np.pi * (np.arange(count) + rng.uniform(-0.25, 0.25, count)) / count
+        corners = RADIUS * np.column_stack([np.cos(angles), np.sin(angles)])
+        table["object"] = {"vertices": corners.round(4).tolist(), "mass": 0.2}
+        table["name"] = f"polygon {kind - len(SHIPPED) + 1}"
+    else:
+        table["name"] = name
+    return table
+
+
+def draw_query(query: Query) -> Problem:
+    """The problem of a query."""
+    rng = np.random.default_rng([query.seed, query.number])
+    table = draw_scene(query.seed, query.number, query.folder)
+    first = _draw_pose(rng, table)
+    while (last := _draw_pose(rng, table)) == first:
+        pass
+    return build_problem({**table, "start": first, "goal": last})
+
+
+def _draw_pose(rng: np.random.Generator, table: Table) -> dict[str, float]:
+    count = len(table["object"]["vertices"])
+    scene = build_problem(table).scene
+    size = scene.scales.length
+    while True:
+        edge, x = int(rng.integers(count)), round(size * rng.uniform(-ACROSS, ACROSS), 4)
+        try:
+            place_start(scene, edge, x)
+            build_problem({**table, "start": {"flush": edge, "x": x}})
+        except InputError:
+            continue
+        return {"flush": edge, "x": x}
+
+
+def run_query(query: Query) -> Outcome:
+    """Ask a query, and a second one on the same map."""
+    problem = draw_query(query)
+    forget_charts()
+    name = f"{problem.name}: {problem.table['start']} to {problem.goals[0]}"
+    started = time.process_time()
+    try:
+        answer = find_route(problem)
+    except InfeasibleError as error:
+        seconds = time.process_time() - started
+        return Outcome(name, "blocked", seconds, np.nan, np.nan, str(error))
+    except WholearmError as error:
+        seconds = time.process_time() - started
+        return Outcome(name, "no answer", seconds, np.nan, np.nan, str(error))
+    seconds = time.process_time() - started
+    failures = verify(answer.problem, answer.plan).failures
+    if failures:
+        return Outcome(name, "plan that fails", seconds, np.nan, np.nan, failures[0])
+    gap = np.nan if answer.gap is None else answer.gap
+    text = f"{answer.plan.duration:.6f} s, {len(answer.problem.phases)} phases"
+    return Outcome(name, "solved", seconds, _ask_again(problem), gap, text)
+
+
+def _ask_again(problem: Problem) -> float:
+    """Processor time of a query to nearly the same goal, with what is known of the scene [s]."""
+    goal, step = problem.goals[0], SECOND * problem.scene.scales.length
+    assert goal.x is not None
+    table = {**problem.table, "goal": Goal(flush=goal.flush, x=goal.x + step).to_table()}
+    started = time.process_time()
+    try:
+        find_route(build_problem(table))
+    except WholearmError:
+        return float("nan")
+    return time.process_time() - started
+
+
+def summarise(outcomes: Sequence[Outcome]) -> str:
+    """Tables of what came of queries, and of the times."""
+    kinds = Counter(own.kind for own in outcomes)
+    lines = ["| queries | " + " | ".join(kinds) + " |", "|---|" + "---|" * len(kinds)]
+    lines.append(f"| {len(outcomes)} | " + " | ".join(str(n) for n in kinds.values()) + " |")
+    lines += ["", "| processor time | median [s] | 95 % [s] | most [s] |", "|---|---|---|---|"]
+    solved = [own for own in outcomes if own.kind == "solved"]
+    rows = [
+        ("solved", [own.seconds for own in solved]),
+        ("second query", [own.second for own in solved if own.second == own.second]),
+        ("blocked", [own.seconds for own in outcomes if own.kind == "blocked"]),
+    ]
+    for name, times in rows:
+        if times:
+            middle, most, last = np.percentile(times, [50, 95, 100])
+            lines.append(f"| {name} | {middle:.2f} | {most:.2f} | {last:.2f} |")
+    ratios = [own.second / own.seconds for own in solved if own.second == own.second]
+    gaps = [own.gap for own in solved if own.gap == own.gap]
+    if ratios:
+        lines += ["", f"Second over first query: median {np.median(ratios):.3f}."]
+    if gaps:
+        text = f"Gap of {len(gaps)} routes along borders alone: at most {100 * max(gaps):.2g} %"
+        lines.append(f"{text}, median {100 * float(np.median(gaps)):.2g} %.")
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Print a line for each query and tables; the exit status is 1 if a plan fails."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--queries", type=int, default=250)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--first", type=int, default=0, help="number of the first query")
+    parser.add_argument("--problems", type=Path, default=Path("problems"), help="folder of scenes")
+    parser.add_argument("--jobs", type=int, default=1, help="worker processes")
+    parser.add_argument("-o", "--output", type=Path, help="file for the tables")
+    options = parser.parse_args()
+    numbers = range(options.first, options.first + options.queries)
+    tasks = [Query(options.seed, number, options.problems) for number in numbers]
+    outcomes = []
+    for answer in run_tasks(run_query, tasks, options.jobs, 2 * BOUND):
+        own = answer.result
+        if answer.ended != "done":
+            own = Outcome("", "no answer", answer.seconds, np.nan, np.nan, str(own)[-300:])
+        outcomes.append(own)
+        line = f"{answer.task.number} {own.scene}: {own.kind}, {own.seconds:.2f} s, then"
+        print(f"{line} {own.second:.2f} s: {own.text[:160]}", flush=True)
+    tables = summarise(outcomes)
+    print(tables)
+    if options.output is not None:
+        heading = f"# From pose to pose: {len(outcomes)} queries, seed {options.seed}\n\n"
+        write_whole(options.output, lambda stream: stream.write(f"{heading}{tables}\n".encode()))
+    return int(any(own.kind == "plan that fails" for own in outcomes))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
