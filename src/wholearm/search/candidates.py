@@ -10,8 +10,10 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import InputError, WholearmError
 from ..contacts.formation import Formation
+from ..geometry.explore import STILL
 from ..geometry.path_guess import find_end
 from ..geometry.tracing import trace_phase
+from ..mechanics.metric import metric_weights
 from ..planning.lower_bound.lower_bound import look_along
 from ..planning.lower_bound.sweep import NoMotionError
 from ..planning.options import Objective, PlanOptions
@@ -19,7 +21,7 @@ from ..planning.plan import solve_with
 from ..planning.result import Plan
 from ..problem.definition import End, Phase, Problem, Until
 from .find import Route
-from .links import INTERVALS, Link, Measured, Step, describe_steps, point_out
+from .links import INTERVALS, Blocked, Link, Measured, Step, describe_steps, point_out
 
 FURTHER = 2
 """Guesses of a phase that is planned alone, beyond the first one."""
@@ -134,6 +136,9 @@ def measure_link(
         if len(phases) > 1 and phases[0].end is End.REST:
             ahead = look_along((trace_phase(phases[0], z),), problem.epsilon, INTERVALS)
             spent, z, phases = ahead.duration, find_end(phases[0], z), phases[1:]
+        moved = find_end(phases[0], z, phases[1:]) - z
+        if metric_weights(problem.scene) @ moved**2 < (STILL * problem.scene.scales.length) ** 2:
+            return f"{phases[0].until} holds already where it starts"
         plans = try_phases(own, phases, z, rough, FURTHER if len(phases) == 1 else 0)
     except NoMotionError:
         return "no motion keeps its limits along the border"
@@ -154,6 +159,18 @@ def list_variants(steps: tuple[Step, ...]) -> list[tuple[Step, ...]]:
         (Step(first.contacts, Until(), End.SMOOTH), *rest),
         (first._replace(end=End.SMOOTH), *rest),
     ]
+
+
+def explain_border(problem: Problem, blocked: Blocked, options: PlanOptions) -> str:
+    """What keeps a border from being followed, and what single change would let it be."""
+    (step,) = blocked.steps
+    phase = Phase(0, Formation(problem.scene, step.contacts), step.until)
+    own = replace(problem, start=blocked.start.z, phases=(phase,), goals=())
+    try:
+        solve_with(own, replace(options, replay=False))
+    except WholearmError as error:
+        return f"from {blocked.start} {error}"
+    return ""
 
 
 def plan_candidate(

@@ -9,7 +9,7 @@ planner's.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -65,7 +65,9 @@ class Crossing(NamedTuple):
     duration: float
 
 
-def cross(formation: Formation, starts: Array, epsilon: float) -> list[Crossing]:
+def cross(
+    formation: Formation, starts: Array, epsilon: float, touching: Sequence[Contact] = ()
+) -> list[Crossing]:
     """The fastest straight way to each contact that can be gained, from each of some places.
 
     Parameters
@@ -75,9 +77,13 @@ def cross(formation: Formation, starts: Array, epsilon: float) -> list[Crossing]
     starts : ndarray, shape (n, 5)
         Where its contacts touch.
     epsilon : float, [N]
+    touching : sequence of Contact
+        What touches at the start; to gain one of these again leads nowhere new.
     """
     best: dict[tuple[int, Contact], Crossing] = {}
     for contact, sources, ends in _shoot(formation, starts, epsilon):
+        if contact in touching:
+            continue
         times = time_ways(formation, starts[sources], ends, epsilon)
         for k in np.flatnonzero(np.isfinite(times)):
             own = Crossing(int(sources[k]), contact, ends[k], float(times[k]))

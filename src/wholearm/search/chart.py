@@ -82,7 +82,7 @@ class Chart:
         if place.key not in self._cells:
             found: Found = []
             for formation in list_formations_at(place, 3):
-                for way in cross(formation, place.z[None], self.epsilon):
+                for way in cross(formation, place.z[None], self.epsilon, place.contacts):
                     found.append(self._link_cell(place, (), formation, way, 0.0))
             self._cells[place.key] = found
         return self._cells[place.key]
@@ -106,7 +106,7 @@ class Chart:
             held = border.formation.contacts
             middle = make_place(self.scene, z[0])
             for formation in list_formations_at(middle, 3):
-                for way in cross(formation, z, self.epsilon):
+                for way in cross(formation, z, self.epsilon, held):
                     first = Step(held, point_out(held, z[way.source]))
                     link = self._link_cell(
                         border.start, (first,), formation, way, times[way.source]

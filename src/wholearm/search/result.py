@@ -104,7 +104,7 @@ class Answer:
         if not self.complete:
             lines.append("interrupted: the best route so far")
         if self.bound is not None:
-            text = f"no route along borders, with stops where they meet, takes less than {{}} s{{}}"
+            text = "no route along borders, with stops where they meet, takes less than {} s{}"
             ended = "" if self.bound.complete else " (the search for such routes ended early)"
             gap = "" if self.gap is None else f": gap {100 * self.gap:.2g} %"
             lines.append(text.format(f"{self.bound.value:.6f}", gap + ended))
@@ -151,16 +151,22 @@ def format_phases(problem: Problem) -> str:
     return "\n".join(lines)
 
 
-def describe_block(search: Search, failures: list[Failure]) -> str:
-    """Why nothing leads to a goal: the ways that no motion can take, nearest to the goal first."""
+def list_blocked(search: Search) -> list[Blocked]:
+    """The ways that no motion can take, those nearest to the goal first."""
     blocked = {(own.start.key, own.steps): own for own in search.blocked}
-    nearest = sorted(blocked.values(), key=lambda own: search.measure(own.start))
-    reasons = [_describe_blocked(own) for own in nearest[:LISTED]]
-    reasons = [failure.reason for failure in failures[:2]] + reasons
+    return sorted(blocked.values(), key=lambda own: search.measure(own.start))
+
+
+def describe_block(search: Search, failures: list[Failure], advice: str) -> str:
+    """Why nothing leads to a goal, with `advice` on the blocked way nearest to it."""
+    blocked = list_blocked(search)
+    reasons = [advice] if advice else []
+    reasons += [failure.reason for failure in failures[:2]]
+    reasons += [_describe_blocked(own) for own in blocked[: LISTED - len(reasons)]]
     text = f"nothing leads from {search.start} to {search.goal}: {search.settled} places reached"
     if not reasons:
         return f"{text}, touching {describe(search.start.contacts)} at the start"
-    more = len(blocked) - LISTED
+    more = len(blocked) - LISTED + 1
     return f"{text}; blocked are " + "; ".join(reasons) + (f"; and {more} more" if more > 0 else "")
 
 

@@ -19,6 +19,7 @@ from .bounds import bound_borders
 from .candidates import (
     Candidate,
     Failure,
+    explain_border,
     list_variants,
     make_candidate,
     measure_link,
@@ -29,7 +30,7 @@ from .find import Route, Search
 from .goals import is_at
 from .links import Link, Measured, Step, describe_steps, leave_at
 from .places import make_place
-from .result import Alternative, Answer, describe_block
+from .result import Alternative, Answer, describe_block, list_blocked
 
 FASTER = 0.7
 """Share of the time of straight ways through cells that plans take at least, by experience."""
@@ -252,6 +253,12 @@ class _Chooser:
         return total
 
 
+def _advise(search: Search, problem: Problem, options: PlanOptions) -> str:
+    """What single change would open the blocked way that is nearest to the goal."""
+    border = next((own for own in list_blocked(search) if len(own.steps) == 1), None)
+    return "" if border is None else explain_border(problem, border, options)
+
+
 def _choose(
     problem: Problem,
     before: list[Route],
@@ -272,7 +279,8 @@ def _choose(
         complete = False
     made, margin = chooser.made, options.goal is Objective.MARGIN
     if not made:
-        raise InfeasibleError(describe_block(search, chooser.failures))
+        advice = _advise(search, problem, options)
+        raise InfeasibleError(describe_block(search, chooser.failures, advice))
     made.sort(key=lambda own: -own[0].value if margin else own[0].value)
     plan, route, candidate = made[0]
     bound = bound_borders(search, plan.duration) if complete and not before else None
