@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import signal
 import tomllib
 from functools import cache
 from typing import Any
@@ -8,7 +9,8 @@ import numpy as np
 import pytest
 
 from shipped import HEPTAGON, problem_of
-from wholearm.common.errors import InfeasibleError, InputError
+from wholearm.common.errors import InputError
+from wholearm.common.interrupts import guard, yielding
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phase
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
@@ -20,6 +22,7 @@ from wholearm.search.cells import cross, time_ways
 from wholearm.search.chart import Chart
 from wholearm.search.find import Route, Search
 from wholearm.search.places import make_place
+from wholearm.search.result import describe_block
 from wholearm.search.route import find_route
 from wholearm.verification.verify import verify
 
@@ -115,10 +118,34 @@ def test_a_problem_with_a_goal_is_planned() -> None:
 
 def test_what_blocks_is_said() -> None:
     # With next to no torque nothing moves.
-    with pytest.raises(InfeasibleError, match=r"nothing leads .* blocked are v0-palm v1-palm"):
-        find_route(read({"flush": 6}, torque_limit=0.02))
+    weak = problem_of(HEPTAGON).with_(torque_limit=0.02)
+    own = Search(Chart(weak, 0.1), make_place(weak.scene, weak.start), Goal(flush=6))
+    assert not list(own.run()) and own.settled == 1
+    text = describe_block(own, [], "")
+    assert text.startswith("nothing leads from x = 45 mm, phi = -1.984 deg to edge 6 on the palm")
+    for contact in ("v3-finger1", "v1-finger1"):
+        assert f"until {contact} from x = 45 mm, phi = -1.984 deg: no motion begins" in text
 
 
 def test_a_goal_that_holds_is_no_goal() -> None:
     with pytest.raises(InputError, match="goal: edge 0 on the palm holds already"):
         find_route(read({"flush": 0}))
+
+
+def test_ctrl_c_ends_a_search_that_has_an_answer() -> None:
+    reached = []
+
+    def run() -> int:
+        try:
+            with yielding():
+                signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            reached.append("stopped")
+        with pytest.raises(KeyboardInterrupt), yielding():
+            try:
+                signal.raise_signal(signal.SIGINT)
+            except KeyboardInterrupt:
+                pass  # as a solver would
+        return 0
+
+    assert guard(run) == 0 and reached == ["stopped"]

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -34,6 +36,19 @@ _BEYOND = (0.0, 0.005, 0.015, 0.05, 0.15, 0.5)
 """Relative distances beyond the least change to try: plans keep limits between nodes too."""
 _CLOSE = 0.02
 """Relative excess over the least change that is good enough."""
+
+
+_unadvised: ContextVar[bool] = ContextVar("_unadvised", default=False)
+
+
+@contextmanager
+def unadvised() -> Iterator[None]:
+    """Have errors say what is missing without looking for changes that would help."""
+    token = _unadvised.set(True)
+    try:
+        yield
+    finally:
+        _unadvised.reset(token)
 
 
 class Advice(NamedTuple):
@@ -121,7 +136,7 @@ def advise(
     seconds : float, [s]
         Processor time after which no further change is tried.
     """
-    if replan is None:
+    if replan is None or _unadvised.get():
         return Advice(text, ())
     stop, undecided = time.thread_time() + seconds, list[Parameter]()
 

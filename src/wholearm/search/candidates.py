@@ -14,6 +14,7 @@ from ..geometry.explore import STILL
 from ..geometry.path_guess import find_end
 from ..geometry.tracing import trace_phase
 from ..mechanics.metric import metric_weights
+from ..planning.advice import unadvised
 from ..planning.lower_bound.lower_bound import look_along
 from ..planning.lower_bound.sweep import NoMotionError
 from ..planning.options import Objective, PlanOptions
@@ -185,7 +186,8 @@ def plan_candidate(
     key = (start, phases, repr(options))
     if key not in kept:
         try:
-            kept[key] = solve_with(candidate.problem, options)
+            with unadvised():
+                kept[key] = solve_with(candidate.problem, options)
         except WholearmError as error:
             kept[key] = str(error)
     return kept[key]

@@ -17,6 +17,7 @@ from ..mechanics.dynamics import Directions, reduced_inertia
 from ..mechanics.metric import metric_weights
 from ..mechanics.uniqueness import find_minors
 from ..planning.lower_bound.lower_bound import Outlook, look_along
+from ..planning.lower_bound.rows import evaluate_rows
 from ..planning.lower_bound.sweep import NoMotionError
 from ..problem.definition import End, Until
 from .places import Place, list_formations_at, make_place
@@ -197,6 +198,10 @@ def look_at(curves: Sequence[Curve], epsilon: float, least_minor: float) -> Outl
         reason = _find_ambiguity(curve, least_minor)
         if reason:
             return reason
+    if reason := _find_held(curves[0], epsilon, 0.0) or _find_held(
+        curves[-1], epsilon, curves[-1].length
+    ):
+        return reason
     try:
         return look_along(curves, epsilon, INTERVALS)
     except NoMotionError as error:
@@ -209,6 +214,22 @@ def look_at(curves: Sequence[Curve], epsilon: float, least_minor: float) -> Outl
             s -= curve.length
         place = curve.evaluate(np.array([min(s, curve.length)])).z[0]
         return f"no motion keeps its limits at {describe_pose(place)}"
+
+
+def _find_held(curve: Curve, epsilon: float, s: float) -> str:
+    """Why a motion along a curve cannot begin or end at rest at a place; empty if it can."""
+    segment = 0 if s == 0 else len(curve.segments) - 1
+    rows = evaluate_rows(curve, epsilon, np.array([s]), np.array([segment]))
+    a, one = rows.a[0], rows.one[0]
+    if s > 0:
+        a = -a
+    with np.errstate(divide="ignore", invalid="ignore"):
+        least = np.where(a > 0, -one / a, 0.0).max()
+        most = np.where(a < 0, -one / a, np.inf).min()
+    if max(least, 0.0) <= most and not ((a == 0) & (one < 0)).any():
+        return ""
+    what = "begins" if s == 0 else "ends"
+    return f"no motion {what} at rest at {describe_pose(curve.evaluate(np.array([s])).z[0])}"
 
 
 def _find_ambiguity(curve: Curve, least: float) -> str:
