@@ -25,9 +25,9 @@ LEVEL = 1.0
 """Level of limits below which feedback gives way, in reserves."""
 IGNORED = 1e6
 """Level from which on a limit is none."""
-CORRECTION = 0.15
+CORRECTION = 0.3
 """Gain on the speed, times the period and the delay."""
-MEMORY = 0.1
+MEMORY = 0.2
 """Gain on the integral of the speed, over the square of that on the speed."""
 LEAST_SPEED = 0.4
 """Part of the touching speed below which braking never aims: friction turns round with motion."""

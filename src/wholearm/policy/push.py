@@ -23,6 +23,8 @@ DRIVE = 0.15
 BRAKE = 0.3
 """Deceleration along the next curve for each reserve, over the scene's unit: the contact that is
 gained need not be in the way of the motion."""
+FRICTION = (0.7, 1.0, 1.2)
+"""Parts of all friction with which the torques have to balance."""
 FULL = 0.98
 """Part of the torque limits that is used."""
 
@@ -48,7 +50,7 @@ def find_push(curve: Curve, gained: Contact, rows: Rows, after: Rows | None) -> 
     both = Formation(scene, (*formation.contacts, gained), formation.rolling)
     if both.n_constraints != 5:
         return None
-    balance = _balance(curve, both)
+    balances = [_balance(curve, both, part) for part in FRICTION]
     count, unit = both.n_contacts, scene.scales.acceleration
     reserves = rows.unit[-1, : formation.n_contacts]
     reserves = np.append(reserves, reserves.max())
@@ -58,7 +60,7 @@ def find_push(curve: Curve, gained: Contact, rows: Rows, after: Rows | None) -> 
     open_forces = forces[:, 3:] @ to_motion
     open_forces[:, 0] += forces[:, 0]
     found = [
-        np.column_stack([balance[:count], -reserves]),
+        *(np.column_stack([own[:count], -reserves]) for own in balances),
         np.append(to_motion[0] - [DRIVE * unit, 0.0, 0.0], 0.0)[None],
         np.column_stack([open_forces, -reserves[:-1]]),
     ]
@@ -76,14 +78,17 @@ def find_push(curve: Curve, gained: Contact, rows: Rows, after: Rows | None) -> 
     return np.asarray(answer.x[:2]) if answer.status == 0 else None
 
 
-def _balance(curve: Curve, both: Formation) -> Array:
-    """Forces of five constraints at the end of a curve, at rest, of (1, tau), shape (5, 3)."""
+def _balance(curve: Curve, both: Formation, part: float) -> Array:
+    """Forces of five constraints at the end of a curve, at rest, of (1, tau), shape (5, 3).
+
+    With a part of all friction.
+    """
     scene, last = curve.formation.scene, curve.segments[-1]
     point = curve.evaluate(np.array([curve.length]))
     kinematics = both.evaluate(point.z, point.z_s)
     slides = np.sign(kinematics.A_t[0] @ point.z_s[0])
     Xi = np.append(last.Xi, slides[-1])[None]
-    G = force_rows(both, kinematics, Directions(Xi, last.sigma[None]))[0]
+    G = force_rows(both, kinematics, Directions(part * Xi, last.sigma[None]))[0]
     known = np.zeros((5, 3))
     known[:, 0] = -scene.applied_force
     known[3:, 0] += scene.dry[3:] * last.sigma
