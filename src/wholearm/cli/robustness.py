@@ -28,6 +28,8 @@ def add_robustness(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the samples (0)")
     text = "only this phase, from its planned start at rest (default: the whole plan)"
     parser.add_argument("--phase", type=int, metavar="K", help=text)
+    text = "torques by this policy (.npz), at its own period, instead of the plan's by the clock"
+    parser.add_argument("--policy", metavar="FILE", help=text)
     text = (
         "half widths of ranges, instead of the problem's: mass, inertia (0.05), friction (0.1), "
         "gain of the torques (0.01), "
@@ -53,6 +55,7 @@ def add_robustness(parser: argparse.ArgumentParser) -> None:
 
 def _robustness(options: argparse.Namespace) -> int:
     from ..common.files import require_ending, require_writable
+    from ..policy.policy import Policy
     from ..problem.read import read_problem
     from ..results.trajectory_file import load_trajectory
     from ..robustness.report import to_dict, to_text
@@ -75,6 +78,7 @@ def _robustness(options: argparse.Namespace) -> int:
         seed=options.seed,
         uncertainty=_read_ranges(options, problem),
         phase=options.phase,
+        policy=None if options.policy is None else Policy.load(options.policy),
         path=output,
         fresh=options.fresh,
         start=_choose_executor(options),

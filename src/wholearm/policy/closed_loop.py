@@ -7,8 +7,10 @@ from collections.abc import Mapping
 from ..common.arrays import Array
 from .policy import Policy
 
-ROOM = 0.5
+ROOM = 1.0
 """Time that a simulation goes on after the policy's own, over that."""
+EXTRA = 0.05
+"""Time in which the contact of the first phase may close, in addition [s]."""
 
 
 class ClosedLoop:
@@ -38,11 +40,16 @@ class ClosedLoop:
         delay: float | None = None,
         gains: tuple[float, float] = (1.0, 1.0),
     ) -> None:
-        self.policy, self.gains = policy.with_(), gains
+        self.policy, self.gains, self.first = policy.with_(), gains, phase
         self.period = policy.pace.period
         self.delay = policy.pace.delay if delay is None else delay
         self.began: dict[int, float] = {}
         self.policy.reset(phase)
+
+    def find_duration(self, last: int) -> float:
+        """How long the phases up to the `last` take where nothing is off [s]."""
+        phases = self.policy.about["phases"][self.first - 1 : last]
+        return EXTRA + sum(float(own["duration"]) for own in phases)
 
     def held(
         self, t: float, theta: Array, theta_dot: Array, forces: Mapping[str, float]

@@ -116,6 +116,10 @@ class Policy:
         """The policy with another `period`, `delay` or other values of `Pace`."""
         return Policy(self.tables, self.pace._replace(**changes), self.about)
 
+    def cut(self, last: int) -> Policy:
+        """The policy of the phases up to the `last`."""
+        return Policy(self.tables[:last], self.pace, self.about)
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the policy to a ``.npz`` file.
 

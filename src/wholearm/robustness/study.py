@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -19,6 +20,7 @@ from ..common.arrays import Array
 from ..common.crowd import DiedError, run_all
 from ..common.errors import InputError
 from ..common.journal import Journal
+from ..policy.policy import Policy
 from ..problem.definition import Problem
 from ..results.narrow import Torques, narrow
 from .sensitivity import Sensitivities, measure_sensitivities
@@ -58,7 +60,9 @@ class Robustness:
 
     @cached_property
     def sensitivities(self) -> Sensitivities:
-        """What the least normal force of the motion depends on."""
+        """What the least normal force of the motion depends on; nothing with a policy."""
+        if self.trial.policy is not None:
+            return Sensitivities("", math.nan, math.nan, ())
         return measure_sensitivities(self.trial)
 
     @property
@@ -92,6 +96,7 @@ def assess_robustness(
     seed: int = 0,
     uncertainty: Uncertainty | None = None,
     phase: int | None = None,
+    policy: Policy | None = None,
     path: str | os.PathLike[str] | None = None,
     fresh: bool = False,
     start: Callable[[], Executor] | None = None,
@@ -110,6 +115,8 @@ def assess_robustness(
         The ranges; those of the problem, or their defaults, if left out.
     phase : int, optional
         Number of the only phase that is tried, from its planned start at rest.
+    policy : Policy, optional
+        What carries the plan out, by feedback from the joints.
     path : path, optional
         File to which results are written one by one. A study that is there already goes on where it
         was stopped, and ends the same to the last bit, unless it is to be `fresh`.
@@ -129,7 +136,7 @@ def assess_robustness(
     if isinstance(samples, bool) or not isinstance(samples, int) or samples < 1:
         raise InputError("", "samples", f"{samples!r} given; allowed are 1 and more")
     own = uncertainty or Uncertainty(problem.uncertainty or {})
-    trial = make_trial(problem, trajectory, own, phase)
+    trial = make_trial(problem, trajectory, own, phase, policy)
     drawn = own.draw(samples, seed)
     stamp = _stamp(trial, samples, seed)
     journal = None if path is None else Journal(os.fspath(path), stamp, fresh)
@@ -173,7 +180,10 @@ def use_processes(jobs: int | None = None) -> Executor:
 
 def _stamp(trial: Trial, samples: int, seed: int) -> dict[str, Any]:
     """What records belong to: another plan, range or version makes them another study's."""
-    known = (trial.torque.breaks, trial.torque.coefficients, trial.state)
+    known = [trial.torque.breaks, trial.torque.coefficients, trial.state]
+    if trial.policy is not None:
+        known += [part for tables in trial.policy.tables for part in tables.values()]
+        known.append(np.array(trial.policy.pace[:-1]))
     digest = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in known))
     return {
         "study": "robustness",

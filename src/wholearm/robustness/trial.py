@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +14,8 @@ from ..common.errors import InputError, SimulationError
 from ..contacts.closing import close_fingers, describe_obstacle
 from ..free_simulation.result import FreeSimulation, list_pauses
 from ..free_simulation.simulate import simulate_free
+from ..policy.closed_loop import ROOM, ClosedLoop
+from ..policy.policy import Policy
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
@@ -42,12 +44,15 @@ class Window(NamedTuple):
         That it is planned with.
     gained : str
         The contact that it ends with; empty where it ends otherwise.
+    start : float, [s]
+        Of the first window.
     """
 
     phase: int
     stop: float
     contacts: tuple[str, ...]
     gained: str
+    start: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +71,8 @@ class Trial:
     goal : ndarray, shape (3,)
         The pose that is planned for the end.
     uncertainty : Uncertainty
+    policy : Policy, optional
+        What the torques are by, instead of the clock; its period is that of the samples.
     """
 
     problem: Problem
@@ -74,6 +81,7 @@ class Trial:
     windows: tuple[Window, ...]
     goal: Array
     uncertainty: Uncertainty
+    policy: Policy | None = None
 
     def run(self, sample: Array) -> dict[str, Any]:
         """What becomes of one sample, as plain values.
@@ -99,15 +107,39 @@ class Trial:
         self, changes: Mapping[str, float], rate: float | None = None, offset: float = 0.0
     ) -> dict[str, Any]:
         """The same for numbers that are off by `changes`, torques sampled and held at a rate."""
-        torque = change_torques(self.torque, changes, rate, offset)
+        what: TorqueProfile | ClosedLoop
+        if self.policy is None:
+            what = change_torques(self.torque, changes, rate, offset)
+        else:
+            gains = (1 + changes.get("gain1", 0.0), 1 + changes.get("gain2", 0.0))
+            delay = changes.get("delay", self.policy.pace.delay)
+            what = ClosedLoop(self.policy, self.windows[0].phase, delay, gains)
         try:
-            simulation = self.simulate(changes, torque, self.uncertainty.tolerance)
+            simulation = self.simulate(changes, what, self.uncertainty.tolerance)
         except (InputError, SimulationError) as error:
             return {"ended": str(error), "reached": False, "kept": False, "lost": "start"}
+        if isinstance(what, ClosedLoop):
+            return self._take_windows(what, simulation).judge(simulation)
         return self.judge(simulation, changes.get("delay", 0.0))
 
+    def _take_windows(self, loop: ClosedLoop, simulation: FreeSimulation) -> Trial:
+        """The trial with phases as a policy has begun them."""
+        began, end = loop.began, float(simulation.t[-1])
+        last = self.windows[-1].phase
+        windows = [
+            own._replace(
+                start=began.get(own.phase, end),
+                stop=end if own.phase == last else began.get(own.phase + 1, math.inf),
+            )
+            for own in self.windows
+        ]
+        return replace(self, windows=tuple(windows))
+
     def simulate(
-        self, changes: Mapping[str, float], torque: TorqueProfile, tolerance: float = 1e-9
+        self,
+        changes: Mapping[str, float],
+        torque: TorqueProfile | ClosedLoop,
+        tolerance: float = 1e-9,
     ) -> FreeSimulation:
         """Replay torques in the scene whose numbers are off, free of assumptions.
 
@@ -121,7 +153,10 @@ class Trial:
         closed = close_fingers(problem.scene, x, self.state[2:3])
         if text := describe_obstacle(closed):
             raise SimulationError(f"the hand cannot close at the start: {text}")
-        return simulate_free(problem, torque, start=closed.z[0], tolerance=tolerance)
+        until = None
+        if isinstance(torque, ClosedLoop):
+            until = (1 + ROOM) * torque.find_duration(self.windows[-1].phase)
+        return simulate_free(problem, torque, start=closed.z[0], until=until, tolerance=tolerance)
 
     def judge(self, simulation: FreeSimulation, delay: float = 0.0) -> dict[str, Any]:
         """Compare a motion with the plan; as `run`."""
@@ -153,7 +188,7 @@ class Trial:
         end by the clock.
         """
         pause = PAUSE * self.problem.scene.scales.time
-        began, losses, least = 0.0, list[tuple[float, int, str]](), math.inf
+        began, losses, least = self.windows[0].start, list[tuple[float, int, str]](), math.inf
         for window in self.windows:
             gains = [own.start for own in simulation.stretches if own.contact == window.gained]
             gain = min((time for time in gains if time > began), default=math.inf)
@@ -189,19 +224,27 @@ def _find_loss(
 
 
 def make_trial(
-    problem: Problem, plan: Trajectory, uncertainty: Uncertainty, phase: int | None = None
+    problem: Problem,
+    plan: Trajectory,
+    uncertainty: Uncertainty,
+    phase: int | None = None,
+    policy: Policy | None = None,
 ) -> Trial:
-    """What is tried of a plan: all of it, or the phase of a number.
+    """What is tried of a plan: all of it, or the phase of a number, by a policy if one is given.
 
     Raises
     ------
     InputError
-        If the plan has no phase of that number, or one that does not start at rest.
+        If the plan has no phase of that number, or one that does not start at rest; or the policy
+        has other phases.
     """
     starts = plan.phase_starts
     count = len(starts) - 1
     if phase is not None and not 1 <= phase <= count:
         raise InputError("", "--phase", f"{phase} given; the plan has phases 1 to {count}")
+    if policy is not None and len(policy.laws) != count:
+        given = f"{len(policy.laws)} given; the plan has {count}"
+        raise InputError("", "phases of the policy", given)
     first, last = (0, count - 1) if phase is None else (phase - 1, phase - 1)
     rows = np.flatnonzero((plan.phase >= first) & (plan.phase <= last))
     speed = problem.scene.scales
@@ -222,4 +265,6 @@ def make_trial(
     torque = plan.torque.cut(begin, float(starts[last + 1]))
     torque = TorqueProfile(torque.breaks - begin, torque.coefficients)
     goal = plan.q[rows[-1]]
-    return Trial(problem, torque, plan.z[rows[0]], windows, goal, uncertainty)
+    if policy is not None:
+        policy = policy.cut(last + 1)
+    return Trial(problem, torque, plan.z[rows[0]], windows, goal, uncertainty, policy)

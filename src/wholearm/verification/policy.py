@@ -62,7 +62,7 @@ def verify_policy(
         if given != count:
             raise InputError("", f"phases of the {name}", f"{given} given; the problem has {count}")
     loop = ClosedLoop(policy)
-    until = (1 + ROOM) * policy.duration
+    until = (1 + ROOM) * loop.find_duration(count)
     whole = simulate_free(problem, loop, until=until, tolerance=tolerance, restitution=restitution)
     phases = tuple(
         _judge(problem, plan, loop, whole, phase, allowed)
