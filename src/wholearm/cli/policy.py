@@ -15,8 +15,8 @@ def add_policy(parser: argparse.ArgumentParser) -> None:
     text = "policy to write (.npz; default: NAME_policy.npz)"
     parser.add_argument("-o", "--output", metavar="FILE", help=text)
     text = "normal force that is kept in reserve along the way, over what usual errors of masses, "
-    text += "friction and torques take away (2); 0 is as fast as the plan"
-    parser.add_argument("--reserve", type=float, default=2.0, help=text)
+    text += "friction and torques take away (2.5); 0 is as fast as the plan"
+    parser.add_argument("--reserve", type=float, default=2.5, help=text)
     text = "of the control loop [s] (1e-3)"
     parser.add_argument("--period", type=float, default=1e-3, help=text)
     text = "time from measuring to when torques take effect [s] (5e-4)"

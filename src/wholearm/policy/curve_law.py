@@ -25,12 +25,14 @@ LEVEL = 1.0
 """Level of limits below which feedback gives way, in reserves."""
 IGNORED = 1e6
 """Level from which on a limit is none."""
-CORRECTION = 0.3
+CORRECTION = 0.25
 """Gain on the speed, times the period and the delay."""
 MEMORY = 0.2
 """Gain on the integral of the speed, over the square of that on the speed."""
 LEAST_SPEED = 0.4
 """Part of the touching speed below which braking never aims: friction turns round with motion."""
+SLOW = 0.5
+"""Part of the reference's speed below which the motion does not brake with it."""
 LAST = 0.02
 """Part of the curve, at its end, on which standing still counts as having arrived."""
 STARTING = 10
@@ -138,9 +140,12 @@ class CurveLaw:
             return self._press()
         j, share = self._locate(j, s)
         b = self.b[j] + share * (self.b[j + 1] - self.b[j])
-        error = max(sqrt(b) if b > 0.0 else 0.0, pace.touch) - v
+        wanted = max(sqrt(b) if b > 0.0 else 0.0, pace.touch)
+        error = wanted - v
         way = half * max(v, pace.touch)
         planned = (self._look(j, s + way) - self._look(j, s - way)) / (4.0 * way)
+        if planned < 0.0 and v < SLOW * wanted:
+            planned = 0.0
         self.sum = min(max(self.sum + self.memory * error, -pace.most), pace.most)
         a = planned + self.gain * error + self.sum
         slowest = (LEAST_SPEED * pace.touch - (v - half * self.a)) / (pace.period + pace.delay)

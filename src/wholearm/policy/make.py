@@ -55,7 +55,7 @@ def make_policy(
     problem: Problem,
     plan: Trajectory,
     *,
-    reserve: float = 2.0,
+    reserve: float = 2.5,
     period: float = 1e-3,
     delay: float = 5e-4,
 ) -> Policy:

@@ -123,8 +123,9 @@ class Trial:
         return self.judge(simulation, changes.get("delay", 0.0))
 
     def _take_windows(self, loop: ClosedLoop, simulation: FreeSimulation) -> Trial:
-        """The trial with phases as a policy has begun them."""
-        began, end = loop.began, float(simulation.t[-1])
+        """The trial with phases as a policy has begun them, from when their torques take effect."""
+        end = float(simulation.t[-1])
+        began = {number: time + loop.delay for number, time in loop.began.items()}
         last = self.windows[-1].phase
         windows = [
             own._replace(
