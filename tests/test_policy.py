@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.linalg import solve_continuous_are
 from scipy.optimize import linprog
 
 import wholearm
@@ -15,9 +16,11 @@ from shipped import HEPTAGON, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.planning.result import Plan
-from wholearm.policy.curve_law import choose_squeeze
+from wholearm.policy.curve_law import CurveLaw, Pace, choose_squeeze
 from wholearm.policy.make import make_policy
+from wholearm.policy.motion_law import MotionLaw
 from wholearm.policy.policy import Policy
+from wholearm.policy.regulator import RATE, Linear, regulate
 from wholearm.policy.retime import eliminate, retime
 from wholearm.problem.definition import Problem
 from wholearm.verification.policy import verify_policy
@@ -87,6 +90,7 @@ def test_without_a_reserve_it_is_as_fast_as_the_plan(problem: Problem, plan: Pla
 
 def test_joints_say_where_the_hand_is(policy: Policy, plan: Plan) -> None:
     law = policy.laws[0]
+    assert isinstance(law, CurveLaw)
     law.begin()
     motion = plan.trajectory.motions[0]
     t = np.linspace(0.0, motion.duration, 41)
@@ -109,6 +113,48 @@ def test_a_policy_keeps_contacts_where_numbers_are_off(
     assert [phase.number for phase in report.phases] == [1, 2]
     end = report.phases[-1].deviation
     assert end is not None and end.position < 1e-3
+
+
+def test_gains_are_those_of_the_riccati_equation() -> None:
+    rng = np.random.default_rng(6)
+    A, B = np.zeros((4, 4)), rng.normal(size=(2, 2))
+    A[:2, 2:], A[2:] = np.eye(2), rng.normal(size=(2, 4))
+    cost, joints = np.diag([1.0, 2.0]), np.eye(2)
+    step = 1e-4
+    gains = regulate([Linear(joints, A, B, cost)] * 50, step)
+    inputs, Q = np.vstack([np.zeros((2, 2)), B]), np.diag([RATE**4] * 2 + [2 * RATE**2] * 2)
+    P = solve_continuous_are(A, inputs, Q, cost)
+    best = np.linalg.solve(cost, inputs.T @ P)
+    # Torques are held for a step.
+    assert gains[0] == pytest.approx(best, rel=0.1)
+    assert np.linalg.eigvals(A - inputs @ gains[0]).real.max() < -0.3 * RATE
+
+
+def test_joints_are_led_along_a_motion() -> None:
+    pace = Pace(1e-3, 0.0, 1e-3, 1e-3, 3e-3, 1.0, (5.0, 5.0))
+    t = np.linspace(0.0, 0.2, 201)
+    theta = np.column_stack([1 - np.cos(5 * np.pi * t), 0 * t])
+    rates = np.column_stack([5 * np.pi * np.sin(5 * np.pi * t), 0 * t])
+    bent = np.column_stack([25 * np.pi**2 * np.cos(5 * np.pi * t), 0 * t])
+    inertia, gains = 0.01, np.hstack([np.diag([100.0] * 2), np.diag([2.0] * 2)])
+    law = MotionLaw(
+        {
+            "starts": np.array([0.0, 0.1]), "step": t[1:2], "theta": theta, "rates": rates,
+            "tau": inertia * bent, "gain": np.tile(gains, (201, 1, 1)), "push": np.zeros(2),
+            "still": np.array([1e-3]),
+        },
+        pace,
+    )  # fmt: skip
+    # It begins off, and a torque that is not known of acts all the time.
+    place, speed = np.array([0.01, -0.01]), np.zeros(2)
+    for k in range(600):
+        tau = np.add(law.step(place.tolist(), speed.tolist(), None), [0.1, -0.1])
+        speed, before = speed + 1e-3 * tau / inertia, speed
+        place = place + 1e-3 * (speed + before) / 2
+        assert law.passed == (k >= 100)
+        if 60 < k < 200:
+            assert place == pytest.approx(theta[k + 1], abs=3e-3)
+    assert law.over and place == pytest.approx(theta[-1], abs=1e-6)
 
 
 def test_files(tmp_path: Path, problem: Problem, plan: Plan, policy: Policy) -> None:

@@ -21,6 +21,8 @@ def add_policy(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--period", type=float, default=1e-3, help=text)
     text = "time from measuring to when torques take effect [s] (5e-4)"
     parser.add_argument("--delay", type=float, default=5e-4, help=text)
+    text = "of both fingers, if it is more than the plan was made with [N m] (default: the same)"
+    parser.add_argument("--torque-limit", type=float, help=text)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     parser.set_defaults(run=_policy)
 
@@ -38,7 +40,7 @@ def _policy(options: argparse.Namespace) -> int:
     require_ending(output, ".npz")
     plan = load_trajectory(options.plan)
     problem = read_own_problem(plan.meta, options.plan)
-    given = {key: getattr(options, key) for key in ("reserve", "period", "delay")}
+    given = {key: getattr(options, key) for key in ("reserve", "period", "delay", "torque_limit")}
     with name_source(options.plan):
         policy = make_policy(problem, plan, **given)
     policy.save(output)

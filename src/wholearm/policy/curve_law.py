@@ -77,13 +77,14 @@ Rows = list[list[float]]
 
 
 class CurveLaw:
-    """The law of one phase.
+    """The law of one phase, of which none is passed before it is over.
 
     Parameters
     ----------
     tables : mapping of str to ndarray
         `s`, (n,); `theta`, (n, 2); `b`, (n,), at nodes; `levels`, (n - 1, 2, m, 5), and `torque`,
-        (n - 1, 2, 2, 5), at both ends of the intervals; `push`, (2,).
+        (n - 1, 2, 2, 5), at both ends of the intervals; `push`, (2,); `passes`, (1,), not zero
+        where the end is passed at speed.
     pace : Pace
 
     Attributes
@@ -96,7 +97,10 @@ class CurveLaw:
         Place and speed along the curve, and the least level, at the last step.
     """
 
+    count, passed = 1, 0
+
     def __init__(self, tables: Mapping[str, Any], pace: Pace) -> None:
+        self.passes = bool(tables["passes"][0])
         self.pace, self.nodes = pace, tables["s"].tolist()
         self.length = self.nodes[-1]
         self.theta, self.b = tables["theta"].tolist(), tables["b"].tolist()
@@ -134,6 +138,8 @@ class CurveLaw:
         lead = pace.delay + half
         s += lead * (v + 0.5 * lead * self.a)
         v += lead * self.a
+        if self.passes:
+            self.over = s >= self.length
         slow = self.v < pace.still and self.ran > STARTING * pace.period
         if (s >= self.length and v < 3.0 * pace.touch) or (slow and s > (1.0 - LAST) * self.length):
             self.pushes = True

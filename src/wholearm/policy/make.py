@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +11,10 @@ from numpy.typing import NDArray
 from ..common.arrays import Array
 from ..common.errors import InputError
 from ..common.require import require_number
+from ..contacts.formation import Formation
 from ..geometry.curve import Curve
 from ..geometry.tracing import runs_on_curve, trace_phase
+from ..mechanics.arrival import Standstill, find_hold
 from ..mechanics.dynamics import inverse
 from ..mechanics.metric import metric_weights
 from ..problem.definition import End, Phase, Problem
@@ -19,7 +22,8 @@ from ..results.trajectory import Trajectory
 from .curve_law import Pace
 from .curve_rows import Rows, find_directions, make_rows
 from .policy import Policy
-from .push import find_hold, find_push
+from .push import find_push, find_still
+from .regulator import follow
 from .retime import retime
 
 INTERVALS = 120
@@ -49,6 +53,7 @@ class Piece(NamedTuple):
     rows: Rows
     b: Array
     share: float
+    passes: bool
 
 
 def make_policy(
@@ -58,6 +63,7 @@ def make_policy(
     reserve: float = 2.5,
     period: float = 1e-3,
     delay: float = 5e-4,
+    torque_limit: float | None = None,
 ) -> Policy:
     """Make a policy that carries out a plan by feedback from the joints.
 
@@ -73,12 +79,14 @@ def make_policy(
         Of the control loop.
     delay : float, [s]
         Time from measuring to when torques take effect, as far as it is known.
+    torque_limit : float, optional, [N m]
+        Of both fingers, if it is not the problem's: what a plan leaves to feedback, where it was
+        made with less than the hand has.
 
     Raises
     ------
     InputError
-        If a number is out of its range, the plan is of another problem, or a phase does not run
-        along a curve.
+        If a number is out of its range, or the plan is of another problem.
     """
     reserve = require_number(reserve, "reserve", nonnegative=True)
     period = require_number(period, "period", positive=True)
@@ -86,36 +94,97 @@ def make_policy(
     if len(plan.phase_starts) != len(problem.phases) + 1:
         given = f"{len(plan.phase_starts) - 1} given; the problem has {len(problem.phases)}"
         raise InputError("", "phases of the plan", given)
-    pieces = [_trace(problem, phase, plan, reserve) for phase in problem.phases]
-    tables = []
-    for k, own in enumerate(pieces):
-        contact = problem.phases[k].until.contact
-        after = pieces[k + 1].rows if k + 1 < len(pieces) else None
-        push = None if contact is None else find_push(own.curve, contact, own.rows, after)
-        tables.append(_tabulate(own, find_hold(own.curve) if push is None else push))
-    scales = problem.scene.scales
-    one, two = problem.scene.torque_limit.tolist()
-    pace = Pace(
-        period,
-        delay,
-        TOUCH * scales.speed,
-        STILL * scales.speed,
-        DWELL,
-        MOST * scales.acceleration,
-        (one, two),
-    )
-    starts = plan.phase_starts
-    about = [
-        {
-            "number": phase.number,
-            "plan": float(starts[phase.number] - starts[phase.index]),
-            "duration": _time(own) + DWELL + delay,
-            "share": own.share,
-        }
-        for phase, own in zip(problem.phases, pieces, strict=True)
+    scales, limit = problem.scene.scales, problem.scene.torque_limit.tolist()
+    if torque_limit is not None:
+        limit = [require_number(torque_limit, "torque_limit", positive=True)] * 2
+    speeds = TOUCH * scales.speed, STILL * scales.speed
+    most = MOST * scales.acceleration
+    pace = Pace(period, delay, *speeds, DWELL, most, (limit[0], limit[1]))
+    blocks = _split(problem.phases)
+    curves = [len(own) == 1 and runs_on_curve(own[0]) for own in blocks]
+    pieces = [
+        _trace(problem, own[0], plan, reserve) if curve else None
+        for own, curve in zip(blocks, curves, strict=True)
     ]
+    tables, about = list[dict[str, Array]](), list[dict[str, Any]]()
+    starts = plan.phase_starts
+    for own, piece, after in zip(blocks, pieces, [*pieces[1:], None], strict=True):
+        lasts = {phase.number: float(np.diff(starts)[phase.index]) for phase in own}
+        found = [{"number": k, "plan": t, "duration": t, "share": 0.0} for k, t in lasts.items()]
+        if piece is None:
+            tables.append(_follow_motion(problem, own, plan, period))
+            ends = [*tables[-1]["starts"], tables[-1]["step"][0] * (len(tables[-1]["theta"]) - 1)]
+            for one, span in zip(found, np.diff(ends).tolist(), strict=True):
+                one["duration"] = span
+        else:
+            tables.append(_tabulate(piece, _end(problem, own[0], plan, piece, after)))
+            found[0].update(duration=_time(piece), share=piece.share)
+        found[-1]["duration"] += DWELL + delay
+        about += found
     whole = sum(own["duration"] for own in about)
     return Policy(tables, pace, {"name": problem.name, "duration": whole, "phases": about})
+
+
+def _split(phases: Sequence[Phase]) -> list[tuple[Phase, ...]]:
+    """Phases that pass into one another in motion belong together, but for impacts along curves."""
+    blocks: list[list[Phase]] = []
+    for phase in phases:
+        before = blocks[-1][-1] if blocks else None
+        impact = before is not None and before.end is End.IMPACT
+        joined = before is not None and before.end is End.SMOOTH
+        if joined or (impact and not (runs_on_curve(phase) and len(blocks[-1]) == 1)):
+            blocks[-1].append(phase)
+        else:
+            blocks.append([phase])
+    return [tuple(own) for own in blocks]
+
+
+def _end(
+    problem: Problem, phase: Phase, plan: Trajectory, piece: Piece, after: Piece | None
+) -> Array:
+    """Torques at the end of a curve: those that the plan holds there, if it does."""
+    if problem.settles(phase):
+        return np.asarray(plan.tau[np.flatnonzero(plan.phase == phase.index)[-1]])
+    contact, push = phase.until.contact, None
+    if contact is not None:
+        push = find_push(piece.curve, contact, piece.rows, None if after is None else after.rows)
+        push = _hold(problem, phase, piece.curve.end) if push is None else push
+    return find_still(piece.curve) if push is None else push
+
+
+def _hold(problem: Problem, phase: Phase, z: Array) -> Array | None:
+    """Torques that hold all that touches where a phase has gained its contact."""
+    contact = phase.until.contact
+    if contact is None:
+        return None
+    touching = Formation(problem.scene, (*phase.formation.contacts, contact))
+    place = Standstill(z, phase.formation, contact, touching)
+    hold = find_hold(place, problem.epsilon, problem.gap)
+    return None if hold is None else hold.tau
+
+
+def _follow_motion(
+    problem: Problem, phases: tuple[Phase, ...], plan: Trajectory, period: float
+) -> dict[str, Array]:
+    """Arrays of `MotionLaw`."""
+    starts = plan.phase_starts[phases[0].index : phases[-1].index + 2].copy()
+    starts[-1] = plan.t[(plan.phase == phases[-1].index) & ~plan.held][-1]
+    count = max(int(np.ceil((starts[-1] - starts[0]) / period)), 2)
+    t = np.linspace(starts[0], starts[-1], count + 1)
+    samples, last = plan.at(t), phases[-1]
+    hold = _hold(problem, last, samples.z[-1])
+    found = follow(problem, phases, plan, t)
+    speed = np.sqrt(found.b)
+    return {
+        "starts": (starts[:-1] - starts[0]) / speed,
+        "step": np.array([(t[1] - t[0]) / speed]),
+        "theta": samples.z[:, 3:],
+        "rates": samples.z_dot[:, 3:] * speed,
+        "tau": found.tau,
+        "gain": found.gains,
+        "push": samples.tau[-1] if hold is None else hold,
+        "still": np.array([STILL * problem.scene.scales.rate]),
+    }
 
 
 def _time(piece: Piece) -> float:
@@ -134,14 +203,12 @@ def _tabulate(piece: Piece, push: Array) -> dict[str, Array]:
         "levels": np.stack([rows.levels[:-1], rows.levels[1:]], axis=1),
         "torque": np.stack([rows.torque[:-1], rows.torque[1:]], axis=1),
         "push": push,
+        "passes": np.array([float(piece.passes)]),
     }
 
 
 def _trace(problem: Problem, phase: Phase, plan: Trajectory, reserve: float) -> Piece:
     """A phase's curve, with the motion that keeps a reserve."""
-    if not runs_on_curve(phase):
-        text = "does not run along a curve; policies are for phases with one freedom"
-        raise InputError(problem.source, f"phases[{phase.number}]", text)
     own = np.flatnonzero((plan.phase == phase.index) & ~plan.held)
     curve = trace_phase(phase, plan.z[own[0]], problem.phases[phase.index + 1 :])
     places, *values = _follow(curve, plan, own)
@@ -154,7 +221,7 @@ def _trace(problem: Problem, phase: Phase, plan: Trajectory, reserve: float) -> 
     wanted = reserve * rows.unit
     wanted[:, rows.presses :] = AUTHORITY * rows.unit[:, rows.presses :]
     motion = retime(s, rows.slack, wanted, b)
-    return Piece(curve, rows, motion.b, float(motion.share.min()))
+    return Piece(curve, rows, motion.b, float(motion.share.min()), phase.end is End.IMPACT)
 
 
 def _follow(

@@ -14,14 +14,22 @@ from ..common.errors import InputError
 from ..common.files import require_ending, write_whole
 from ..common.require import require_number
 from .curve_law import CurveLaw, Pace
+from .motion_law import MotionLaw
 
 FORMAT = 1
 """Version of the files."""
-TABLES = {
+CURVE = {
     "s": (-1,), "theta": (-1, 2), "b": (-1,), "levels": (-1, 2, -1, 5), "torque": (-1, 2, 2, 5),
-    "push": (2,),
+    "push": (2,), "passes": (1,),
 }  # fmt: skip
-"""Arrays of a phase and their shapes; -1 is any."""
+"""Arrays of a phase along a curve and their shapes; -1 is any."""
+MOTION = {
+    "starts": (-1,), "step": (1,), "theta": (-1, 2), "rates": (-1, 2), "tau": (-1, 2),
+    "gain": (-1, 2, 4), "push": (2,), "still": (1,),
+}  # fmt: skip
+"""Arrays of phases that are followed over time."""
+KINDS: Mapping[str, Mapping[str, tuple[int, ...]]] = {"curve": CURVE, "motion": MOTION}
+Law = CurveLaw | MotionLaw
 
 
 class Policy:
@@ -29,17 +37,16 @@ class Policy:
 
     Parameters
     ----------
-    phases : sequence of mapping
-        Tables of each phase; see `CurveLaw`.
+    tables : sequence of mapping
+        Of each law; see `CurveLaw` and `MotionLaw`.
     pace : Pace
     about : mapping, optional
         What the policy is of: name of the problem, duration, contacts that end phases.
 
     Attributes
     ----------
-    phase : int
-        Number of the present phase, from 1.
-    laws : tuple of CurveLaw
+    laws : tuple of CurveLaw or MotionLaw
+        One for each phase, or for phases that pass into one another in motion.
 
     Notes
     -----
@@ -58,13 +65,27 @@ class Policy:
 
     def __init__(
         self,
-        phases: Sequence[Mapping[str, Any]],
+        tables: Sequence[Mapping[str, Any]],
         pace: Pace,
         about: Mapping[str, Any] | None = None,
     ) -> None:
-        self.tables, self.pace, self.about = tuple(phases), pace, dict(about or {})
-        self.laws = tuple(CurveLaw(tables, pace) for tables in self.tables)
+        self.tables, self.pace, self.about = tuple(tables), pace, dict(about or {})
+        self.laws = tuple(
+            CurveLaw(own, pace) if "s" in own else MotionLaw(own, pace) for own in self.tables
+        )
+        counts = [law.count for law in self.laws]
+        self.firsts = [1 + sum(counts[:k]) for k in range(len(counts))]
         self.reset()
+
+    @property
+    def count(self) -> int:
+        """Number of phases."""
+        return sum(law.count for law in self.laws)
+
+    @property
+    def phase(self) -> int:
+        """Number of the present phase, from 1."""
+        return self.firsts[self.index] + self.laws[self.index].passed
 
     @property
     def duration(self) -> float:
@@ -80,13 +101,14 @@ class Policy:
         Raises
         ------
         InputError
-            If there is no such phase.
+            If there is no such phase, or the one before passes into it in motion.
         """
-        if not 1 <= phase <= len(self.laws):
-            allowed = f"the policy has phases 1 to {len(self.laws)}"
-            raise InputError("", "phase", f"{phase} given; {allowed}")
-        self.phase = max(phase - 1, 1)
-        self.laws[self.phase - 1].begin(at_end=phase > 1)
+        if phase not in self.firsts:
+            allowed = f"allowed are {', '.join(map(str, self.firsts))}"
+            raise InputError("", "phase", f"{phase} given; the policy can begin with: {allowed}")
+        own = self.firsts.index(phase)
+        self.index = max(own - 1, 0)
+        self.laws[self.index].begin(at_end=own > 0)
 
     def step(
         self,
@@ -103,11 +125,11 @@ class Policy:
         forces : mapping of str to float, optional
             Normal forces by name of the contact, as far as they are measured [N].
         """
-        law = self.laws[self.phase - 1]
+        law = self.laws[self.index]
         tau = law.step(theta, theta_dot, forces)
-        if law.over and self.phase < len(self.laws):
-            self.phase += 1
-            law = self.laws[self.phase - 1]
+        if law.over and self.index + 1 < len(self.laws):
+            self.index += 1
+            law = self.laws[self.index]
             law.begin()
             tau = law.step(theta, theta_dot, forces)
         return tau
@@ -117,8 +139,9 @@ class Policy:
         return Policy(self.tables, self.pace._replace(**changes), self.about)
 
     def cut(self, last: int) -> Policy:
-        """The policy of the phases up to the `last`."""
-        return Policy(self.tables[:last], self.pace, self.about)
+        """The policy of the phases up to the `last`, with those that it passes into in motion."""
+        kept = sum(first <= last for first in self.firsts)
+        return Policy(self.tables[:kept], self.pace, self.about)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the policy to a ``.npz`` file.
@@ -129,11 +152,12 @@ class Policy:
             If the file has another ending or cannot be written.
         """
         require_ending(path, ".npz")
-        meta = {"policy": FORMAT, "phases": len(self.tables), "pace": self.pace._asdict()}
+        kinds = ["curve" if "s" in own else "motion" for own in self.tables]
+        meta = {"policy": FORMAT, "kinds": kinds, "pace": self.pace._asdict()}
         arrays = {
             f"{name}_{number}": tables[name]
-            for number, tables in enumerate(self.tables, start=1)
-            for name in TABLES
+            for number, (kind, tables) in enumerate(zip(kinds, self.tables, strict=True), start=1)
+            for name in KINDS[kind]
         }
         arrays["meta"] = np.array(json.dumps({**meta, "about": self.about}))
         write_whole(path, lambda stream: np.savez(stream, **arrays))
@@ -149,18 +173,19 @@ class Policy:
         """
         source = str(path)
         meta = _read_meta(source, read_arrays(path, ["meta"]))
-        numbers = range(1, meta["phases"] + 1)
-        names = [f"{name}_{number}" for number in numbers for name in TABLES]
+        kinds = list(enumerate(meta["kinds"], start=1))
+        names = [f"{name}_{number}" for number, kind in kinds for name in KINDS[kind]]
         arrays = read_arrays(path, names)
-        phases = [_pick(source, arrays, number) for number in numbers]
-        return Policy(phases, Pace(**meta["pace"]), meta.get("about", {}))
+        tables = [_pick(source, arrays, number, KINDS[kind]) for number, kind in kinds]
+        return Policy(tables, Pace(**meta["pace"]), meta.get("about", {}))
 
 
 def _read_meta(source: str, arrays: Mapping[str, Any]) -> dict[str, Any]:
     try:
         meta = json.loads(str(arrays["meta"]))
         known = meta["policy"] == FORMAT and set(meta["pace"]) == set(Pace._fields)
-        known = known and isinstance(meta["phases"], int) and 1 <= meta["phases"] <= 1000
+        known = known and isinstance(meta["kinds"], list) and set(meta["kinds"]) <= set(KINDS)
+        known = known and 1 <= len(meta["kinds"]) <= 1000
         known = known and isinstance(meta.get("about", {}), dict)
     except (KeyError, TypeError, ValueError, RecursionError):
         known = False
@@ -183,10 +208,12 @@ def _read_meta(source: str, arrays: Mapping[str, Any]) -> dict[str, Any]:
     return dict(meta)
 
 
-def _pick(source: str, arrays: Mapping[str, Any], number: int) -> dict[str, Any]:
-    """Tables of a phase, checked."""
+def _pick(
+    source: str, arrays: Mapping[str, Any], number: int, shapes: Mapping[str, tuple[int, ...]]
+) -> dict[str, Any]:
+    """Tables of a law, checked."""
     found = {}
-    for name, shape in TABLES.items():
+    for name, shape in shapes.items():
         key = f"{name}_{number}"
         if key not in arrays:
             raise InputError(source, key, "array is missing")
@@ -197,10 +224,19 @@ def _pick(source: str, arrays: Mapping[str, Any], number: int) -> dict[str, Any]
             text = f"{array.dtype} of shape {array.shape} given, numbers of shape ({needed}) needed"
             raise InputError(source, key, text)
         found[name] = array
-    count = len(found["s"])
-    lengths = [len(found[name]) for name in ("theta", "b", "levels", "torque")]
-    if count < 2 or lengths != [count, count, count - 1, count - 1]:
-        raise InputError(source, f"s_{number}", "has not as many places as the other arrays")
-    if not (np.diff(found["s"]) > 0).all():
-        raise InputError(source, f"s_{number}", "does not increase")
+    _check_lengths(source, number, found)
     return found
+
+
+def _check_lengths(source: str, number: int, tables: Mapping[str, Any]) -> None:
+    """Check that a law's tables have as many places as one another, in order."""
+    axis, spans = ("s", ("levels", "torque")) if "s" in tables else ("starts", ())
+    others = ("theta", "b") if "s" in tables else ("theta", "rates", "tau", "gain")
+    count = len(tables[others[0]])
+    lengths = [len(tables[name]) for name in others] + [len(tables[name]) + 1 for name in spans]
+    if count < 2 or set(lengths) != {count} or (spans and len(tables["s"]) != count):
+        raise InputError(source, f"{others[0]}_{number}", "has not as many places as other arrays")
+    if not (np.diff(tables[axis]) > 0).all() or not len(tables[axis]):
+        raise InputError(source, f"{axis}_{number}", "does not increase")
+    if not spans and tables["step"][0] <= 0:
+        raise InputError(source, f"step_{number}", "is not positive")

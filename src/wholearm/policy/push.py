@@ -33,7 +33,8 @@ def find_push(curve: Curve, gained: Contact, rows: Rows, after: Rows | None) -> 
     """Torques that balance at rest with the gained contact and drive on without it, shape (2,).
 
     They are those for which the least normal force of all contacts is largest, in reserves; in the
-    balance friction is as it was in the motion. None where no torques do all of it.
+    balance friction is as it was in the motion. None where no torques do all of it, or forces at
+    rest are not the only ones.
 
     Parameters
     ----------
@@ -50,7 +51,10 @@ def find_push(curve: Curve, gained: Contact, rows: Rows, after: Rows | None) -> 
     both = Formation(scene, (*formation.contacts, gained), formation.rolling)
     if both.n_constraints != 5:
         return None
-    balances = [_balance(curve, both, part) for part in FRICTION]
+    try:
+        balances = [_balance(curve, both, part) for part in FRICTION]
+    except np.linalg.LinAlgError:
+        return None
     count, unit = both.n_contacts, scene.scales.acceleration
     reserves = rows.unit[-1, : formation.n_contacts]
     reserves = np.append(reserves, reserves.max())
@@ -102,7 +106,7 @@ def _invert(torque: Array) -> Array:
     return np.column_stack([-back @ torque[:, 0], back])
 
 
-def find_hold(curve: Curve) -> Array:
+def find_still(curve: Curve) -> Array:
     """Torques that hold the end of a curve at rest, in the middle of what friction bears, (2,)."""
     formation, point = curve.formation, curve.evaluate(np.array([curve.length]))
     still = Directions(np.zeros((1, formation.n_contacts)), np.zeros((1, 2)))

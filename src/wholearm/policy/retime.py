@@ -55,8 +55,11 @@ def retime(s: Array, slack: Array, reserve: Array, cap: Array) -> Profile:
             if b >= SLOWEST * cap[k]:
                 break
             share[k] *= LESS
+        if b < 0:
+            # Nothing but the plan itself passes here.
+            rows, b, share[k] = rows[-1:], cap[k], 0.0
         bounds.append(rows)
-        most[k] = max(b, 0.0)
+        most[k] = b
     b_here = np.empty(count)
     b_here[0] = most[0]
     for k, rows in enumerate(reversed(bounds)):

@@ -243,8 +243,8 @@ def make_trial(
     count = len(starts) - 1
     if phase is not None and not 1 <= phase <= count:
         raise InputError("", "--phase", f"{phase} given; the plan has phases 1 to {count}")
-    if policy is not None and len(policy.laws) != count:
-        given = f"{len(policy.laws)} given; the plan has {count}"
+    if policy is not None and policy.count != count:
+        given = f"{policy.count} given; the plan has {count}"
         raise InputError("", "phases of the policy", given)
     first, last = (0, count - 1) if phase is None else (phase - 1, phase - 1)
     rows = np.flatnonzero((plan.phase >= first) & (plan.phase <= last))

@@ -58,7 +58,7 @@ def verify_policy(
     """
     allowed = require_number(departure, "departure", positive=True)
     count = len(problem.phases)
-    for name, given in (("policy", len(policy.laws)), ("plan", len(plan.phase_starts) - 1)):
+    for name, given in (("policy", policy.count), ("plan", len(plan.phase_starts) - 1)):
         if given != count:
             raise InputError("", f"phases of the {name}", f"{given} given; the problem has {count}")
     loop = ClosedLoop(policy)

@@ -1,0 +1,106 @@
+"""The law of phases with more freedoms: linear feedback of the joints along a motion over time.
+
+The gains are those of a linear-quadratic regulator (`regulator`). Time counts from when the phases
+begin, which is when the contact before them is made. At the end torques hold what is reached until
+the joints have stood still.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from .curve_law import Pace
+
+SHARE = 0.3
+"""Part of the torque limits that feedback adds at most."""
+
+MEMORY = 30.0
+"""Gain on the integral of what the angles are off at the end, over that on the angles [1/s]."""
+
+
+class MotionLaw:
+    """The law of phases that pass into one another in motion.
+
+    Parameters
+    ----------
+    tables : mapping of str to ndarray
+        `starts`, (m,), of the phases [s]; `step`, (1,), of the samples that follow [s]; `theta`,
+        `rates`, `tau`, (n, 2); `gain`, (n, 2, 4), torques over what angles and speeds are off;
+        `push`, (2,); `still`, (1,), the joint speed that counts as none [rad/s].
+    pace : Pace
+
+    Attributes
+    ----------
+    over : bool
+        Whether the next phase may begin.
+    passed : int
+        How many of the phases have been passed.
+    """
+
+    def __init__(self, tables: Mapping[str, Any], pace: Pace) -> None:
+        self.pace, self.starts = pace, tables["starts"].tolist()
+        self.every, self.still = float(tables["step"][0]), float(tables["still"][0])
+        self.theta, self.rates = tables["theta"].tolist(), tables["rates"].tolist()
+        self.tau, self.gain = tables["tau"].tolist(), tables["gain"].tolist()
+        self.push = tuple(tables["push"].tolist())
+        self.end = self.every * (len(self.theta) - 1)
+        self.begin()
+
+    @property
+    def count(self) -> int:
+        """Number of phases."""
+        return len(self.starts)
+
+    def begin(self, at_end: bool = False) -> None:
+        """Start anew, at the beginning or at the end."""
+        self.clock = self.end if at_end else 0.0
+        self.passed = len(self.starts) - 1 if at_end else 0
+        self.over, self.rested = False, 0.0
+        self.left_one = self.left_two = 0.0
+
+    def step(
+        self, theta: Sequence[float], rates: Sequence[float], forces: Mapping[str, float] | None
+    ) -> tuple[float, float]:
+        """Torques for joint angles and speeds [N m]."""
+        pace, now = self.pace, self.clock
+        self.clock = now + pace.period
+        last = self.passed + 1
+        if last < len(self.starts) and now >= self.starts[last] - 0.5 * pace.period:
+            self.passed = last
+        if now >= self.end:
+            stands = max(abs(rates[0]), abs(rates[1])) < self.still
+            self.rested = self.rested + pace.period if stands else 0.0
+            self.over = self.rested > pace.dwell + pace.delay
+        lead = pace.delay + 0.5 * pace.period
+        k, share = self._locate(now)
+        (p, q), (u, w) = self.theta[k], self.theta[k + 1]
+        (f, g), (c, d) = self.rates[k], self.rates[k + 1]
+        fast_one = rates[0] - f - share * (c - f)
+        fast_two = rates[1] - g - share * (d - g)
+        one = theta[0] - p - share * (u - p) + lead * fast_one
+        two = theta[1] - q - share * (w - q) + lead * fast_two
+        k, share = self._locate(now + lead)
+        found = []
+        if now >= self.end:
+            # What is left at the end adds up until it is gone.
+            self.left_one += MEMORY * pace.period * one
+            self.left_two += MEMORY * pace.period * two
+            one, two = one + self.left_one, two + self.left_two
+        for row in (0, 1):
+            first, after = self.tau[k][row], self.tau[k + 1][row]
+            if now >= self.end:
+                first = after = self.push[row]
+            a, b, c, d = self.gain[k][row]
+            feedback = a * one + b * two + c * fast_one + d * fast_two
+            most = pace.limit[row]
+            feedback = min(max(feedback, -SHARE * most), SHARE * most)
+            tau = first + share * (after - first) - feedback
+            found.append(min(max(tau, -most), most))
+        return found[0], found[1]
+
+    def _locate(self, t: float) -> tuple[int, float]:
+        """Sample before a time, and the share of the way to the next one."""
+        place = min(t, self.end) / self.every
+        k = min(int(place), len(self.theta) - 2)
+        return k, min(place - k, 1.0)
