@@ -39,6 +39,8 @@ DWELL = 3e-3
 """How long joints stand still before the next phase begins [s]."""
 ARRIVAL = 3e-3
 """Time in which the rest of the way is run through at the end, a motion that fades away [s]."""
+CLOSING = 0.02
+"""Time in which held torques are to close a contact [s]."""
 MOST = 0.5
 """Largest acceleration of the integral, over the scene's."""
 
@@ -159,7 +161,7 @@ def _hold(problem: Problem, phase: Phase, z: Array) -> Array | None:
         return None
     touching = Formation(problem.scene, (*phase.formation.contacts, contact))
     place = Standstill(z, phase.formation, contact, touching)
-    hold = find_hold(place, problem.epsilon, problem.gap)
+    hold = find_hold(place, problem.epsilon, problem.gap, CLOSING)
     return None if hold is None else hold.tau
 
 
