@@ -35,7 +35,7 @@ LEAST = 1e-2
 """Margin over what is ample below which torques do not hold, or close, for sure."""
 AMPLE = 0.1
 """Margin that is ample: of a normal force, a torque or an acceleration, over the scene's."""
-DRIVE = 0.05
+DRIVE = 0.02
 """Least acceleration towards a contact that is still open, over the scene's."""
 SLOW = 0.2
 """Least margin of torques that close a contact more slowly, over that of torques that only hold."""
