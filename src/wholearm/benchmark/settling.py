@@ -41,8 +41,8 @@ HEAD = (
     stamp(),
     "",
     "Distance of the object's pose from the plan's at the end of the whole, simulated by the clock",
-    "without telling which contacts hold; `short` and `ahead` start 0.1 mm off. Of three ways to share",
-    "the time that is shown which serves the short start best.",
+    "without telling which contacts hold; `short` and `ahead` start 0.1 mm off. Of three ways to",
+    "share the time that is shown which serves the short start best.",
     "",
     "| problem | settle of each phase [ms] | time [s] | longer | exact [mm] | [deg] "
     "| short [mm] | [deg] | ahead [mm] | [deg] |",
