@@ -47,6 +47,8 @@ _STILL = 1e-9
 that counts as none, over how far everything moves."""
 _JAMS = 1e-6
 """Determinant of K over that without friction, at which and below a way jams."""
+_INDEPENDENT = 1e-12
+"""Least Gram determinant of the rows of constraints, each of length one, that are independent."""
 _SMALL = 1e-9
 """What counts as zero in the linear programme."""
 _FAR = 1e3
@@ -259,6 +261,10 @@ def list_ways(formation: Formation, z: Array) -> Iterator[Way]:
     scales = scene.scales
     rates = np.vstack([kinematics.A_t[0] / scales.acceleration, scales.time**2 * np.eye(5)[3:]])
     drive = np.column_stack([scene.applied_force, np.eye(5)[:, 3:]])
+    lines = P * np.sqrt(inverse_mass)
+    lines /= np.linalg.norm(lines, axis=1)[:, None]
+    if np.linalg.det(lines @ lines.T) < _INDEPENDENT:
+        return
     plain = np.linalg.det((P * inverse_mass) @ P.T)
     rolls = list(formation.rolling_rows)
     for signs, heading in _list_signs(scene, P, rates, rolls):

@@ -74,29 +74,6 @@ def find_static_torques(
     return static._replace(bounds=static.bounds + np.abs(static.normals) @ scene.dry[3:])
 
 
-def find_stopping_impulses(touching: Sequence[Formation], z: Array, v: Array) -> StaticTorques:
-    """Impulses at the joints that impulses of contacts within their cones can take up.
-
-    Together with those of the contacts they stop the object, which comes with `v`. Everything
-    stops where the momenta of the joints are among them.
-
-    Parameters
-    ----------
-    touching : sequence of Formation
-        With all contacts that touch just after.
-    z, v : ndarray, shape (5,)
-
-    Returns
-    -------
-    StaticTorques
-        With impulses [N m s] for torques, for the momenta J theta' of the joints.
-    """
-    scene = touching[0].scene
-    momentum = scene.mass_diagonal * v
-    momentum[3:] = 0.0
-    return _project(scene, _list_edges(touching, z)[0], momentum)
-
-
 def _list_edges(touching: Sequence[Formation], z: Array) -> tuple[Array, Array]:
     """Edges of all cones as forces on (q, theta), shape (2 n_c, 5), and the normals, (n_c, 5)."""
     rows: dict[Contact, tuple[Array, Array]] = {}
