@@ -193,6 +193,7 @@ def test_keys_are_checked_and_kept() -> None:
         ({"settle": -1}, "settle", ">= 0"),
         ({"settle": 1e9}, "settle", "allowed are"),
         ({"settle_gap": 1.0}, "settle_gap", "allowed are"),
+        ({"settle": 0.01, "torque_rate_limit": 100.0}, "settle", "torque_rate_limit"),
         ({"phases[1].settle": "x"}, "phases[1].settle", ">= 0"),
         ({"phases[1].settle": 0.01, "phases[1].end": "smooth"}, "phases[1].settle", "smooth"),
     ],

@@ -47,6 +47,9 @@ def check_problem(problem: Problem) -> None:
     check_place(problem.scene, "start.x", float(require_vector(problem.start, "start", 5)[0]))
     settle = require_number(problem.settle, "settle", nonnegative=True)
     check_settle(problem.scene, "settle", settle)
+    if problem.scene.has_slow_motors and any(map(problem.settles, problem.phases)):
+        text = "held ends step torques: with torque_rate_limit or actuator_lag allowed is 0"
+        raise InputError("", "settle", text)
     if problem.settle_gap is not None:
         gap = require_number(problem.settle_gap, "settle_gap", positive=True)
         check_settle_gap(problem.scene, gap)
