@@ -10,8 +10,10 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
-from multiprocessing import get_context
-from typing import Any
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import wait
+from threading import Thread
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -142,19 +144,27 @@ def assess_robustness(
     journal = None if path is None else Journal(os.fspath(path), stamp, fresh)
     found = {} if journal is None else {own["sample"]: own for own in journal.records}
     tasks = ((k, tuple(drawn[k].tolist())) for k in range(samples) if k not in found)
-    for record in _list_records(trial, tasks, start or use_processes):
+    good = sum(own["reached"] for own in found.values())
+    for record in list_records(trial, tasks, start or use_processes):
         found[record["sample"]] = record
+        good += record["reached"]
         if journal is not None:
             journal.add(record)
         if progress is not None:
-            good = sum(own["reached"] for own in found.values())
             progress(f"{len(found)} of {samples} samples, {good} reach the goal")
     records = tuple(found[number] for number in range(samples))
     return Robustness(trial, drawn, seed, records)
 
 
-def _list_records(
-    trial: Trial, tasks: Iterable[Task], start: Callable[[], Executor]
+class Runs(Protocol):
+    """What runs a sample, here or in another process."""
+
+    def run(self, sample: Array) -> dict[str, Any]:
+        """What becomes of a sample, as plain values; as of `Trial`."""
+
+
+def list_records(
+    trial: Runs, tasks: Iterable[Task], start: Callable[[], Executor]
 ) -> Iterator[dict[str, Any]]:
     """Records as they come; a sample that workers die of has one that says so."""
     for (number, _), answer in run_all(partial(_run, trial), tasks, start):
@@ -165,7 +175,7 @@ def _list_records(
         yield {"sample": number, **answer}
 
 
-def _run(trial: Trial, task: Task) -> dict[str, Any]:
+def _run(trial: Runs, task: Task) -> dict[str, Any]:
     number, sample = task
     record = trial.run(np.array(sample))
     if number >= DRAWN:
@@ -175,7 +185,19 @@ def _run(trial: Trial, task: Task) -> dict[str, Any]:
 
 def use_processes(jobs: int | None = None) -> Executor:
     """Processes of one thread each, on all cores or as many as `jobs` says."""
-    return ProcessPoolExecutor(jobs or os.cpu_count(), get_context("spawn"))
+    return ProcessPoolExecutor(jobs or os.cpu_count(), get_context("spawn"), _end_with_parent)
+
+
+def _end_with_parent() -> None:
+    """Have this process end when the one that started it is killed, and can tell it no more."""
+    parent = parent_process()
+    if parent is not None:
+
+        def watch() -> None:
+            wait([parent.sentinel])
+            os._exit(1)
+
+        Thread(target=watch, daemon=True).start()
 
 
 def _stamp(trial: Trial, samples: int, seed: int) -> dict[str, Any]:
