@@ -115,3 +115,6 @@ def test_maps_know_where_forces_are_not_unique() -> None:
         z = curve.evaluate(np.linspace(0.0, curve.length, 9)).z
         _, back, ambiguous = check_border(formation.scene, problem.epsilon, label, z, 0)
         assert ambiguous.any() == expected and (back | ambiguous).all()
+        # What is asked for decides.
+        asked = [check_border(formation.scene, 0.05, label, z, 0, limit)[2] for limit in (-9, 0.99)]
+        assert not asked[0].any() and asked[1].any()

@@ -163,3 +163,4 @@ def add_map(parser: argparse.ArgumentParser) -> None:
     )
     text = "print the formations along a route of two or more poses [m, deg] as [[phases]]"
     parser.add_argument("--list", metavar="X,PHI", nargs="+", help=text)
+    _add_least_minor(parser)

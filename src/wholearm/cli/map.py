@@ -44,7 +44,9 @@ def _draw_map(options: argparse.Namespace, phi: tuple[float, float] | None) -> i
     problem = read_problem(options.problem)
     plan = None if options.plan is None else load_trajectory(options.plan)
     window = choose_window(problem, phi)
-    plots.save(draw_map(build_map(problem, window=window, progress=show_progress()), plan), output)
+    limit = {} if options.least_minor is None else {"least_minor": options.least_minor}
+    known = build_map(problem, window=window, progress=show_progress(), **limit)
+    plots.save(draw_map(known, plan), output)
     clear_progress()
     print(f"wrote {output}", file=sys.stderr if options.list else sys.stdout)
     return 0

@@ -23,6 +23,7 @@ from ..contacts.closing import (
     lower,
 )
 from ..contacts.elemental import Contact
+from ..mechanics.uniqueness import LEAST_MINOR, require_minor
 from ..problem.definition import Problem
 from ..scene.model import Scene
 from .borders import NOWHERE, Piece, Window, label_cells, label_closed, list_tracks, name_contacts
@@ -150,6 +151,7 @@ def build_map(
     resolution: int = 200,
     window: Window | None = None,
     progress: Callable[[str], None] | None = None,
+    least_minor: float = LEAST_MINOR,
 ) -> FormationMap:
     """Build the contact-formation map of a problem's scene.
 
@@ -164,14 +166,18 @@ def build_map(
         from the flush angle below the plan to that above it.
     progress : callable, optional
         Receives a line of text now and then.
+    least_minor : float
+        Where principal minors of the contact problem are less, over those without friction, motion
+        is ambiguous.
 
     Raises
     ------
     InputError
-        If the resolution is too low or nothing in the window can be reached.
+        If a number is out of its range or nothing in the window can be reached.
     """
     if resolution < 10:
         raise InputError("", "resolution", f"{resolution!r} given; allowed is 10 or more")
+    limit = require_minor(least_minor)
     scene, report = problem.scene, progress or (lambda text: None)
     report("map: cells")
     window = window or choose_window(problem)
@@ -187,9 +193,9 @@ def build_map(
     report("map: borders")
     samples = round(SAMPLES * max(1.0, window.phi[1] - window.phi[0]))
     tracks = list(list_tracks(scene, window, samples))
-    borders = [_build_border(problem, piece) for piece in cut(scene, tracks, window)]
+    borders = [_build_border(problem, piece, limit) for piece in cut(scene, tracks, window)]
     report("map: crossings and directions")
-    directions = _check_cells(problem, window)
+    directions = _check_cells(problem, window, limit)
     return FormationMap(
         problem,
         x,
@@ -263,7 +269,7 @@ def _label_grid(scene: Scene, x: Array, phi: Array) -> tuple[Numbers, Numbers]:
     return labels.reshape(*shape, 6), obstacle.reshape(shape)
 
 
-def _build_border(problem: Problem, piece: Piece) -> Border:
+def _build_border(problem: Problem, piece: Piece, limit: float) -> Border:
     scene = problem.scene
     x, phi = piece.track.pose(piece.places)
     z = close_fingers(scene, x, phi).z
@@ -276,7 +282,7 @@ def _build_border(problem: Problem, piece: Piece) -> Border:
     ways = (np.zeros(len(z), dtype=bool),) * 3
     if flush is not None:
         row = 0 if along == "x" else 2
-        ways = check_border(scene, problem.epsilon, label, z, row)
+        ways = check_border(scene, problem.epsilon, label, z, row, limit)
     contacts = name_contacts(contact_table(scene), label)
     return Border(contacts, flush, along, np.column_stack([x, phi]), z, *ways)
 
@@ -311,7 +317,7 @@ def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]
     return tuple(crossings)
 
 
-def _check_cells(problem: Problem, window: Window) -> tuple[Array, Flags, Flags]:
+def _check_cells(problem: Problem, window: Window, limit: float) -> tuple[Array, Flags, Flags]:
     """Directions of possible motion at the points of a lattice inside cells."""
     scene = problem.scene
     x, phi = (np.linspace(*ends, ARROWS + 1) for ends in (window.x, window.phi))
@@ -325,7 +331,8 @@ def _check_cells(problem: Problem, window: Window) -> tuple[Array, Flags, Flags]
     ambiguous = np.zeros(len(places), dtype=bool)
     for index, label in enumerate(known):
         mine = owner.ravel() == index
-        possible[mine], ambiguous[mine] = check_cell(scene, problem.epsilon, label, z[mine])
+        found = check_cell(scene, problem.epsilon, label, z[mine], limit)
+        possible[mine], ambiguous[mine] = found
     return places, possible, ambiguous
 
 

@@ -29,7 +29,12 @@ _WAYS = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 
 def check_border(
-    scene: Scene, epsilon: float, label: Numbers, z: Array, coordinate: int
+    scene: Scene,
+    epsilon: float,
+    label: Numbers,
+    z: Array,
+    coordinate: int,
+    least_minor: float = LEAST_MINOR,
 ) -> tuple[Flags, Flags, Flags]:
     """Whether a quasistatic motion along a border is possible, each way.
 
@@ -43,6 +48,8 @@ def check_border(
         Configurations on the border.
     coordinate : {0, 2}
         x or phi, whichever increases along the border.
+    least_minor : float
+        Limit on principal minors, as of `find_minors`.
 
     Returns
     -------
@@ -61,11 +68,13 @@ def check_border(
     held, unique = (np.zeros((2, len(z)), dtype=bool) for _ in range(2))
     for row, sole, way in zip(held, unique, (z_s[regular], -z_s[regular]), strict=True):
         row[regular] = _check_path(formation, part, epsilon, z[regular], way)
-        sole[row] = _are_unique(formation, part, way, row[regular])
+        sole[row] = _are_unique(formation, part, way, row[regular], least_minor)
     return held[0] & unique[0], held[1] & unique[1], np.any(held & ~unique, axis=0)
 
 
-def check_cell(scene: Scene, epsilon: float, label: Numbers, z: Array) -> tuple[Flags, Flags]:
+def check_cell(
+    scene: Scene, epsilon: float, label: Numbers, z: Array, least_minor: float = LEAST_MINOR
+) -> tuple[Flags, Flags]:
     """Whether a quasistatic motion from inside a cell is possible towards each of `WAYS`.
 
     Parameters
@@ -76,6 +85,8 @@ def check_cell(scene: Scene, epsilon: float, label: Numbers, z: Array) -> tuple[
         The three contacts, as indices into `closing.contact_table`.
     z : ndarray, shape (n, 5)
         Configurations in the cell.
+    least_minor : float
+        As of `check_border`.
 
     Returns
     -------
@@ -95,7 +106,8 @@ def check_cell(scene: Scene, epsilon: float, label: Numbers, z: Array) -> tuple[
         right[:, 3:, 0] = way
         z_s = np.linalg.solve(matrix[regular], right)[..., 0]
         held[regular, k] = _check_balance(formation, part, epsilon, z_s)
-        unique[held[:, k], k] = _are_unique(formation, part, z_s, held[regular, k])
+        own = _are_unique(formation, part, z_s, held[regular, k], least_minor)
+        unique[held[:, k], k] = own
     return held & unique, np.any(held & ~unique, axis=1)
 
 
@@ -124,11 +136,13 @@ def _check_balance(
     return np.asarray(held & regular)
 
 
-def _are_unique(formation: Formation, kinematics: Kinematics, z_s: Array, rows: Flags) -> Flags:
+def _are_unique(
+    formation: Formation, kinematics: Kinematics, z_s: Array, rows: Flags, least_minor: float
+) -> Flags:
     """Whether contact forces of travel along `z_s` are the only ones, at those of the `rows`."""
     part = Kinematics(*(array[rows] for array in kinematics))
     Xi = _directions(part, z_s[rows]).Xi
-    return np.asarray(find_minors(formation, part, Xi).ratios >= LEAST_MINOR)
+    return np.asarray(find_minors(formation, part, Xi).ratios >= least_minor)
 
 
 def _directions(kinematics: Kinematics, z_s: Array) -> Directions:
