@@ -3,7 +3,7 @@
 A random run may end in any way, but it must not gain energy, nothing may overlap, and its events
 have to end. A plan is simulated phase by phase from rest, and compared with the plan.
 
-    python -m wholearm.benchmark.free_runs --runs 1000
+    python -m wholearm.benchmark.free_runs --runs 1000 -o results
     python -m wholearm.benchmark.free_runs --plans plan.npz ...
 """
 
@@ -13,11 +13,13 @@ import argparse
 import time
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from ..common.arrays import Array
+from ..common.files import write_text
 from ..free_simulation.hand import measure_gaps
 from ..free_simulation.result import FreeSimulation
 from ..free_simulation.simulate import simulate_free, simulate_phases
@@ -29,6 +31,7 @@ from ..scene.model import Finger, Friction, Scene
 from ..scene.polygon import Polygon
 from ..simulation.events import OutcomeKind
 from ..simulation.simulate import simulate
+from .report import stamp
 
 DURATION = 0.4
 """Of a random run [s]."""
@@ -114,30 +117,52 @@ def judge_run(run: FreeSimulation) -> Figures:
     )
 
 
-def _study_runs(first: int, count: int) -> None:
-    """Run many, and print what stands out."""
+def _study_runs(first: int, count: int) -> list[str]:
+    """Run many, and list what stands out."""
     worst: dict[str, tuple[float, int]] = {}
     kinds: Counter[str] = Counter()
-    begin = time.process_time()
+    odd, begin = [], time.process_time()
     for seed in range(first, first + count):
         try:
             run = run_draw(draw_run(seed))
         except Exception as error:  # what a study is for
-            print(f"run {seed}: {type(error).__name__}: {error}")
+            odd.append(f"run {seed}: {type(error).__name__}: {error}")
             kinds["errors"] += 1
             continue
         kinds.update(event.kind.value for event in run.events)
         if run.outcome.kind is not OutcomeKind.ENDED:
-            print(f"run {seed}: {run.outcome.text}")
+            odd.append(f"run {seed}: {run.outcome.text}")
             kinds["runs given up"] += 1
         for name, value in {**judge_run(run)._asdict(), "residual": run.residual}.items():
             if value > worst.get(name, (-1.0, 0))[0]:
                 worst[name] = value, seed
     spent = time.process_time() - begin
-    print(f"{count} runs of {DURATION} s in {spent:.1f} s of processor time")
-    for name, (value, seed) in worst.items():
-        print(f"largest {name}: {value:.2e} (run {seed})")
-    print(", ".join(f"{name}: {number}" for name, number in sorted(kinds.items())))
+    return [
+        f"{count} runs of {DURATION} s, from run {first} on, in {spent:.0f} s of processor time.",
+        "",
+        "| largest | is | in run |",
+        "|---|---:|---:|",
+        *(f"| {name} | {value:.1e} | {seed} |" for name, (value, seed) in worst.items()),
+        "",
+        "; ".join(odd) or "Every run comes to its end.",
+        "",
+        "Events: " + ", ".join(f"{name} {number}" for name, number in sorted(kinds.items())) + ".",
+    ]
+
+
+def _write_runs(lines: Sequence[str], folder: Path, command: str) -> None:
+    """Write the table of random runs."""
+    head = [
+        "# Random free runs: drops, throws and torques",
+        "",
+        f"`{command}`; {stamp()}",
+        "",
+        "Gained: energy over what the torques did, and unexplained: what its balance leaves, over",
+        "all that has moved. Overlap: of two bodies, over the object's radius of gyration.",
+        "Residual: of a contact problem, over its largest rate.",
+        "",
+    ]
+    write_text(str(folder / "bench_free_runs.md"), "\n".join([*head, *lines]) + "\n")
 
 
 def _study_plans(paths: Sequence[str]) -> None:
@@ -169,9 +194,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--runs", type=int, default=0)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--plans", nargs="*", default=())
+    parser.add_argument("-o", "--output", type=Path, help="folder to write the table of runs to")
     options = parser.parse_args(arguments)
     if options.runs:
-        _study_runs(options.first, options.runs)
+        lines = _study_runs(options.first, options.runs)
+        print("\n".join(lines))
+        if options.output is not None:
+            command = f"python -m wholearm.benchmark.free_runs --runs {options.runs}"
+            command += f" --first {options.first}" if options.first else ""
+            _write_runs(lines, options.output, command)
     if options.plans:
         _study_plans(options.plans)
 
