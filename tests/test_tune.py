@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import wholearm
-from shipped import FOLDER, HEXAGON, LANDING, problem_of
+from shipped import FOLDER, HEPTAGON, HEXAGON, LANDING, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.results.torque import read_notes
@@ -157,13 +157,17 @@ def test_a_passage_follows_what_happens_from_phase_to_phase() -> None:
     assert "v3-finger1" not in passage.list_pressed(0)
 
 
-@pytest.mark.parametrize("name", ["heptagon_four_contacts", "hexagon"])
-def test_shipped_torques_hold_every_contact(name: str) -> None:
-    path = FOLDER / "torques" / f"{name.split('_')[0]}_tuned.csv"
-    problem = problem_of(FOLDER / f"{name}.toml")
-    report = wholearm.verify_free(problem, wholearm.read_torque_csv(str(path)))
+@pytest.mark.parametrize(
+    ("path", "torques"),
+    [(HEPTAGON, "heptagon"), (LANDING, "heptagon_landing"), (HEXAGON, "hexagon")],
+)
+def test_shipped_torques_hold_every_contact(path: Path, torques: str) -> None:
+    problem = problem_of(path)
+    torque = wholearm.read_torque_csv(str(FOLDER / "torques" / f"{torques}_tuned.csv"))
+    report = wholearm.verify_free(problem, torque)
     assert report.ok, report.reason
     assert [phase.reached for phase in report.phases] == [True] * len(problem.phases)
     assert not any(phase.losses for phase in report.phases)
-    assert np.nanmin(report.whole.c_n) > 0
+    # What is let go ends at zero.
+    assert np.nanmin(report.whole.c_n) > -1e-9 * problem.scene.scales.force
     assert not report.whole.z_dot[-1].any()

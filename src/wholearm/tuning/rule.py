@@ -12,6 +12,8 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from ..common.arrays import Array
 from .trial import Bench, Outcome, Step, Trial
 
@@ -25,7 +27,7 @@ _ROUGH = 50.0
 _RAISED = 60
 """Most times a torque is raised or lowered: a factor of 300."""
 _SUPPORT = 3
-"""So many times the supporting torque is raised at once, by a third, as each needs a search."""
+"""So many times the supporting torque is raised at once, by a third, as each needs searches."""
 ENOUGH = 600
 """Simulations from one start after which no further drive, brake or support is tried."""
 _SUPPORTED = 13
@@ -34,6 +36,11 @@ _SOONER = 0.02
 """Share of the time by which another 10 % has to bring the end sooner."""
 _COARSE = 2
 """So many times the acting torque is lowered at once while it brakes too little."""
+_PLACES = 16
+"""Instants to brake at that are looked at, where each of them lets the object arrive."""
+_CLOSER = 45
+"""Most steps to the one at which it arrives most slowly, by golden sections."""
+_GOLDEN = (3 - math.sqrt(5)) / 2
 _MISSES = 2
 """So many torques that stop nothing end that, once one has."""
 _SEARCH = 24
@@ -97,7 +104,12 @@ class Rule:
     """
 
     def __init__(
-        self, bench: Bench, tau: Array, last: Array, acting: int, tell: Callable[[str], None]
+        self,
+        bench: Bench,
+        tau: Array,
+        last: Array,
+        acting: int,
+        tell: Callable[[str], None],
     ) -> None:
         self.bench, self.acting, self.tell = bench, acting, tell
         self.tau, self.last = tau, last
@@ -110,6 +122,11 @@ class Rule:
     def is_enough(self) -> bool:
         """Whether there have been so many simulations that no other torques are tried."""
         return self.bench.simulations > ENOUGH
+
+    @property
+    def is_free(self) -> bool:
+        """Whether the object has two freedoms where it arrives."""
+        return self.bench.passage.phases[-1].formation.n_constraints < 4
 
     def scale(self, acting: int, supporting: int = 0) -> tuple[float, float]:
         """The torques raised so many times, lowered where negative."""
@@ -149,8 +166,7 @@ class Rule:
         first = min(drives[0].raised - 1, self._count_steps(self.acting))
         last = self._count_steps(1 - self.acting)
         # With two freedoms either torque sets the object in motion again, if it is too much there.
-        free = self.bench.passage.phases[-1].formation.n_constraints < 4
-        likely = [last, 0] if free else [0, last]
+        likely = [last, 0] if self.is_free else [0, last]
         for supported in dict.fromkeys([*likely, *range(_SUPPORT, _SUPPORTED, _SUPPORT)]):
             if abs(self.scale(0, supported)[1 - self.acting]) > self.limit[1 - self.acting]:
                 continue
@@ -183,6 +199,8 @@ class Rule:
             if best and trial.time > (1 - _SOONER) * best.trial.time:
                 break
             best = Brake(raised, supported, trial)
+            if trial.rate < self.slow:
+                return best
             raised -= 1
         if best is None:
             return None
@@ -215,13 +233,12 @@ class Rule:
                 if trial.rate < slow:
                     return trial
                 if at < _SOON * drive.time:
-                    return None
+                    return self._graze(steps, drive) if self.is_free else None
                 high, above, rate = at, self._overshoot(trial, slow), trial.rate
                 below /= 2 if side < 0 else 1
                 side = -1
             else:
-                # What is lost on the way back says no more than that it turned back.
-                losses += trial.outcome is Outcome.LOSES and trial.rate > 0
+                losses += trial.outcome is Outcome.LOSES
                 if losses > _LOSSES:
                     return None
                 low, short = at, trial.short
@@ -238,6 +255,40 @@ class Rule:
                 return None
         return None
 
+    def _graze(self, steps: list[Step], drive: Trial) -> Trial | None:
+        """Find the instant to brake at which the end is just touched, on a way that always arrives.
+
+        With two freedoms the object may turn back before the end, and come there later another way:
+        how fast it arrives has a kink where it just touches, and falls to zero there.
+        """
+
+        def run(at: float) -> tuple[float, Trial]:
+            again = [*steps[:-1], steps[-1]._replace(time=at)]
+            trial = self._run(again, f"brake at {at:.5g} s")
+            return trial.rate if trial.outcome is Outcome.ARRIVES else math.inf, trial
+
+        grid = [drive.time * (k + 1) / (_PLACES + 1) for k in range(_PLACES)]
+        found = [run(at) for at in grid]
+        k = min(range(1, _PLACES - 1), key=lambda k: found[k][0])
+        low, at, high = grid[k - 1 : k + 2]
+        rate, best = found[k]
+        if rate > min(found[k - 1][0], found[k + 1][0]):
+            return None
+        for count in range(_CLOSER):
+            if rate < self.slow:
+                return best
+            if count == _PLACES and rate > 2 * _ROUGH * self.slow:
+                return None
+            left = at - low > high - at
+            other = at - _GOLDEN * (at - low) if left else at + _GOLDEN * (high - at)
+            new, trial = run(other)
+            if new < rate:
+                low, high = (low, at) if left else (at, high)
+                at, rate, best = other, new, trial
+            else:
+                low, high = (other, high) if left else (low, other)
+        return None
+
     def _overshoot(self, trial: Trial, slow: float) -> float:
         """How far beyond the end the object would come to rest, less the wanted speed's part."""
         slowing = max(trial.slowing, 0.1 * trial.rate / self.time)
@@ -247,3 +298,20 @@ class Rule:
         trial = self.bench.run(steps)
         self.tell(f"{text}: {trial.to_text()}")
         return trial
+
+
+def list_starts(tau: Array, acting: int) -> list[Array]:
+    """Torques to begin with, of quasistatic ones along the way, shape (n, 2) [N m].
+
+    Those at the start; then with the supporting one where it presses most, or between the two. The
+    right finger presses anticlockwise, the left one clockwise.
+    """
+    start, other = float(tau[0, 1 - acting]), 1 - acting
+    hard = float(tau[:, 0].max() if acting else tau[:, 1].min())
+    values = list(dict.fromkeys([start, hard]))
+    if start and hard / start > 1:
+        count = math.ceil(math.log(hard / start) / math.log(FACTOR) / _SUPPORT)
+        values += [start * FACTOR ** (_SUPPORT * n) for n in range(1, count)]
+    found = np.tile(tau[0], (len(values), 1))
+    found[:, other] = values
+    return list(found)

@@ -181,7 +181,10 @@ class Bench:
         """Simulate torques until the end of the passage, or what keeps it from coming."""
         end = steps[-1].time + LASTS * self.problem.scene.scales.time
         found = simulate_free(
-            self.problem, read_rows(make_rows(steps, end)), start=self.z, halt=self._is_over
+            self.problem,
+            read_rows(make_rows(steps, end)),
+            start=self.z,
+            halt=self._is_over,
         )
         self.simulations += 1
         self.trials.append(self._judge(tuple(steps), found))
@@ -233,23 +236,23 @@ class Bench:
         arrival = ends[-1] if len(ends) == len(self.passage.phases) else math.inf
         if self.pair is None and gaps.min() <= 0:
             arrival = self._find_passing(found, int(np.flatnonzero(gaps <= 0)[0]))
+        begun = self._find_last(ends)
+        turn = self._find_turn(found, gaps, begun)
         losses = [] if lost is None else [(lost.time, lost.contact)]
-        stop = min(arrival, float(found.t[-1]))
+        stop = min(arrival, turn, float(found.t[-1]))
         losses = [loss for loss in losses + self._list_losses(found, ends, stop) if loss[0] < stop]
         time, contact = min(losses, default=(stop, ""))
         at = int(np.searchsorted(found.t, time))
         least, weakest, row = self._find_least(found, ends, at)
-        begun = found.t[: at + 1] >= self._find_last(ends)
-        short = float(gaps[: at + 1][begun].min(initial=math.inf))
+        short = float(gaps[: at + 1][found.t[: at + 1] >= begun].min(initial=math.inf))
         if losses:
             outcome = Outcome.LOSES
         elif least < self.problem.epsilon:
             outcome, contact, time = Outcome.LOSES, weakest, float(found.t[row])
-        elif arrival < math.inf:
+        elif arrival == stop:
             outcome = Outcome.ARRIVES
         else:
-            turned = gaps[at] > short + _BACK * abs(self.way)
-            rests = turned or not found.z_dot[at].any()
+            rests = turn == stop or not found.z_dot[at].any()
             outcome = Outcome.RESTS if rests else Outcome.LASTS
         rate, slowing, z = self._close(found, time, at)
         return Trial(steps, outcome, time, contact, rate, slowing, short, least, weakest, z)
@@ -258,6 +261,13 @@ class Bench:
         """When the last phase begins [s], infinite if it does not."""
         before = len(self.passage.phases) - 1
         return [0.0, *ends][before] if len(ends) >= before else math.inf
+
+    def _find_turn(self, found: FreeSimulation, gaps: Array, begun: float) -> float:
+        """When the end, once nearer, is farther away again [s], infinite if it never is."""
+        rows = np.flatnonzero(found.t >= begun)
+        risen = gaps[rows] - np.minimum.accumulate(gaps[rows]) if len(rows) else gaps[:0]
+        back = np.flatnonzero(risen > _BACK * abs(self.way))
+        return float(found.t[rows[back[0]]]) if len(back) else math.inf
 
     def _list_losses(
         self, found: FreeSimulation, ends: Sequence[float], stop: float
@@ -304,7 +314,11 @@ class Bench:
             return -self.sign * float(v), self.sign * float(a), row.z[0]
         z, v, a = found.z[at], found.z_dot[at], found.z_ddot[at]
         if self.pair is None:
-            return -self.sign * float(v[self.column]), self.sign * float(a[self.column]), z
+            return (
+                -self.sign * float(v[self.column]),
+                self.sign * float(a[self.column]),
+                z,
+            )
         if self.passage.passed:
             step = _NUDGE * self.problem.scene.scales.time
             back, _, on = (float(x) for x in self.measure(z + np.outer([-step, 0, step], v)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -22,15 +21,13 @@ from ..simulation.tolerances import REST_WINDOW
 from ..verification.free import verify_free
 from .passage import Passage, split_passages
 from .result import PhaseTuning, Tuning
-from .rule import FACTOR, Drive, Rule
+from .rule import FACTOR, Drive, Rule, list_starts
 from .trial import Bench, Outcome, Step, Trial, make_rows
 
 PAUSE = 0.2
 """How long the object is held at the end of each phase, relative to the scene's time."""
 MOST_STOPS = 7
 """Stops of a phase that may be allowed at most: halves of halves of halves."""
-_FINER = 3
-"""So many steps of 10 % are between supporting torques that are tried."""
 _LOWERED = 6
 """How many times the acting torque is lowered for that, less one."""
 
@@ -184,10 +181,18 @@ class _Setting(NamedTuple):
         phases = self.passage.phases
         own = PhaseTuning(phases[0].number, phases[-1].number, str(self.passage.until))
         if any(phase.until.value is not None for phase in phases[:-1]):
-            return own, None, "a coordinate is passed in motion; the rule tunes phases to rest"
+            return (
+                own,
+                None,
+                "a coordinate is passed in motion; the rule tunes phases to rest",
+            )
         found = self._balance(phases, z)
         if found is None:
-            return own, None, "no quasistatic motion keeps every contact, where tuning would start"
+            return (
+                own,
+                None,
+                "no quasistatic motion keeps every contact, where tuning would start",
+            )
         bench = Bench(self.problem, self.passage, z)
         first = self._tune_by(found.acting, own, bench, found)
         if first[1] is not None or first[0].raised is not None:
@@ -200,9 +205,13 @@ class _Setting(NamedTuple):
         """Tune it by the torque of one finger, with supporting torques until one serves."""
         title = f"phase {self.passage.title} of {len(self.problem.phases)}, finger {acting + 1}"
         best: _Attempt | None = None
-        for tau in _list_starts(balance.tau, acting):
+        for tau in list_starts(balance.tau, acting):
             rule = Rule(
-                bench, tau, balance.tau[-1], acting, lambda text: self.tell(f"{title}: {text}")
+                bench,
+                tau,
+                balance.tau[-1],
+                acting,
+                lambda text: self.tell(f"{title}: {text}"),
             )
             found = self._tune_from(rule, replace(own, acting=acting + 1))
             if found[1] is not None:
@@ -265,7 +274,8 @@ class _Setting(NamedTuple):
     def _list_holds(self, rule: Rule, trial: Trial) -> list[tuple[float, float] | None]:
         """What may hold the object: what it arrives with, or quasistatic torques lowered.
 
-        Those are of the next phase, or of the end of the last one.
+        Those are of the next phase, or of the end of the last one; then those it arrives with, the
+        acting one lowered, and the supporting one more so.
         """
         after = self.passage.after
         acting, (first, second) = rule.acting, (float(tau) for tau in rule.last)
@@ -278,6 +288,11 @@ class _Setting(NamedTuple):
             (first / FACTOR**n, second) if acting == 0 else (first, second / FACTOR**n)
             for n in range(1, _LOWERED)
         ]
+        if after is None:
+            arrived = np.array(trial.steps[-1].tau)
+            arrived[1 - acting] /= FACTOR**_LOWERED
+            held = [tuple((arrived / FACTOR ** (_LOWERED * n)).tolist()) for n in range(3)]
+            return [None, *lowered, *held]
         return [None, *lowered]
 
     def _balance(self, phases: Sequence[Phase], z: Array) -> _Balance | None:
@@ -308,22 +323,6 @@ class _Setting(NamedTuple):
             trials=tuple(bench.trials),
             simulations=bench.simulations,
         )
-
-
-def _list_starts(tau: Array, acting: int) -> list[Array]:
-    """Torques to begin with: those at the start, the supporting one where it presses most, or less.
-
-    The right finger presses anticlockwise, the left one clockwise.
-    """
-    start, other = float(tau[0, 1 - acting]), 1 - acting
-    hard = float(tau[:, 0].max() if acting else tau[:, 1].min())
-    values = list(dict.fromkeys([start, hard]))
-    if start and hard / start > 1:
-        count = math.ceil(math.log(hard / start) / math.log(FACTOR) / _FINER)
-        values += [start * FACTOR ** (_FINER * n) for n in range(1, count)]
-    found = np.tile(tau[0], (len(values), 1))
-    found[:, other] = values
-    return list(found)
 
 
 def _explain(bench: Bench) -> str:
