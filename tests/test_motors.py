@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ import pytest
 from shipped import HEPTAGON, LANDING, problem_of
 from toys import LIMIT, Toy, constant
 from wholearm import InputError, Problem, solve, verify
+from wholearm.planning.table_check import make_table
 from wholearm.problem.table import describe_scene
-from wholearm.results.torque import TorqueProfile
+from wholearm.results.torque import TorqueProfile, read_torque_csv
 from wholearm.simulation.statics import balances
 from wholearm.verification.motors import describe_motors, find_commands
 
@@ -54,7 +56,7 @@ def test_commands_of_motors_that_lag_stay_within_the_torque_limits() -> None:
 
 
 def test_torques_of_a_plan_never_step_and_hold_the_object_between_phases(
-    heptagon: Problem,
+    heptagon: Problem, tmp_path: Path
 ) -> None:
     problem = heptagon.with_(torque_rate_limit=50.0, actuator_lag2=1e-3)
     plan = solve(problem, replay=False)
@@ -66,6 +68,14 @@ def test_torques_of_a_plan_never_step_and_hold_the_object_between_phases(
         contacts = problem.phases[int(t > 0)].formation.contacts
         assert balances(scene, contacts, z, tau)
     assert verify(problem, plan).ok
+    path = tmp_path / "torques.csv"
+    make_table(problem, plan.trajectory, replay=False).save(path)
+    t, tau1, tau2, command1, command2 = np.loadtxt(path, delimiter=",", skiprows=2).T
+    # Rows of torques are a fit of lines.
+    np.testing.assert_allclose(command1, tau1, atol=1e-3 * scene.torque_limit[0])
+    ahead = np.gradient(tau2, t) * 1e-3
+    assert np.median(np.abs(command2 - tau2 - ahead)) < 1e-2 * np.abs(ahead).max()
+    assert read_torque_csv(str(path)).duration == t[-1]
 
 
 def test_what_a_motor_cannot_follow_is_reported(heptagon: Problem) -> None:

@@ -14,6 +14,7 @@ from ..problem.definition import Problem
 from ..results.report import Report
 from ..results.torque_table import ERROR, format_rows, place_rows, read_rows, sample_rows
 from ..results.trajectory import Trajectory
+from ..verification.motors import find_commands
 from ..verification.verdict import Allowance, find_least_force
 from ..verification.verify import judge, observe
 
@@ -34,14 +35,23 @@ class Table(NamedTuple):
         Plain values: number of rows, rate and interpolation of samples, and from the replay whether
         it holds, why, and the arrival and the least normal force of each phase beside those of the
         plan.
+    commands : ndarray, shape (n, 2), or None, [N m]
+        What motors that lag are told at these times.
     """
 
     rows: Array
     figures: dict[str, Any]
+    commands: Array | None = None
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the rows as CSV."""
-        write_text(path, format_rows(self.rows))
+        write_text(path, format_rows(self.rows, self.commands))
+
+
+def _list_commands(problem: Problem, trajectory: Trajectory, rows: Array) -> Array | None:
+    """What motors are told at the times of rows, if they lag."""
+    lag = problem.scene.actuator_lag
+    return find_commands(trajectory.torque, lag).at(rows[:, 0]) if lag.any() else None
 
 
 def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) -> Table:
@@ -63,7 +73,8 @@ def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) ->
     """
     rows = place_rows(trajectory.torque)
     if not replay:
-        return Table(rows, {"rows": len(rows), "replay": None})
+        commands = _list_commands(problem, trajectory, rows)
+        return Table(rows, {"rows": len(rows), "replay": None}, commands)
     for attempt in range(ATTEMPTS):
         rows = place_rows(trajectory.torque, ERROR / FINER**attempt)
         # The table has to keep the limits of the plan, and to stay near it.
@@ -78,7 +89,8 @@ def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) ->
             f"the torques as a table of {len(rows)} rows do not hold in their replay: "
             f"{report.reason}; --no-replay (replay=False) leaves the check out"
         )
-    return Table(rows, {"rows": len(rows), "replay": _compare(trajectory, report)})
+    figures = {"rows": len(rows), "replay": _compare(trajectory, report)}
+    return Table(rows, figures, _list_commands(problem, trajectory, rows))
 
 
 def sample_table(
@@ -98,6 +110,7 @@ def sample_table(
         If the rate or the interpolation is not one that is allowed.
     """
     rows = sample_rows(trajectory.torque, rate, interpolation)
+    commands = _list_commands(problem, trajectory, rows)
     figures: dict[str, Any] = {
         "rows": len(rows),
         "sample_rate": rate,
@@ -105,13 +118,15 @@ def sample_table(
         "replay": None,
     }
     if not replay:
-        return Table(rows, figures)
+        return Table(rows, figures, _list_commands(problem, trajectory, rows))
     try:
         seen = observe(problem, read_rows(rows), trajectory)
     except (JammingError, SimulationError) as error:
-        return Table(rows, figures | {"replay": {"ok": False, "reason": str(error), "phases": []}})
+        return Table(
+            rows, figures | {"replay": {"ok": False, "reason": str(error), "phases": []}}, commands
+        )
     report = judge(seen._replace(plan=None), Allowance())
-    return Table(rows, figures | {"replay": _compare(trajectory, report)})
+    return Table(rows, figures | {"replay": _compare(trajectory, report)}, commands)
 
 
 def _compare(trajectory: Trajectory, report: Report) -> dict[str, Any]:

@@ -26,6 +26,10 @@ _PLACES = np.linspace(-1.0, 1.0, 17)
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(6)
 
 
+COMMANDS = ("command1", "command2")
+"""Columns of what motors that lag are told, so that they make the torques."""
+
+
 def place_rows(torque: TorqueProfile, error: float = ERROR) -> Array:
     """Rows (t, tau_1, tau_2) whose straight lines give torques back, shape (n, 3) [s, N m, N m].
 
@@ -98,9 +102,13 @@ def require_sampling(rate: object, interpolation: str) -> float:
     return require_number(rate, "sample_rate", positive=True)
 
 
-def format_rows(rows: Array) -> str:
-    """The rows as CSV with the columns t, tau1 and tau2."""
-    lines = [",".join(COLUMNS), *(",".join(map(repr, row)) for row in rows.tolist())]
+def format_rows(rows: Array, commands: Array | None = None) -> str:
+    """The rows as CSV with the columns t, tau1 and tau2, and those of commands, shape (n, 2)."""
+    columns, notes = list(COLUMNS), list[str]()
+    if commands is not None:
+        columns, rows = [*COLUMNS, *COMMANDS], np.column_stack([rows, commands])
+        notes.append(f"# {' and '.join(COMMANDS)}: tau + actuator_lag d tau / dt, in N m")
+    lines = [*notes, ",".join(columns), *(",".join(map(repr, row)) for row in rows.tolist())]
     return "\n".join(lines) + "\n"
 
 

@@ -32,6 +32,8 @@ _CORNER = 0.2
 _GUARD = 1e-2
 """Length in time of an element on each side of a switch, over the duration: in these a motion shows
 by how much the switch is off."""
+_CLOSEST = 0.6
+"""Least of such a place before the first switch, over the way there; and after the last one."""
 _APART = 2e-3
 """Least time between two switches, over the duration."""
 
@@ -93,6 +95,9 @@ def find_motor_switches(part: PhaseData, profile: Profile) -> list[Switch]:
     beside = (inside[:, None] + _GUARD * motion.duration * np.array([-1.0, 1.0])).ravel()
     far = np.abs(beside[:, None] - np.append(inside, [0.0, motion.duration])).min(axis=1)
     guards = motion.locate(beside[far > 0.7 * _GUARD * motion.duration])[0]
+    # Next to rest speeds are roots of the way, and a short way there is long for a polynomial.
+    first, last = _CLOSEST * places[0], length - _CLOSEST * (length - places[-1])
+    guards = np.clip(guards, first, last)
     switches = [Switch(float(place), True) for place in places]
     return switches + [Switch(float(place), False) for place in guards]
 
