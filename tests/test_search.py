@@ -3,12 +3,14 @@ from __future__ import annotations
 import signal
 import tomllib
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from shipped import HEPTAGON, problem_of
+from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.common.interrupts import guard, yielding
 from wholearm.contacts.formation import Formation
@@ -149,3 +151,17 @@ def test_ctrl_c_ends_a_search_that_has_an_answer() -> None:
         return 0
 
     assert guard(run) == 0 and reached == ["stopped"]
+
+
+def test_route_prints_phases_that_load(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = HEPTAGON.read_text(encoding="utf-8").split("[[phases]]")[0]
+    path = tmp_path / "goal.toml"
+    path.write_text(f"{text}[goal]\nflush = 0\nx = 0.03\n", encoding="utf-8")
+    assert main(["route", str(path)]) == 0
+    (phase,) = tomllib.loads(capsys.readouterr().out)["phases"]
+    assert phase["until"] == {"x": 0.03}
+    assert main(["route", str(path), "--alternatives", "-1"]) == 2
+    assert "--alternatives: -1 given" in capsys.readouterr().err
+    # What needs phases says where they come from.
+    assert main(["predict", str(path)]) == 2
+    assert "`wholearm route FILE` finds" in capsys.readouterr().err

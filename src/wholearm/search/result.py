@@ -11,15 +11,16 @@ from ..planning.result import Plan
 from ..problem.definition import End, Problem
 from .bounds import BorderBound
 from .candidates import Failure
-from .find import Route, Search
+from .find import SETTLED, Route, Search
 from .links import Blocked, describe_steps
 
 LISTED = 6
 """Most reasons that a message names."""
 NOT_CONSIDERED = (
     "not considered: rolling contacts, formations without the palm or without one of the fingers, "
-    "impacts, and motions that pass crossings without a stop; through cells, motions that leave a "
-    "border in motion or from rest and that a straight way shows to be possible"
+    "impacts, motions that pass crossings without a stop, those through cells that no straight way "
+    f"from rest shows to be possible, and what is further than {SETTLED} places; phases may be as "
+    "many as it takes"
 )
 
 
