@@ -1,0 +1,164 @@
+"""What plans within ranges cost, and what they bear that planning has not seen.
+
+``python -m wholearm.benchmark.robust_plans problems/heptagon_four_contacts.toml --samples 100``
+plans each problem without ranges, within them, and without them but with a larger epsilon that
+takes as long. It lists the times, the least normal force in the corner scenes of the ranges (at the
+same places and speeds, under the same torques), and how wide ranges may be. Of the first problem
+it counts, phase by phase, samples that reach their goal and keep all contacts, free of assumptions
+and by the clock. The start is off in the first phase alone: where the others start, contacts hold
+the object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from ..common.errors import InfeasibleError
+from ..common.files import write_text
+from ..geometry.path_guess import load
+from ..mechanics.dynamics import build_forward
+from ..planning.plan import solve, solve_with
+from ..planning.result import Plan
+from ..problem.definition import Problem
+from ..robustness.study import assess_robustness, use_processes
+from ..robustness.uncertainty import Uncertainty, change_problem
+from .report import stamp
+
+RANGES = {
+    "mass": 0.1,
+    "inertia": 0.1,
+    "friction": 0.2,
+    "start_x": 5e-4,
+    "geometry": 0.0,
+    "gain": 0.0,
+    "delay": 0.0,
+}
+"""Half widths of the ranges."""
+SCENES = {"mass": 0.1, "inertia": 0.1} | {
+    f"friction_{part}": 0.2 for part in ("palm", "finger1", "finger2")
+}
+"""Those of them whose corners are other scenes at the same place."""
+PLACES = 101
+"""Instants of a phase at which corners are looked at."""
+SEED = 7
+
+
+def plan_three(problem: Problem) -> dict[str, Plan]:
+    """Plans without ranges, within them, and with an epsilon that takes as long."""
+    robust = solve(problem, robust=1.0, largest=True)
+    plans = {"nominal": solve(problem), "robust": robust}
+    low, high = problem.epsilon, 16 * problem.epsilon
+    for _ in range(8):
+        middle = (low + high) / 2
+        try:
+            quicker = solve(problem.with_(epsilon=middle), replay=False).value < robust.value
+        except InfeasibleError:
+            quicker = False
+        low, high = (middle, high) if quicker else (low, middle)
+    plans[f"epsilon = {low:.3g} N"] = solve(problem.with_(epsilon=low))
+    return plans
+
+
+def find_least_in_corners(problem: Problem, plan: Plan) -> float:
+    """The least normal force of a plan in all corner scenes of the ranges [N]."""
+    least = np.inf
+    for phase, motion in zip(problem.phases, plan.trajectory.motions, strict=True):
+        own = motion.evaluate(np.linspace(0.0, motion.duration, PLACES)[1:-1])
+        Xi, sigma = -np.sign(own.c_t), np.sign(own.z_dot[:, 3:])
+        for signs in product((-1, 1), repeat=len(SCENES)):
+            pairs = zip(SCENES.items(), signs, strict=True)
+            scene = change_problem(problem, {name: k * w for (name, w), k in pairs}).scene
+            forward = build_forward(replace(phase.formation, scene=scene)).map(len(Xi))
+            c = forward(own.z.T, own.z_dot.T, own.tau.T, Xi.T, sigma.T)[1].full()
+            least = min(least, float(c[: phase.formation.n_contacts].min()))
+    return least
+
+
+def measure_planning(plan: Plan) -> float:
+    """Processor time of planning again, without a look at wider ranges [s]."""
+    started = time.process_time()
+    solve_with(plan.problem, replace(plan.options, largest=False))
+    return time.process_time() - started
+
+
+def list_times(problem: Problem, plans: Mapping[str, Plan]) -> Iterator[str]:
+    """Rows of the first table."""
+    for name, plan in plans.items():
+        ratio = plan.value / plans["nominal"].value - 1
+        widest = "-"
+        if plan.ranges is not None and plan.ranges.largest is not None:
+            each = ", ".join("-" if own is None else f"{own:.2f}" for own in plan.ranges.phases)
+            widest = f"{plan.ranges.largest:.2f} ({each})"
+        corner = "-"
+        if not any(phase.formation.rolling for phase in problem.phases):
+            corner = f"{find_least_in_corners(problem, plan):+.3f}"
+        cells = problem.name, name, f"{plan.duration:.4f}", f"{100 * ratio:+.1f} %", corner
+        yield f"| {' | '.join((*cells, f'{measure_planning(plan):.2f}', widest))} |"
+
+
+def list_samples(problem: Problem, plan: Plan, name: str, samples: int, jobs: int) -> Iterator[str]:
+    """Rows of the second table: of each phase."""
+    for phase in problem.phases:
+        ranges = RANGES | ({} if phase.index == 0 else {"start_x": 0.0})
+        found = assess_robustness(
+            problem,
+            plan.trajectory,
+            samples=samples,
+            seed=SEED,
+            uncertainty=Uncertainty(ranges, None),
+            phase=phase.number,
+            start=partial(use_processes, jobs),
+        )
+        first = next(iter(found.first_lost.items()), None)
+        lost = "-" if first is None else f"{first[0]}: {first[1]}"
+        cells = name, str(phase.number), str(found.reached), str(found.kept), lost
+        yield f"| {' | '.join(cells)} |"
+
+
+def main() -> int:
+    """Write the tables and print their rows."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("problems", nargs="+", type=Path, help="problem files")
+    parser.add_argument("--samples", type=int, default=100)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--output", type=Path, default=Path("results"))
+    options = parser.parse_args()
+    radii = ", ".join(f"{name} {width:g}" for name, width in RANGES.items() if width)
+    lines = ["# Plans within ranges", "", stamp(), "", f"Ranges: {radii} (relative, m)."]
+    lines += ["", "| problem | plan | time [s] | longer by | least c_n in corners [N] |"]
+    lines[-1] += " processor [s] | widest (each phase) |"
+    lines += ["|---|---|---:|---:|---:|---:|---|"]
+    first: tuple[Problem, dict[str, Plan]] | None = None
+
+    def add(row: str) -> None:
+        lines.append(row)
+        print(row, flush=True)
+
+    for path in options.problems:
+        problem = load(str(path)).with_(uncertainty=RANGES)
+        plans = plan_three(problem)
+        first = first or (problem, plans)
+        for row in list_times(problem, plans):
+            add(row)
+    assert first is not None
+    problem, plans = first
+    lines += ["", f"{problem.name}: {options.samples} samples of each phase, seed {SEED}"]
+    lines += ["", "| plan | phase | goal reached | and contacts kept | lost first |"]
+    lines += ["|---|---:|---|---|---|"]
+    for name, plan in plans.items():
+        for row in list_samples(problem, plan, name, options.samples, options.jobs):
+            add(row)
+    write_text(str(options.output / "bench_robust.md"), "\n".join(lines) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
