@@ -51,7 +51,7 @@ class Policy:
     Notes
     -----
     Call `step` once in a period, as soon as angles and speeds are measured; its torques are right
-    if they hold from `pace.delay` later until the next ones do. It takes some 30 us, allocates
+    if they hold from `pace.delay` later until the next ones do. It takes some 20 us, allocates
     little, and uses neither CasADi nor arrays. One policy carries out one motion at a time::
 
         policy = Policy.load("policy.npz")
@@ -123,7 +123,8 @@ class Policy:
         theta, theta_dot : sequence of two float, [rad, rad/s]
             Of finger 1, the right one, and finger 2.
         forces : mapping of str to float, optional
-            Normal forces by name of the contact, as far as they are measured [N].
+            Normal forces by name of the contact, as far as they are measured [N]; no law uses them
+            yet.
         """
         law = self.laws[self.index]
         tau = law.step(theta, theta_dot, forces)
