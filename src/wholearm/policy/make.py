@@ -39,6 +39,8 @@ DWELL = 3e-3
 """How long joints stand still before the next phase begins [s]."""
 ARRIVAL = 3e-3
 """Time in which the rest of the way is run through at the end, a motion that fades away [s]."""
+CRAWLS = 0.02
+"""Part of the plan's b below which a motion with a reserve is none."""
 CLOSING = 0.02
 """Time in which held torques are to close a contact [s]."""
 MOST = 0.5
@@ -223,7 +225,11 @@ def _trace(problem: Problem, phase: Phase, plan: Trajectory, reserve: float) -> 
     wanted = reserve * rows.unit
     wanted[:, rows.presses :] = AUTHORITY * rows.unit[:, rows.presses :]
     motion = retime(s, rows.slack, wanted, b)
-    return Piece(curve, rows, motion.b, float(motion.share.min()), phase.end is End.IMPACT)
+    share = float(motion.share.min())
+    if share == 0 or (motion.b[1:-1] < CRAWLS * b[1:-1]).any():
+        # Where hardly anything but the plan passes, the plan is followed.
+        motion, share = motion._replace(b=b), 0.0
+    return Piece(curve, rows, motion.b, share, phase.end is End.IMPACT)
 
 
 def _follow(
