@@ -157,6 +157,14 @@ def test_joints_are_led_along_a_motion() -> None:
     assert law.over and place == pytest.approx(theta[-1], abs=1e-6)
 
 
+def test_ends_that_a_plan_holds_are_held_with_its_torques(problem: Problem) -> None:
+    own = problem.with_({"settle": 0.01, "phases": problem.table["phases"][:1]})
+    plan = wholearm.solve(own, replay=False).trajectory
+    assert plan.held.any()
+    (law,) = make_policy(own, plan).laws
+    assert law.push == pytest.approx(plan.tau[-1].tolist())
+
+
 def test_files(tmp_path: Path, problem: Problem, plan: Plan, policy: Policy) -> None:
     path = tmp_path / "policy.npz"
     plan.save(tmp_path / "plan.npz")
