@@ -190,8 +190,9 @@ def _answer(run: Run, problem: ContactProblem, last: Sequence[int]) -> Answer | 
     answer = None if problem.is_unique else try_modes(problem, last)
     if answer is None:
         answer = solve(problem, [mode != APART for mode in last[: len(problem.b_n)]])
-        if answer is not None:
-            run.residual = max(run.residual, answer.residual)
+        if answer is None:
+            return next(iter(list_answers(problem) or ()), None)
+        run.residual = max(run.residual, answer.residual)
     return answer
 
 
@@ -210,7 +211,7 @@ def _choose(run: Run, pattern: Pattern, problem: ContactProblem, free: Array) ->
         starts = [run.resting and not _is_still(run, free + a.change) for a in found]
         away = [sum(a != b for a, b in zip(own, last, strict=True)) for own in modes]
         return found[min(range(len(found)), key=lambda k: (starts[k], away[k]))]
-    return _answer(run, problem, last) or (found[0] if found else None)
+    return _answer(run, problem, last)
 
 
 def _make_modes(run: Run, pattern: Pattern, answer: Answer, rows: Rows) -> Modes:
