@@ -3,6 +3,7 @@ from __future__ import annotations
 import copy
 import json
 import tomllib
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 import wholearm
-from shipped import HEPTAGON
+from shipped import FOLDER, HEPTAGON, problem_of
 from wholearm.common.errors import InputError
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.path_guess import guess_phase
@@ -252,3 +253,17 @@ def test_list_goes_on_where_loading_ends_a_phase(heptagon: Problem, tmp_path: Pa
         assert np.abs(gaps).max() < 1e-9
         assert phase.formation.evaluate_limits(z[None]).min() > -1e-9
         z = guess_phase(phase, z)[-1].z[-1]
+
+
+def test_a_contact_that_a_leg_begins_with_has_been_gained(tmp_path: Path) -> None:
+    """Also after a leg that ends in a cell where that touches at the nearest end alone."""
+    square = problem_of(FOLDER / "square.toml")
+    turns = [(0.0352104, -0.1879037), (0.0561329, -0.4940113), (0.0813296, -0.6529818)]
+    route = list_formations(square, (0.06, 0.0), (0.007424, 0.0), *turns)
+    for before, after in pairwise(route):
+        assert {*after.contacts} <= {*before.contacts, before.until.contact}
+    landing = route[-2]
+    assert landing.until.contact is not None
+    away = np.abs(landing.stop - turns[1]) / (square.scene.scales.length, 1.0)
+    assert away.max() < 0.1
+    load_pasted(dict(square.table), route, tmp_path)

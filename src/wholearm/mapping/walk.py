@@ -167,14 +167,14 @@ def _list_plain(scene: Scene, part: Part) -> Iterator[list[Step]]:
     for contact in part.gained:
         yield [(part.contacts, Until(contact=contact))]
     if not part.gained or (part.inside != part.stop).any():
-        yield [(part.contacts, _coordinate(scene, part.coordinate, part.inside))]
+        yield [(part.contacts, end_at(scene, part.coordinate, part.inside))]
 
 
 def _list_guided(scene: Scene, part: Part, rows: tuple[int, ...]) -> Iterator[list[Step]]:
     """Phases that lead to near the end first, by x and phi: another end may be nearer."""
     share = BEFORE if part.gained else 1.0
     aim = part.start + share * (part.stop - part.start)
-    guides = [(part.contacts, _coordinate(scene, row, aim)) for row in rows]
+    guides = [(part.contacts, end_at(scene, row, aim)) for row in rows]
     ends = [[(part.contacts, Until(contact=contact))] for contact in part.gained] or [[]]
     for count in range(1, len(rows) + 1):
         for chosen in permutations(guides, count):
@@ -182,7 +182,7 @@ def _list_guided(scene: Scene, part: Part, rows: tuple[int, ...]) -> Iterator[li
                 yield [*chosen, *end]
 
 
-def _coordinate(scene: Scene, row: int, pose: Array) -> Until:
+def end_at(scene: Scene, row: int, pose: Array) -> Until:
     """The end of a phase at x or phi of a pose, rounded as it is printed."""
     if row == 0:
         digits = math.ceil(-math.log10(DIGITS * scene.scales.length))
