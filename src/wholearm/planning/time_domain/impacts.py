@@ -69,6 +69,9 @@ def plan_with_impacts(
         going_on = partial(own, begun=begun or (), only_begin=only_begin)
         return [*going_on(fastest=fastest or (), pinned=pinned)]
     explained = plan_parts_of(problem, block, ample, explained=True)
+    if duration is not None and fastest and all(_is_stop(problem, fastest[k - 1]) for k in ends):
+        # Where least time has not led through an impact, nor will a longer duration.
+        return plan_stops(explained, [0, *ends, len(block)], z, options, duration)
     # A duration that is too short for stops need not be so without them.
     probe = (
         options if duration is None else replace(options, objective=Objective.TIME, duration=None)
@@ -91,14 +94,17 @@ def plan_with_impacts(
 def plan_parts_of(
     problem: Problem, block: Sequence[Phase], ample: float = math.inf, explained: bool = False
 ) -> PlanPart:
-    """How parts of a block are planned; `explained`: finding out why where there is no plan."""
+    """How parts of a block are planned; `explained`: looking further where there is no plan.
+
+    Otherwise from the first guess alone: there is a plan with stops.
+    """
 
     def plan_part(
         start: int, stop: int, z: Array, options: PlanOptions, duration: float | None
     ) -> Plans:
         part = block[start:stop]
-        plans = plan_phases(problem, part, z, options, duration, ample=ample, explained=explained)
-        return [*plans]
+        own = partial(plan_phases, problem, part, z, options, duration, ample=ample)
+        return [*own(explained=explained, patient=explained)]
 
     return plan_part
 
@@ -119,6 +125,12 @@ def list_impacts(block: Sequence[Phase], plans: Sequence[PhasePlan[Motion]]) -> 
         ratio = measure_speed(scene, impact.v)
         found.append(BlockImpact(k - 1, impact, ratio, reason, speed))
     return found
+
+
+def _is_stop(problem: Problem, plan: PhasePlan[Motion]) -> bool:
+    """Whether a plan ends at rest."""
+    speed = measure_speed(problem.scene, end_of(plan)[1])
+    return speed < AT_REST * problem.scene.scales.speed
 
 
 def _find_impacts(block: Sequence[Phase]) -> list[int]:

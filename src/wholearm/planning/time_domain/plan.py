@@ -222,7 +222,8 @@ def _try_all(
         late = search.tried.iterations > stop
         if outcomes[-1].solution.success or late or count == (1 if far else CONVINCING):
             break
-    if not outcomes[-1].solution.success and not any(outcome.short for outcome in outcomes):
+    looked = not begun.is_lost and any(own.name == NEAREST for own in outcomes)
+    if not (looked or outcomes[-1].solution.success or any(own.short for own in outcomes)):
         short = _find_short(search, problem, attempts.first.stages)[1]
         outcomes.append(_Outcome(NEAREST, begun, short))
     return outcomes
