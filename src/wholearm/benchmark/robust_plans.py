@@ -4,9 +4,9 @@
 plans each problem without ranges, within them, and without them but with a larger epsilon that
 takes as long. It lists the times, the least normal force in the corner scenes of the ranges (at the
 same places and speeds, under the same torques), and how wide ranges may be. Of the first problem
-it counts, phase by phase, samples that reach their goal and keep all contacts, free of assumptions
-and by the clock. The start is off in the first phase alone: where the others start, contacts hold
-the object.
+it counts, phase by phase, samples that reach their goal and keep all contacts, free of
+assumptions: torques by the clock, and by a policy. The start is off in the first phase alone: where
+the others start, contacts hold the object.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ from ..geometry.path_guess import load
 from ..mechanics.dynamics import build_forward
 from ..planning.plan import solve, solve_with
 from ..planning.result import Plan
+from ..policy.make import make_policy
+from ..policy.policy import Policy
 from ..problem.definition import Problem
 from ..robustness.study import assess_robustness, use_processes
 from ..robustness.uncertainty import Uncertainty, change_problem
@@ -104,7 +106,9 @@ def list_times(problem: Problem, plans: Mapping[str, Plan]) -> Iterator[str]:
         yield f"| {' | '.join((*cells, f'{measure_planning(plan):.2f}', widest))} |"
 
 
-def list_samples(problem: Problem, plan: Plan, name: str, samples: int, jobs: int) -> Iterator[str]:
+def list_samples(
+    problem: Problem, plan: Plan, name: str, policy: Policy | None, samples: int, jobs: int
+) -> Iterator[str]:
     """Rows of the second table: of each phase."""
     for phase in problem.phases:
         ranges = RANGES | ({} if phase.index == 0 else {"start_x": 0.0})
@@ -115,6 +119,7 @@ def list_samples(problem: Problem, plan: Plan, name: str, samples: int, jobs: in
             seed=SEED,
             uncertainty=Uncertainty(ranges, None),
             phase=phase.number,
+            policy=policy,
             start=partial(use_processes, jobs),
         )
         first = next(iter(found.first_lost.items()), None)
@@ -154,7 +159,12 @@ def main() -> int:
     lines += ["", "| plan | phase | goal reached | and contacts kept | lost first |"]
     lines += ["|---|---:|---|---|---|"]
     for name, plan in plans.items():
-        for row in list_samples(problem, plan, name, options.samples, options.jobs):
+        for row in list_samples(problem, plan, name, None, options.samples, options.jobs):
+            add(row)
+    for name in ("robust", "nominal"):
+        policy = make_policy(problem, plans[name].trajectory)
+        text = f"{name}, policy ({policy.duration:.4f} s)"
+        for row in list_samples(problem, plans[name], text, policy, options.samples, options.jobs):
             add(row)
     write_text(str(options.output / "bench_robust.md"), "\n".join(lines) + "\n")
     return 0
