@@ -43,7 +43,7 @@ def tip() -> Curve:
 @lru_cache(maxsize=1)
 def tilting() -> Problem:
     """That phase alone, in which the vertex may slide as well."""
-    problem = box().with_(friction_palm=0.5)
+    problem = box().with_(friction_palm=0.5, torque_limit=2.0)
     formation = replace(problem.phases[1].formation, rolling=())
     phase = Phase(0, formation, problem.phases[1].until)
     return replace(problem, start=trace_phases(problem)[0].end, phases=(phase,))
