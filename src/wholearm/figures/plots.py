@@ -191,13 +191,15 @@ def require_format(path: str | os.PathLike[str]) -> str:
 
 
 @exclusive
-def save(figure: Figure, path: str | os.PathLike[str]) -> None:
+def save(figure: Figure, path: str | os.PathLike[str], *, resolution: int = 180) -> None:
     """Write a figure as PNG, PDF or SVG, by the ending of `path`; equal figures, equal bytes.
+
+    `resolution` is that of PNG [dots per inch].
 
     Raises `InputError` if the ending is another one, or the file cannot be written.
     """
     ending = require_format(path)
-    options: Any = {"format": ending[1:], "metadata": _FORMATS[ending], "dpi": 180}
+    options: Any = {"format": ending[1:], "metadata": _FORMATS[ending], "dpi": resolution}
     with matplotlib.rc_context(STYLE):
         write_whole(path, lambda stream: figure.savefig(stream, **options))
 

@@ -13,10 +13,10 @@ from ..planning.result import Plan
 from ..verification.verify import verify
 from .movie import Movie, write_movie
 
-_WIDTH = 8.0
-"""Of figures [in]."""
-_SPEED, _RESOLUTION = 0.3, 50
-"""Of movies: over real time, and dots per inch."""
+_WIDTH, _DOTS = 8.0, 110
+"""Of figures [in] and [dots per inch]."""
+_LASTS, _RESOLUTION = 2.0, 50
+"""Of movies [s] and [dots per inch]."""
 _HEADS = "| problem | phases | least time [s] | least c_n [N] | finger gap [mm] | replayed |"
 
 
@@ -44,18 +44,18 @@ def write_gallery(
         place = f"{os.path.basename(folder)}/{name}"
         links = f"![{name} in motion]({place}.gif)\n\n![{name}]({place}.png)"
         pictures.append(f"## {plan.problem.name}\n\n{links}")
-    slower = f"{1 / _SPEED:.2g} times slower than real"
     text = (
-        f"Least-time plans, {slower}: contact forces in their friction cones, and torques as arcs "
-        "at the joints."
+        f"Least-time plans, each slowed down to {_LASTS:g} s: contact forces in their friction "
+        "cones, and torques as arcs at the joints."
     )
     write_text(page, "\n\n".join(["# Gallery", text, "\n".join(rows), *pictures]) + "\n")
 
 
 def _draw(plan: Plan, stem: str) -> None:
     """Write the figure and the movie of a plan."""
-    plots.save(plots.force_margins(plan, width=_WIDTH), f"{stem}.png")
-    movie = Movie(plan.problem, plan.trajectory, speed=_SPEED, resolution=_RESOLUTION)
+    plots.save(plots.force_margins(plan, width=_WIDTH), f"{stem}.png", resolution=_DOTS)
+    speed = plan.duration / _LASTS
+    movie = Movie(plan.problem, plan.trajectory, speed=speed, resolution=_RESOLUTION)
     write_movie(movie, f"{stem}.gif")
 
 
