@@ -153,23 +153,27 @@ def _draw(
     if slim:
         margins.set_ylabel("margin [N]")
         torques.set_ylabel("torque [N m]")
-    lowest = panels[-1] if motion else torques
+        _draw_legend(figure, [margins, torques], columns)
+    _label(figure, panels, panels[-1] if motion else torques, trajectory, slim)
+    look: Any = {"fontsize": 10.5, "fontweight": "bold", "parse_math": False}
+    top = 1 - 0.12 / sheet.height
+    figure.text(0.2 / width, top, "\n".join(title), va="top", **look)
+    return figure
+
+
+def _label(
+    figure: Figure, panels: Sequence[Axes], lowest: Axes, trajectory: Trajectory, slim: bool
+) -> None:
+    """Mark phases on panels over time, name the time on the lowest, and give each its legend."""
     for axes in panels:
-        draw_phases(axes, trajectory.phase_starts, labels=axes is margins)
+        draw_phases(axes, trajectory.phase_starts, labels=axes is panels[0])
         if axes is not lowest:
             axes.tick_params(labelbottom=False)
         if not slim:
             spacing = 0.5 if len(trajectory.contacts) < 14 else 0.1
             axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.02), labelspacing=spacing)
-    if slim:
-        _draw_legend(figure, [margins, torques], columns)
-    lowest.set_xlabel("time $t$ [s]")
-    margins.set_xlim(0.0, trajectory.duration)
-    figure.align_ylabels(panels)
-    look: Any = {"fontsize": 10.5, "fontweight": "bold", "parse_math": False}
-    top = 1 - 0.12 / sheet.height
-    figure.text(0.2 / width, top, "\n".join(title), va="top", **look)
-    return figure
+    lowest.set(xlabel="time $t$ [s]", xlim=(0.0, trajectory.duration))
+    figure.align_ylabels([*panels])
 
 
 def _draw_legend(figure: Figure, panels: Sequence[Axes], columns: int) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,8 +12,9 @@ from ..mechanics.uniqueness import find_minors
 from ..mechanics.wedging import SURE, find_static_torques
 from ..problem.definition import Phase, Problem
 from ..results.report import LeastMinor
+from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
-from ..simulation.events import Simulation
+from ..simulation.events import EventKind, Simulation
 from .verdict import measure_speed
 
 PLACES = 33
@@ -52,6 +55,13 @@ def find_least_minor(
         ratio, names, row = find_minors(formation, part, Xi[own], sticking).find_least()
         found.append(LeastMinor(ratio, names, float(motion.t[rows[own[row]]])))
     return min(found)
+
+
+def find_departure(simulation: Simulation, torque: TorqueProfile, index: int) -> float:
+    """When the torques set a phase in motion: the last break before it starts, if it does [s]."""
+    starts = [e.time for e in simulation.find(EventKind.START) if e.phase == index]
+    known = [b for b in torque.breaks.tolist() if starts and b <= starts[0]]
+    return max(known, default=-math.inf)
 
 
 def find_wedged(

@@ -38,7 +38,7 @@ from .margins import (
     list_slip_margins,
 )
 from .motors import describe_motors
-from .sureness import find_least_minor, find_wedged
+from .sureness import find_departure, find_least_minor, find_wedged
 from .verdict import (
     DEPARTURE,
     REST_SPEED,
@@ -243,7 +243,7 @@ def _report_phase(
     arrivals = [e for e in simulation.events if e.phase == index and e.kind in _ENDS]
     impacts = [e for e in simulation.find(EventKind.IMPACT) if e.phase == index]
     stops = bool(arrivals) and phase.end is End.REST
-    moves = _find_departure(simulation, torque, index)
+    moves = find_departure(simulation, torque, index)
     end = worst = None
     if plan is not None:
         # A motion that goes on is compared when its phase was planned to end, not when it did.
@@ -265,13 +265,6 @@ def _report_phase(
         minor=find_least_minor(phase, simulation, rows) if sure else None,
         wedged=find_wedged(problem, phase, simulation, rows, REST_SPEED, moves) if sure else None,
     )
-
-
-def _find_departure(simulation: Simulation, torque: TorqueProfile, index: int) -> float:
-    """When the torques set a phase in motion: the last break before it starts, if it does [s]."""
-    starts = [e.time for e in simulation.find(EventKind.START) if e.phase == index]
-    known = [b for b in torque.breaks.tolist() if starts and b <= starts[0]]
-    return max(known, default=-math.inf)
 
 
 def _compare(
