@@ -11,10 +11,11 @@ import pytest
 
 from shipped import HEPTAGON, LANDING, problem_of
 from toys import LIMIT, Toy, constant
-from wholearm import InputError, Problem, solve, verify
+from wholearm import InputError, Plan, Problem, simulate, solve, verify
 from wholearm.planning.table_check import make_table
 from wholearm.problem.table import describe_scene
 from wholearm.results.torque import TorqueProfile, read_torque_csv
+from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.simulation.statics import balances
 from wholearm.verification.motors import describe_motors, find_commands
 
@@ -23,6 +24,12 @@ from wholearm.verification.motors import describe_motors, find_commands
 def heptagon() -> Problem:
     problem = problem_of(HEPTAGON)
     return replace(problem, phases=problem.phases[:2])
+
+
+@pytest.fixture(scope="module")
+def slow(heptagon: Problem) -> tuple[Problem, Plan]:
+    problem = heptagon.with_(torque_rate_limit=500.0, actuator_lag2=1e-3)
+    return problem, solve(problem, replay=False)
 
 
 def fastest(rate: float) -> float:
@@ -56,10 +63,9 @@ def test_commands_of_motors_that_lag_stay_within_the_torque_limits() -> None:
 
 
 def test_torques_of_a_plan_never_step_and_hold_the_object_between_phases(
-    heptagon: Problem, tmp_path: Path
+    slow: tuple[Problem, Plan], tmp_path: Path
 ) -> None:
-    problem = heptagon.with_(torque_rate_limit=50.0, actuator_lag2=1e-3)
-    plan = solve(problem, replay=False)
+    problem, plan = slow
     torque, scene = plan.trajectory.torque, problem.scene
     assert describe_motors(problem, torque) == []
     start = plan.trajectory.phase_starts[1]
@@ -76,6 +82,24 @@ def test_torques_of_a_plan_never_step_and_hold_the_object_between_phases(
     ahead = np.gradient(tau2, t) * 1e-3
     assert np.median(np.abs(command2 - tau2 - ahead)) < 1e-2 * np.abs(ahead).max()
     assert read_torque_csv(str(path)).duration == t[-1]
+
+
+def test_a_phase_that_ends_early_keeps_its_torques_until_it_was_to_end(
+    slow: tuple[Problem, Plan],
+) -> None:
+    problem, plan = slow
+    # With less mass the first phase ends half a millisecond early, on torques that still brake.
+    lighter = problem.with_(mass=(1 - 1e-4) * problem.scene.polygon.mass)
+    torque, first = plan.trajectory.torque, float(plan.trajectory.phase_starts[1])
+    found = simulate(lighter, torque)
+    assert found.outcome.kind is OutcomeKind.GOAL_REACHED
+    came = next(event.time for event in found.events if event.kind is EventKind.ARRIVAL)
+    assert came < first - 2e-4
+    # Torques that go on braking instead lose the contact.
+    ends = (came + first) / 2 + np.array([0.0, 2e-2])
+    brakes = TorqueProfile.join_rows(ends - ends[0], torque.at(ends[[0, 0]]))
+    found = simulate(lighter, TorqueProfile.chain([torque.cut(0.0, ends[0]), brakes]))
+    assert found.outcome.kind is OutcomeKind.CONTACT_LOST
 
 
 def test_what_a_motor_cannot_follow_is_reported(heptagon: Problem) -> None:

@@ -32,11 +32,14 @@ class Arrival(NamedTuple):
         If the next break of the torques is no further off, the arrival belongs to it.
     strikes : bool
         Whether it takes an impact to go on.
+    left : float, [s]
+        Time in which a motion whose deceleration fades would have come to rest.
     """
 
     rate: float
     window: float
     strikes: bool = False
+    left: float = 0.0
 
 
 class Released(NamedTuple):

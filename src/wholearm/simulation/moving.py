@@ -162,10 +162,9 @@ def _reach(run: Replay) -> Arrival:
     rate = -float(s.outputs[s.to.until_rate])
     # A planned motion that comes this early by its error would have stopped v / a later.
     stopping = 2 * _time_to_stop(run)
-    window = min(stopping, run.tolerances.longest_window) if stopping < math.inf else 0.0
-    if abs(_measure_rate(run)) < SLOW:
-        window = max(window, run.tolerances.settling)
-    return Arrival(rate, window)
+    left = min(stopping, run.tolerances.longest_window) if stopping < math.inf else 0.0
+    slow = abs(_measure_rate(run)) < SLOW
+    return Arrival(rate, max(left, run.tolerances.settling) if slow else left, left=left)
 
 
 def _measure_rate(run: Replay) -> float:

@@ -88,7 +88,7 @@ class Replay:
         self.y = np.zeros(STATE)
         self.y[:5] = problem.start
         self.h = self.tolerances.first_step
-        self.held_until = -math.inf
+        self.held_until = self.settled_by = -math.inf
         self.impact = 0.0
         self.moving = False
         self.side = 1.0

@@ -193,7 +193,21 @@ def _arrive(run: Replay, arrival: Arrival, following: Phase | None) -> Outcome |
     # The torques of the phase that has ended go on until they step, or end.
     coming = min(run.coming_step, run.breaks[-1])
     run.held_until = coming if coming - run.t <= arrival.window else run.t
+    if run.problem.scene.has_slow_motors:
+        _await_torques(run, arrival)
     return None
+
+
+def _await_torques(run: Replay, arrival: Arrival) -> None:
+    """Let the phase that has ended keep its torques, which do not step, until it was to end.
+
+    A motion whose deceleration fades comes early by about the cube root of its error. The time that
+    it would still have taken is twice its speed over its deceleration.
+    """
+    early = run.breaks[run.piece] < run.t < run.breaks[run.piece + 1]
+    left = arrival.left if early else 0.0
+    run.held_until = max(run.held_until, min(run.t + left, run.breaks[-1]))
+    run.settled_by = run.held_until + run.tolerances.rest_window
 
 
 def _release(run: Replay, release: Released) -> None:
@@ -238,13 +252,18 @@ def _rest(run: Replay) -> Departure | Arrival | Released | Switched | Outcome:
                 return change
             if isinstance(change, Collapse) and not _settles(run, change):
                 return _collapse(run, rest, change)
-        _advance(run, run.breaks[run.piece + 1])
-        run.next_piece()
+        stop = run.breaks[run.piece + 1]
+        if run.t < run.settled_by < stop:
+            _advance(run, run.settled_by)
+        else:
+            _advance(run, stop)
+            run.next_piece()
 
 
 def _settles(run: Replay, change: Collapse) -> bool:
-    """Whether the torques step before a contact could part."""
-    return run.coming_step - run.time(change.x) <= run.tolerances.rest_window
+    """Whether the torques step, or become those of the next phase, before a contact could part."""
+    t = run.time(change.x)
+    return t < run.settled_by or run.coming_step - t <= run.tolerances.rest_window
 
 
 def _advance(run: Replay, stop: float) -> None:
