@@ -15,14 +15,16 @@ import wholearm
 from shipped import HEPTAGON, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
+from wholearm.free_simulation.simulate import simulate_free
 from wholearm.planning.result import Plan
 from wholearm.policy.curve_law import CurveLaw, Pace, choose_squeeze
-from wholearm.policy.make import make_policy
+from wholearm.policy.make import hold_end, make_policy
 from wholearm.policy.motion_law import MotionLaw
 from wholearm.policy.policy import Policy
 from wholearm.policy.regulator import RATE, Linear, regulate
 from wholearm.policy.retime import eliminate, retime
 from wholearm.problem.definition import Problem
+from wholearm.results.torque import TorqueProfile
 from wholearm.verification.policy import verify_policy
 
 
@@ -195,3 +197,32 @@ def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str], plan: Pla
     assert main(["policy", str(file), "--reserve", "-1", "-o", str(tmp_path / "p.npz")]) == 2
     assert "reserve: -1.0 is not a number >= 0" in capsys.readouterr().err
     assert not (tmp_path / "p.npz").exists()
+
+
+def test_no_policy_is_written_that_does_not_carry_out_its_plan(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    plan: Plan,
+    policy: Policy,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    plan.save(tmp_path / "plan.npz")
+    # Torques that let go at the end of the first phase.
+    weak = Policy([{**policy.tables[0], "push": np.zeros(2)}, policy.tables[1]], policy.pace)
+    weak.about = policy.about
+    monkeypatch.setattr("wholearm.policy.make.make_policy", lambda *_, **__: weak)
+    output = tmp_path / "policy.npz"
+    assert main(["policy", str(tmp_path / "plan.npz"), "-o", str(output)]) == 1
+    said = capsys.readouterr().err
+    assert "no policy is written" in said and "phase 2, and opens by" in said
+    assert not output.exists()
+
+
+def test_an_end_without_a_gained_contact_is_held(problem: Problem) -> None:
+    phases = [{**problem.table["phases"][0], "until": {"x": 0.01}}]
+    own = problem.with_({"phases": phases})
+    tau = hold_end(own, own.phases[0], own.start)
+    assert tau is not None
+    torque = TorqueProfile(np.array([0.0, 0.05]), tau[None, :, None])
+    held = simulate_free(own, torque)
+    assert held.z[-1] == pytest.approx(own.start, abs=1e-9)

@@ -28,11 +28,13 @@ def add_policy(parser: argparse.ArgumentParser) -> None:
 
 
 def _policy(options: argparse.Namespace) -> int:
+    from ..common.errors import ReplayError
     from ..common.files import require_ending, require_writable
     from ..policy.make import make_policy
     from ..problem.read import read_own_problem
     from ..results.report_text import align
     from ..results.trajectory_file import load_trajectory
+    from ..verification.policy import verify_policy
 
     stem = os.path.splitext(os.path.basename(options.plan))[0]
     output = options.output or f"{stem}_policy.npz"
@@ -43,6 +45,12 @@ def _policy(options: argparse.Namespace) -> int:
     given = {key: getattr(options, key) for key in ("reserve", "period", "delay", "torque_limit")}
     with name_source(options.plan):
         policy = make_policy(problem, plan, **given)
+        report = verify_policy(problem, plan, policy)
+    if not report.ok:
+        failures = "; ".join(report.failures)
+        raise ReplayError(
+            f"{options.plan}: no policy is written: in the free simulation, {failures}"
+        )
     policy.save(output)
     if options.json:
         print(json.dumps(policy.about, indent=2))

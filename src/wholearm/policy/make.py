@@ -152,16 +152,15 @@ def _end(
     contact, push = phase.until.contact, None
     if contact is not None:
         push = find_push(piece.curve, contact, piece.rows, None if after is None else after.rows)
-        push = _hold(problem, phase, piece.curve.end) if push is None else push
+        push = hold_end(problem, phase, piece.curve.end) if push is None else push
     return find_still(piece.curve) if push is None else push
 
 
-def _hold(problem: Problem, phase: Phase, z: Array) -> Array | None:
-    """Torques that hold all that touches where a phase has gained its contact."""
+def hold_end(problem: Problem, phase: Phase, z: Array) -> Array | None:
+    """Torques that hold all that touches where a phase ends, None if there are none."""
     contact = phase.until.contact
-    if contact is None:
-        return None
-    touching = Formation(problem.scene, (*phase.formation.contacts, contact))
+    gained = () if contact is None else (contact,)
+    touching = Formation(problem.scene, (*phase.formation.contacts, *gained))
     place = Standstill(z, phase.formation, contact, touching)
     hold = find_hold(place, problem.epsilon, problem.gap, CLOSING)
     return None if hold is None else hold.tau
@@ -176,7 +175,7 @@ def _follow_motion(
     count = max(int(np.ceil((starts[-1] - starts[0]) / period)), 2)
     t = np.linspace(starts[0], starts[-1], count + 1)
     samples, last = plan.at(t), phases[-1]
-    hold = _hold(problem, last, samples.z[-1])
+    hold = hold_end(problem, last, samples.z[-1])
     found = follow(problem, phases, plan, t)
     speed = np.sqrt(found.b)
     return {
