@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -108,6 +110,26 @@ def test_a_corner_that_strikes_off_its_centroid(restitution: float) -> None:
     run = simulate(body, [0, 0.1, 0], [0.2, -1.0, 0.0], 1e-3, restitution)
     p = (1 + restitution) / (1 + 0.1**2 / 0.01)
     assert run.records[0].y[3:6] == pytest.approx([0.2, -1 + p, -0.1 * p / 0.01], abs=CLOSE)
+
+
+@pytest.mark.parametrize(("enters", "lands"), [(0.006, True), (0.018, False)])
+def test_a_corner_that_rises_past_the_end_of_a_table(enters: float, lands: bool) -> None:
+    # Its level is passed upwards at 0.003 and downwards at 0.015 of the unit of time, and the end
+    # of the table at `enters`: onto the table, or beneath it.
+    system = make_body([(0.0, 0.0)])
+    (pair,), z = system.structure.pairs, system.structure.z
+    pairs = (dataclasses.replace(pair, ranges=(z[0],)),)
+    system = dataclasses.replace(
+        system, structure=dataclasses.replace(system.structure, pairs=pairs)
+    )
+    unit = system.scales.time
+    up, down, speed = 0.003 * unit, 0.015 * unit, 1 / unit
+    start = [-speed * enters * unit, -G * up * down / 2, 0.0]
+    run = simulate(system, start, [speed, G * (up + down) / 2, 0.0], 0.04 * unit)
+    impacts = list_times(run, EventKind.IMPACT)
+    assert impacts == pytest.approx([down] if lands else [], rel=1e-6)
+    fallen = start[1] + G * (up + down) / 2 * run.t - G * run.t**2 / 2
+    assert run.z[1] == pytest.approx(0.0 if lands else fallen, abs=1e-10)
 
 
 def test_a_block_falls_flat() -> None:

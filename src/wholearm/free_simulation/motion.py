@@ -193,6 +193,7 @@ class _Motion:
         while True:
             values = end.values + floor
             closing = self._find_closing(start, end, passed)
+            closing = closing or self._find_entering(start, end, passed)
             low = np.flatnonzero(values < 0)
             if not len(low) and closing is None:
                 return found, end
@@ -269,6 +270,46 @@ class _Motion:
         row, pair = int(rows[0]), int(pairs[0])
         left = 0.0 if row == 0 else float(end.times[row - 1])
         return Closing(pair, float(level[row, pair]), left, float(end.times[row]))
+
+    def _find_entering(self, start: View, end: View, passed: set[int]) -> Closing | None:
+        """The first pair that comes into range as it touches or is apart, and overlaps after that.
+
+        A gap means nothing out of range, so that it may be negative at every look.
+        """
+        earlier = start.ranges[-1:]
+        if len(end.times) > 1:
+            earlier = np.vstack([earlier, end.ranges[:-1]])
+        turns = (end.ranges > 0) & (earlier <= 0)
+        if not turns.any():
+            return None
+        turns &= self.watched & (end.gaps < -CLOSED * self.unit) & (end.gaps > -REACH * self.unit)
+        h, found = float(self.s.inputs[self.s.at.h]), None
+        for row, pair in zip(*(part.tolist() for part in turns.nonzero()), strict=True):
+            if pair in passed or found is not None:
+                continue
+            left, right = float(end.times[row - 1]) if row else 0.0, float(end.times[row])
+            entry, gap = self._find_entry(pair, left, right, -float(earlier[row, pair]))
+            if gap > -SUNK * self.unit:
+                found = Closing(pair, min(gap, 0.0) - 0.5 * CLOSED * self.unit, entry, right)
+        self._step_to(h)
+        return found
+
+    def _find_entry(
+        self, pair: int, left: float, right: float, outside: float
+    ) -> tuple[float, float]:
+        """When a pair comes into range between two instants of a step, and its gap then."""
+        s = self.s
+
+        def value(step: float) -> float:
+            self._step_to(step)
+            return -float(s.outputs[s.to.ranges.start + pair])
+
+        within, flat = value(right), CLOSED * self.unit
+        entered = right
+        if within < 0 <= outside:
+            entered = find_root(value, right, outside, within, self.near, flat, left)
+        self._step_to(entered)
+        return entered, float(s.outputs[s.to.gaps.start + pair])
 
     def _time_to_return(self, start: View) -> float:
         """Half the time in which the nearest pair that has just parted would close again [s]."""
