@@ -19,9 +19,10 @@ inelastic collisions and Coulomb friction", 1996.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import product
 from typing import NamedTuple
 
@@ -222,54 +223,91 @@ def list_answers(problem: ContactProblem) -> list[Answer] | None:
 
     Each contact is apart, or presses and sticks or slides either way; each joint is held or turns.
     """
-    k, s = len(problem.b_n), len(problem.b_t)
-    held = [i in problem.owner for i in range(k)]
-    options: list[tuple[int, ...]]
-    options = [(APART, STICKS, FORTH, BACK) if one else (APART, STICKS) for one in held]
-    options += [(STICKS, FORTH, BACK) for _ in range(s - sum(held))]
-    if np.prod([float(len(option)) for option in options]) > MOST:
-        return None
-    every = list(product(*options))
-    return _try(problem, np.array(every, dtype=int).reshape(len(every), len(options)))
+    combinations = _combine(len(problem.b_n), len(problem.lift), tuple(problem.owner.tolist()))
+    return None if combinations is None else _try(problem, combinations)
 
 
 def try_modes(problem: ContactProblem, choice: Sequence[int]) -> Answer | None:
     """The solution with given modes of contacts, then joints, if they are consistent."""
-    found = _try(problem, np.array([choice], dtype=int))
+    sizes = len(problem.b_n), len(problem.lift), tuple(problem.owner.tolist())
+    combinations = _combine(*sizes, tuple(choice))
+    found = [] if combinations is None else _try(problem, combinations)
     return found[0] if found else None
 
 
-def _try(p: ContactProblem, choices: NDArray[np.int64]) -> list[Answer]:
-    """Solve with each row's modes, and return what is consistent, each motion once."""
-    s_n, s_t, K, q = p.scaled
-    k, s, held = len(s_n), len(s_t), np.flatnonzero(p.owner >= 0)
-    modes = np.empty((len(choices), s), dtype=int)
-    modes[:, held], modes[:, p.owner < 0] = choices[:, p.owner[held]], choices[:, k:]
-    ways = np.where(modes == FORTH, 1.0, np.where(modes == BACK, -1.0, 0.0))
-    share, bound = np.zeros(s), p.bound / s_t
-    share[held] = p.mu[held] * s_n[p.owner[held]] / s_t[held]
-    # A contact that slides brings its friction with it, what turns has a given one.
-    matrices = np.broadcast_to(K, (len(choices), k + s, k + s)).copy()
-    for j in held.tolist():
-        matrices[:, :, p.owner[j]] -= (share[j] * ways[:, j])[:, None] * K[:, k + j]
-    right = (ways * bound) @ K[:, k:].T - q
-    forces = np.zeros((len(choices), k + s))
+class _Combinations(NamedTuple):
+    """Modes to try.
+
+    Attributes
+    ----------
+    ways : ndarray, shape (m, s)
+        Which way what may stick gives way, 0 where it does not.
+    groups : tuple
+        Rows with as many conditions, and the forces that these are for, shape (r,) and (r, count).
+    """
+
+    ways: Array
+    groups: tuple[tuple[NDArray[np.int64], NDArray[np.int64]], ...]
+
+
+@lru_cache(maxsize=256)
+def _combine(
+    k: int, n: int, owner: tuple[int, ...], choice: tuple[int, ...] | None = None
+) -> _Combinations | None:
+    """Modes of k contacts and n coordinates: one choice, or all of them if they are not too many.
+
+    More conditions than coordinates are no conditions of their own.
+    """
+    own = np.array(owner, dtype=int)
+    options: list[tuple[int, ...]]
+    options = [(APART, STICKS, FORTH, BACK) if i in owner else (APART, STICKS) for i in range(k)]
+    options += [(STICKS, FORTH, BACK) for _ in range(owner.count(-1))]
+    if choice is None and math.prod(len(option) for option in options) > MOST:
+        return None
+    every = list(product(*options)) if choice is None else [choice]
+    choices = np.array(every, dtype=int).reshape(len(every), len(options))
+    modes = np.empty((len(choices), len(own)), dtype=int)
+    modes[:, own >= 0], modes[:, own < 0] = choices[:, own[own >= 0]], choices[:, k:]
     active = np.hstack([choices[:, :k] != APART, modes == STICKS])
     counts = active.sum(axis=1)
-    # More conditions than coordinates are no conditions of their own.
-    sound = counts <= len(p.lift)
-    for count in range(1, int(counts[sound].max(initial=0)) + 1):
+    sound = counts <= n
+    modes, active, counts = modes[sound], active[sound], counts[sound]
+    groups = []
+    for count in range(1, int(counts.max(initial=0)) + 1):
         rows = np.flatnonzero(counts == count)
-        at = np.nonzero(active[rows])[1].reshape(len(rows), count)
-        own = matrices[rows[:, None, None], at[:, :, None], at[:, None, :]]
+        if len(rows):
+            groups.append((rows, np.nonzero(active[rows])[1].reshape(len(rows), count)))
+    ways = np.where(modes == FORTH, 1.0, np.where(modes == BACK, -1.0, 0.0))
+    return _Combinations(ways, tuple(groups))
+
+
+def _try(p: ContactProblem, combinations: _Combinations) -> list[Answer]:
+    """Solve with each of some modes, and return what is consistent, each motion once."""
+    s_n, s_t, K, q = p.scaled
+    ways, groups = combinations
+    k, held = len(s_n), (p.owner >= 0).nonzero()[0]
+    owner = p.owner[held]
+    share, bound = p.mu[held] * s_n[owner] / s_t[held], p.bound / s_t
+    # A contact that slides brings its friction with it, what turns has a given one.
+    rubs, partner = np.zeros((len(ways), len(q))), np.arange(len(q))
+    rubs[:, owner], partner[owner] = share * ways[:, held], k + held
+    right = (ways * bound) @ K[:, k:].T - q
+    forces, sound = np.zeros((len(ways), len(q))), np.ones(len(ways), dtype=bool)
+    for rows, at in groups:
+        places, across, row = at[:, :, None], at[:, None, :], rows[:, None]
+        own = K[places, across] - rubs[row, at][:, None, :] * K[places, partner[across]]
         fine = np.abs(np.linalg.det(own)) > SINGULAR
-        sound[rows[~fine]] = False
-        rows, at = rows[fine], at[fine]
-        known = np.linalg.solve(own[fine], right[rows[:, None], at][:, :, None])[:, :, 0]
-        forces[rows[:, None], at] = known
+        if not fine.all():
+            sound[rows[~fine]] = False
+            own, row, at = own[fine], row[fine], at[fine]
+        forces[row, at] = np.linalg.solve(own, right[row, at][:, :, None])[:, :, 0]
+    size = float(np.abs(q).max(initial=0.0)) or 1.0
+    # What pulls is none, whatever else it does.
+    sound &= (forces[:, :k] >= -EDGE * size).all(axis=1)
+    forces, ways = forces[sound], ways[sound]
     forces[:, k:] -= ways * bound
-    forces[:, k + held] -= ways[:, held] * share[held] * forces[:, p.owner[held]]
-    return _pick(p, forces[sound], p.scaled, float(np.abs(q).max(initial=0.0)) or 1.0)
+    forces[:, k + held] -= ways[:, held] * share * forces[:, owner]
+    return _pick(p, forces, p.scaled, size) if len(forces) else []
 
 
 def _pick(
