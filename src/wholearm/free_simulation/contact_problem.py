@@ -160,12 +160,12 @@ def _exchange(p: ContactProblem, presses: Sequence[bool]) -> Answer | None:
     active = np.array(presses, dtype=bool) if len(presses) else q < 0
     for turn in range(k + 2**k):
         c = np.zeros(k)
-        at = np.flatnonzero(active)
+        at = active.nonzero()[0]
         if len(at):
             c[at] = np.linalg.solve(K[at[:, None], at], -q[at])
         rates = K @ c + q
         values = np.where(active, c, rates)
-        wrong = np.flatnonzero(values < -EDGE * size)
+        wrong = (values < -EDGE * size).nonzero()[0]
         if not len(wrong):
             worst = max(float(np.abs(rates[at]).max(initial=0.0)), float(-values.min(initial=0.0)))
             return read(p, s_n * np.maximum(c, 0.0), np.zeros(0), worst / size)
@@ -177,7 +177,7 @@ def _exchange(p: ContactProblem, presses: Sequence[bool]) -> Answer | None:
 def _solve_by_lemke(p: ContactProblem) -> Answer | None:
     s_n, s_t, K, q = p.scaled
     k, s = len(s_n), len(s_t)
-    held = np.flatnonzero(p.owner >= 0)
+    held = (p.owner >= 0).nonzero()[0]
     # Unknowns are c_n, both parts of f, and how fast each of them gives way.
     M, plus, minus = np.zeros((k + 3 * s, k + 3 * s)), k + s, k + 2 * s
     M[:plus, :plus] = K

@@ -79,13 +79,13 @@ def _pivot(M: Array, q: Array, size: float, least: float) -> Solution:
         table[row] /= table[row, entering]
         factors = table[:, entering].copy()
         factors[row] = 0.0
-        table -= np.outer(factors, table[row])
+        table -= factors[:, None] * table[row]
         basis[row] = entering
         if leaving == 2 * n + 1:
             return _read(M, q, basis)
         entering = leaving + n if leaving <= n else leaving - n
         column = table[:, entering]
-        rising = np.flatnonzero(column > least)
+        rising = (column > least).nonzero()[0]
         if not len(rising):
             break
         # The artificial unknown goes as soon as it may: its level is what is missing.
@@ -103,7 +103,7 @@ def _choose(table: Array, rows: NDArray[np.int64], pivots: Array) -> int:
     """
     sizes = np.abs(pivots)
     ratios = table[rows, 0] / sizes
-    least = np.flatnonzero(ratios == ratios.min())
+    least = (ratios == ratios.min()).nonzero()[0]
     if len(least) > 1:
         chosen = rows[least]
         ties = table[chosen, 1 : len(table) + 1] / sizes[least, None]

@@ -74,20 +74,21 @@ class _Motion:
     def __init__(self, run: Run) -> None:
         self.run, self.s = run, run.load()
         system = run.system
-        self.unit, self.per_unit = system.scales.length, 1 / system.units[: system.n]
+        self.unit, self.per_unit = system.scales.length, (1 / system.units[: system.n]).tolist()
         if run.modes not in run.watches:
             run.watches[run.modes] = build_watch(system, run.modes, self.s.to)
         self.watch = run.watches[run.modes]
         self.slack, self.watched = self.watch.slack, self.watch.pairs
-        self.near = 1e-3 * SHORTEST * max(system.scales.time, abs(run.t))
+        self.time = system.scales.time
+        self.near = 1e-3 * SHORTEST * max(self.time, abs(run.t))
 
     def move(self) -> None:
         """Integrate until something happens or the torques step or end."""
         run, s = self.run, self.s
         run.stay(s)
         s.look()
-        run.record(s)
         start = self.view(None, 0.0)
+        run.record(s, start.out)
         # What touches already may sink by rounding; what is behind something else never closes.
         shallow = start.gaps[-1] > -SUNK * self.unit
         sunk = np.minimum(start.gaps[-1], 0.0) - 0.5 * CLOSED * self.unit
@@ -101,7 +102,7 @@ class _Motion:
             run.t = run.t + float(s.inputs[s.at.h]) if found or not whole else run.stop
             run.y = end.out[s.to.y].copy()
             run.steps += 1
-            run.record(s)
+            run.record(s, end.out)
             run.armed = end.gaps[-1] > ARMED * self.unit
             if found:
                 return
@@ -115,7 +116,7 @@ class _Motion:
                     end = self.view(None, 0.0)
                     if not self._holds(end):
                         return
-                    run.record(s)
+                    run.record(s, end.out)
             else:
                 run.feed(s)
             start = end
@@ -125,22 +126,22 @@ class _Motion:
 
         Everything that touches has to press and slide, as it did before.
         """
-        if not (self.run.unique and self.watch.plain and (end.values > self.watch.clear).all()):
+        clear = np.count_nonzero(end.values > self.watch.clear) == len(end.values)
+        if not (self.run.unique and self.watch.plain and clear):
             return False
         near = CLOSED * self.unit
         touches = (np.abs(end.gaps[-1]) < near) & (end.ranges[-1] > -near)
-        return not (touches & self.watched).any()
+        return not np.count_nonzero(touches & self.watched)
 
     def _try_step(self, start: View) -> tuple[float, bool, View]:
         """Make a step within the tolerance; its length, and whether it ends the torques' piece."""
         run, s = self.run, self.s
         inputs, outputs, at, to = s.inputs, s.outputs, s.at, s.to
         n, remaining = run.system.n, run.stop - run.t
-        per_unit, out = self.per_unit.tolist(), start.out
-        speed = max(map(abs, map(mul, out[n : 2 * n].tolist(), per_unit)))
-        push = max(map(abs, map(mul, out[to.acceleration].tolist(), per_unit)))
+        speed = self._find_most(start.out[n : 2 * n])
+        push = self._find_most(start.out[to.acceleration])
         reach = 2 * REACH / (speed + math.sqrt(speed**2 + 2 * push * REACH) + 1e-300)
-        least = SHORTEST * max(run.system.scales.time, abs(run.t))
+        least = SHORTEST * max(self.time, abs(run.t))
         while True:
             h = min(run.h, reach)
             whole = h >= 0.999 * remaining
@@ -150,7 +151,7 @@ class _Motion:
             error = float(outputs[to.error])
             if error <= 1:
                 view = self.view(start.out, h)
-                sudden = outputs[to.dip] < -1e-6 and h > AHEAD * run.system.scales.time
+                sudden = outputs[to.dip] < -1e-6 and h > AHEAD * self.time
                 if not sudden or (view.values < -self.slack).any():
                     grown = h * min(GROWTH, 0.9 * max(error, 1e-300) ** (-1 / ORDER))
                     run.h = grown if h >= run.h else max(run.h, grown)
@@ -160,6 +161,10 @@ class _Motion:
                 raise StuckError
             run.h = h * (max(0.1, 0.9 * error ** (-1 / ORDER)) if error > 1 else 0.5)
 
+    def _find_most(self, motion: Array) -> float:
+        """Largest of coordinates or their rates, in units of the scene."""
+        return float(max(map(abs, map(mul, motion.tolist(), self.per_unit))))
+
     def view(self, before: Array | None, h: float) -> View:
         """Look at the step just made, of length h from the outputs `before`, if any."""
         n, to = self.run.system.n, self.s.to
@@ -168,8 +173,9 @@ class _Motion:
         times, gaps, ranges = np.array([h]), out[None, to.gaps], out[None, to.ranges]
         if before is None:
             return View(out, values, times, gaps, ranges)
-        gone = np.abs(out[:n] - before[:n]) + h * np.abs(out[n : 2 * n] - before[n : 2 * n])
-        count = 1 + int(LOOKS * min(1.0, float((gone * self.per_unit).max()) / REACH))
+        gone = np.abs(out[: 2 * n] - before[: 2 * n])
+        most = self._find_most(gone[:n] + h * gone[n:])
+        count = 1 + int(LOOKS * min(1.0, most / REACH))
         if count > 1:
             times = h * np.arange(1, count + 1) / count
             ends = np.array([before, out])
@@ -194,7 +200,7 @@ class _Motion:
             values = end.values + floor
             closing = self._find_closing(start, end, passed)
             closing = closing or self._find_entering(start, end, passed)
-            low = np.flatnonzero(values < 0)
+            low = (values < 0).nonzero()[0]
             if not len(low) and closing is None:
                 return found, end
             shares = first[low] / (first[low] - values[low])
@@ -258,11 +264,16 @@ class _Motion:
             armed = np.logical_or.accumulate(np.vstack([armed, apart]), axis=0)
         level = np.where(armed, 0.0, self.level)
         below = (end.gaps < level) & self.watched
-        if not below.any():
+        if not np.count_nonzero(below):
             return None
-        crosses = below & (np.vstack([start.gaps[-1:], end.gaps[:-1]]) >= level)
-        ranges = np.vstack([start.ranges[-1:], end.ranges])
-        crosses &= np.maximum(ranges[1:], ranges[:-1]) > -1e-3 * self.unit
+        earlier = [start.gaps[-1:], start.ranges[-1:]]
+        if len(end.times) > 1:
+            both = zip(earlier, (end.gaps, end.ranges), strict=True)
+            earlier = [np.vstack([first, later[:-1]]) for first, later in both]
+        crosses = below & (earlier[0] >= level)
+        if not np.count_nonzero(crosses):
+            return None
+        crosses &= np.maximum(end.ranges, earlier[1]) > -1e-3 * self.unit
         crosses[:, list(passed)] = False
         rows, pairs = np.nonzero(crosses)
         if not len(rows):
@@ -280,7 +291,7 @@ class _Motion:
         if len(end.times) > 1:
             earlier = np.vstack([earlier, end.ranges[:-1]])
         turns = (end.ranges > 0) & (earlier <= 0)
-        if not turns.any():
+        if not np.count_nonzero(turns):
             return None
         turns &= self.watched & (end.gaps < -CLOSED * self.unit) & (end.gaps > -REACH * self.unit)
         h, found = float(self.s.inputs[self.s.at.h]), None
@@ -315,9 +326,9 @@ class _Motion:
         """Half the time in which the nearest pair that has just parted would close again [s]."""
         run, s = self.run, self.s
         near = self.watched & ~run.armed & (np.abs(start.gaps[-1]) < CLOSED * self.unit)
-        if not near.any():
-            return float("inf")
-        rows = run.system.evaluate(run.z, run.v, np.flatnonzero(near).tolist())
+        if not np.count_nonzero(near):
+            return math.inf
+        rows = run.system.evaluate(run.z, run.v, near.nonzero()[0].tolist())
         rate = rows.A @ run.v
         bend = rows.A @ s.outputs[s.to.acceleration] + rows.bend
         # What parts more slowly was closed when the modes were chosen.

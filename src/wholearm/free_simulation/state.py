@@ -83,6 +83,8 @@ class Run:
         Energy lost to impacts so far.
     watches : dict
         What is looked at with each of the modes so far.
+    rub : ndarray, shape (k,)
+        c_t over c_n of the present kept pairs, zero where they stick.
     """
 
     def __init__(
@@ -111,6 +113,7 @@ class Run:
         self.records: list[Record] = []
         self.events: list[Event] = []
         self.watches: dict[Modes, Any] = {}
+        self.rub = np.zeros(0)
         known = self.torque.coefficients
         self._steps = _find_steps(known[:-1], known[1:], system.scales.torque).tolist()
         self._begin_piece()
@@ -187,7 +190,7 @@ class Run:
         near = CLOSED * scales.length
         faces = ranges > near
         at_end = (ranges > -near) & ~faces
-        if at_end.any():
+        if np.count_nonzero(at_end):
             faces |= at_end & (self.system.look(z + AHEAD * scales.time * v)[1] >= ranges)
         return gaps, faces
 
@@ -213,6 +216,7 @@ class Run:
         inputs[at.dry], inputs[at.mu] = system.dry, system.friction[list(modes.kept)]
         inputs[at.units], inputs[at.force] = system.units, system.scales.force
         inputs[at.friction_units] = system.friction_units
+        self.rub = inputs[at.mu] * -inputs[at.Xi]
         self.feed(s)
         return s
 
@@ -234,17 +238,18 @@ class Run:
         text = f"{text} at t = {self.t:.6g} s"
         self.events.append(Event(self.t, 0, kind, text, contact, value))
 
-    def record(self, s: Stepper | None) -> None:
-        """Record the present instant, with the forces in a stepper's outputs; None at rest."""
+    def record(self, s: Stepper | None, out: Array | None = None) -> None:
+        """Record the present instant, with a stepper's outputs, which are kept; without at rest."""
         n = self.system.n
-        if s is None:
+        if s is None or out is None:
             none = np.full(len(self.modes.kept), np.nan)
             row = (np.zeros(n), self.tau(self.t), self.modes.kept, none, none)
-        else:
-            out, to = s.outputs, s.to
-            c_n = out[to.c_n].copy()
-            c_t = c_n * s.inputs[s.at.mu] * -s.inputs[s.at.Xi]
-            for place, pair in enumerate(self.modes.stuck):
-                c_t[self.modes.kept.index(pair)] = out[to.f.start + place]
-            row = (out[to.acceleration].copy(), out[to.tau].copy(), self.modes.kept, c_n, c_t)
-        self.records.append(Record(self.t, self.y.copy(), *row, self.impact))
+            self.records.append(Record(self.t, self.y.copy(), *row, self.impact))
+            return
+        to, kept = s.to, self.modes.kept
+        c_n = out[to.c_n]
+        c_t = c_n * self.rub
+        for place, pair in enumerate(self.modes.stuck):
+            c_t[kept.index(pair)] = out[to.f.start + place]
+        row = (out[to.acceleration], out[to.tau], kept, c_n, c_t)
+        self.records.append(Record(self.t, out[to.y], *row, self.impact))
