@@ -15,9 +15,10 @@ from wholearm.common.errors import InputError
 from wholearm.engines.mjcf import write_mjcf
 from wholearm.engines.replay import list_settings, replay_in
 from wholearm.engines.report_text import to_dict, write
-from wholearm.engines.stretch import Setting, require_same_phases
+from wholearm.engines.stretch import Setting
 from wholearm.planning.plan import solve
 from wholearm.problem.definition import Problem
+from wholearm.results.narrow import require_same_phases
 from wholearm.results.trajectory import Trajectory
 
 EXTRAS = {"mujoco": "mujoco", "drake": "pydrake"}

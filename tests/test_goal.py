@@ -3,16 +3,18 @@ from __future__ import annotations
 import math
 import tomllib
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from shipped import HEPTAGON, problem_of
+from shipped import HEPTAGON, plan_of, problem_of
 from wholearm.common.errors import InputError
+from wholearm.comparison.compare import compare
 from wholearm.mapping.formation_map import choose_window
 from wholearm.problem.definition import Problem
 from wholearm.problem.goal import Goal
-from wholearm.problem.read import build_problem
+from wholearm.problem.read import adopt_phases, build_problem
 
 TABLE = {k: v for k, v in tomllib.loads(HEPTAGON.read_text()).items() if k != "phases"}
 
@@ -68,3 +70,18 @@ def test_the_map_covers_goals() -> None:
     scene = problem_of(HEPTAGON).scene
     low, high = choose_window(read({"flush": 6})).phi
     assert low < scene.polygon.flush_angle(0) < scene.polygon.flush_angle(6) < high
+
+
+def test_a_plan_brings_the_phases_that_lead_to_its_goal(tmp_path: Path) -> None:
+    plan, planned = plan_of(HEPTAGON), problem_of(HEPTAGON)
+    phi = math.degrees(plan.q[-1, 2])
+    problem = read({"phi_deg": phi})
+    found = adopt_phases(problem, plan.meta, plan.q[-1])
+    assert found.table["phases"] == planned.table["phases"] and not found.goals
+    assert adopt_phases(planned, plan.meta, plan.q[-1]) is planned
+    plan.save(tmp_path / "plan.npz")
+    (own,) = compare(problem, [str(tmp_path / "plan.npz")]).contenders
+    assert own.ok and len(own.lasts) == 5
+    for goal in ({"phi_deg": phi + 1.0}, {"phi_deg": phi, "x": plan.q[-1, 0] + 1e-3}, {"flush": 6}):
+        with pytest.raises(InputError, match=r"goal: the plan ends at .*, and not with"):
+            adopt_phases(read(goal), plan.meta, plan.q[-1])

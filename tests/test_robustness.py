@@ -157,8 +157,16 @@ def test_bad_options_are_named(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     plan.save("plan.npz")
-    assert main(["robustness", str(PROBLEM), "plan.npz", *options]) == 2
+    # The file as far as the second phase.
+    text_of_one = "[[phases]]".join(PROBLEM.read_text(encoding="utf-8").split("[[phases]]")[:2])
+    Path("one.toml").write_text(text_of_one, encoding="utf-8")
+    assert main(["robustness", "one.toml", "plan.npz", *options]) == 2
     assert text in capsys.readouterr().err
+
+
+def test_a_plan_of_other_phases_is_refused(plan: Plan) -> None:
+    with pytest.raises(InputError, match="phases: the plan's contacts are not those"):
+        assess_robustness(wholearm.load(str(PROBLEM)), plan.trajectory, samples=1)
 
 
 def follow(

@@ -12,7 +12,6 @@ import json
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, NoReturn
 
 from ..common.errors import InputError, WholearmError, name_source
@@ -225,7 +224,7 @@ def _stem(path: str) -> str:
 def _verify(options: argparse.Namespace) -> int:
     from ..common.files import require_ending, require_writable
     from ..common.require import require_number
-    from ..problem.read import read_own_problem, read_problem
+    from ..problem.read import adopt_phases, read_problem
     from ..results.trajectory import Trajectory
     from ..verification.verify import verify
 
@@ -242,10 +241,8 @@ def _verify(options: argparse.Namespace) -> int:
         given["least_minor"] = options.least_minor
     problem = read_problem(options.problem)
     torques = _read_torques(options.torques)
-    if problem.goals and isinstance(torques, Trajectory):
-        # Which formations lead to the goals the plan has found out.
-        phases = read_own_problem(torques.meta, options.torques).phases
-        problem = replace(problem, phases=phases, goals=())
+    if isinstance(torques, Trajectory):
+        problem = adopt_phases(problem, torques.meta, torques.q[-1], options.torques)
     if getattr(torques, "meta", {}).get("problem") != problem.table:
         # What has been planned or replayed can be carried out.
         from ..geometry.path_guess import check_phases

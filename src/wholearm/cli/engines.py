@@ -60,7 +60,9 @@ def _export(options: argparse.Namespace) -> int:
     problem = read_problem(options.problem)
     if step is not None:
         _read_step(step, problem.scene.scales.time)
-    plan = None if options.plan is None else _load_plan(options.plan, problem)
+    plan = None
+    if options.plan is not None:
+        problem, plan = _load_plan(options.plan, problem)
     with name_source(options.problem):
         write_text(options.mjcf, write_mjcf(problem, plan, step=step))
     print(f"wrote {options.mjcf}")
@@ -77,7 +79,7 @@ def _replay(options: argparse.Namespace) -> int:
     if not 0 <= options.refine <= MOST:
         raise InputError("", "--refine", f"{options.refine} given; allowed are 0 to {MOST}")
     problem = read_problem(options.problem)
-    plan = _load_plan(options.plan, problem)
+    problem, plan = _load_plan(options.plan, problem)
     setting, time = ENGINES[options.engine].setting, problem.scene.scales.time
     if given["step"] is not None:
         setting = setting._replace(step=_read_step(given["step"], time))
@@ -115,16 +117,18 @@ def _read_positive(options: argparse.Namespace, key: str) -> float | None:
     return None if value is None else require_number(value, f"--{key}", positive=True)
 
 
-def _load_plan(path: str, problem: Problem) -> Trajectory:
-    """A plan of the problem's phases."""
+def _load_plan(path: str, problem: Problem) -> tuple[Problem, Trajectory]:
+    """A plan, and the problem whose phases it has."""
     from ..common.files import require_ending
-    from ..engines.stretch import require_same_phases
+    from ..problem.read import adopt_phases
+    from ..results.narrow import require_same_phases
     from ..results.trajectory_file import load_trajectory
 
     if require_ending(path, ".npz", ".csv") == ".csv":
         text = "torques alone have no motion to compare with; verify -o FILE.npz writes one"
         raise InputError(path, "", text)
     plan = load_trajectory(path)
+    problem = adopt_phases(problem, plan.meta, plan.q[-1], path)
     with name_source(path):
         require_same_phases(problem, plan)
-    return plan
+    return problem, plan

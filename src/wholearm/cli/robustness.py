@@ -56,7 +56,7 @@ def add_robustness(parser: argparse.ArgumentParser) -> None:
 def _robustness(options: argparse.Namespace) -> int:
     from ..common.files import require_ending, require_writable
     from ..policy.policy import Policy
-    from ..problem.read import read_problem
+    from ..problem.read import adopt_phases, read_problem
     from ..results.trajectory_file import load_trajectory
     from ..robustness.report import to_dict, to_text
     from ..robustness.study import assess_robustness
@@ -70,10 +70,12 @@ def _robustness(options: argparse.Namespace) -> int:
 
         require_writable(options.figure)
         plots.require_format(options.figure)
+    plan = load_trajectory(options.plan)
     problem = read_problem(options.problem)
+    problem = adopt_phases(problem, plan.meta, plan.q[-1], options.plan)
     study = assess_robustness(
         problem,
-        load_trajectory(options.plan),
+        plan,
         samples=options.samples,
         seed=options.seed,
         uncertainty=_read_ranges(options, problem),

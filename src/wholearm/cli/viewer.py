@@ -99,11 +99,10 @@ def _report(options: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory() as folder:
         paths = options.files
         if not paths:
-            from ..planning.options import PlanOptions
-            from ..planning.plan import solve_with
+            from ..search.solve import solve
 
             paths = [os.path.join(folder, f"{stem}.npz")]
-            solve_with(problem, PlanOptions(), say).save(paths[0])
+            solve(problem, progress=say).save(paths[0])
         text = Path(options.problem).read_text(encoding="utf-8")
         content = build_report(problem, paths, text, say or (lambda text: None))
     write_text(output, content)

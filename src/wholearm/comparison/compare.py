@@ -12,7 +12,9 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import InputError, JammingError, SimulationError, name_source
 from ..common.files import require_ending
+from ..problem.check import require_phases
 from ..problem.definition import Problem
+from ..problem.read import adopt_phases
 from ..results.report import Report
 from ..results.torque import TorqueProfile, read_notes, read_torque_csv
 from ..results.trajectory import Trajectory
@@ -23,7 +25,7 @@ from .side_by_side import Comparison, Contender
 
 SIMULATIONS = "simulations"
 """Key of a comment of torques, and of the `meta` of a trajectory, with how many it took."""
-_FREE = ("name", "epsilon", "settle_gap")
+_FREE = ("name", "epsilon", "settle_gap", "uncertainty")
 """Keys of a problem in which trajectories may differ from it; so may `settle`, of a phase too."""
 
 
@@ -38,22 +40,27 @@ def compare(problem: Problem, paths: Sequence[str]) -> Comparison:
     short = [os.path.basename(path) for path in paths]
     names = short if len({*short}) == len(short) else paths
     given = [(name, *_read(problem, str(path))) for name, path in zip(names, paths, strict=True)]
-    return Comparison(problem.name, problem.epsilon, tuple(_judge(problem, *own) for own in given))
+    return Comparison(problem.name, problem.epsilon, tuple(_judge(*own) for own in given))
 
 
-def _read(problem: Problem, path: str) -> tuple[Trajectory | TorqueProfile, int | None]:
-    """Torques or a trajectory that fits the problem, and how many simulations it took."""
+def _read(problem: Problem, path: str) -> tuple[Problem, Trajectory | TorqueProfile, int | None]:
+    """Torques or a trajectory that fits the problem, and how many simulations it took.
+
+    Goals of the problem give way to the phases that a trajectory has found.
+    """
     if require_ending(path, ".npz", ".csv") == ".csv":
         noted = read_notes(path).get(SIMULATIONS)
         if noted is not None and not noted.isdecimal():
             raise InputError(path, SIMULATIONS, f"{noted!r} given; a whole number is needed")
-        return read_torque_csv(path), None if noted is None else int(noted)
+        require_phases(problem)
+        return problem, read_torque_csv(path), None if noted is None else int(noted)
     trajectory = load_trajectory(path)
+    problem = adopt_phases(problem, trajectory.meta, trajectory.q[-1], path)
     with name_source(path):
         _require_fit(problem, trajectory)
     replay = trajectory.meta.get("replay")
     known = (replay or {}).get(SIMULATIONS, trajectory.meta.get(SIMULATIONS))
-    return trajectory, known if isinstance(known, int) else None
+    return problem, trajectory, known if isinstance(known, int) else None
 
 
 def _require_fit(problem: Problem, trajectory: Trajectory) -> None:
@@ -91,7 +98,7 @@ def _find_difference(own: Any, other: Any, key: str) -> tuple[str, str, str] | N
 
 
 def _judge(
-    problem: Problem, name: str, what: Trajectory | TorqueProfile, simulations: int | None
+    name: str, problem: Problem, what: Trajectory | TorqueProfile, simulations: int | None
 ) -> Contender:
     """What one of them does."""
     torque = what if isinstance(what, TorqueProfile) else what.torque

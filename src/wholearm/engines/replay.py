@@ -10,12 +10,13 @@ from typing import NamedTuple
 
 from ..common.errors import InputError
 from ..problem.definition import Problem
+from ..results.narrow import require_same_phases
 from ..results.trajectory import Trajectory
 from .applied import apply_friction
 from .between import find_between
 from .departure import Departure, compare
 from .report_text import name_phases
-from .stretch import Engine, Setting, Stretch, list_stretches, require_same_phases
+from .stretch import Engine, Setting, Stretch, list_stretches
 
 
 class Known(NamedTuple):

@@ -8,8 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InputError
-from ..problem.check import require_phases
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
@@ -138,11 +136,3 @@ def list_steps(problem: Problem, stretch: Stretch, torque: TorqueProfile, step: 
     rows = min(count, ROWS * len(stretch.phases))
     ends = np.linspace(0, count, rows + 1)[1:].astype(int).tolist()
     return Steps(h, v, tau, ends)
-
-
-def require_same_phases(problem: Problem, plan: Trajectory) -> None:
-    """Check that a plan has the phases of a problem."""
-    require_phases(problem)
-    given = [set(motion.contacts) for motion in plan.motions]
-    if given != [set(phase.formation.names) for phase in problem.phases]:
-        raise InputError("", "contacts", "the plan's phases are not those of the problem")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -30,6 +30,9 @@ from .uncertainty import GROUPS as PARAMETER_GROUPS
 from .uncertainty import NAMES as PARAMETER_NAMES
 
 _T = TypeVar("_T")
+
+_THERE = 1e-3
+"""How far from a goal a plan may end, in radii of gyration and in rad."""
 
 ROLLING = " rolling"
 """Follows the name of a contact that rolls in a phase's `contacts`."""
@@ -126,6 +129,34 @@ def read_own_problem(meta: Mapping[str, Any], source: str = "") -> Problem:
         return build_problem(table)
     except InputError as error:
         raise InputError(source, f"meta.problem.{error.key}", error.problem) from None
+
+
+def adopt_phases(problem: Problem, meta: Mapping[str, Any], q: Array, source: str = "") -> Problem:
+    """The problem with the phases that a plan has found, where it has goals in their place.
+
+    Parameters
+    ----------
+    problem : Problem
+    meta : mapping
+        Of the plan.
+    q : ndarray, shape (3,), [m, m, rad]
+        Where the plan ends.
+    source : str
+        The plan's file.
+
+    Raises
+    ------
+    InputError
+        If the plan does not hold its problem, or ends elsewhere than at the last goal.
+    """
+    if not problem.goals:
+        return problem
+    goal, (x, _, phi) = problem.goals[-1], q.tolist()
+    turned = abs(goal.find_angle(problem.scene, phi) - phi) > _THERE
+    if turned or (goal.x is not None and abs(goal.x - x) > _THERE * problem.scene.scales.length):
+        place = f"x = {1e3 * x:.4g} mm, phi = {math.degrees(phi):.4g} deg"
+        raise InputError(source, "goal", f"the plan ends at {place}, and not with {goal}")
+    return replace(problem, phases=read_own_problem(meta, source).phases, goals=())
 
 
 def _read_scene(table: Mapping[str, Any]) -> Scene:

@@ -7,6 +7,8 @@ from typing import Protocol
 
 from ..common.errors import InputError
 from ..common.files import require_ending, write_text
+from ..problem.check import require_phases
+from ..problem.definition import Problem
 from .torque import TorqueProfile
 from .trajectory import Trajectory
 
@@ -29,6 +31,14 @@ def narrow(what: Torques) -> tuple[TorqueProfile, Trajectory | None]:
         return what, None
     trajectory = what if isinstance(what, Trajectory) else what.trajectory
     return trajectory.torque, trajectory
+
+
+def require_same_phases(problem: Problem, plan: Trajectory) -> None:
+    """Check that a plan has the phases of a problem."""
+    require_phases(problem)
+    given = [set(motion.contacts) for motion in plan.motions]
+    if given != [set(phase.formation.names) for phase in problem.phases]:
+        raise InputError("", "phases", "the plan's contacts are not those of the problem's phases")
 
 
 def save(what: Torques, path: str | os.PathLike[str]) -> None:

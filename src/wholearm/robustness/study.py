@@ -24,7 +24,7 @@ from ..common.errors import InputError
 from ..common.journal import Journal
 from ..policy.policy import Policy
 from ..problem.definition import Problem
-from ..results.narrow import Torques, narrow
+from ..results.narrow import Torques, narrow, require_same_phases
 from .sensitivity import Sensitivities, measure_sensitivities
 from .statistics import Share, count_share
 from .trial import Trial, make_trial
@@ -137,6 +137,7 @@ def assess_robustness(
         raise InputError("", "plan", "torques alone given; a plan with its motion is needed")
     if isinstance(samples, bool) or not isinstance(samples, int) or samples < 1:
         raise InputError("", "samples", f"{samples!r} given; allowed are 1 and more")
+    require_same_phases(problem, trajectory)
     own = uncertainty or Uncertainty(problem.uncertainty or {})
     trial = make_trial(problem, trajectory, own, phase, policy)
     drawn = own.draw(samples, seed)

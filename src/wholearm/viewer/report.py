@@ -9,6 +9,7 @@ from ..comparison.compare import compare
 from ..comparison.side_by_side import Comparison, Contender
 from ..mapping.formation_map import FormationMap, build_map, choose_window
 from ..problem.definition import Problem
+from ..problem.read import adopt_phases
 from ..results.trajectory import Trajectory
 from ..results.trajectory_file import load_trajectory
 from . import page
@@ -53,7 +54,10 @@ def build_report(
         progress(contender.name)
         planned = load_trajectory(path) if path.lower().endswith(".npz") else None
         first = first or planned
-        parts += _describe(problem, contender, planned)
+        own = problem
+        if planned is not None:
+            own = adopt_phases(problem, planned.meta, planned.q[-1], path)
+        parts += _describe(own, contender, planned)
     progress("map")
     chart = chart or build_map(problem, _RESOLUTION, choose_window(problem, None))
     parts += [
