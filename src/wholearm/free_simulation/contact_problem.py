@@ -87,7 +87,7 @@ class ContactProblem:
             b = np.concatenate([b, self.b_t])
         lifted = rows * self.lift
         units = 1 / np.sqrt((lifted * rows).sum(axis=1))
-        K = (lifted @ pushes.T) * np.outer(units, units)
+        K = (lifted @ pushes.T) * (units[:, None] * units)
         return units[: len(b) - s], units[len(b) - s :], K, units * b
 
     @cached_property
@@ -99,7 +99,9 @@ class ContactProblem:
         if len(self.b_t):
             return False
         K = self.scaled[2]
-        return not len(K) or bool(np.linalg.eigvalsh(K + K.T)[0] > SINGULAR)
+        if len(K) < 2:
+            return not len(K) or float(2 * K[0, 0]) > SINGULAR
+        return bool(np.linalg.eigvalsh(K + K.T)[0] > SINGULAR)
 
 
 class Answer(NamedTuple):

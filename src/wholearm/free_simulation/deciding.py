@@ -57,13 +57,17 @@ def find_closed(run: Run) -> Closed:
     if not touching:
         return Closed((), rows)
     slow = (rows.A @ run.v < run.chatter).tolist()
-    lines = rows.A / np.sqrt(system.mass)
-    lines /= np.sqrt((lines**2).sum(axis=1))[:, None]
-    own = (np.abs(lines[:, None] - lines).max(axis=2) > DEPENDENT).tolist()
+    own = [[True]]
+    if len(touching) > 1:
+        lines = rows.A / np.sqrt(system.mass)
+        lines /= np.sqrt((lines**2).sum(axis=1))[:, None]
+        own = (np.abs(lines[:, None] - lines) > DEPENDENT).any(axis=2).tolist()
     chosen: list[int] = []
     for k in sorted(range(len(touching)), key=lambda k: touching[k] not in run.modes.kept):
         if slow[k] and all(own[k][j] for j in chosen):
             chosen.append(k)
+    if len(chosen) == len(touching):
+        return Closed(tuple(touching), rows)
     chosen.sort()
     return Closed(tuple(touching[k] for k in chosen), Rows(*(part[chosen] for part in rows)))
 
