@@ -61,7 +61,7 @@ def find_closed(run: Run) -> Closed:
     if len(touching) > 1:
         lines = rows.A / np.sqrt(system.mass)
         lines /= np.sqrt((lines**2).sum(axis=1))[:, None]
-        own = (np.abs(lines[:, None] - lines) > DEPENDENT).any(axis=2).tolist()
+        own = (np.abs(lines[:, None] - lines).max(axis=2) > DEPENDENT).tolist()
     chosen: list[int] = []
     for k in sorted(range(len(touching)), key=lambda k: touching[k] not in run.modes.kept):
         if slow[k] and all(own[k][j] for j in chosen):
