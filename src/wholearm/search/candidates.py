@@ -150,16 +150,10 @@ def measure_link(
     return Measured(spent + sum(plan.motion.duration for plan in plans), steps)
 
 
-def list_variants(steps: tuple[Step, ...]) -> list[tuple[Step, ...]]:
-    """Phases that leave a border, with the border left in motion.
-
-    At a place that the planner chooses, and at that of some phases of the link.
-    """
+def leave_in_motion(steps: tuple[Step, ...]) -> tuple[Step, ...]:
+    """Phases that leave a border in motion, at a place that the planner chooses."""
     first, *rest = steps
-    return [
-        (Step(first.contacts, Until(), End.SMOOTH), *rest),
-        (first._replace(end=End.SMOOTH), *rest),
-    ]
+    return (Step(first.contacts, Until(), End.SMOOTH), *rest)
 
 
 def explain_border(problem: Problem, blocked: Blocked, options: PlanOptions) -> str:

@@ -33,7 +33,7 @@ from ..scene.model import Scene
 from .places import unit_steps
 from .sweep import find_durations
 
-HEADINGS = 72
+HEADINGS = 36
 """Ways in which motions may set out from a place."""
 SPACING, REACH = 0.2, 3.0
 """Distance of places looked at along a ray, and its length, in radii of gyration and radians."""

@@ -20,9 +20,9 @@ from .goals import is_at, measure_turn
 from .links import Blocked, Border, Link
 from .places import Place
 
-TURNING = 4.0
+TURNING = 14.0
 """Least time that turning by a radian takes, by a rule of thumb, in the scene's time."""
-CROSSING, LEAVING = 1.0, 2.5
+CROSSING, LEAVING = 1.0, 4.0
 """The same of a motion through a cell, from a place and from somewhere along a border."""
 SETTLED = 100
 """Most places that are looked at."""

@@ -20,7 +20,7 @@ from .candidates import (
     Candidate,
     Failure,
     explain_border,
-    list_variants,
+    leave_in_motion,
     make_candidate,
     measure_link,
     plan_candidate,
@@ -39,7 +39,7 @@ TRIED = 6
 BEYOND = 1.1
 """Times of routes, by the search, over that of the best plan, from which on they are left out."""
 MOVE = 0.12
-"""Share of a border by which the place where it is left is moved at first."""
+"""Share of a border by which the place where it is left is moved."""
 ELSEWHERE = (0.15, -0.15)
 """The same where a way from the first place has no plan."""
 GAIN = 0.998
@@ -167,21 +167,20 @@ class _Chooser:
                 continue
             self.chart.polished.add(link)
             report(f"planning {describe_steps(link.steps)} in other ways")
-            self._move(link)
-            before = self.chart.measured[link]
-            assert isinstance(before, Measured)
-            for steps in list_variants(before.steps):
-                self._try(link, steps)
+            known = self.chart.measured[link]
+            assert isinstance(known, Measured)
+            # The planner chooses the place itself where a border is left in motion.
+            if not self._try(link, leave_in_motion(known.steps)):
+                self._move(link)
 
     def _move(self, link: Link) -> None:
         """Leave a border elsewhere for as long as that is faster."""
-        share, step, better = link.share, MOVE, False
-        while abs(step) > MOVE / 3:
-            moved = share + step
-            if 0.02 < moved < 0.98 and self._try(link, leave_at(link, moved)):
-                share, better = moved, True
-            else:
-                step = -step if step > 0 and not better else -step / 2
+        for step in (MOVE, -MOVE):
+            share = link.share + step
+            while 0.02 < share < 0.98 and self._try(link, leave_at(link, share)):
+                share += step
+            if share != link.share + step:
+                return
 
     def _try(self, link: Link, steps: tuple[Step, ...]) -> bool:
         """Plan a link with other phases, and take them if it is faster so."""
