@@ -31,7 +31,7 @@ from .links import (
 )
 from .places import Key, Place, list_formations_at, make_place, settle
 
-RELEASES = (0.15, 0.5, 0.88)
+RELEASES = (0.15, 0.4, 0.6, 0.75, 0.88)
 """Shares of a border at which contacts may be let go."""
 
 Found = list[Link | Blocked]

@@ -2,7 +2,8 @@
 
 Places are settled in the order of what it costs to get there and at least, by a rule of thumb, from
 there on. Borders that lead on from a place are looked at when it is settled; cells, which take
-longer, are put off by what motions through them cost at least, by the same rule.
+longer, are put off by what motions through them cost at least, by the same rule. One rule leads
+quickly to a first plan; one that expects less of what lies ahead finds others near the start.
 """
 
 from __future__ import annotations
@@ -13,23 +14,44 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import count
+from typing import NamedTuple
 
 from ..problem.goal import Goal
 from .chart import Chart
 from .goals import is_at, measure_turn
 from .links import Blocked, Border, Link
-from .places import Place
+from .places import Key, Place
 
-TURNING = 14.0
-"""Least time that turning by a radian takes, by a rule of thumb, in the scene's time."""
-CROSSING, LEAVING = 1.0, 4.0
-"""The same of a motion through a cell, from a place and from somewhere along a border."""
-SETTLED = 100
-"""Most places that are looked at."""
+CROSSING = 1.0
+"""Least time of a motion through a cell from a place, by a rule of thumb, in the scene's time."""
 OFTEN = 2
 """How often a place is settled, on different ways."""
 MOST = 4000
 """Most entries of the queue that are looked at."""
+
+
+class Rule(NamedTuple):
+    """A rule of thumb for what lies ahead, in the scene's time, and how far it is followed.
+
+    Attributes
+    ----------
+    turning : float
+        Time that turning by a radian takes.
+    leaving : float
+        That of a motion through a cell from somewhere along a border.
+    most : int
+        Most places that are looked at.
+    """
+
+    turning: float
+    leaving: float
+    most: int
+
+
+EAGER = Rule(14.0, 4.0, 130)
+"""Times as routes through cells take them: it leads to a first plan soon."""
+CAREFUL = Rule(4.0, 2.5, 16)
+"""Times that hardly any route falls short of: it finds routes that set out the wrong way."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +97,10 @@ class Search:
     goal : Goal
     blocked : list of Blocked
         Links that no motion can take, as they are met.
-    settled : int
-        Places that have been settled.
+    reached : set
+        Keys of places that have been settled.
+    found : set
+        Signatures of routes that have been found.
     limit : float
         Cost from which on nothing is of interest [s].
     """
@@ -85,46 +109,49 @@ class Search:
     start: Place
     goal: Goal
     blocked: list[Blocked] = field(default_factory=list)
-    settled: int = 0
+    reached: set[Key] = field(default_factory=set)
+    found: set[object] = field(default_factory=set)
     limit: float = math.inf
 
-    def measure(self, place: Place) -> float:
-        """About the least time from a place to the goal [s]."""
-        return TURNING * self.chart.scene.scales.time * measure_turn(place, self.goal)
+    @property
+    def settled(self) -> int:
+        """How many places have been settled."""
+        return len(self.reached)
 
-    def run(self) -> Iterator[Route]:
-        """Find routes, about in the order of their durations."""
+    def measure(self, place: Place, turning: float = 1.0) -> float:
+        """About the time from a place to the goal, where turning by a radian takes that [s]."""
+        return turning * self.chart.scene.scales.time * measure_turn(place, self.goal)
+
+    def run(self, rule: Rule = EAGER) -> Iterator[Route]:
+        """Find routes that have not been found before, about in the order of their durations."""
         time = self.chart.scene.scales.time
         number, queue = count(), list[tuple[float, int, float, Route, Place, object]]()
         times: Counter[object] = Counter()
-        found: set[object] = set()
 
         def put(route: Route, place: Place, work: object, more: float = 0.0) -> None:
             cost = route.duration
-            heapq.heappush(
-                queue, (cost + self.measure(place) + more, next(number), cost, route, place, work)
-            )
+            least = cost + self.measure(place, rule.turning) + more
+            heapq.heappush(queue, (least, next(number), cost, route, place, work))
 
         put(Route(()), self.start, None)
         for _ in range(MOST):
             if not queue:
                 return
             cost, _, _, route, place, work = heapq.heappop(queue)
-            if cost > self.limit or self.settled > SETTLED:
+            if cost > self.limit or len(times) > rule.most:
                 return
             if work is None:
                 if route.links and is_at(place, self.goal):
-                    if route.signature not in found:
-                        found.add(route.signature)
+                    if route.signature not in self.found:
+                        self.found.add(route.signature)
                         yield route
                     continue
                 key = place.key
                 if times[key] >= (1 if place.landed else OFTEN):
                     continue
                 times[key] += 1
-                if times[key] == 1:
-                    self.settled += 1
-                links = self._follow(route, place, put, times[key] == 1)
+                self.reached.add(key)
+                links = self._follow(route, place, put, rule.leaving, times[key] == 1)
                 put(route, place, "cells", CROSSING * time) if not place.landed else None
             elif isinstance(work, tuple):
                 border, index = work
@@ -132,12 +159,14 @@ class Search:
             else:
                 links = [*self.chart.cross_cells(place), *self.chart.end_in_cell(place, self.goal)]
             for link in links:
-                if isinstance(link, Blocked):
-                    self.blocked.append(link)
-                else:
+                if isinstance(link, Link):
                     put(Route((*route.links, link)), link.stop, None)
+                elif link not in self.blocked:
+                    self.blocked.append(link)
 
-    def _follow(self, route: Route, place: Place, put: object, first: bool) -> list[Link | Blocked]:
+    def _follow(
+        self, route: Route, place: Place, put: object, leaving: float, first: bool
+    ) -> list[Link | Blocked]:
         """Links along borders, whole or to a goal; releases on the way are put off."""
         time, links = self.chart.scene.scales.time, list[Link | Blocked]()
         for index, (border, link) in enumerate(self.chart.follow(place)):
@@ -146,7 +175,7 @@ class Search:
             ending = self.chart.end_at(border, self.goal)
             links += [own for own in (link, ending) if own is not None]
             if not place.landed:
-                put(route, place, (border, index), LEAVING * time)  # type: ignore[operator]
+                put(route, place, (border, index), leaving * time)  # type: ignore[operator]
         return links if first else [own for own in links if isinstance(own, Link)]
 
     @staticmethod

@@ -11,7 +11,7 @@ from ..planning.result import Plan
 from ..problem.definition import End, Problem
 from .bounds import BorderBound
 from .candidates import Failure
-from .find import SETTLED, Route, Search
+from .find import EAGER, Route, Search
 from .links import Blocked, describe_steps
 
 LISTED = 6
@@ -19,8 +19,8 @@ LISTED = 6
 NOT_CONSIDERED = (
     "not considered: rolling contacts, formations without the palm or without one of the fingers, "
     "impacts, motions that pass crossings without a stop, those through cells that no straight way "
-    f"from rest shows to be possible, and what is further than {SETTLED} places; phases may be as "
-    "many as it takes"
+    f"from rest shows to be possible, and what is further than {EAGER.most} places; phases may be "
+    "as many as it takes"
 )
 
 

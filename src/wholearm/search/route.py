@@ -26,7 +26,7 @@ from .candidates import (
     plan_candidate,
 )
 from .chart import Chart
-from .find import Route, Search
+from .find import CAREFUL, EAGER, Route, Rule, Search
 from .goals import is_at
 from .links import Link, Measured, Step, describe_steps, leave_at
 from .places import make_place
@@ -35,11 +35,11 @@ from .result import Alternative, Answer, describe_block, list_blocked
 FASTER = 0.7
 """Share of the time of straight ways through cells that plans take at least, by experience."""
 TRIED = 6
-"""Most routes that are planned in vain, or beyond those that are asked for."""
+"""Most routes that are planned in vain by one rule, or beyond those that are asked for."""
 BEYOND = 1.1
 """Times of routes, by the search, over that of the best plan, from which on they are left out."""
 MOVE = 0.12
-"""Share of a border by which the place where it is left is moved."""
+"""Share of a border by which the place where it is left is moved at first."""
 ELSEWHERE = (0.15, -0.15)
 """The same where a way from the first place has no plan."""
 GAIN = 0.998
@@ -150,10 +150,18 @@ class _Chooser:
 
     def run(self, wanted: int, report: Callable[[str], None]) -> None:
         """Plan routes for as long as one may be better, or there are fewer than `wanted`."""
-        for route in self.search.run():
+        self._run_by(EAGER, wanted, report)
+        # Without a plan by then, the other rule leads elsewhere, and as far.
+        most = CAREFUL.most if self.made else EAGER.most
+        self._run_by(CAREFUL._replace(most=most), wanted, report)
+
+    def _run_by(self, rule: Rule, wanted: int, report: Callable[[str], None]) -> None:
+        """Plan routes as one rule of thumb leads to them."""
+        failed = len(self.failures)
+        for route in self.search.run(rule):
             if len(self.made) >= wanted and self._estimate(route) > self.best:
                 return
-            if len(self.failures) >= TRIED or len(self.made) >= TRIED + wanted:
+            if len(self.failures) - failed >= TRIED or len(self.made) >= TRIED + wanted:
                 return
             if not self._measure(route, report):
                 continue
@@ -175,12 +183,13 @@ class _Chooser:
 
     def _move(self, link: Link) -> None:
         """Leave a border elsewhere for as long as that is faster."""
-        for step in (MOVE, -MOVE):
-            share = link.share + step
-            while 0.02 < share < 0.98 and self._try(link, leave_at(link, share)):
-                share += step
-            if share != link.share + step:
-                return
+        share, step, better = link.share, MOVE, False
+        while abs(step) > MOVE / 3:
+            moved = share + step
+            if 0.02 < moved < 0.98 and self._try(link, leave_at(link, moved)):
+                share, better = moved, True
+            else:
+                step = -step if step > 0 and not better else -step / 2
 
     def _try(self, link: Link, steps: tuple[Step, ...]) -> bool:
         """Plan a link with other phases, and take them if it is faster so."""
@@ -226,8 +235,11 @@ class _Chooser:
         return found
 
     def _plan(self, route: Route, wanted: int, report: Callable[[str], None]) -> None:
-        self._polish(route, report)
-        candidate = make_candidate(self.problem, [*self.before, route], self.chart.measured)
+        routes, known = [*self.before, route], self.chart.measured
+        candidate = make_candidate(self.problem, routes, known)
+        if isinstance(candidate, Candidate):
+            self._polish(route, report)
+            candidate = make_candidate(self.problem, routes, known)
         if isinstance(candidate, Failure):
             self.failures.append(candidate)
             return
