@@ -142,20 +142,22 @@ def replay_plan(
     """
     problem = planning.problem
     usual, strict = Allowance(), Allowance().scale(STRICT)
-    simulations = 0
+    simulations, known = 0, None
     while True:
         simulations += 1
         report("replaying the plan")
         check, accepted = check_plan(problem, trajectory, strict, usual)
         if check.failure is None:
             break
+        if accepted.failure is None:
+            known = planning, trajectory, accepted
         durations = np.diff(trajectory.phase_starts)
         number = check.find_culprit(problem.scene.scales, strict, durations)
         better = _improve(planning, number, accepted.failure is not None, report)
         if better is None and accepted.failure is not None:
             better = _press_more(planning, number, accepted, report)
-        if better is None and accepted.failure is None:
-            check = accepted
+        if better is None and known is not None:
+            planning, trajectory, check = known
             break
         if better is None:
             block = planning.blocks[planning.find_block(number)]

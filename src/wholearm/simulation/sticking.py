@@ -178,7 +178,8 @@ class Rest:
 
         Torques that balance form a convex set: the ends of a linear piece speak for it all.
         """
-        places = np.linspace(x, 1.0, 2 if coefficients.shape[1] <= 2 else _CHECKS).tolist()
+        count = _CHECKS if coefficients[:, 2:].any() else 2
+        places = np.linspace(x, 1.0, count).tolist()
         low = x
         for high in places:
             if not self._balances(coefficients, high):

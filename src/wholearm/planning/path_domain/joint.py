@@ -37,8 +37,8 @@ _INSIDE = 0.01
 """Part of the range at both of its ends that is left out."""
 _ELEMENTS = 3
 """Elements of a grid of which only the ends count."""
-_BRIEF = 1e-6
-"""Pause that is none, over the scene's time."""
+_STEP = 1e-6
+"""Largest step of torques that needs no pause, over their limits."""
 _SHARE = 0.5
 """Part of a torque limit that a command may be beyond its torque in a pause."""
 
@@ -81,8 +81,8 @@ def choose_joint(ending: Curve, beginning: Curve, epsilon: float, phase: int) ->
     steps = np.abs(after[None] - before[held][:, None])
     times = (steps / rates).max(axis=2)
     p, q = np.unravel_index(int(times.argmin()), times.shape)
-    pause = float(times[p, q])
-    pause = pause if pause > _BRIEF * scene.scales.time else 0.0
+    much = (steps[p, q] > _STEP * scene.torque_limit).any()
+    pause = float(times[p, q]) if much else 0.0
     return Joint(float(ends[held][p]), float(begins[q]), before[held][p], after[q], pause)
 
 

@@ -16,7 +16,7 @@ from .motor_terms import list_slopes
 
 _LOOKS = 21
 """Instants of each interval at which rates are looked at."""
-_SLOWEST = 60.0
+_SLOWEST = 400.0
 """Rate, over the torque limit in the time of the motion, from which on slower ones come first."""
 _QUICKER = 6.0
 """Ratio of one of them to the one before."""
