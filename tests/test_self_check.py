@@ -18,6 +18,7 @@ from wholearm.planning.options import PlanOptions
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
 from wholearm.planning.self_check import (
+    Check,
     check_plan,
     find_residual,
     replay_plan,
@@ -200,6 +201,25 @@ def test_a_finer_plan_that_is_not_found_leaves_the_error(
     monkeypatch.setattr(self_check, "refine_block", fail)
     with pytest.raises(ReplayError, match="the plan of phase 2 does not hold in its replay: "):
         spoiled.run()
+
+
+def test_a_plan_that_is_allowed_is_kept_where_finer_ones_are_not(
+    slide: Problem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spoiled, seen = Spoiled(slide, 1, 0), list[Trajectory]()
+
+    def look(problem: Problem, trajectory: Trajectory, *allowances: Allowance) -> list[Check]:
+        error = JammingError("jams")
+        error.phase = 2
+        jammed = Check(error, find_residual(problem, trajectory))
+        seen.append(trajectory)
+        holds = check_plan(problem, trajectory, *allowances)[1] if len(seen) == 1 else jammed
+        return [jammed, holds]
+
+    monkeypatch.setattr(self_check, "check_plan", look)
+    planning, trajectory, figures = spoiled.run()
+    assert planning is spoiled.planning and trajectory is seen[0] and len(seen) > 1
+    assert figures.simulations == len(seen)
 
 
 def test_meta_keeps_the_figures(heptagon: Problem, trajectory: Trajectory) -> None:
