@@ -12,7 +12,7 @@ from scipy.linalg import solve_continuous_are
 from scipy.optimize import linprog
 
 import wholearm
-from shipped import HEPTAGON, problem_of
+from shipped import HEPTAGON, LANDING, problem_of, solved
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.free_simulation.simulate import simulate_free
@@ -226,3 +226,15 @@ def test_an_end_without_a_gained_contact_is_held(problem: Problem) -> None:
     torque = TorqueProfile(np.array([0.0, 0.05]), tau[None, :, None])
     held = simulate_free(own, torque)
     assert held.z[-1] == pytest.approx(own.start, abs=1e-9)
+
+
+def test_a_landing_without_a_reserve_is_planned_anew() -> None:
+    problem, plan = problem_of(LANDING), solved(LANDING).trajectory
+    policy = make_policy(problem, plan)
+    law = policy.laws[-1]
+    assert isinstance(law, MotionLaw)
+    # The plan's torques are at their limit, the policy's leave some of it to feedback.
+    assert np.abs(plan.tau).max() == pytest.approx(2.0, rel=1e-6)
+    assert np.abs(law.tau).max() < 1.85
+    report = verify_policy(problem, plan, policy)
+    assert report.ok, report.failures

@@ -24,6 +24,7 @@ from .curve_rows import Rows, find_directions, make_rows
 from .policy import Policy
 from .push import find_push, find_still
 from .regulator import follow
+from .replan import replan
 from .retime import retime
 
 INTERVALS = 120
@@ -106,12 +107,14 @@ def make_policy(
     pace = Pace(period, delay, *speeds, DWELL, most, (limit[0], limit[1]))
     blocks = _split(problem.phases)
     curves = [len(own) == 1 and runs_on_curve(own[0]) for own in blocks]
+    starts = plan.phase_starts
+    if reserve:
+        plan = replan(problem, blocks, curves, plan)
     pieces = [
         _trace(problem, own[0], plan, reserve) if curve else None
         for own, curve in zip(blocks, curves, strict=True)
     ]
     tables, about = list[dict[str, Array]](), list[dict[str, Any]]()
-    starts = plan.phase_starts
     for own, piece, after in zip(blocks, pieces, [*pieces[1:], None], strict=True):
         lasts = {phase.number: float(np.diff(starts)[phase.index]) for phase in own}
         found = [{"number": k, "plan": t, "duration": t, "share": 0.0} for k, t in lasts.items()]

@@ -25,7 +25,7 @@ from ..results.trajectory import Trajectory
 
 RATE = 100.0
 """Rate at which errors fade where torques change no contact force [1/s]."""
-PRESSED = 0.5
+PRESSED = 0.1
 """Acceleration, over the scene's unit, that costs as much as doubling a contact force."""
 LEAST = 0.05
 """Least contact force in that, over the scene's unit of force."""
