@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.linalg import solve_continuous_are
 from scipy.optimize import linprog
 
 import wholearm
-from shipped import HEPTAGON, LANDING, problem_of, solved
+from shipped import HEPTAGON, LANDING, plan_of, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.free_simulation.simulate import simulate_free
@@ -229,7 +230,12 @@ def test_an_end_without_a_gained_contact_is_held(problem: Problem) -> None:
 
 
 def test_a_landing_without_a_reserve_is_planned_anew() -> None:
-    problem, plan = problem_of(LANDING), solved(LANDING).trajectory
+    # The last two phases, from where the other heptagon's fifth one begins, too.
+    whole, other = problem_of(LANDING), plan_of(HEPTAGON)
+    start = other.z[np.flatnonzero(other.phase == 4)[0]]
+    phases = tuple(replace(phase, index=k) for k, phase in enumerate(whole.phases[4:]))
+    problem = replace(whole, start=start, phases=phases)
+    plan = wholearm.solve(problem, replay=False).trajectory
     policy = make_policy(problem, plan)
     law = policy.laws[-1]
     assert isinstance(law, MotionLaw)
