@@ -26,6 +26,7 @@ from wholearm.policy.regulator import RATE, Linear, regulate
 from wholearm.policy.retime import eliminate, retime
 from wholearm.problem.definition import Problem
 from wholearm.results.torque import TorqueProfile
+from wholearm.results.trajectory import Trajectory
 from wholearm.verification.policy import verify_policy
 
 
@@ -235,8 +236,12 @@ def test_a_landing_without_a_reserve_is_planned_anew() -> None:
     start = other.z[np.flatnonzero(other.phase == 4)[0]]
     phases = tuple(replace(phase, index=k) for k, phase in enumerate(whole.phases[4:]))
     problem = replace(whole, start=start, phases=phases)
-    plan = wholearm.solve(problem, replay=False).trajectory
-    policy = make_policy(problem, plan)
+
+    def planner(own: Problem) -> Trajectory:
+        return wholearm.solve(own, replay=False).trajectory
+
+    plan = planner(problem)
+    policy = make_policy(problem, plan, planner=planner)
     law = policy.laws[-1]
     assert isinstance(law, MotionLaw)
     # The plan's torques are at their limit, the policy's leave some of it to feedback.

@@ -30,6 +30,7 @@ def add_policy(parser: argparse.ArgumentParser) -> None:
 def _policy(options: argparse.Namespace) -> int:
     from ..common.errors import ReplayError
     from ..common.files import require_ending, require_writable
+    from ..planning.plan import solve
     from ..policy.make import make_policy
     from ..problem.read import read_own_problem
     from ..results.report_text import align
@@ -44,7 +45,9 @@ def _policy(options: argparse.Namespace) -> int:
     problem = read_own_problem(plan.meta, options.plan)
     given = {key: getattr(options, key) for key in ("reserve", "period", "delay", "torque_limit")}
     with name_source(options.plan):
-        policy = make_policy(problem, plan, **given)
+        policy = make_policy(
+            problem, plan, **given, planner=lambda own: solve(own, replay=False).trajectory
+        )
         report = verify_policy(problem, plan, policy)
     if not report.ok:
         failures = "; ".join(report.failures)

@@ -24,7 +24,7 @@ from .curve_rows import Rows, find_directions, make_rows
 from .policy import Policy
 from .push import find_push, find_still
 from .regulator import follow
-from .replan import replan
+from .replan import Planner, replan
 from .retime import retime
 
 INTERVALS = 120
@@ -69,6 +69,7 @@ def make_policy(
     period: float = 1e-3,
     delay: float = 5e-4,
     torque_limit: float | None = None,
+    planner: Planner | None = None,
 ) -> Policy:
     """Make a policy that carries out a plan by feedback from the joints.
 
@@ -87,6 +88,9 @@ def make_policy(
     torque_limit : float, optional, [N m]
         Of both fingers, if it is not the problem's: what a plan leaves to feedback, where it was
         made with less than the hand has.
+    planner : callable, optional
+        Makes a trajectory of a problem: phases with more freedoms are planned anew with it, where
+        the plan leaves no reserve, unless `reserve` is 0; as they are if it is left out.
 
     Raises
     ------
@@ -108,8 +112,8 @@ def make_policy(
     blocks = _split(problem.phases)
     curves = [len(own) == 1 and runs_on_curve(own[0]) for own in blocks]
     starts = plan.phase_starts
-    if reserve:
-        plan = replan(problem, blocks, curves, plan)
+    if reserve and planner is not None:
+        plan = replan(planner, problem, blocks, curves, plan)
     pieces = [
         _trace(problem, own[0], plan, reserve) if curve else None
         for own, curve in zip(blocks, curves, strict=True)

@@ -7,7 +7,7 @@ is planned from the new end for as long as it takes to be where the plan is agai
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -28,9 +28,16 @@ FAR = 0.02
 SAME = 1e-5
 """How far ends may be from the plan's to count as the same, likewise."""
 
+Planner = Callable[[Problem], Trajectory]
+"""Makes a plan of a problem."""
+
 
 def replan(
-    problem: Problem, blocks: Sequence[tuple[Phase, ...]], curves: Sequence[bool], plan: Trajectory
+    planner: Planner,
+    problem: Problem,
+    blocks: Sequence[tuple[Phase, ...]],
+    curves: Sequence[bool],
+    plan: Trajectory,
 ) -> Trajectory:
     """A plan in which blocks that are not along curves have a reserve where there is one."""
     motions, k = list(plan.motions), 0
@@ -38,7 +45,7 @@ def replan(
         after = k + 1
         if not curves[k] and _lacks(problem, blocks[k], plan):
             for share in SHARES:
-                found = _detour(problem, blocks[k:], curves[k:], plan, share)
+                found = _detour(planner, problem, blocks[k:], curves[k:], plan, share)
                 if found is not None:
                     new, after = found[0], k + found[1]
                     first = blocks[k][0].index
@@ -63,6 +70,7 @@ def _lacks(problem: Problem, phases: Sequence[Phase], plan: Trajectory) -> bool:
 
 
 def _detour(
+    planner: Planner,
     problem: Problem,
     blocks: Sequence[tuple[Phase, ...]],
     curves: Sequence[bool],
@@ -73,7 +81,7 @@ def _detour(
     starts, found = plan.phase_starts, list[Motion]()
     z = plan.z[np.flatnonzero(plan.phase == blocks[0][0].index)[0]]
     for count, (own, curve) in enumerate(zip(blocks, curves, strict=True), start=1):
-        part = _solve(problem, own, z, 0.0 if curve else share)
+        part = _solve(planner, problem, own, z, 0.0 if curve else share)
         lasts = starts[own[-1].index + 1] - starts[own[0].index]
         if part is None or (not curve and part.duration > SLOWER * lasts):
             return None
@@ -86,10 +94,10 @@ def _detour(
     return None
 
 
-def _solve(problem: Problem, phases: Sequence[Phase], z: Array, share: float) -> Trajectory | None:
+def _solve(
+    planner: Planner, problem: Problem, phases: Sequence[Phase], z: Array, share: float
+) -> Trajectory | None:
     """Phases from a configuration at rest, with a part of the reserve."""
-    from ..planning.plan import solve
-
     scene, room = problem.scene, share * ROOM
     one, two = (replace(own, torque_limit=(1 - room) * own.torque_limit) for own in scene.fingers)
     own = replace(
@@ -100,6 +108,6 @@ def _solve(problem: Problem, phases: Sequence[Phase], z: Array, share: float) ->
         phases=tuple(replace(phase, index=k) for k, phase in enumerate(phases)),
     )
     try:
-        return solve(own, replay=False).trajectory
+        return planner(own)
     except WholearmError:
         return None
