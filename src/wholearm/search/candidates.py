@@ -29,6 +29,9 @@ FURTHER = 2
 ROUGH = 1e-2
 """Accuracy of plans of which only matters about how long they take."""
 
+SINGULAR = "its contacts depend on each other"
+"""Why there is no plan where the equations of motion have no single solution."""
+
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
@@ -145,6 +148,8 @@ def measure_link(
         return "no motion keeps its limits along the border"
     except WholearmError as error:
         return str(error)
+    except np.linalg.LinAlgError:
+        return SINGULAR
     if plans is None:
         return "no guess leads to a plan"
     return Measured(spent + sum(plan.motion.duration for plan in plans), steps)
@@ -165,6 +170,8 @@ def explain_border(problem: Problem, blocked: Blocked, options: PlanOptions) -> 
         solve_with(own, replace(options, replay=False))
     except WholearmError as error:
         return f"from {blocked.start} {error}"
+    except np.linalg.LinAlgError:
+        return f"from {blocked.start} {SINGULAR}"
     return ""
 
 
@@ -184,4 +191,6 @@ def plan_candidate(
                 kept[key] = solve_with(candidate.problem, options)
         except WholearmError as error:
             kept[key] = str(error)
+        except np.linalg.LinAlgError:
+            kept[key] = SINGULAR
     return kept[key]
