@@ -94,7 +94,8 @@ class FreeReport:
         if self.failures:
             return self.failures[0]
         if not self.alone:
-            return f"every contact holds and {len(self.phases)} phases end"
+            count = len(self.phases)
+            return f"every contact holds, and {count} phase{'s end' if count > 1 else ' ends'}"
         ends = [phase.deviation for phase in self.alone if phase.deviation is not None]
         position, angle = max(end.position for end in ends), max(end.angle for end in ends)
         return (
