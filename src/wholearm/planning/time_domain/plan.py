@@ -34,7 +34,7 @@ from .mode_search import improve
 from .modes import LEAST_INTERVALS
 from .motion import TimeMotion
 from .phase_plans import list_plans
-from .refinement import bisect_intervals
+from .refinement import halve
 from .search import Search, Solution
 from .stage import Stage
 
@@ -242,12 +242,12 @@ def _try(search: Search, problem: Problem, attempt: Attempt, known: Solution | N
         return _Outcome(attempt.name, solution, [])
     # What coarse intervals are not short of, finer ones may be.
     lost = solution.is_lost
-    stages = _halve(search, solution.stages) if lost else attempt.stages
+    stages = halve(solution.stages, search.scheme) if lost else attempt.stages
     elastic, short = _find_short(search, problem, stages)
     if elastic is not None and not short and not lost:
         solution = solve_attempt(search, attempt._replace(stages=elastic))
         if not solution.success:
-            short = _find_short(search, problem, _halve(search, elastic))[1]
+            short = _find_short(search, problem, halve(elastic, search.scheme))[1]
     return _Outcome(attempt.name, solution, short)
 
 
@@ -308,7 +308,7 @@ def solve_attempt(search: Search, attempt: Attempt) -> Solution:
     for _ in range(attempt.halvings):
         # Modes that were found may have asked for more intervals than the guess has.
         if solution.success and sum(stage.intervals for stage in solution.stages) < wanted:
-            solution = search.solve(_halve(search, solution.stages), solution)
+            solution = search.solve(halve(solution.stages, search.scheme), solution)
     return enforce_between(search, solution) if solution.success else solution
 
 
@@ -344,9 +344,3 @@ def _slow_down(
     search.tried.complete = False
     nlp = search.build(fastest)
     return Solution(fastest, 0.0, 0.0, solution.status, True, nlp, {})
-
-
-def _halve(search: Search, stages: list[Stage]) -> list[Stage]:
-    """Stages with all intervals halved."""
-    every = [np.ones(stage.intervals, dtype=int) for stage in stages]
-    return bisect_intervals(stages, search.scheme, every)

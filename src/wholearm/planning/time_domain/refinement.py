@@ -42,6 +42,11 @@ def bisect_intervals(
     ]
 
 
+def halve(stages: Sequence[Stage], scheme: Scheme) -> list[Stage]:
+    """Stages with all intervals halved."""
+    return bisect_intervals(stages, scheme, [np.ones(own.intervals, dtype=int) for own in stages])
+
+
 def count_halvings(prices: Array, defects: Array, scheme: Scheme) -> NDArray[np.int64]:
     """How often to halve each interval and its parts, shape (K,).
 
