@@ -152,8 +152,8 @@ def _list_headings(problem: Problem, phase: Phase, z: Array) -> list[Array]:
 
 
 def _is_free(way: Way) -> bool:
-    """Whether nothing is in a way, and it has few stretches and no end of its contacts."""
-    if len(way) > _STRETCHES:
+    """Whether nothing is in a way, and it moves all along, in few stretches with their contacts."""
+    if len(way) > _STRETCHES or not all(np.diff(part.z, axis=0).any(axis=1).all() for part in way):
         return False
     touching = way[0].formation.scene.touching
     return all(part.formation.evaluate_limits(part.z).min() > -touching for part in way)
