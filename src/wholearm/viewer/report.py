@@ -17,7 +17,7 @@ from .chart import describe_map
 from .motion import describe_motion
 from .tables import JOINT_HEADS, PHASE_HEADS, list_joints, list_phases
 
-_RESOLUTION = 120
+_RESOLUTION = 90
 """Grid of the map: its borders are exact, only cells are drawn by it."""
 
 
