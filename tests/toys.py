@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
+from wholearm.benchmark.torque_rates import LinePoint
 from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve, Segment
 from wholearm.mechanics.dynamics import Directions, PathForces
@@ -108,21 +109,9 @@ class Toy:
         return PathForces(none, none, none, one, flat, Ta, flat, Tl, Tv, none)
 
 
-class _Point(tuple[Array, Array, Array]):
-    kinematics = None
-
-    @property
-    def z(self) -> Array:
-        return self[0]
-
-    @property
-    def z_s(self) -> Array:
-        return self[1]
-
-
-def _evaluate(s: Array) -> _Point:
+def _evaluate(s: Array) -> LinePoint:
     z = np.outer(s, [1.0, 0.0, 0.0, 1.0, 1.0])
-    return _Point((z, np.ones_like(z), 0 * z))
+    return LinePoint((z, np.ones_like(z), 0 * z))
 
 
 def constant(Ta: float, Tl: float = 0.0, Tv: float = 0.0) -> Law:

@@ -105,21 +105,25 @@ class Line(NamedTuple):
         return PathForces(none, none, none, one, flat, Ta, flat, flat, flat, none)
 
 
-class _Point(tuple[Array, Array, Array]):
+class LinePoint(tuple[Array, Array, Array]):
+    """Points of a straight line in place of those of a curve: z, z' and z''."""
+
     kinematics = None
 
     @property
     def z(self) -> Array:
+        """Configurations, shape (n, 5)."""
         return self[0]
 
     @property
     def z_s(self) -> Array:
+        """Their derivatives along the line, shape (n, 5)."""
         return self[1]
 
 
-def _evaluate(s: Array) -> _Point:
+def _evaluate(s: Array) -> LinePoint:
     z = np.outer(s, np.ones(5))
-    return _Point((z, np.ones_like(z), 0 * z))
+    return LinePoint((z, np.ones_like(z), 0 * z))
 
 
 def ask_ruckig(line: Line) -> float:
