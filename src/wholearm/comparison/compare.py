@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -39,8 +40,13 @@ def compare(problem: Problem, paths: Sequence[str]) -> Comparison:
     """
     short = [os.path.basename(path) for path in paths]
     names = short if len({*short}) == len(short) else paths
-    given = [(name, *_read(problem, str(path))) for name, path in zip(names, paths, strict=True)]
-    return Comparison(problem.name, problem.epsilon, tuple(_judge(*own) for own in given))
+    contenders = []
+    for name, path in zip(names, paths, strict=True):
+        own, what, simulations = _read(problem, str(path))
+        planned = what if isinstance(what, Trajectory) else None
+        judged = _judge(name, own, what, simulations)
+        contenders.append(replace(judged, problem=own, planned=planned))
+    return Comparison(problem.name, problem.epsilon, tuple(contenders))
 
 
 def _read(problem: Problem, path: str) -> tuple[Problem, Trajectory | TorqueProfile, int | None]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
+from ..problem.definition import Problem
 from ..results.report import Report, plain
 from ..results.report_text import align, show
+from ..results.trajectory import Trajectory
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +40,10 @@ class Contender:
         Durations of the phases that were entered, and the least margin of each; NaN where unknown.
     report : Report or None
         None where the replay could not go on.
+    problem : Problem or None
+        With the phases that it goes through.
+    planned : Trajectory or None
+        The motion that was given; None for torques alone.
     """
 
     name: str
@@ -54,6 +60,8 @@ class Contender:
     lasts: tuple[float, ...] = ()
     margins: tuple[float, ...] = ()
     report: Report | None = field(default=None, repr=False)
+    problem: Problem | None = field(default=None, repr=False)
+    planned: Trajectory | None = field(default=None, repr=False)
 
     @property
     def verdict(self) -> str:
@@ -82,8 +90,9 @@ class Comparison(NamedTuple):
         return 0 if all(own.ok for own in self.contenders) else 1
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything but the replays as plain values for JSON."""
-        keys = [key for key in Contender.__dataclass_fields__ if key != "report"]
+        """Everything but motions and replays as plain values for JSON."""
+        # What is left out of the text of one is no plain value.
+        keys = [own.name for own in fields(Contender) if own.repr]
         rows = [plain({key: getattr(own, key) for key in keys}) for own in self.contenders]
         return {"name": self.name, "epsilon": self.epsilon, "contenders": rows}
 

@@ -9,9 +9,6 @@ from ..comparison.compare import compare
 from ..comparison.side_by_side import Comparison, Contender
 from ..mapping.formation_map import FormationMap, build_map, choose_window
 from ..problem.definition import Problem
-from ..problem.read import adopt_phases
-from ..results.trajectory import Trajectory
-from ..results.trajectory_file import load_trajectory
 from . import page
 from .chart import describe_map
 from .motion import describe_motion
@@ -49,15 +46,11 @@ def build_report(
     """
     progress("replay")
     comparison = compare(problem, paths)
-    parts, first = [_summarise(comparison)], None
-    for path, contender in zip(paths, comparison.contenders, strict=True):
+    parts = [_summarise(comparison)]
+    for contender in comparison.contenders:
         progress(contender.name)
-        planned = load_trajectory(path) if path.lower().endswith(".npz") else None
-        first = first or planned
-        own = problem
-        if planned is not None:
-            own = adopt_phases(problem, planned.meta, planned.q[-1], path)
-        parts += _describe(own, contender, planned)
+        parts += _describe(contender)
+    first = next((own.planned for own in comparison.contenders if own.planned is not None), None)
     progress("map")
     chart = chart or build_map(problem, _RESOLUTION, choose_window(problem, None))
     parts += [
@@ -88,14 +81,15 @@ def _summarise(comparison: Comparison) -> str:
     return page.write_table(heads, rows, words=2)
 
 
-def _describe(problem: Problem, contender: Contender, planned: Trajectory | None) -> list[str]:
+def _describe(contender: Contender) -> list[str]:
     """The section of one plan or table of torques: player, verdict, phases and joints."""
+    problem, planned = contender.problem, contender.planned
     parts = [page.write_heading(contender.name)]
     kind = "ok" if contender.ok else "bad"
     parts.append(page.write_paragraph(f"{contender.verdict}: {contender.reason}", kind))
     replayed = None if contender.report is None else contender.report.trajectory
     shown = planned or replayed
-    if shown is None:
+    if shown is None or problem is None:
         return parts
     ghost = replayed if planned is not None else None
     parts.append(page.write_player(describe_motion(shown, problem, ghost)))
