@@ -124,7 +124,7 @@ class Curve:
         formation = self.formation
         kinematics = formation.evaluate(z, tangent)
         metric = metric_weights(formation.scene)
-        z_s, z_ss = _solve_tangent(kinematics.P, kinematics.P_dot_v, tangent, metric)
+        z_s, z_ss = solve_tangent(kinematics.P, kinematics.P_dot_v, tangent, metric)
         return CurvePoint(z, z_s * self.speed_ratio, z_ss * self.speed_ratio**2, kinematics)
 
     def _interpolate(self, s: Array) -> tuple[Array, Array]:
@@ -192,7 +192,7 @@ class Curve:
         return tuple(segments)
 
 
-def _solve_tangent(P: Array, P_dot_v: Array, tangent: Array, metric: Array) -> tuple[Array, Array]:
+def solve_tangent(P: Array, P_dot_v: Array, tangent: Array, metric: Array) -> tuple[Array, Array]:
     """Unit null vector of P nearest to `tangent`, and the curvature orthogonal to it."""
     matrix = border(P, tangent * metric)
     right = np.zeros((len(P), 5, 2))

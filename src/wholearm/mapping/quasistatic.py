@@ -114,7 +114,7 @@ def check_cell(
 def _check_path(
     formation: Formation, kinematics: Kinematics, epsilon: float, z: Array, z_s: Array
 ) -> Flags:
-    directions = _directions(kinematics, z_s)
+    directions = Directions.of(kinematics, z_s)
     forces = inverse(formation, z, z_s, np.zeros_like(z_s), directions, kinematics)
     squeezing, still = Squeezing.of(formation, forces, z_s[:, 3:]), np.zeros(len(z))
     low, high = squeezing.find_span(still, still, epsilon)
@@ -124,7 +124,7 @@ def _check_path(
 def _check_balance(
     formation: Formation, kinematics: Kinematics, epsilon: float, z_s: Array
 ) -> Flags:
-    scene, directions = formation.scene, _directions(kinematics, z_s)
+    scene, directions = formation.scene, Directions.of(kinematics, z_s)
     G = force_rows(formation, kinematics, directions)
     wrench = G[:, :, :3].transpose(0, 2, 1)
     regular = np.abs(np.linalg.det(wrench)) > REGULAR * scene.scales.length
@@ -141,12 +141,8 @@ def _are_unique(
 ) -> Flags:
     """Whether contact forces of travel along `z_s` are the only ones, at those of the `rows`."""
     part = Kinematics(*(array[rows] for array in kinematics))
-    Xi = _directions(part, z_s[rows]).Xi
+    Xi = Directions.of(part, z_s[rows]).Xi
     return np.asarray(find_minors(formation, part, Xi).ratios >= least_minor)
-
-
-def _directions(kinematics: Kinematics, z_s: Array) -> Directions:
-    return Directions(np.sign(np.einsum("nij,nj->ni", kinematics.A_t, z_s)), np.sign(z_s[:, 3:]))
 
 
 def _pick(scene: Scene, label: Numbers, z: Array) -> tuple[Formation, Kinematics]:

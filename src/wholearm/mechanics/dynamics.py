@@ -46,6 +46,12 @@ class Directions(NamedTuple):
     Xi: Array
     sigma: Array
 
+    @staticmethod
+    def of(kinematics: Kinematics, v: Array) -> Directions:
+        """Those of contacts that slide and joints that turn with velocities, shape (n, 5)."""
+        slip = np.einsum("nij,nj->ni", kinematics.A_t, v)
+        return Directions(np.sign(slip), np.sign(v[:, 3:]))
+
 
 class PathForces(NamedTuple):
     """Forces along a curve, affine in a = s'', b = s'^2, the squeeze and the speed.

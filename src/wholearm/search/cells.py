@@ -26,9 +26,8 @@ from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..mapping.borders import label_cells
 from ..mechanics.dynamics import Directions, inverse
-from ..mechanics.limits import SPEED, make_limits
-from ..mechanics.sides import SideTerms
-from ..planning.lower_bound.rows import GIVE, Rows
+from ..mechanics.limits import make_limits
+from ..planning.lower_bound.rows import Rows, limit
 from ..scene.model import Scene
 from .places import unit_steps
 from .sweep import find_durations
@@ -223,19 +222,10 @@ def _evaluate(formation: Formation, epsilon: float, z: Array, ways: Array) -> Ro
     right = np.zeros((len(z), 5, 1))
     right[:, :3, 0] = -at.P_dot_v
     z_uu = np.linalg.solve(matrix, right)[..., 0]
-    slip = np.einsum("nij,nj->ni", at.A_t, z_u)
-    directions = Directions(np.sign(slip), np.sign(z_u[:, 3:]))
     try:
-        forces = inverse(formation, z, z_u, z_uu, directions, at)
+        forces = inverse(formation, z, z_u, z_uu, Directions.of(at, z_u), at)
     except np.linalg.LinAlgError:
         # Three contacts that do not hold the object let nothing through.
         none = np.zeros((len(z), 1))
         return Rows(none, none, none, none - 1, none[:, 0])
-    every = make_limits(formation, epsilon)
-    terms = SideTerms.of(every.without(SPEED), forces, z_u[:, 3:])
-    cap = np.full(len(z), np.inf)
-    for limit in every.only(SPEED).limits:
-        rates = np.abs(z_u[:, 3:] @ limit.rows[0, -2:])
-        with np.errstate(divide="ignore"):
-            cap = np.minimum(cap, (limit.high[0] / rates) ** 2)
-    return Rows(terms.rate, terms.bend, terms.drag, terms.rest + GIVE, cap)
+    return limit(make_limits(formation, epsilon), forces, z_u[:, 3:])

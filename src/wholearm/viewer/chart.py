@@ -18,6 +18,7 @@ from ..figures.formation_map import draw_map
 from ..figures.style import STYLE
 from ..mapping.formation_map import Border, Crossing, FormationMap
 from ..results.trajectory import Trajectory
+from ..search.times import time_borders
 
 _RESOLUTION = 130
 """Of the picture [dots per inch]."""
@@ -38,10 +39,11 @@ def describe_map(
         stream = io.BytesIO()
         figure.savefig(stream, format="png", dpi=_RESOLUTION)
     axes = figure.axes[0]
+    held = [border for border in chart.borders if border.flush is not None]
+    times = time_borders(chart.problem, held)
     borders = [
-        {"points": _place(axes, border.points), "text": _describe_border(border)}
-        for border in chart.borders
-        if border.flush is not None
+        {"points": _place(axes, border.points), "text": _describe_border(border, own)}
+        for border, own in zip(held, times, strict=True)
     ]
     crossings = [
         {"point": _place(axes, own.point[None])[0], "text": _describe_crossing(own)}
@@ -62,19 +64,30 @@ def _list(contacts: Iterable[Contact]) -> str:
     return " ".join(contact.name for contact in contacts)
 
 
-def _describe_border(border: Border) -> str:
-    """Contacts of a border, where it runs, and which way slow motions are possible."""
-    ways = {"increasing": border.forth.mean(), "decreasing": border.back.mean()}
+def _describe_border(border: Border, times: Array) -> str:
+    """Contacts of a border, where it runs, and what motions along it are possible each way."""
+    ways = zip(("increasing", "decreasing"), (border.forth, border.back), times, strict=True)
     possible = [
-        f"{'all along' if share == 1 else 'on parts'} with {border.along} {way}"
-        for way, share in ways.items()
-        if share > 0
+        f"{border.along} {way}: {_name_share(share.mean())}, {_name_time(time)}"
+        for way, share, time in ways
     ]
     (x, phi), (x_end, phi_end) = border.points[0], border.points[-1]
     return (
         f"{_list(border.contacts)}: x {1e3 * x:.1f} to {1e3 * x_end:.1f} mm, phi "
-        f"{math.degrees(phi):.1f} to {math.degrees(phi_end):.1f} deg; slow motions "
-        f"{' and '.join(possible) or 'neither way'}"
+        f"{math.degrees(phi):.1f} to {math.degrees(phi_end):.1f} deg; {'; '.join(possible)}"
+    )
+
+
+def _name_share(share: float) -> str:
+    """Where along a border slow motions are possible."""
+    where = "all along" if share == 1 else "on parts" if share > 0 else "nowhere"
+    return f"slow motions {where}"
+
+
+def _name_time(time: float) -> str:
+    """How long the fastest motion from one end to the other takes."""
+    return (
+        f"from rest to rest about {time:.3f} s" if math.isfinite(time) else "none from end to end"
     )
 
 

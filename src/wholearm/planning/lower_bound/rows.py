@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from ...common.arrays import Array
 from ...geometry.curve import Curve
-from ...mechanics.dynamics import Directions, inverse
-from ...mechanics.limits import SPEED, make_limits
+from ...mechanics.dynamics import Directions, PathForces, inverse
+from ...mechanics.limits import SPEED, LimitSet, make_limits
 from ...mechanics.sides import SideTerms
 
 GIVE = 2.5e-7
@@ -96,15 +96,34 @@ def evaluate_rows(curve: Curve, epsilon: float, s: Array, segment: NDArray[np.in
     signs = ([getattr(part, name) for part in curve.segments] for name in ("Xi", "sigma"))
     directions = Directions(*(np.array(sign)[segment] for sign in signs))
     forces = inverse(curve.formation, *point[:3], directions, point.kinematics)
-    every = make_limits(curve.formation, epsilon)
-    limits = every.without(SPEED)
-    terms = SideTerms.of(limits, forces, point.z_s[:, 3:])
-    cap = np.full(len(s), np.inf)
-    for limit in every.only(SPEED).limits:
-        rates = np.abs(point.z_s[:, 3:] @ limit.rows[0, -2:])
+    return limit(make_limits(curve.formation, epsilon), forces, point.z_s[:, 3:])
+
+
+def limit(every: LimitSet, forces: PathForces, rates: Array) -> Rows:
+    """Limits at n places of curves or of other ways, from the forces that motions along them take.
+
+    Parameters
+    ----------
+    every : LimitSet
+    forces : PathForces
+    rates : ndarray, shape (n, 2)
+        d theta / ds.
+
+    Returns
+    -------
+    Rows
+        Without the squeeze, which three contacts do not have.
+    """
+    terms = SideTerms.of(every.without(SPEED), forces, rates)
+    cap = np.full(len(rates), np.inf)
+    for own in every.only(SPEED).limits:
+        turned = np.abs(rates @ own.rows[0, -2:])
         with np.errstate(divide="ignore"):
-            cap = np.minimum(cap, (limit.high[0] / rates) ** 2 * (1 + GIVE))
-    return eliminate(terms.press, terms.rate, terms.bend, terms.drag, terms.rest + GIVE, cap)
+            cap = np.minimum(cap, (own.high[0] / turned) ** 2 * (1 + GIVE))
+    one = terms.rest + GIVE
+    if terms.press.any():
+        return eliminate(terms.press, terms.rate, terms.bend, terms.drag, one, cap)
+    return Rows(terms.rate, terms.bend, terms.drag, one, cap)
 
 
 def eliminate(squeeze: Array, a: Array, b: Array, v: Array, one: Array, cap: Array) -> Rows:
