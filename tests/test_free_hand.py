@@ -178,13 +178,17 @@ def begin() -> tuple[Problem, Trajectory]:
     return two, assemble(list(trajectory.motions[:2]), torque, meta, 201)
 
 
+TOLD: list[str] = []
+
+
 @lru_cache
 def checked() -> FreeReport:
-    return verify_free(*begin())
+    return verify_free(*begin(), progress=TOLD.append)
 
 
 def test_phases_of_a_plan_are_as_told() -> None:
     report = checked()
+    assert TOLD == ["simulating the whole", *(f"simulating phase {k} of 2" for k in (1, 2))]
     assert report.ok and report.exit_status == 0 and len(report.alone) == 2
     for phase in report.alone:
         assert phase.reached and phase.losses == () and phase.deviation is not None

@@ -31,9 +31,17 @@ def first_phase() -> Problem:
     return dataclasses.replace(problem, phases=problem.phases[:1])
 
 
+TOLD: list[str] = []
+
+
 @cache
 def predicted() -> Prediction:
-    return predict(first_phase())
+    return predict(first_phase(), progress=TOLD.append)
+
+
+def test_progress_tells_the_phase() -> None:
+    predicted()
+    assert TOLD == ["predicting phase 1 of 1"]
 
 
 @cache

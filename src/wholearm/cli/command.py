@@ -272,7 +272,7 @@ def _simulate_free(
     if options.policy is None:
         from ..verification.free import verify_free
 
-        return verify_free(problem, torques, **given)
+        return verify_free(problem, torques, progress=show_progress(), **given)
     from ..policy.policy import Policy
     from ..results.torque import TorqueProfile
     from ..verification.policy import verify_policy

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 
+from .progress import clear_progress, show_progress
+
 
 def compare(options: argparse.Namespace) -> int:
     """Replay what is given, print the tables, and draw the margins."""
@@ -17,7 +19,8 @@ def compare(options: argparse.Namespace) -> int:
 
         plots.require_format(options.output)
         require_writable(options.output)
-    found = run(load(options.problem), options.files)
+    found = run(load(options.problem), options.files, show_progress())
+    clear_progress()
     if options.output is not None:
         from ..figures.comparison import draw_comparison
 

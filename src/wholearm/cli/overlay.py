@@ -15,11 +15,13 @@ def overlay(simulator: str, trajectory: Trajectory) -> Simulation:
     """The motion of a trajectory simulated, with its contacts; `simulator` is told or free."""
     from ..problem.read import read_own_problem
 
-    problem = read_own_problem(trajectory.meta)
+    problem, say = read_own_problem(trajectory.meta), show_progress()
     if simulator == "free":
         from ..free_simulation.simulate import simulate_free
 
+        if say is not None:
+            say("simulating the whole")
         return simulate_free(problem, trajectory).show(trajectory.contacts)
     from ..simulation.simulate import simulate
 
-    return simulate(problem, trajectory.torque, progress=show_progress())
+    return simulate(problem, trajectory.torque, progress=say)

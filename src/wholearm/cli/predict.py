@@ -6,6 +6,7 @@ import argparse
 import json
 
 from ..common.errors import InputError
+from .progress import clear_progress, show_progress
 
 _SPEED = 0.05
 """Mean speed along the phases of the torques that are written [m/s]."""
@@ -28,7 +29,10 @@ def predict(options: argparse.Namespace) -> int:
         require_ending(options.torques, ".csv")
     elif options.speed is not None:
         raise InputError("", "--speed", "is for --torques FILE, the torques to write")
-    prediction = run(read_problem(options.problem), squeeze=options.squeeze)
+    prediction = run(
+        read_problem(options.problem), squeeze=options.squeeze, progress=show_progress()
+    )
+    clear_progress()
     wrote = []
     if options.torques is not None:
         from ..results.narrow import save

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -30,8 +30,17 @@ _FREE = ("name", "epsilon", "settle_gap", "uncertainty")
 """Keys of a problem in which trajectories may differ from it; so may `settle`, of a phase too."""
 
 
-def compare(problem: Problem, paths: Sequence[str]) -> Comparison:
+def compare(
+    problem: Problem, paths: Sequence[str], progress: Callable[[str], None] | None = None
+) -> Comparison:
     """Replay trajectory files (.npz) and torques (.csv) for a problem, and compare them.
+
+    Parameters
+    ----------
+    problem : Problem
+    paths : sequence of str
+    progress : callable
+        Told which of them is replayed.
 
     Raises
     ------
@@ -42,6 +51,8 @@ def compare(problem: Problem, paths: Sequence[str]) -> Comparison:
     names = short if len({*short}) == len(short) else paths
     contenders = []
     for name, path in zip(names, paths, strict=True):
+        if progress is not None:
+            progress(f"replaying {name}")
         own, what, simulations = _read(problem, str(path))
         planned = what if isinstance(what, Trajectory) else None
         judged = _judge(name, own, what, simulations)

@@ -98,7 +98,12 @@ def simulate_free(
 
 @exclusive
 def simulate_phases(
-    problem: Problem, plan: Trajectory, *, restitution: float = 0.0, tolerance: float = 1e-9
+    problem: Problem,
+    plan: Trajectory,
+    *,
+    restitution: float = 0.0,
+    tolerance: float = 1e-9,
+    progress: Callable[[str], None] | None = None,
 ) -> tuple[PhaseRun, ...]:
     """Simulate the phases of a plan one by one, each from its planned start.
 
@@ -109,6 +114,8 @@ def simulate_phases(
     problem, restitution, tolerance
         As of `simulate_free`.
     plan : Trajectory
+    progress : callable
+        Told which phase is simulated.
     """
     starts, found = plan.phase_starts, []
     rows = [int(row) for row in np.flatnonzero(np.diff(plan.phase, prepend=-1))]
@@ -117,6 +124,8 @@ def simulate_phases(
     for last in range(len(rows)):
         if not rests[last + 1]:
             continue
+        if progress is not None:
+            progress(f"simulating phase {problem.phases[first].number} of {len(rows)}")
         profile = plan.torque.cut(float(starts[first]), float(starts[last + 1]))
         row = rows[first]
         state = np.concatenate([plan.z[row], plan.z_dot[row]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +42,12 @@ _ROWS = 8
 
 
 @exclusive
-def predict(problem: Problem, *, squeeze: float = SQUEEZE) -> Prediction:
+def predict(
+    problem: Problem,
+    *,
+    squeeze: float = SQUEEZE,
+    progress: Callable[[str], None] | None = None,
+) -> Prediction:
     """Predict quasistatic motions along the phases of a problem, and at which speed they break.
 
     Parameters
@@ -51,6 +57,8 @@ def predict(problem: Problem, *, squeeze: float = SQUEEZE) -> Prediction:
         How hard quasistatic torques squeeze, from 0, the least torques that keep epsilon, to 1,
         those with which what presses least in the phase presses most. They are the least torques
         that keep a normal force that far between.
+    progress : callable
+        Told which phase is looked at.
 
     Raises
     ------
@@ -65,6 +73,8 @@ def predict(problem: Problem, *, squeeze: float = SQUEEZE) -> Prediction:
     z, moving = problem.start, False
     with name_source(problem.source):
         for phase in problem.phases:
+            if progress is not None:
+                progress(f"predicting phase {phase.number} of {len(problem.phases)}")
             later = problem.phases[phase.index + 1 :]
             road = make_road(phase, z, later)
             rests = not moving, phase.end is End.REST

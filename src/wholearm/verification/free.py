@@ -7,7 +7,7 @@ alone are followed by what happens: a phase ends where its `until` is reached.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,7 @@ def verify_free(
     tolerance: float = 1e-9,
     departure: float = DEPARTURE,
     restitution: float = 0.0,
+    progress: Callable[[str], None] | None = None,
 ) -> FreeReport:
     """Simulate torques without being told which contacts hold, and report what happens.
 
@@ -51,6 +52,8 @@ def verify_free(
         phase may open, over the scene's length: bounces by less are events, but no failure.
     restitution : float
         Poisson's coefficient of impacts.
+    progress : callable
+        Told what is simulated.
 
     Raises
     ------
@@ -66,13 +69,15 @@ def verify_free(
         odd = ", ".join(sorted(set(plan.contacts) ^ names))
         raise InputError("", "contacts", f"trajectory and problem differ in {odd}")
     options: dict[str, Any] = {"tolerance": tolerance, "restitution": restitution}
+    if progress is not None:
+        progress("simulating the whole")
     whole = simulate_free(problem, torque if plan is None else plan, **options)
     warnings = warn("whole", whole)
     if plan is None:
         phases, failures = _follow(problem, whole, allowed)
         return FreeReport(problem.name, whole, (), phases, tuple(failures), tuple(warnings))
     failures, alone = [], []
-    for part in simulate_phases(problem, plan, **options):
+    for part in simulate_phases(problem, plan, progress=progress, **options):
         own = range(part.first, part.last + 1)
         found = _compare(problem, plan, part.simulation, own, allowed)
         alone += found

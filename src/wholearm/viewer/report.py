@@ -44,11 +44,10 @@ def build_report(
     InputError
         If a file cannot be read, or is one of another problem; names the file.
     """
-    progress("replay")
-    comparison = compare(problem, paths)
+    comparison = compare(problem, paths, progress)
     parts = [_summarise(comparison)]
     for contender in comparison.contenders:
-        progress(contender.name)
+        progress(f"writing {contender.name}")
         parts += _describe(contender)
     first = next((own.planned for own in comparison.contenders if own.planned is not None), None)
     progress("map")
