@@ -9,7 +9,14 @@ from thrown import shove
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain import plan as time_plan
-from wholearm.planning.time_domain.attempts import FALLS, GRADUAL, NEAREST, Attempt, Attempts
+from wholearm.planning.time_domain.attempts import (
+    FALLS,
+    GRADUAL,
+    NEAREST,
+    Attempt,
+    Attempts,
+    solve_attempt,
+)
 from wholearm.planning.time_domain.plan import plan_phases
 from wholearm.planning.time_domain.search import Search, Solution
 from wholearm.problem.definition import Problem
@@ -67,7 +74,7 @@ def test_a_plan_names_the_attempt_that_led_to_it(monkeypatch: pytest.MonkeyPatch
     assert {phase.attempt for phase in plan.phases} == {NEAREST}
     assert plan.meta["attempts"] == [NEAREST] * len(problem.phases)
     tried: list[str] = []
-    run = time_plan.solve_attempt
+    run = solve_attempt
 
     def lose_first(search: Search, attempt: Attempt) -> Solution:
         tried.append(attempt.name)

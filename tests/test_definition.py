@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import math
 import tomllib
 from collections.abc import Callable
@@ -14,8 +15,10 @@ from plane import finger_gap, place_corners
 from shipped import HEPTAGON
 from wholearm.common.errors import InputError
 from wholearm.geometry.path_guess import load
+from wholearm.mapping.walk import format_until
 from wholearm.problem.definition import End, Problem
 from wholearm.problem.read import build_problem, read_problem
+from wholearm.problem.table import write_table
 
 TEXT = HEPTAGON.read_text(encoding="utf-8")
 Edit = Callable[[dict[str, Any]], object]
@@ -103,6 +106,28 @@ def test_optional_keys() -> None:
     assert str(problem.phases[0].until) == "x = 0.02 m"
 
 
+@pytest.mark.parametrize(
+    "given, text",
+    [
+        ({"contact": "v2-palm", "x": -0.022}, "v2-palm at x = -0.022 m"),
+        ({"contact": "v2-palm", "phi_deg": -61.9}, "v2-palm at phi = -61.9 deg"),
+        ({"phi_deg": -40.0, "x": 0.01}, "phi = -40 deg, x = 0.01 m"),
+        ({"x": 0.01, "phi_deg": -40.0}, "x = 0.01 m, phi = -40 deg"),
+    ],
+)
+def test_both_freedoms_of_a_cell_may_be_given(given: dict[str, Any], text: str) -> None:
+    phase = {"contacts": ["v1-palm", "v3-finger1", "v0-finger2"], "until": given}
+    problem = read_edited(put("phases.3", phase))
+    assert str(problem.phases[3].until) == text
+    assert problem.table["phases"][3] == phase
+    # What is written of the phase alone reads as the same.
+    written = write_table(dataclasses.replace(problem, table={}))["phases"][3]
+    assert list(written["until"]) == list(given)
+    again = read_edited(put("phases.3", written)).phases[3].until
+    assert again == problem.phases[3].until
+    assert tomllib.loads(f"until = {format_until(again)}")["until"] == pytest.approx(given)
+
+
 def test_a_problem_for_a_map_needs_no_phases() -> None:
     problem = read_edited(drop("phases"))
     assert problem.phases == () and repr(problem).endswith("0 phases)")
@@ -133,6 +158,10 @@ def test_a_contact_without_friction_cannot_roll() -> None:
 
 
 ALLOWED_UNTIL = "allowed are a contact name"
+THREE = {
+    "contacts": ["v1-palm", "v3-finger1", "v0-finger2"],
+    "until": {"contact": "v2-palm", "x": 0.0, "phi_deg": 0.0},
+}
 
 
 @pytest.mark.parametrize(
@@ -206,7 +235,10 @@ ALLOWED_UNTIL = "allowed are a contact name"
         (put("phases.3.until", 3), "phases[4].until", ALLOWED_UNTIL),
         (put("phases.3.until", {}), "phases[4].until", ALLOWED_UNTIL),
         (put("phases.3.until", {"phi": 1}), "phases[4].until", ALLOWED_UNTIL),
-        (put("phases.3.until", {"x": 1, "phi_deg": 1}), "phases[4].until", ALLOWED_UNTIL),
+        (put("phases.3.until", {"x": 1, "phi": 1}), "phases[4].until", ALLOWED_UNTIL),
+        (put("phases.3.until", {"contact": 3}), "phases[4].until", "3 is not a contact"),
+        (put("phases.3.until", {"contact": "v4-finger1", "x": 99.0}), "phases[4].until", "99"),
+        (put("phases.3", THREE), "phases[4].until", "gives 3 conditions; allowed are 2"),
         (put("phases.3.until", {"x": math.nan}), "phases[4].until", "finite"),
         (put("phases.3.until", {"phi_deg": "1"}), "phases[4].until", "'1'"),
     ],

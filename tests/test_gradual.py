@@ -39,7 +39,7 @@ def corner() -> tuple[Problem, Phase, Array]:
     """The triangle turns about its vertex in the corner of palm and link, which first goes back."""
     problem, phase = with_phase("triangle", "v1-palm v1-finger1 v0-finger2", "v2-finger1")
     near = np.array([0.030153, 0.02887, -1e-9, 1.032, 2.713])
-    z = close_contacts(phase.formation, near, np.zeros(0), (2, 0.0))
+    z = close_contacts(phase.formation, near, np.zeros(0), ((2, 0.0),))
     assert z is not None
     return problem, phase, z
 
@@ -97,7 +97,7 @@ def test_an_end_where_a_contact_changes_its_name_has_a_slope() -> None:
     problem, phase = with_phase("hexagon", "v1-palm v1-finger1 v4-finger2", "v4-tip2")
     z = np.array([0.06, 0.045, -0.05, 1.3, 2.2])
     end = list_ends(phase)[0]
-    goal = close_contacts(phase.formation, z, np.zeros(0), None, end.active)
+    goal = close_contacts(phase.formation, z, np.zeros(0), (), end.active)
     assert goal is not None
     kernel = goal_kernel(phase.formation, phase.until, (), None)
     assert kernel is not None

@@ -184,11 +184,11 @@ def test_closing_moves_as_little_as_possible(landing: Problem, released: Array) 
 def test_configurations_are_closed_side_by_side(landing: Problem, released: Array) -> None:
     formation, phi = landing.phases[5].formation, released[2] - 0.02
     away = released + np.array([[0.0], [0.1], [1e3]]) * released[0] * np.eye(5)[0]
-    for z, start in zip(close_all(formation, away, np.zeros(0), (2, phi)), away, strict=True):
-        alone = close_contacts(formation, start, np.zeros(0), (2, phi))
+    for z, start in zip(close_all(formation, away, np.zeros(0), ((2, phi),)), away, strict=True):
+        alone = close_contacts(formation, start, np.zeros(0), ((2, phi),))
         assert alone is not None and np.abs(z - alone).max() < 1e-12 * (1 + np.abs(z).max())
         assert z[2] == pytest.approx(phi, abs=1e-12)
-    assert np.isnan(close_all(formation, away, np.zeros(0), (1, 1.0))).all()
+    assert np.isnan(close_all(formation, away, np.zeros(0), ((1, 1.0),))).all()
 
 
 def test_closing_keeps_what_has_rolled_by(landing: Problem, released: Array) -> None:
@@ -210,7 +210,7 @@ def test_closing_keeps_what_has_rolled_by(landing: Problem, released: Array) -> 
 
 
 def test_closing_what_cannot_touch_gives_nothing(landing: Problem, released: Array) -> None:
-    assert close_contacts(landing.phases[5].formation, released, np.zeros(0), (1, 1.0)) is None
+    assert close_contacts(landing.phases[5].formation, released, np.zeros(0), ((1, 1.0),)) is None
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ import time
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -116,13 +117,19 @@ def draw_leg(seed: int, number: int, folder: Path) -> Leg | None:
         try:
             route = list_formations(base, *poses)
             phases = tomllib.loads(format_route(route))["phases"]
-            problem = build_problem({**table, "phases": phases})
+            problem = _leave_open(build_problem({**table, "phases": phases}))
         except InputError:
             continue
         if any(phase.formation.n_constraints == 3 for phase in problem.phases):
             stops = [(float(part.stop[0]), float(part.stop[1])) for part in route]
             return Leg(name, problem, stops)
     return None
+
+
+def _leave_open(problem: Problem) -> Problem:
+    """The problem with ends that the planner chooses: what a refusal says holds for all places."""
+    phases = (replace(own, until=replace(own.until, pins=())) for own in problem.phases)
+    return replace(problem, phases=tuple(phases))
 
 
 def run_leg(leg: Leg, objective: str) -> Outcome:

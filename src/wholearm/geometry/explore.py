@@ -23,6 +23,10 @@ _STEP = 1e-5
 """Step of the differences that give the gradients of limits, in radii of gyration or radians."""
 
 
+Fixed = tuple[tuple[int, float], ...]
+"""Rows of z, and values that they have to take."""
+
+
 @dataclass(frozen=True, eq=False)
 class Ending:
     """What has to hold where a phase ends.
@@ -31,22 +35,21 @@ class Ending:
     ----------
     formation : Formation
         Contacts that are closed.
-    fixed : (int, float), or None
-        Row of z and the value that it has to take.
+    fixed : tuple of (int, float)
+        Rows of z and the values that they have to take.
     active : tuple of int
         Limits of the formation that are met exactly.
     """
 
     formation: Formation
-    fixed: tuple[int, float] | None = None
+    fixed: Fixed = ()
     active: tuple[int, ...] = ()
 
     def measure(self, z: Array) -> Array:
         """How far configurations with the phase's own contacts closed are from the end [m]."""
         metric = metric_weights(self.formation.scene)
         off = np.abs(self.formation.evaluate(z, z).C).max(axis=1)
-        if self.fixed is not None:
-            row, value = self.fixed
+        for row, value in self.fixed:
             off = np.maximum(off, np.abs(z[:, row] - value) * np.sqrt(metric[row]))
         if self.active:
             limits = self.formation.evaluate_limits(z)[:, list(self.active)]
@@ -116,7 +119,7 @@ def close_contacts(
     formation: Formation,
     z: Array,
     slip: Array,
-    fixed: tuple[int, float] | None = None,
+    fixed: Fixed = (),
     active: tuple[int, ...] = (),
 ) -> Array | None:
     """Nearest configuration with all contacts closed, shape (5,); None if there is none.
@@ -131,7 +134,7 @@ def close_all(
     formation: Formation,
     z: Array,
     slip: Array,
-    fixed: tuple[int, float] | None = None,
+    fixed: Fixed = (),
     active: tuple[int, ...] = (),
 ) -> Array:
     """Nearest configurations with all contacts closed, by Gauss-Newton, shape (n, 5).
@@ -145,25 +148,24 @@ def close_all(
         Where to start.
     slip : ndarray, shape (R,), [m]
         Slip coordinates that rolling contacts keep.
-    fixed : (int, float), optional
-        Row of z and the value that it has to take.
+    fixed : tuple of (int, float)
+        Rows of z and the values that they have to take.
     active : tuple of int
         Limits of the formation that are met exactly.
     """
     metric, rho = metric_weights(formation.scene), formation.scene.scales.length
     sizes = np.full(formation.n_constraints, rho)
     steps = _STEP * np.diag([rho, rho, 1.0, 1.0, 1.0])
-    if fixed is not None:
-        sizes = np.append(sizes, rho if fixed[0] == 0 else 1.0)
+    sizes = np.append(sizes, [rho if row < 2 else 1.0 for row, _ in fixed])
     sizes = np.append(sizes, np.full(len(active), rho))
     found, z, left = np.full(z.shape, np.nan), z.copy(), np.arange(len(z))
     for _ in range(50):
         kinematics = formation.evaluate(z, np.zeros(z.shape))
         residual = np.hstack([kinematics.C, formation.evaluate_slip(z) - slip])
         rows = kinematics.P
-        if fixed is not None:
-            residual = np.column_stack([residual, z[:, fixed[0]] - fixed[1]])
-            one = np.broadcast_to(np.eye(5)[fixed[0]], (len(z), 1, 5))
+        for row, value in fixed:
+            residual = np.column_stack([residual, z[:, row] - value])
+            one = np.broadcast_to(np.eye(5)[row], (len(z), 1, 5))
             rows = np.concatenate([rows, one], axis=1)
         if active:
             residual = np.hstack([residual, formation.evaluate_limits(z)[:, active]])

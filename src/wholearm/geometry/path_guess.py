@@ -167,7 +167,7 @@ def _find_goal(phase: Phase, z: Array, later: Sequence[Phase]) -> Array:
         reasons.append(reason)
         goals += [goal] if goal is not None else []
     if not goals and phase.until.contact is not None:
-        found = _look_around(phase.formation, _end_formation(phase), z, slip)
+        found = _look_around(phase.formation, _close_end(phase), z, slip)
         goals = [found] if found is not None else []
     if not goals:
         found = explore(phase.formation, z, slip, endings)
@@ -182,14 +182,14 @@ def _find_goal(phase: Phase, z: Array, later: Sequence[Phase]) -> Array:
 def list_ends(phase: Phase) -> list[Ending]:
     """What has to hold where a phase ends; a contact may be gained in more than one way."""
     formation, until = phase.formation, phase.until
-    if until.value is not None:
-        return [Ending(formation, (0 if until.coordinate == "x" else 2, until.value))]
+    if until.contact is None:
+        return [Ending(formation, until.poses)]
     own = sum(len(build_limits(c, formation.scene)) for c in formation.contacts)
     gaining = [k for k, limit in enumerate(formation.limits) if limit.gains(until.contact)]
     # Where a contact changes its name its gap has no slope, but the end of its range has.
-    ends = [Ending(formation, active=(k,)) for k in gaining if k < own]
+    ends = [Ending(formation, until.poses, (k,)) for k in gaining if k < own]
     if not ends or any(k >= own for k in gaining):
-        ends.append(Ending(_end_formation(phase)))
+        ends.append(_close_end(phase))
     return ends
 
 
@@ -217,9 +217,9 @@ def guess_onwards(phase: Phase, before: PathGuess) -> list[PathGuess]:
     these are nearest to places ahead. There are none for a phase with one freedom.
     """
     formation, z = phase.formation, before.z[-1]
-    if phase.until.contact is None or count_freedoms(formation, z) < 2:
+    if phase.until.contact is None or phase.until.pins or count_freedoms(formation, z) < 2:
         return []
-    ending, slip = _end_formation(phase), formation.evaluate_slip(z[None])[0]
+    ending, slip = _close_end(phase).formation, formation.evaluate_slip(z[None])[0]
     step = z - before.z[-2]
     metric, outlines = metric_weights(formation.scene), []
     nearest = close_contacts(ending, z, slip)
@@ -233,21 +233,20 @@ def guess_onwards(phase: Phase, before: PathGuess) -> list[PathGuess]:
     return outlines
 
 
-def _end_formation(phase: Phase) -> Formation:
-    """A phase's formation with the contact that is gained at the end."""
+def _close_end(phase: Phase) -> Ending:
+    """The end of a phase at which the contact that is gained is closed."""
     formation, gained = phase.formation, phase.until.contact
-    if gained is None:
-        return formation
-    return Formation(formation.scene, (*formation.contacts, gained), formation.rolling)
+    closed = (*formation.contacts, *(() if gained is None else (gained,)))
+    return Ending(Formation(formation.scene, closed, formation.rolling), phase.until.poses)
 
 
-def _look_around(formation: Formation, ending: Formation, z: Array, slip: Array) -> Array | None:
+def _look_around(formation: Formation, end: Ending, z: Array, slip: Array) -> Array | None:
     """Nearest end inside all limits that is found from `z` turned by some angle, if any."""
     metric, best, least = metric_weights(formation.scene), None, np.inf
     for turn in _TURNS:
-        turned = close_contacts(formation, z, slip, (2, z[2] + turn))
-        goal = None if turned is None else close_contacts(ending, turned, slip)
-        if goal is None or not is_inside(ending, goal):
+        turned = close_contacts(formation, z, slip, ((2, z[2] + turn),))
+        goal = None if turned is None else close_contacts(end.formation, turned, slip, end.fixed)
+        if goal is None or not is_inside(end.formation, goal):
             continue
         distance = float(metric @ (goal - z) ** 2)
         if distance < least:

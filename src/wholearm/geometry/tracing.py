@@ -123,17 +123,18 @@ def require_touching(phase: Phase, z: Array) -> None:
 
 
 def _trace_phase(phase: Phase, z: Array) -> Curve:
-    formation, until = phase.formation, phase.until
+    formation, until, rho = phase.formation, phase.until, phase.formation.scene.scales.length
     key = f"phases[{phase.number}].until"
     if _holds(formation, until, z):
         raise InputError("", key, f"{until} holds already at the start of the phase")
     reason = []
     for heading in _headings(formation, z, until):
         curve = trace_curve(formation, z, heading, until)
-        if curve.reached and _is_regular(curve):
+        if curve.reached and until.measure_pins(curve.end, rho) < 3 * HELD and _is_regular(curve):
             return curve
         reason.append(curve.ending)
     text = f"going one way {reason[0]}, going the other way {reason[1]}"
+    text += "; one freedom leaves no choice" if until.pins else ""
     raise InputError("", key, f"{until} is never reached: {text}")
 
 

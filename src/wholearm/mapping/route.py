@@ -22,7 +22,7 @@ from ..scene.ranges import TURN, check_place
 from .borders import Window
 from .legs import describe_place
 from .nearby import describe_miss, find_miss, tolerance
-from .walk import BEFORE, Walked, advance, end_at, format_until, walk_leg
+from .walk import Walked, format_until, walk_leg
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,8 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
 
     A leg with both ends near one border (`nearby.NEAR`) follows the border, and ends that near a
     change of contacts are moved to it. Each phase is carried out as when the list is loaded: on
-    a border along its curve, in a cell to the nearest end.
+    a border along its curve, in a cell to the pose at which the leg ends, or before that to the
+    nearest end.
 
     Parameters
     ----------
@@ -115,7 +116,7 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
             text = f"two poses at {describe_place(one)} are the same place"
             raise InputError("", "route", text)
     z, start, given, notes = _begin(problem, given)
-    here, stretches, legs, came = z[[0, 2]], list[Stretch](), list[int](), z
+    here, stretches, legs = z[[0, 2]], list[Stretch](), list[int]()
     for leg, there in enumerate(given):
         miss = find_miss(problem.scene, here, there)
         note = "" if miss is None else describe_miss(problem.scene, miss)
@@ -126,53 +127,11 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
             raise InputError("", "route", text) from None
         if note:
             notes.append(f"leg {leg + 1} goes through cells: {note}")
-        last = len(stretches) - 1
-        landed = _land(problem, stretches[-1], last, (came, there), walked[0]) if leg else None
-        if landed is not None:
-            stretches[-1:], walked = landed
-            legs.append(legs[-1])
         for entry in walked:
             _append(stretches, legs, leg, entry)
-        came, z = walked[-2][2] if len(walked) > 1 else z, walked[-1][2]
+        z = walked[-1][2]
         here = z[[0, 2]]
     return Route(tuple(stretches), start, tuple(notes))
-
-
-def _land(
-    problem: Problem,
-    before: Stretch,
-    index: int,
-    ends: tuple[Array, Array],
-    first: Walked,
-) -> tuple[list[Stretch], list[Walked]] | None:
-    """Two stretches in place of the one before a leg if that has to gain a contact for it.
-
-    In a cell a phase that ends at x or phi may do so anywhere: what touches at the nearest such
-    place need not touch where a plan ends. One that leads to near there is followed by one that
-    ends with the contact. Also returns the leg from there.
-
-    Parameters
-    ----------
-    before, index : Stretch, int
-        The stretch, and which of the phases it is, from 0.
-    ends : tuple of ndarray
-        The configuration in which it starts, and the pose at which the leg after it ends.
-    first : Walked
-        What that leg begins with.
-    """
-    news = [contact for contact in first[1][0] if contact not in before.contacts]
-    if len(before.contacts) != 3 or before.until.contact is not None or len(news) != 1:
-        return None
-    aim = before.start + BEFORE * (before.stop - before.start)
-    row, z, made = 0 if before.until.coordinate == "x" else 1, ends[0], list[Stretch]()
-    try:
-        for until in (end_at(problem.scene, row, aim), Until(contact=news[0])):
-            here = z[[0, 2]]
-            z = advance(problem, index + len(made), z, (before.contacts, until))
-            made.append(Stretch(before.contacts, until, here, z[[0, 2]]))
-        return made, walk_leg(problem, index + len(made), z, z[[0, 2]], ends[1])
-    except InputError:
-        return None
 
 
 def _append(stretches: list[Stretch], legs: list[int], leg: int, entry: Walked) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import lru_cache
 from itertools import permutations
 
@@ -50,8 +51,9 @@ def advance(problem: Problem, index: int, z: Array, step: Step) -> Array:
 def walk_leg(problem: Problem, index: int, z: Array, start: Array, stop: Array) -> list[Walked]:
     """Phases along a leg, with what each ends in.
 
-    A phase with two freedoms ends where the end is nearest, not where the leg has it. Where the
-    phases of the leg do not go on from there, the rest of the leg starts from there.
+    A phase with two freedoms ends where the end is nearest, not where the leg has it, but for the
+    last one, whose place is given. Where the phases of the leg do not go on from there, the rest
+    of the leg starts from there.
 
     Parameters
     ----------
@@ -104,7 +106,7 @@ def _walk_part(problem: Problem, index: int, z: Array, parts: list[Part]) -> lis
     """The first way through a part that can be carried out, and goes on if there is such a way."""
     first: InputError | None = None
     spare: list[Walked] = []
-    for steps in _list_ways(problem.scene, z, parts[0]):
+    for steps in _list_ways(problem.scene, z, parts[0], len(parts) == 1):
         here = z
         walked: list[Walked] = []
         try:
@@ -147,8 +149,10 @@ def _require_motion(scene: Scene, z: Array, end: Array, step: Step) -> None:
         raise InputError("", "", f"{step[1]} holds already at {describe_pose(z)}")
 
 
-def _list_ways(scene: Scene, z: Array, part: Part) -> Iterator[list[Step]]:
+def _list_ways(scene: Scene, z: Array, part: Part, last: bool) -> Iterator[list[Step]]:
     """Phases that may carry a part from `z`, the plain ones first."""
+    if last and len(part.contacts) == 3:
+        yield from _list_pinned(scene, part)
     missing = _list_missing(scene, z, part.contacts)
     if len(missing) == 1 and len(part.contacts) == 4:
         # A border that `z` is beside, not on, has to be reached first.
@@ -160,6 +164,20 @@ def _list_ways(scene: Scene, z: Array, part: Part) -> Iterator[list[Step]]:
     yield from _list_plain(scene, part)
     rows = (part.coordinate,) if len(part.contacts) == 4 else (0, 1)
     yield from _list_guided(scene, part, rows)
+
+
+def _list_pinned(scene: Scene, part: Part) -> Iterator[list[Step]]:
+    """One phase each through a cell, which ends where the part does."""
+    pose = [end_at(scene, row, part.stop) for row in (0, 1)]
+    for contact in part.gained:
+        for own in pose:
+            assert own.value is not None
+            pins = ((own.coordinate, own.value),)
+            yield [(part.contacts, Until(contact=contact, pins=pins))]
+    if not part.gained:
+        own, other = pose[part.coordinate], pose[1 - part.coordinate]
+        assert other.value is not None
+        yield [(part.contacts, replace(own, pins=((other.coordinate, other.value),)))]
 
 
 def _list_plain(scene: Scene, part: Part) -> Iterator[list[Step]]:
@@ -193,13 +211,14 @@ def end_at(scene: Scene, row: int, pose: Array) -> Until:
 
 def format_until(until: Until) -> str:
     """The value of a phase's `until` in a problem file, which reads back as it was."""
-    if until.contact is not None:
+    if until.contact is not None and not until.pins:
         return f'"{until.contact}"'
-    assert until.value is not None
-    if until.coordinate == "x":
-        return f"{{ x = {until.value + 0.0!r} }}"
-    degrees = round(math.degrees(until.value), math.ceil(-math.log10(math.degrees(DIGITS))))
-    return f"{{ phi_deg = {degrees + 0.0!r} }}"
+    parts = [] if until.contact is None else [f'contact = "{until.contact}"']
+    digits = math.ceil(-math.log10(math.degrees(DIGITS)))
+    for row, value in until.poses:
+        number = round(math.degrees(value), digits) if row else value
+        parts.append(f"{'phi_deg' if row else 'x'} = {number + 0.0!r}")
+    return f"{{ {', '.join(parts)} }}"
 
 
 @lru_cache(maxsize=64)

@@ -295,6 +295,7 @@ def _look_ahead(
     if (
         options.goal is Objective.MARGIN
         or until is None
+        or ending.until.pins
         or gained != {until}
         or not runs_along_curves(following, options)
     ):

@@ -24,7 +24,7 @@ from ..scene.ranges import (
     check_settle,
     check_settle_gap,
 )
-from .definition import End, Phase, Problem, Until
+from .definition import ROWS, End, Phase, Problem
 from .goal import check_goal, name_goal
 from .uncertainty import spread_widths
 
@@ -116,8 +116,15 @@ def _check_until(scene: Scene, phase: Phase, key: str) -> None:
         raise InputError("", key, "is missing; only a phase with end = 'smooth' has none")
     if until.contact is not None and until.contact in phase.formation.contacts:
         raise InputError("", key, f"{until} is already in the phase's contacts")
-    if until.value is not None:
-        check_coordinate(scene, until, key)
+    ends = until.pins if until.value is None else ((until.coordinate, until.value), *until.pins)
+    for coordinate, value in ends:
+        check_coordinate(scene, coordinate, value, key)
+    freedoms = 5 - phase.formation.n_constraints
+    if len({name for name, _ in ends}) < len(ends):
+        raise InputError("", key, f"{until} gives a coordinate twice")
+    if freedoms > 1 and (given := len(ends) + (until.contact is not None)) > freedoms:
+        text = f"{until} gives {given} conditions; allowed are {freedoms}, as the contacts leave"
+        raise InputError("", key, f"{text} {freedoms} freedoms")
 
 
 def _check_settle(scene: Scene, phase: Phase, key: str) -> None:
@@ -129,18 +136,18 @@ def _check_settle(scene: Scene, phase: Phase, key: str) -> None:
         raise InputError("", key, f"{phase.settle:g} given, but the phase has end = 'smooth'")
 
 
-def check_coordinate(scene: Scene, until: Until, key: str) -> None:
-    """Check the coordinate of the pose that ends a phase, and its value.
+def check_coordinate(scene: Scene, coordinate: str, given: float, key: str) -> None:
+    """Check a coordinate of the pose where a phase ends, and its value.
 
     Raises
     ------
     InputError
         If there is no such coordinate, or its value is out of its range.
     """
-    if until.coordinate not in ("x", "phi"):
-        raise InputError("", key, f"{until.coordinate!r} given; allowed are 'x' and 'phi'")
-    value = require_number(until.value, key)
-    if until.coordinate == "x":
+    if coordinate not in ROWS:
+        raise InputError("", key, f"{coordinate!r} given; allowed are 'x' and 'phi'")
+    value = require_number(given, key)
+    if coordinate == "x":
         check_place(scene, key, value)
     else:
         # Rounding in radians is no matter at the end of the range.

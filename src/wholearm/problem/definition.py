@@ -16,6 +16,8 @@ from ..scene.model import Scene
 from .goal import Goal
 from .table import change_table, match_table, write_table
 
+ROWS = {"x": 0, "phi": 2}
+"""Rows of z that may be given where a phase ends."""
 SETTLE_GAP = 3e-3
 """Gap that closes where the end of a phase is held, over the scene's length: 0.1 mm of 35 mm."""
 
@@ -42,6 +44,8 @@ class Until:
     coordinate : {"", "x", "phi"}
         The coordinate, when there is one.
     value : float or None, [m] or [rad]
+    pins : tuple of (str, float), [m] or [rad]
+        Coordinates of the pose, and the values that they have there, too.
 
     Notes
     -----
@@ -52,6 +56,19 @@ class Until:
     contact: Contact | None = None
     coordinate: str = ""
     value: float | None = None
+    pins: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def poses(self) -> tuple[tuple[int, float], ...]:
+        """Rows of z that are given where the phase ends, and their values."""
+        own = () if self.value is None else ((self.coordinate, self.value),)
+        return tuple((ROWS[name], value) for name, value in (*own, *self.pins))
+
+    def measure_pins(self, z: Array, length: float) -> float:
+        """How far z, shape (5,), is from the pins at most, x over a `length` and phi in rad."""
+        units = {"x": length, "phi": 1.0}
+        off = (abs(z[ROWS[name]] - value) / units[name] for name, value in self.pins)
+        return float(max(off, default=0.0))
 
     @property
     def is_release(self) -> bool:
@@ -59,13 +76,16 @@ class Until:
         return self.contact is None and self.value is None
 
     def __str__(self) -> str:
-        if self.contact is not None:
-            return self.contact.name
-        if self.value is None:
+        if self.is_release:
             return "release"
-        if self.coordinate == "x":
-            return f"x = {self.value:g} m"
-        return f"phi = {math.degrees(self.value):g} deg"
+        poses = self.pins if self.value is None else ((self.coordinate, self.value), *self.pins)
+        parts = [
+            f"x = {value:g} m" if name == "x" else f"phi = {math.degrees(value):g} deg"
+            for name, value in poses
+        ]
+        if self.contact is not None:
+            parts[:1] = [" at ".join([self.contact.name, *parts[:1]])]
+        return ", ".join(parts)
 
 
 @dataclass(frozen=True, eq=False)

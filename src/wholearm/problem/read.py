@@ -267,7 +267,9 @@ def _parse_name(name: object, scene: Scene) -> Contact:
 
 
 def read_until(scene: Scene, given: object) -> Until:
-    """What ends a phase: the name of a contact, ``{"phi_deg": ...}`` or ``{"x": ...}``.
+    """What ends a phase: the name of a contact, or a table of ``contact``, ``phi_deg`` and ``x``.
+
+    Without a contact the first coordinate ends the phase; what else is given has to hold there.
 
     Raises
     ------
@@ -276,15 +278,22 @@ def read_until(scene: Scene, given: object) -> Until:
     """
     if isinstance(given, str):
         return Until(contact=parse_contact(given, scene))
-    allowed = "allowed are a contact name, { phi_deg = ... } or { x = ... }"
-    if not isinstance(given, dict) or len(given) != 1 or not set(given) <= {"phi_deg", "x"}:
+    allowed = "allowed are a contact name, or a table with contact, phi_deg or x, or several"
+    if not isinstance(given, dict) or not given or not set(given) <= {"contact", "phi_deg", "x"}:
         raise InputError("", "", f"{given!r} does not end a phase; {allowed}")
-    ((key, value),) = given.items()
+    pins = tuple(_read_pin(key, value) for key, value in given.items() if key != "contact")
+    if "contact" in given:
+        return Until(contact=parse_contact(given["contact"], scene), pins=pins)
+    (coordinate, value), *others = pins
+    return Until(None, coordinate, value, tuple(others))
+
+
+def _read_pin(key: str, value: object) -> tuple[str, float]:
     number = require_number(value, "")
     if key == "x":
-        return Until(coordinate="x", value=number)
+        return key, number
     TURN.check("", number, "degrees")
-    return Until(coordinate="phi", value=math.radians(number))
+    return "phi", math.radians(number)
 
 
 def _at(key: str, read: Callable[[], _T]) -> _T:

@@ -19,7 +19,7 @@ from ..scene.polygon import Polygon
 from .goal import match_goals
 
 if TYPE_CHECKING:
-    from .definition import Phase, Problem
+    from .definition import Phase, Problem, Until
 
 _OWN = {
     "mass": ("object.mass",),
@@ -249,23 +249,39 @@ def _match_phase(entries: Sequence[Mapping[str, Any]], phase: Phase) -> Mapping[
     """The entry that says what a phase is, or a new one."""
     until = phase.until
     own: dict[str, Any] = {"contacts": name_contacts(phase)}
-    if until.contact is not None:
-        own["until"] = until.contact.name
-    elif until.value is not None:
-        x = until.coordinate == "x"
-        own["until"] = {"x": until.value} if x else {"phi_deg": math.degrees(until.value)}
+    if not until.is_release:
+        own["until"] = write_until(until)
     if phase.settle is not None:
         own["settle"] = phase.settle
     for entry in (*entries[phase.index : phase.index + 1], *entries):
         given = entry.get("until")
-        if isinstance(given, Mapping) and "phi_deg" in given and until.coordinate == "phi":
-            same = math.radians(given["phi_deg"]) == until.value
-        else:
-            same = given == own.get("until")
+        same = _is_same(given, own.get("until"))
         same = same and all(entry.get(key) == own.get(key) for key in ("contacts", "settle"))
         if same and entry.get("end", "rest") == phase.end.value:
             return entry
     return own | ({} if phase.end.value == "rest" else {"end": phase.end.value})
+
+
+def write_until(until: Until) -> Any:
+    """What ends a phase, as its file has it: a name, or a table."""
+    if until.contact is not None and not until.pins:
+        return until.contact.name
+    own: dict[str, Any] = {} if until.contact is None else {"contact": until.contact.name}
+    names = {0: "x", 2: "phi_deg"}
+    for row, value in until.poses:
+        own[names[row]] = math.degrees(value) if row else value
+    return own
+
+
+def _is_same(given: Any, own: Any) -> bool:
+    """Whether an `until` says the same as another one, in the same order."""
+    if not isinstance(given, Mapping) or not isinstance(own, Mapping):
+        return bool(given == own)
+    # An angle of a file is known in radians, to whose rounding its degrees are the same.
+    return list(given) == list(own) and all(
+        math.radians(value) == math.radians(own[key]) if key == "phi_deg" else value == own[key]
+        for key, value in given.items()
+    )
 
 
 def name_contacts(phase: Phase) -> list[str]:

@@ -18,6 +18,7 @@ from ..common.sharing import exclusive
 from ..free_simulation.hand import build_system
 from ..free_simulation.result import FreeSimulation, list_pauses
 from ..free_simulation.simulate import simulate_free, simulate_phases
+from ..geometry.curve import describe_pose
 from ..problem.definition import Phase, Problem
 from ..results.narrow import Torques, narrow
 from ..results.report import Deviation
@@ -160,6 +161,11 @@ def _follow(
         if stop is None:
             failures.append(f"phase {phase.number} does not end: {phase.until} is not reached")
             break
+        z = simulation.z[int(np.searchsorted(simulation.t, stop, side="right")) - 1]
+        if phase.until.measure_pins(z, problem.scene.scales.length) > allowed:
+            failures.append(
+                f"phase {phase.number} ends at {describe_pose(z)}, and not with {phase.until}"
+            )
         start = stop
     return tuple(found), failures
 

@@ -134,12 +134,16 @@ def describe_speed(scene: Scene, v: Array) -> str:
     return f"{what} turns at {abs(v[2 + fastest]):.3g} rad/s"
 
 
-def describe_stops(problem: Problem, simulation: Simulation, allowance: Allowance) -> list[Failure]:
-    """Sentences on phases that end at rest but are reached at a speed."""
+def describe_ends(problem: Problem, simulation: Simulation, allowance: Allowance) -> list[Failure]:
+    """Sentences on phases that end elsewhere than pinned, or at a speed where they are to rest."""
     scene, failures = problem.scene, []
     for event in simulation.find(EventKind.ARRIVAL):
         phase = problem.phases[event.phase]
-        v = simulation.z_dot[int(np.flatnonzero(simulation.phase == event.phase)[-1])]
+        row = int(np.flatnonzero(simulation.phase == event.phase)[-1])
+        z, v = simulation.z[row], simulation.z_dot[row]
+        if phase.until.measure_pins(z, scene.scales.length) > allowance.departure:
+            text = f"phase {phase.number} ends at {describe_pose(z)}, and not with {phase.until}"
+            failures.append(Failure(phase.number, text))
         fast = measure_speed(scene, v) > allowance.rest_speed * scene.scales.speed
         if phase.end is End.REST and fast:
             energy = 0.5 * float(scene.mass_diagonal @ v**2)

@@ -45,8 +45,8 @@ from .verdict import (
     Allowance,
     describe_ambiguity,
     describe_departures,
+    describe_ends,
     describe_overlap,
-    describe_stops,
     describe_thin_margins,
     describe_wedging,
     judge_end,
@@ -182,7 +182,7 @@ def judge(seen: Observation, allowance: Allowance, reduced: bool = False) -> Rep
     problem, simulation, phases, gap = seen.problem, seen.simulation, seen.phases, seen.gap
     reached, outcome = judge_end(problem, simulation, allowance)
     failures = [] if reached else [Failure(len(phases), outcome)]
-    failures += describe_stops(problem, simulation, allowance)
+    failures += describe_ends(problem, simulation, allowance)
     failures += describe_overlap(problem.scene, phases, gap) if reached else []
     failures += describe_ambiguity(problem, simulation, phases, allowance)
     thin = describe_thin_margins(problem, phases, simulation, allowance)

@@ -7,7 +7,7 @@ import json
 import math
 import tomllib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -98,7 +98,7 @@ def can_move(problem: Problem, stretches: Sequence[Stretch]) -> bool:
         if np.isnan(z).any():
             return False
         formation = Formation(scene, stretch.contacts)
-        phase = Phase(0, formation, stretch.until)
+        phase = Phase(0, formation, replace(stretch.until, pins=()))
         for place, following in zip(z[::2], z[1::2], strict=True):
             way = np.array([following - place] * 2)
             pair = np.array([place, following])

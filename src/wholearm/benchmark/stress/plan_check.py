@@ -202,6 +202,9 @@ def _check_end(problem: Problem, phase: Phase, rows: Samples) -> list[str]:
         off = abs(rows.z[-1, 2 if angle else 0] - until.value) / (1.0 if angle else size)
     else:
         off = 0.0
+    units = {"x": (0, size), "phi": (2, 1.0)}
+    pinned = [(*units[name], value) for name, value in until.pins]
+    off = max([off, *(abs(rows.z[-1, row] - value) / unit for row, unit, value in pinned)])
     if off > 1e-5:
         texts.append(f"ends {off:.3g} from {until}")
     if phase.end is End.REST:

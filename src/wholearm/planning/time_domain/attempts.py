@@ -1,4 +1,4 @@
-"""Guesses that phases are planned from, one after the other, each with a name."""
+"""Guesses that phases are planned from, one after the other, and what each leads to."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from typing import NamedTuple
 from ...common.arrays import Array
 from ...geometry.cost_to_go import CostToGo
 from ...problem.definition import Phase, Problem
-from .ending import keep_apart
+from .ending import choose_end, keep_apart
+from .enforcing import DEARER, enforce_between, is_hopeless
+from .mode_search import improve
+from .refinement import halve
 from .search import Search, Solution
 from .stage import Stage
 from .staging import guess_stages
@@ -27,6 +30,15 @@ NEAR = -0.3
 """Margin of a way from which on a motion beside it may keep its limits."""
 WAYS = 3
 """Most ways along which a motion is guessed."""
+ATTEMPT = 50
+"""Most iterations of the first run of the solver from a guess: where it leads to a plan it takes 25
+or less in one phase."""
+SPLIT = 80
+"""The same in modes that friction has shown which sets in gradually, with many stages."""
+MUCH_DEARER = 3.0
+"""Cost of a plan, over that with friction that sets in gradually, with which it is none."""
+ROUNDING = 5e-7
+"""Largest shortfall of a margin below epsilon by rounding, over the weight of the object."""
 FALLS = (2.0, 4.0, 1.0)
 """Guessed durations to try, over that of a fall over the length of the outlines."""
 
@@ -155,3 +167,34 @@ class Attempts:
         if self.to_go is not None:
             stages[-1] = keep_apart(stages[-1], self.to_go.phase.until.contact)
         return stages
+
+
+def solve_attempt(search: Search, attempt: Attempt) -> Solution:
+    """Solve, find modes and intervals, halve these, and make limits hold in between."""
+    stages, least = attempt.stages, math.nan
+    if attempt.gradual:
+        from .gradual import find_modes
+
+        found = find_modes(search, stages)
+        if not found.success:
+            return found
+        stages, least = found.stages, found.cost
+    solution = search.solve(stages, attempt.before, SPLIT if attempt.gradual else ATTEMPT)
+    if solution.success and solution.margin < -ROUNDING:
+        # A way that presses too little may be far from one that presses enough.
+        return solution._replace(success=False, status="the largest c_n is below epsilon")
+    if not solution.success:
+        return solution
+    if 0 < MUCH_DEARER * least < solution.cost or is_hopeless(search, solution):
+        return solution._replace(success=False, status=DEARER)
+    plain = not search.options.mode_search or search.has_ample(solution)
+    better = solution if plain else improve(search, solution)
+    if search.only_begins:
+        return better
+    search, solution = choose_end(search, better)
+    wanted = 2**attempt.halvings * sum(stage.intervals for stage in attempt.stages)
+    for _ in range(attempt.halvings):
+        # Modes that were found may have asked for more intervals than the guess has.
+        if solution.success and sum(stage.intervals for stage in solution.stages) < wanted:
+            solution = search.solve(halve(solution.stages, search.scheme), solution)
+    return enforce_between(search, solution) if solution.success else solution

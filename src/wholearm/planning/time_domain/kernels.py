@@ -174,8 +174,8 @@ def goal_kernel(
         ranges = [limit for c in formation.contacts for limit in build_limits(c, scene)]
         ends = [limit.value for limit in ranges if limit.gains(until.contact)]
         parts.append(ends[0] if len(ends) == 1 else build_gap(until.contact, scene))
-    elif until is not None and until.value is not None:
-        parts.append((z[0] if until.coordinate == "x" else z[2]) - until.value)
+    if until is not None:
+        parts += [z[row] - value for row, value in until.poses]
     if turns:
         rates = ca.vertcat(formation.function(z, v)[2] @ v, v[3:])
         parts += [rates[k] for k in turns]

@@ -62,6 +62,10 @@ def _scale_phase(phase: Phase, scene: Scene, scales: Scales) -> Phase:
     if until.coordinate == "x" and until.value is not None:
         until = replace(until, value=until.value / scales.length)
     formation = Formation(scene, phase.formation.contacts, phase.formation.rolling)
+    units = {"x": scales.length, "phi": 1.0}
+    # With one freedom nothing is left for pins to say.
+    pins = () if formation.n_constraints >= 4 else until.pins
+    until = replace(until, pins=tuple((name, own / units[name]) for name, own in pins))
     return replace(phase, formation=formation, until=until)
 
 

@@ -26,14 +26,12 @@ from ...problem.definition import Phase, Problem
 from ...results.trajectory import Motion
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
-from .attempts import NEAREST, Attempt, Attempts
-from .ending import choose_end
-from .enforcing import DEARER, enforce_between, is_hopeless
+from .attempts import NEAREST, Attempt, Attempts, solve_attempt
 from .mesh import resample
-from .mode_search import improve
 from .modes import LEAST_INTERVALS
 from .motion import TimeMotion
 from .phase_plans import list_plans
+from .pinning import MOVED, approach
 from .refinement import halve
 from .search import Search, Solution
 from .stage import Stage
@@ -45,17 +43,8 @@ CONVINCING = 2
 """Motions that miss limits least, from different guesses, after which there seems to be no plan."""
 BUDGET = 400
 """Iterations of the solver after which no further guess is begun: of one block."""
-ATTEMPT = 50
-"""Most iterations of the first run of the solver from a guess: where it leads to a plan it takes 25
-or less in one phase."""
-SPLIT = 80
-"""The same in modes that friction has shown which sets in gradually, with many stages."""
-MUCH_DEARER = 3.0
-"""Cost of a plan, over that with friction that sets in gradually, with which it is none."""
 ROUGH = 1e-2
 """Least accuracy of plans of which only matters that there are any."""
-ROUNDING = 5e-7
-"""Largest shortfall of a margin below epsilon by rounding, over the weight of the object."""
 
 
 def plan_phases(
@@ -111,6 +100,8 @@ def plan_phases(
     if known is not None:
         return list_plans(problem, search, phases, known, begun[0].attempt)
     first, name = _begin(search, attempts.first, fastest, pinned)
+    if not first.success and (moved := approach(search, problem, phases, z)) is not None:
+        first, name = moved, MOVED
     if first.success:
         return list_plans(problem, search, phases, first, name)
     return _look_further(search, attempts, problem, phases, first, explained)
@@ -129,7 +120,8 @@ def try_phases(
         solution = solve_attempt(search, attempt)
         if solution.success:
             return list_plans(problem, search, phases, solution, attempt.name)
-    return None
+    moved = approach(search, problem, phases, z)
+    return None if moved is None else list_plans(problem, search, phases, moved, MOVED)
 
 
 def _look_further(
@@ -279,37 +271,6 @@ def _explain(
     if not short:
         refuse_ways(problem, attempts.phases[0], attempts.ways)
     return explain(search, problem, attempts.phases, short, reason, replan)
-
-
-def solve_attempt(search: Search, attempt: Attempt) -> Solution:
-    """Solve, find modes and intervals, halve these, and make limits hold in between."""
-    stages, least = attempt.stages, math.nan
-    if attempt.gradual:
-        from .gradual import find_modes
-
-        found = find_modes(search, stages)
-        if not found.success:
-            return found
-        stages, least = found.stages, found.cost
-    solution = search.solve(stages, attempt.before, SPLIT if attempt.gradual else ATTEMPT)
-    if solution.success and solution.margin < -ROUNDING:
-        # A way that presses too little may be far from one that presses enough.
-        return solution._replace(success=False, status="the largest c_n is below epsilon")
-    if not solution.success:
-        return solution
-    if 0 < MUCH_DEARER * least < solution.cost or is_hopeless(search, solution):
-        return solution._replace(success=False, status=DEARER)
-    plain = not search.options.mode_search or search.has_ample(solution)
-    better = solution if plain else improve(search, solution)
-    if search.only_begins:
-        return better
-    search, solution = choose_end(search, better)
-    wanted = 2**attempt.halvings * sum(stage.intervals for stage in attempt.stages)
-    for _ in range(attempt.halvings):
-        # Modes that were found may have asked for more intervals than the guess has.
-        if solution.success and sum(stage.intervals for stage in solution.stages) < wanted:
-            solution = search.solve(halve(solution.stages, search.scheme), solution)
-    return enforce_between(search, solution) if solution.success else solution
 
 
 def _slow_down(
