@@ -23,6 +23,8 @@ LANDING = FOLDER / "heptagon.toml"
 TWICE = FOLDER / "heptagon_twice.toml"
 """Two of them, one after the other."""
 HEXAGON = FOLDER / "hexagon.toml"
+SQUARE = FOLDER / "square.toml"
+"""Its links lie so low that a hundredth of a torque is much of a normal force."""
 BOX = FOLDER / "box_rolling.toml"
 """A box that tips over a vertex that rolls."""
 

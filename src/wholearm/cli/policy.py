@@ -58,11 +58,13 @@ def _policy(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(policy.about, indent=2))
         return 0
-    rows = [
-        [str(own["number"]), f"{own['plan']:.6f}", f"{own['duration']:.6f}", f"{own['share']:.2f}"]
-        for own in policy.about["phases"]
-    ]
-    header = ["phase", "plan [s]", "policy [s]", "least part of the reserve"]
-    print("\n".join(align(header, rows, set())))
+    rows = []
+    for own in policy.about["phases"]:
+        times = [f"{own[name]:.6f}" for name in ("plan", "duration")]
+        kept = [f"{level:.2f} {name}" for name, level in own.get("reserves", {}).items()]
+        share = f"{own['share']:.2f}" if kept else ""
+        rows.append([str(own["number"]), *times, share, ", ".join(kept)])
+    header = ["phase", "plan [s]", "policy [s]", "reserve", "least of each contact"]
+    print("\n".join(align(header, rows, {4})))
     print(f"{policy.duration:.6f} s in all, the plan {plan.duration:.6f} s; wrote {output}")
     return 0

@@ -21,8 +21,9 @@ from collections.abc import Mapping, Sequence
 from math import sqrt
 from typing import Any, NamedTuple
 
-LEVEL = 1.0
-"""Level of limits below which feedback gives way, in reserves."""
+LEVEL, PART = 1.0, 0.5
+"""Level of limits below which feedback gives way, in reserves: at most the first, and at most the
+second times that of the reference, which may have less."""
 IGNORED = 1e6
 """Level from which on a limit is none."""
 CORRECTION = 0.25
@@ -114,6 +115,7 @@ class CurveLaw:
         self.squares = [one * one + two * two or 1e-30 for one, two in self.chords]
         self.levels, self.level_rises = _split(tables["levels"], IGNORED)
         self.torque, self.torque_rises = _split(tables["torque"])
+        self.floor = self._find_floor()
         self.gain = CORRECTION / (pace.period + pace.delay)
         self.memory = MEMORY * self.gain**2 * pace.period
         self.begin()
@@ -188,6 +190,24 @@ class CurveLaw:
         j, share = self._locate(j, s)
         return float(self.b[j] + share * (self.b[j + 1] - self.b[j]))
 
+    def _find_floor(self) -> list[float]:
+        """Level on each interval below which feedback gives way."""
+        found = []
+        for j, h in enumerate(self.steps):
+            b, after = self.b[j], self.b[j + 1]
+            a, level = (after - b) / (2 * h), 1e30
+            for share, own in ((0.0, b), (1.0, after)):
+                v, base, rates, press = sqrt(own), [], [], []
+                for (c, cb, cv, ca, cl), (d, db, dv, da, dl) in zip(
+                    self.levels[j], self.level_rises[j], strict=True
+                ):
+                    base.append(c + share * d + (cb + share * db) * own + (cv + share * dv) * v)
+                    rates.append(ca + share * da)
+                    press.append(cl + share * dl)
+                level = min(level, choose_squeeze(base, rates, press, a)[0])
+            found.append(min(LEVEL, PART * level))
+        return found
+
     def _act(self, j: int, share: float, v: float, planned: float, a: float) -> tuple[float, float]:
         """Torques for an acceleration, as far as limits allow it."""
         b = v * v
@@ -199,11 +219,12 @@ class CurveLaw:
             rates.append(ca + share * da)
             press.append(cl + share * dl)
         level, squeeze = choose_squeeze(base, rates, press, a)
-        if level < LEVEL:
+        floor = self.floor[j]
+        if level < floor:
             safe, other = choose_squeeze(base, rates, press, planned)
-            if safe > LEVEL:
+            if safe > floor:
                 # Least levels are concave in a: this part of the way keeps the level.
-                a = planned + (safe - LEVEL) / (safe - level) * (a - planned)
+                a = planned + (safe - floor) / (safe - level) * (a - planned)
                 level, squeeze = choose_squeeze(base, rates, press, a)
             elif safe > level:
                 a, level, squeeze = planned, safe, other

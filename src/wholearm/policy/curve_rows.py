@@ -18,6 +18,7 @@ from ..geometry.curve import Curve, CurvePoint
 from ..mechanics.dynamics import Directions, PathForces, inverse
 from ..mechanics.limits import CONE, PRESS, LimitSet, make_limits
 from ..scene.model import Friction, Scene
+from .curve_law import choose_squeeze
 
 DOUBTS = {"mass": 0.05, "inertia": 0.05, "palm": 0.1, "finger1": 0.1, "finger2": 0.1}
 """By how much numbers of a scene may be off, relative: what a reserve of normal force is for."""
@@ -88,6 +89,22 @@ def make_rows(curve: Curve, s: Array, motion: tuple[Array, Array, Array]) -> Row
     unit.append(np.tile(SPARE * most, (len(s), 1)))
     count = 2 * len(limits.low)
     return Rows(s, torque, np.concatenate(slack, axis=1), np.concatenate(unit, axis=1), count)
+
+
+def find_squeeze(rows: Rows, a: Array, b: Array) -> Array:
+    """The squeeze with the largest least level for a motion, shape (n,)."""
+    pairs = zip(_measure_base(rows, a, b).tolist(), rows.levels[:, :, 4].tolist(), strict=True)
+    return np.array([choose_squeeze(base, [0.0] * len(base), by, 0.0)[1] for base, by in pairs])
+
+
+def measure_levels(rows: Rows, a: Array, b: Array) -> Array:
+    """Levels of all limits for a motion with that squeeze, shape (n, m)."""
+    return _measure_base(rows, a, b) + rows.levels[:, :, 4] * find_squeeze(rows, a, b)[:, None]
+
+
+def _measure_base(rows: Rows, a: Array, b: Array) -> Array:
+    known = np.column_stack([np.ones(len(a)), b, np.sqrt(b), a])
+    return np.asarray(np.einsum("nmi,ni->nm", rows.levels[:, :, :4], known))
 
 
 def find_directions(curve: Curve, s: Array) -> Directions:

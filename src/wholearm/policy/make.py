@@ -3,62 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from ..common.errors import InputError
 from ..common.require import require_number
 from ..contacts.formation import Formation
-from ..geometry.curve import Curve
-from ..geometry.tracing import runs_on_curve, trace_phase
+from ..geometry.tracing import runs_on_curve
 from ..mechanics.arrival import Standstill, find_hold
-from ..mechanics.dynamics import inverse
-from ..mechanics.metric import metric_weights
 from ..problem.definition import End, Phase, Problem
 from ..results.trajectory import Trajectory
 from .curve_law import Pace
-from .curve_rows import Rows, find_directions, make_rows
 from .policy import Policy
 from .push import find_push, find_still
+from .reference import TOUCH, Piece, trace_piece
 from .regulator import follow
 from .replan import Planner, replan
-from .retime import retime
 
-INTERVALS = 120
-"""Intervals of a curve's table, dense at its ends."""
-PLACES = 400
-"""Places of a curve at which a plan's place is looked for first."""
-NEWTON = 4
-AUTHORITY = 2.0
-"""Reserve of torques along the way, in those of `curve_rows`: feedback adds to the motion."""
-TOUCH, STILL = 3e-3, 1e-3
-"""Speeds along curves at which contacts are made, and that count as none, over the scene's."""
+STILL = 1e-3
+"""Speed along curves that counts as none, over the scene's."""
 DWELL = 3e-3
 """How long joints stand still before the next phase begins [s]."""
-ARRIVAL = 3e-3
-"""Time in which the rest of the way is run through at the end, a motion that fades away [s]."""
-CRAWLS = 0.02
-"""Part of the plan's b below which a motion with a reserve is none."""
 CLOSING = 0.02
 """Time in which held torques are to close a contact [s]."""
 MOST = 0.5
 """Largest acceleration of the integral, over the scene's."""
-
-
-class Piece(NamedTuple):
-    """A phase along a curve.
-
-    Its rows, the reference's b at their places, and the least part of the reserve that it keeps.
-    """
-
-    curve: Curve
-    rows: Rows
-    b: Array
-    share: float
-    passes: bool
 
 
 def make_policy(
@@ -115,13 +86,15 @@ def make_policy(
     if reserve and planner is not None:
         plan = replan(planner, problem, blocks, curves, plan)
     pieces = [
-        _trace(problem, own[0], plan, reserve) if curve else None
+        trace_piece(problem, own[0], plan, reserve) if curve else None
         for own, curve in zip(blocks, curves, strict=True)
     ]
     tables, about = list[dict[str, Array]](), list[dict[str, Any]]()
     for own, piece, after in zip(blocks, pieces, [*pieces[1:], None], strict=True):
         lasts = {phase.number: float(np.diff(starts)[phase.index]) for phase in own}
-        found = [{"number": k, "plan": t, "duration": t, "share": 0.0} for k, t in lasts.items()]
+        found: list[dict[str, Any]] = [
+            {"number": k, "plan": t, "duration": t, "share": 0.0} for k, t in lasts.items()
+        ]
         if piece is None:
             tables.append(_follow_motion(problem, own, plan, period))
             ends = [*tables[-1]["starts"], tables[-1]["step"][0] * (len(tables[-1]["theta"]) - 1)]
@@ -129,7 +102,7 @@ def make_policy(
                 one["duration"] = span
         else:
             tables.append(_tabulate(piece, _end(problem, own[0], plan, piece, after)))
-            found[0].update(duration=_time(piece), share=piece.share)
+            found[0].update(duration=_time(piece), share=piece.share, reserves=piece.reserves)
         found[-1]["duration"] += DWELL + delay
         about += found
     whole = sum(own["duration"] for own in about)
@@ -215,53 +188,3 @@ def _tabulate(piece: Piece, push: Array) -> dict[str, Array]:
         "push": push,
         "passes": np.array([float(piece.passes)]),
     }
-
-
-def _trace(problem: Problem, phase: Phase, plan: Trajectory, reserve: float) -> Piece:
-    """A phase's curve, with the motion that keeps a reserve."""
-    own = np.flatnonzero((plan.phase == phase.index) & ~plan.held)
-    curve = trace_phase(phase, plan.z[own[0]], problem.phases[phase.index + 1 :])
-    places, *values = _follow(curve, plan, own)
-    s = _place_nodes(curve)
-    a, b, squeeze = (np.interp(s, places, value) for value in values)
-    if phase.end is not End.IMPACT:
-        touch = TOUCH * problem.scene.scales.speed
-        b = np.minimum(b, (touch + (curve.length - s) / ARRIVAL) ** 2)
-    rows = make_rows(curve, s, (a, b, squeeze))
-    wanted = reserve * rows.unit
-    wanted[:, rows.presses :] = AUTHORITY * rows.unit[:, rows.presses :]
-    motion = retime(s, rows.slack, wanted, b)
-    share = float(motion.share.min())
-    if share == 0 or (motion.b[1:-1] < CRAWLS * b[1:-1]).any():
-        # Where hardly anything but the plan passes, the plan is followed.
-        motion, share = motion._replace(b=b), 0.0
-    return Piece(curve, rows, motion.b, share, phase.end is End.IMPACT)
-
-
-def _follow(
-    curve: Curve, plan: Trajectory, own: NDArray[np.int64]
-) -> tuple[Array, Array, Array, Array]:
-    """Places s, a, b and squeeze of a plan's rows along a curve."""
-    formation, metric = curve.formation, metric_weights(curve.formation.scene)
-    z, grid = plan.z[own], np.linspace(0.0, curve.length, PLACES)
-    away = (z[:, None] - curve.evaluate(grid).z[None]) ** 2 @ metric
-    s = grid[away.argmin(axis=1)]
-    for _ in range(NEWTON):
-        point = curve.evaluate(s)
-        s = np.clip(s + ((z - point.z) * point.z_s) @ metric, 0.0, curve.length)
-    point = curve.evaluate(s)
-    v = (point.z_s * plan.z_dot[own]) @ metric
-    a = (point.z_s * plan.z_ddot[own]) @ metric
-    forces = inverse(formation, *point[:3], find_directions(curve, s), point.kinematics)
-    columns = [plan.contacts.index(name) for name in formation.names]
-    rolls = [columns[row] for row in formation.rolling_rows]
-    c = np.hstack([plan.c_n[own][:, columns], plan.c_t[own][:, rolls]])
-    # The other parts of the forces are orthogonal to that of the squeeze.
-    return s, a, v**2, np.asarray(np.einsum("ni,ni->n", c, forces.Cl))
-
-
-def _place_nodes(curve: Curve) -> Array:
-    """Places of a table, with all reversals."""
-    s = curve.length * (1 - np.cos(np.pi * np.linspace(0, 1, INTERVALS + 1))) / 2
-    s = np.sort(np.concatenate([s, [part.stop for part in curve.segments[:-1]]]))
-    return np.asarray(s[np.diff(s, prepend=-1.0) > 1e-7 * curve.length])

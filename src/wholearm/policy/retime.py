@@ -14,11 +14,17 @@ import numpy as np
 
 from ..common.arrays import Array
 
-LESS = 0.8
-"""Factor by which a reserve shrinks where there is no motion with it."""
+SHARES = (*(0.8**k for k in range(20)), 0.0, -0.05, -0.1, -0.2, -0.4, -0.8)
+"""Parts of the reserve that are tried, the largest first. A plan's limits hold between its own
+nodes, so that at others a little may lack."""
 SLOWEST = 0.1
-"""Least part of the plan's b that a reserve must allow: what crawls can stick."""
-TRIES = 40
+"""Least part of the plan's b of a motion with a reserve: what crawls can stick."""
+PARTS = (0.6, 0.4, 0.25, 0.1, 0.0)
+"""Parts of the reserve that all places are limited to, where some place has less."""
+NEAR, ENOUGH = 0.8, 0.4
+"""Part of such a limit, and of the reserve, from which on the place with least is near enough."""
+SPACE = 1e-9
+"""Part of the plan's b by which limits of b may cross, from rounding."""
 
 
 class Profile(NamedTuple):
@@ -29,7 +35,7 @@ class Profile(NamedTuple):
 
 
 def retime(s: Array, slack: Array, reserve: Array, cap: Array) -> Profile:
-    """Find the motion.
+    """Find the motion whose least part of the reserve is largest, as far as it makes a difference.
 
     Parameters
     ----------
@@ -42,31 +48,51 @@ def retime(s: Array, slack: Array, reserve: Array, cap: Array) -> Profile:
     cap : ndarray, shape (n,), [m^2/s^2]
         Largest b; the motion begins with the first one, or less, and ends with the last one.
     """
+    best: Profile | None = None
+    for part in (1.0, *PARTS):
+        # What one place keeps can be what another one lacks.
+        found = _pass(s, slack, reserve, cap, part)
+        if best is None or found.share.min() > best.share.min():
+            best = found
+        if best.share.min() >= min(NEAR * part, ENOUGH):
+            break
+    assert best is not None
+    return best
+
+
+def _pass(s: Array, slack: Array, reserve: Array, cap: Array, part: float) -> Profile:
+    """The motion with as much of a part of the reserve as there can be on each interval."""
     steps, count = np.diff(s), len(s)
-    most, share = np.empty(count), np.ones(count - 1)
-    most[-1] = cap[-1]
+    least, most = SLOWEST * cap, cap.copy()
+    least[-1] = cap[-1]
+    shares = [part, *(own for own in SHARES if own < part)]
+    share = np.empty(count - 1)
     bounds: list[Array] = []
     for k in range(count - 2, -1, -1):
-        for _ in range(TRIES):
-            ends = slice(k, k + 2)
-            rows = _bound(slack[ends], share[k] * reserve[ends], steps[k], cap[ends])
-            rows = np.vstack([rows, [most[k + 1], -1.0, -2 * steps[k]]])
-            b = _find_largest(rows)
-            if b >= SLOWEST * cap[k]:
-                break
-            share[k] *= LESS
-        if b < 0:
-            # Nothing but the plan itself passes here.
-            rows, b, share[k] = rows[-1:], cap[k], 0.0
+        ends, twice = slice(k, k + 2), 2 * steps[k]
+        after = np.array([[most[k + 1], -1.0, -twice], [-least[k + 1], 1.0, twice]])
+        # Nothing but the plan itself may pass here.
+        rows, low, high, share[k] = after, least[k], cap[k], shares[-1]
+        first, last = 0, len(shares)
+        while first < last:
+            own = first if first == 0 else (first + last) // 2
+            tried = _bound(slack[ends], shares[own] * reserve[ends], steps[k], cap[ends])
+            tried = np.vstack([tried, after])
+            slowest, fastest = find_range(tried)
+            slowest, fastest = max(slowest, least[k]), min(fastest, most[k])
+            if slowest <= fastest + SPACE * cap[k]:
+                rows, low, high, share[k], last = tried, slowest, fastest, shares[own], own
+            else:
+                first = own + 1
         bounds.append(rows)
-        most[k] = b
-    b_here = np.empty(count)
-    b_here[0] = most[0]
+        least[k], most[k] = low, high
+    b = np.empty(count)
+    b[0] = most[0]
     for k, rows in enumerate(reversed(bounds)):
         falls = rows[:, 2] < 0
-        a = float(((rows[:, 0] + rows[:, 1] * b_here[k])[falls] / -rows[falls, 2]).min())
-        b_here[k + 1] = min(max(b_here[k] + 2 * steps[k] * a, 0.0), most[k + 1])
-    return Profile(b_here, share)
+        a = float(((rows[:, 0] + rows[:, 1] * b[k])[falls] / -rows[falls, 2]).min())
+        b[k + 1] = min(max(b[k] + 2 * steps[k] * a, least[k + 1]), most[k + 1])
+    return Profile(b, share)
 
 
 def eliminate(rows: Array) -> Array:
@@ -76,7 +102,7 @@ def eliminate(rows: Array) -> Array:
     """
     last = rows[:, -1]
     up, down = np.flatnonzero(last > 0), np.flatnonzero(last < 0)
-    first, second = (index.ravel() for index in np.meshgrid(up, down))
+    first, second = np.tile(up, len(down)), np.repeat(down, len(up))
     share = (-last[second] / (last[first] - last[second]))[:, None]
     mixed = share * rows[first, :-1] + (1 - share) * rows[second, :-1]
     return np.vstack([mixed, rows[last == 0, :-1]])
@@ -95,10 +121,10 @@ def _bound(slack: Array, reserve: Array, step: float, cap: Array) -> Array:
     return np.vstack(found)
 
 
-def _find_largest(rows: Array) -> float:
-    """Largest b with rows (1, b, a) >= 0 for some a, -1 if there is none."""
+def find_range(rows: Array) -> tuple[float, float]:
+    """Least and largest b >= 0 with rows (1, b, a) >= 0 for some a; the least is larger if none."""
     size = np.abs(rows).max(axis=1, keepdims=True)
     fixed, slope = eliminate(rows / np.where(size > 0, size, 1.0)).T
-    low = (-fixed[slope > 0] / slope[slope > 0]).max(initial=0.0)
-    high = (-fixed[slope < 0] / slope[slope < 0]).min(initial=np.inf)
-    return float(high) if high >= low and not (fixed[slope == 0] < 0).any() else -1.0
+    low = float((-fixed[slope > 0] / slope[slope > 0]).max(initial=0.0))
+    high = float((-fixed[slope < 0] / slope[slope < 0]).min(initial=np.inf))
+    return (low, high) if not (fixed[slope == 0] < 0).any() else (1.0, -1.0)
