@@ -14,9 +14,12 @@ def add_policy(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("plan", help="trajectory file (.npz)")
     text = "policy to write (.npz; default: NAME_policy.npz)"
     parser.add_argument("-o", "--output", metavar="FILE", help=text)
-    text = "normal force that is kept in reserve along the way, over what usual errors of masses, "
+    text = (
+        "normal force that is kept in reserve along the way: where plan or problem have ranges of "
+    )
+    text += "numbers, for so many times these (1); otherwise over what usual errors of masses, "
     text += "friction and torques take away (2.5); 0 is as fast as the plan"
-    parser.add_argument("--reserve", type=float, default=2.5, help=text)
+    parser.add_argument("--reserve", type=float, help=text)
     text = "of the control loop [s] (1e-3)"
     parser.add_argument("--period", type=float, default=1e-3, help=text)
     text = "time from measuring to when torques take effect [s] (5e-4)"

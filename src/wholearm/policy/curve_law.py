@@ -43,6 +43,11 @@ THERE = 1e-3
 SHORT = 4.0
 """How many times as long the joints have to stand still short of that."""
 
+CATCH = 10.0
+"""Way in which the reference's place becomes the motion's, over how far off the start is."""
+SAME = 1e-12
+"""Difference of levels that is none."""
+
 
 class Pace(NamedTuple):
     """What the laws of all phases have in common.
@@ -126,6 +131,7 @@ class CurveLaw:
         self.over = self.pushes = False
         self.sum = self.a = self.ran = self.rested = 0.0
         self.s, self.v, self.level = self.nodes[self.j], 0.0, 0.0
+        self.off, self.fresh = 0.0, not at_end
 
     def step(
         self, theta: Sequence[float], rates: Sequence[float], forces: Mapping[str, float] | None
@@ -135,6 +141,8 @@ class CurveLaw:
         pace, s, v, j = self.pace, self.s, self.v, self.j
         if self.pushes:
             return self._press()
+        if self.fresh:
+            self.fresh, self.off = False, s
         self.ran += pace.period
         half = 0.5 * pace.period
         lead = pace.delay + half
@@ -146,12 +154,15 @@ class CurveLaw:
         if (s >= self.length and v < 3.0 * pace.touch) or (slow and s > (1.0 - LAST) * self.length):
             self.pushes = True
             return self._press()
-        j, share = self._locate(j, s)
-        b = self.b[j] + share * (self.b[j + 1] - self.b[j])
+        # The reference begins where the motion does.
+        off = self.off
+        place = s - off * max(1.0 - (s - off) / (CATCH * abs(off)), 0.0) if off else s
+        b = self._look(j, place)
         wanted = max(sqrt(b) if b > 0.0 else 0.0, pace.touch)
         error = wanted - v
         way = half * max(v, pace.touch)
-        planned = (self._look(j, s + way) - self._look(j, s - way)) / (4.0 * way)
+        planned = (self._look(j, place + way) - self._look(j, place - way)) / (4.0 * way)
+        j, share = self._locate(j, s)
         if planned < 0.0 and v < SLOW * wanted:
             planned = 0.0
         self.sum = min(max(self.sum + self.memory * error, -pace.most), pace.most)
@@ -265,21 +276,32 @@ def choose_squeeze(
     """The largest least level of limits base + rates a + press squeeze, and its squeeze.
 
     Of two limits that the squeeze moves to and fro, no squeeze has a larger least level than where
-    they meet; the least of all these levels is reached by all limits.
+    they meet. The limit that is least there takes the place of one of them, until it is one.
     """
-    ups, downs, least = [], [], 1e30
-    for p, rate, q in zip(base, rates, press, strict=True):
-        p += rate * a
-        if q > 0.0:
-            ups.append((p, q))
-        elif q < 0.0:
-            downs.append((p, q))
-        elif p < least:
-            least = p
-    squeeze = 0.0
-    for p, q in ups:
-        for u, w in downs:
-            level = (u * q - p * w) / (q - w)
-            if level < least:
-                least, squeeze = level, (u - p) / (q - w)
-    return least, squeeze
+    lines = [(p + rate * a, q) for p, rate, q in zip(base, rates, press, strict=True)]
+    ups, downs = [own for own in lines if own[1] > 0.0], [own for own in lines if own[1] < 0.0]
+    flat = min([p for p, q in lines if q == 0.0], default=1e30)
+    if not ups or not downs:
+        return flat, 0.0
+    # Begun with those that meet where the squeeze is what it would be without either.
+    (p, q), (u, w) = min(ups), min(downs)
+    level, squeeze = 1e30, 0.0
+    while True:
+        meets = (u * q - p * w) / (q - w)
+        if meets >= level:
+            break
+        level, squeeze = meets, (u - p) / (q - w)
+        least = level
+        for c, d in lines:
+            value = c + d * squeeze
+            if value < least:
+                least, last = value, (c, d)
+        if least > level - SAME * (1.0 + abs(level)):
+            break
+        if last[1] > 0.0:
+            p, q = last
+        elif last[1] < 0.0:
+            u, w = last
+        else:
+            break
+    return min(level, flat), squeeze

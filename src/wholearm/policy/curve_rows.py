@@ -17,10 +17,14 @@ from ..contacts.formation import Formation
 from ..geometry.curve import Curve, CurvePoint
 from ..mechanics.dynamics import Directions, PathForces, inverse
 from ..mechanics.limits import CONE, PRESS, LimitSet, make_limits
-from ..scene.model import Friction, Scene
+from ..problem.uncertainty import change_scene
+from ..scene.model import Scene
+from .corners import respond
 from .curve_law import choose_squeeze
 
-DOUBTS = {"mass": 0.05, "inertia": 0.05, "palm": 0.1, "finger1": 0.1, "finger2": 0.1}
+DOUBTS = {"mass": 0.05, "inertia": 0.05} | {
+    f"friction_{part}": 0.1 for part in ("palm", "finger1", "finger2")
+}
 """By how much numbers of a scene may be off, relative: what a reserve of normal force is for."""
 GAIN = 0.01
 """By how much each torque may be off, relative."""
@@ -50,6 +54,10 @@ class Rows(NamedTuple):
         What is in reserve at level 1.
     presses : int
         How many of the m are of forces.
+    ends : ndarray, shape (k, n_c, 5), [N]
+        Normal forces at the last place, in each corner of ranges if they are known.
+    scenes : tuple of Scene
+        The scenes of these corners.
     """
 
     s: Array
@@ -57,6 +65,8 @@ class Rows(NamedTuple):
     slack: Array
     unit: Array
     presses: int
+    ends: Array
+    scenes: tuple[Scene, ...]
 
     @property
     def levels(self) -> Array:
@@ -67,7 +77,7 @@ class Rows(NamedTuple):
 def make_rows(curve: Curve, s: Array, motion: tuple[Array, Array, Array]) -> Rows:
     """Rows at places of a curve, with reserves for a motion (a, b, lambda) there."""
     formation, point, speed = curve.formation, curve.evaluate(s), np.sqrt(motion[1])
-    mean, *sides = _turn(curve, s, speed * NEAR)
+    mean, *sides = turn(curve, s, speed * NEAR)
     forces = inverse(formation, *point[:3], mean, point.kinematics)
     torque = np.stack([forces.T0, forces.Tb, forces.Tv, forces.Ta, forces.Tl], axis=2)
     late = curve.evaluate(np.clip(s - LATE * speed, 0.0, curve.length))
@@ -76,7 +86,7 @@ def make_rows(curve: Curve, s: Array, motion: tuple[Array, Array, Array]) -> Row
     limits = make_limits(formation, 0.0).only(PRESS, CONE)
     slack, unit = [], []
     for side in sides:
-        own = _respond(inverse(formation, *point[:3], side, point.kinematics), torque)
+        own = respond(inverse(formation, *point[:3], side, point.kinematics), torque)[0]
         slack.append(np.einsum("mi,nij->nmj", limits.columns[0], own))
         doubt = _doubt(formation, point, side, limits, speed, (tau, delayed))
         unit.append(LEAST * limits.scales + doubt)
@@ -88,7 +98,18 @@ def make_rows(curve: Curve, s: Array, motion: tuple[Array, Array, Array]) -> Row
     slack.append(left)
     unit.append(np.tile(SPARE * most, (len(s), 1)))
     count = 2 * len(limits.low)
-    return Rows(s, torque, np.concatenate(slack, axis=1), np.concatenate(unit, axis=1), count)
+    ends, scenes = slack[0][-1:, : formation.n_contacts], (formation.scene,)
+    table = np.concatenate(slack, axis=1)
+    return Rows(s, torque, table, np.concatenate(unit, axis=1), count, ends, scenes)
+
+
+def leave_one(levels: Array) -> Array:
+    """Levels of intervals, (n, 2, m, 5), of which those that are there twice count once."""
+    found = levels.copy()
+    for k in range(1, levels.shape[2]):
+        twice = (found[:, :, :k] == levels[:, :, k : k + 1]).all(axis=(1, 3)).any(axis=1)
+        found[twice, :, k] = np.array([NEVER, 0.0, 0.0, 0.0, 0.0])
+    return found
 
 
 def find_squeeze(rows: Rows, a: Array, b: Array) -> Array:
@@ -114,7 +135,7 @@ def find_directions(curve: Curve, s: Array) -> Directions:
     return Directions(np.array([part.Xi for part in own]), np.array([part.sigma for part in own]))
 
 
-def _turn(curve: Curve, s: Array, width: Array) -> list[Directions]:
+def turn(curve: Curve, s: Array, width: Array) -> list[Directions]:
     """Directions halfway through each reversal, before it and after it.
 
     They differ within a width of each reversal, shape (n,) [m].
@@ -128,17 +149,6 @@ def _turn(curve: Curve, s: Array, width: Array) -> list[Directions]:
             own[0] += part * (after.Xi - before.Xi)
             own[1] += part * (after.sigma - before.sigma)
     return [Directions(*own) for own in found]
-
-
-def _respond(forces: PathForces, torque: Array) -> Array:
-    """Contact forces that torques, (n, 2, 5), lead to where these forces hold, (n, n_c + R, 5)."""
-    lacking = torque.copy()
-    lacking[:, :, :3] -= np.stack([forces.T0, forces.Tb, forces.Tv], axis=2)
-    of_c = np.stack([forces.Ca, forces.Cl], axis=2)
-    found = of_c @ np.linalg.solve(np.stack([forces.Ta, forces.Tl], axis=2), lacking)
-    found[:, :, 0] += forces.C0
-    found[:, :, 1] += forces.Cb
-    return np.asarray(found)
 
 
 def _doubt(
@@ -162,22 +172,14 @@ def _doubt(
     def measure(forces: PathForces, tau: Array) -> Array:
         held = np.zeros((*tau.shape, 5))
         held[:, :, 0] = tau
-        c = np.einsum("nij,nj->ni", _respond(forces, held)[:, :, :3], known)
+        c = np.einsum("nij,nj->ni", respond(forces, held)[0][:, :, :3], known)
         return np.asarray(c @ limits.columns[0].T)
 
     own = find(formation.scene)
-    cases = [(find(_change(formation.scene, name, width)), tau) for name, width in DOUBTS.items()]
+    cases = [
+        (find(change_scene(formation.scene, {name: width})), tau) for name, width in DOUBTS.items()
+    ]
     cases += [(own, tau * (1 + GAIN * np.eye(2)[k])) for k in range(2)]
     cases.append((own, delayed))
     plain = measure(own, tau)
     return np.asarray(np.sqrt(np.sum([(measure(*case) - plain) ** 2 for case in cases], axis=0)))
-
-
-def _change(scene: Scene, name: str, width: float) -> Scene:
-    """A scene with one number larger by a part of it."""
-    if name in ("mass", "inertia"):
-        body = scene.polygon
-        return replace(scene, polygon=replace(body, **{name: getattr(body, name) * (1 + width)}))
-    mu = {part: getattr(scene.friction, part) for part in ("palm", "finger1", "finger2")}
-    mu[name] *= 1 + width
-    return replace(scene, friction=Friction(**mu))

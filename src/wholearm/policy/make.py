@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,16 +14,20 @@ from ..contacts.formation import Formation
 from ..geometry.tracing import runs_on_curve
 from ..mechanics.arrival import Standstill, find_hold
 from ..problem.definition import End, Phase, Problem
+from ..problem.uncertainty import read_widths
 from ..results.trajectory import Trajectory
 from .curve_law import Pace
+from .curve_rows import leave_one
 from .policy import Policy
 from .push import find_push, find_still
-from .reference import TOUCH, Piece, trace_piece
+from .reference import TOUCH, Piece, Reserve, trace_piece
 from .regulator import follow
 from .replan import Planner, replan
 
 STILL = 1e-3
 """Speed along curves that counts as none, over the scene's."""
+USUAL = 2.5
+"""Reserve of normal forces where no ranges are known, in those of `curve_rows`."""
 DWELL = 3e-3
 """How long joints stand still before the next phase begins [s]."""
 CLOSING = 0.02
@@ -36,7 +40,7 @@ def make_policy(
     problem: Problem,
     plan: Trajectory,
     *,
-    reserve: float = 2.5,
+    reserve: float | None = None,
     period: float = 1e-3,
     delay: float = 5e-4,
     torque_limit: float | None = None,
@@ -48,10 +52,12 @@ def make_policy(
     ----------
     problem : Problem
     plan : Trajectory
-    reserve : float
-        How much normal force is kept in reserve along the way, over what numbers that are 5 %
-        (masses), 10 % (friction) and 1 % (torques) off take away, one by one and summed as squares.
-        Where the plan leaves less, the motion is slower; with 0 it is the plan's.
+    reserve : float, optional
+        How much normal force is kept in reserve along the way. Where the plan was made for ranges
+        of numbers, or the problem has them: for so many times these ranges (1). Otherwise in what
+        numbers that are 5 % (masses), 10 % (friction) and 1 % (torques) off take away, one by one
+        and summed as squares (2.5). Where the plan leaves less, the motion is slower; with 0 it is
+        the plan's.
     period : float, [s]
         Of the control loop.
     delay : float, [s]
@@ -68,6 +74,8 @@ def make_policy(
     InputError
         If a number is out of its range, or the plan is of another problem.
     """
+    ranges = _find_ranges(problem, plan)
+    reserve = (USUAL if ranges is None else 1.0) if reserve is None else reserve
     reserve = require_number(reserve, "reserve", nonnegative=True)
     period = require_number(period, "period", positive=True)
     delay = require_number(delay, "delay", nonnegative=True)
@@ -86,7 +94,7 @@ def make_policy(
     if reserve and planner is not None:
         plan = replan(planner, problem, blocks, curves, plan)
     pieces = [
-        trace_piece(problem, own[0], plan, reserve) if curve else None
+        trace_piece(problem, own[0], plan, Reserve(reserve, ranges, delay)) if curve else None
         for own, curve in zip(blocks, curves, strict=True)
     ]
     tables, about = list[dict[str, Array]](), list[dict[str, Any]]()
@@ -178,13 +186,21 @@ def _time(piece: Piece) -> float:
 
 def _tabulate(piece: Piece, push: Array) -> dict[str, Array]:
     """Arrays of `CurveLaw`."""
-    rows = piece.rows
+    rows, levels = piece.rows, piece.rows.levels
     return {
         "s": rows.s,
         "theta": piece.curve.evaluate(rows.s).z[:, 3:],
         "b": piece.b,
-        "levels": np.stack([rows.levels[:-1], rows.levels[1:]], axis=1),
+        "levels": leave_one(np.stack([levels[:-1], levels[1:]], axis=1)),
         "torque": np.stack([rows.torque[:-1], rows.torque[1:]], axis=1),
         "push": push,
         "passes": np.array([float(piece.passes)]),
     }
+
+
+def _find_ranges(problem: Problem, plan: Trajectory) -> Mapping[str, float] | None:
+    """Half widths that the plan was made for, or those of the problem; None if there are none."""
+    figures = plan.meta.get("ranges")
+    if figures:
+        return dict(figures["radii"])
+    return None if problem.uncertainty is None else read_widths(problem.uncertainty)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..common.arrays import Array
@@ -45,14 +47,15 @@ def find_push(curve: Curve, gained: Contact, rows: Rows, after: Rows | None) -> 
     after : Rows, optional
         Along the next one.
     """
-    from scipy.optimize import linprog
-
     formation, scene = curve.formation, curve.formation.scene
     both = Formation(scene, (*formation.contacts, gained), formation.rolling)
     if both.n_constraints != 5:
         return None
     try:
         balances = [_balance(curve, both, part) for part in FRICTION]
+        balances += [
+            _balance(curve, replace(both, scene=own), 1.0) for own in rows.scenes if own != scene
+        ]
     except np.linalg.LinAlgError:
         return None
     count, unit = both.n_contacts, scene.scales.acceleration
@@ -60,24 +63,38 @@ def find_push(curve: Curve, gained: Contact, rows: Rows, after: Rows | None) -> 
     reserves = np.append(reserves, reserves.max())
     # Rows of (1, tau, level) >= 0: forces with all contacts, a without the gained one, forces then.
     to_motion = _invert(rows.torque[-1])
-    forces = rows.slack[-1, : formation.n_contacts]
+    forces = rows.ends.reshape(-1, 5)
     open_forces = forces[:, 3:] @ to_motion
     open_forces[:, 0] += forces[:, 0]
+    open_reserves = np.tile(reserves[:-1], len(rows.ends))
     found = [
         *(np.column_stack([own[:count], -reserves]) for own in balances),
         np.append(to_motion[0] - [DRIVE * unit, 0.0, 0.0], 0.0)[None],
-        np.column_stack([open_forces, -reserves[:-1]]),
+        np.column_stack([open_forces, -open_reserves]),
     ]
+    # Where no torques do all of it, the next motion may be in the way.
+    tables = [found]
     if after is not None:
-        found.append(np.append(-_invert(after.torque[0])[0], -BRAKE * unit)[None])
+        tables.insert(0, [*found, np.append(-_invert(after.torque[0])[0], -BRAKE * unit)[None]])
+    for own in tables:
+        tau = _find_best(np.vstack(own), scene.torque_limit)
+        if tau is not None:
+            return tau
+    return None
+
+
+def _find_best(rows: Array, limit: Array) -> Array | None:
+    """Torques with the largest level, and least effort among them; rows (1, tau, level) >= 0."""
+    from scipy.optimize import linprog
+
     # Effort, the largest torque over its limit, decides among equally good ones.
-    limit = FULL * scene.torque_limit
-    table = np.pad(np.vstack(found), ((0, 0), (0, 1)))
+    most = FULL * limit
+    table = np.pad(rows, ((0, 0), (0, 1)))
     efforts = np.zeros((4, 5))
-    efforts[:, 1:3] = np.vstack([np.diag(1 / limit), np.diag(-1 / limit)])
+    efforts[:, 1:3] = np.vstack([np.diag(1 / most), np.diag(-1 / most)])
     efforts[:, 4] = 1.0
     table = np.vstack([table, efforts])
-    bounds = [*((-most, most) for most in limit), (LEAST, ENOUGH), (0.0, 1.0)]
+    bounds = [*((-own, own) for own in most), (LEAST, ENOUGH), (0.0, 1.0)]
     answer = linprog([0, 0, -1, 1], A_ub=-table[:, 1:], b_ub=table[:, 0], bounds=bounds)
     return np.asarray(answer.x[:2]) if answer.status == 0 else None
 

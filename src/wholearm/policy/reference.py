@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -11,11 +12,13 @@ from ..common.arrays import Array
 from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phase
 from ..mechanics.dynamics import inverse
+from ..mechanics.limits import CONE, PRESS, make_limits
 from ..mechanics.metric import metric_weights
 from ..problem.definition import End, Phase, Problem
 from ..results.trajectory import Trajectory
 from .curve_rows import Rows, find_directions, find_squeeze, make_rows, measure_levels
 from .retime import ENOUGH, retime
+from .within import retime_within
 
 INTERVALS = 120
 """Intervals of a curve's table, dense at its ends."""
@@ -50,7 +53,15 @@ class Piece(NamedTuple):
     passes: bool
 
 
-def trace_piece(problem: Problem, phase: Phase, plan: Trajectory, reserve: float) -> Piece:
+class Reserve(NamedTuple):
+    """What is kept in reserve: as `make_policy` says, for torques that are late as it knows [s]."""
+
+    size: float
+    ranges: Mapping[str, float] | None
+    delay: float
+
+
+def trace_piece(problem: Problem, phase: Phase, plan: Trajectory, reserve: Reserve) -> Piece:
     """A phase's curve, with the motion that keeps a reserve, or most of it if none keeps enough."""
     own = np.flatnonzero((plan.phase == phase.index) & ~plan.held)
     curve = trace_phase(phase, plan.z[own[0]], problem.phases[phase.index + 1 :])
@@ -60,13 +71,20 @@ def trace_piece(problem: Problem, phase: Phase, plan: Trajectory, reserve: float
     if phase.end is not End.IMPACT:
         touch = TOUCH * problem.scene.scales.speed
         b = np.minimum(b, (touch + (curve.length - s) / ARRIVAL) ** 2)
+    passes = phase.end is End.IMPACT
+    if reserve.ranges is not None and reserve.size:
+        widths = {name: reserve.size * width for name, width in reserve.ranges.items()}
+        widths["delay"] = max(widths.get("delay", 0.0) - reserve.delay, 0.0)
+        within, share = retime_within(curve, s, (a, b, squeeze), widths, problem.epsilon)
+        if within is not None:
+            return Piece(curve, *within, share, _list_reserves(curve, *within), passes)
     best: tuple[float, Rows, Array] | None = None
     for part in SLOWER:
         motion = part * a, part * b
         rows = make_rows(curve, s, (*motion, squeeze))
         for _ in range(REFINE if part < 1.0 else 0):
             rows = make_rows(curve, s, (*motion, find_squeeze(rows, *motion)))
-        wanted = reserve * rows.unit
+        wanted = reserve.size * rows.unit
         wanted[:, rows.presses :] = AUTHORITY * rows.unit[:, rows.presses :]
         found = retime(s, rows.slack, wanted, motion[1])
         share = float(found.share.min())
@@ -77,15 +95,17 @@ def trace_piece(problem: Problem, phase: Phase, plan: Trajectory, reserve: float
             break
     assert best is not None
     share, rows, b = best
-    return Piece(curve, rows, b, share, _list_reserves(curve, rows, b), phase.end is End.IMPACT)
+    return Piece(curve, rows, b, share, _list_reserves(curve, rows, b), passes)
 
 
 def _list_reserves(curve: Curve, rows: Rows, b: Array) -> dict[str, float]:
     """Least level of each contact's normal force along a motion."""
     a = np.diff(b) / (2 * np.diff(rows.s))
     a = np.append(a, a[-1])
-    names, half = curve.formation.names, rows.presses // 2
-    least = measure_levels(rows, a, b)[:, : rows.presses].min(axis=0).reshape(2, half).min(axis=0)
+    names = curve.formation.names
+    count = len(make_limits(curve.formation, 0.0).of(PRESS, CONE))
+    levels = measure_levels(rows, a, b)[:, : rows.presses]
+    least = levels.min(axis=0).reshape(-1, count).min(axis=0)
     return dict(zip(names, least[: len(names)].tolist(), strict=True))
 
 

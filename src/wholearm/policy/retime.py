@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.arrays import Array
+from .curve_rows import NEVER
 
 SHARES = (*(0.8**k for k in range(20)), 0.0, -0.05, -0.1, -0.2, -0.4, -0.8)
 """Parts of the reserve that are tried, the largest first. A plan's limits hold between its own
@@ -25,6 +26,11 @@ NEAR, ENOUGH = 0.8, 0.4
 """Part of such a limit, and of the reserve, from which on the place with least is near enough."""
 SPACE = 1e-9
 """Part of the plan's b by which limits of b may cross, from rounding."""
+
+ROUNDING = 1e-12
+"""Part of its terms that is nothing in a difference."""
+HUGE = 1e12
+"""Larger than any b."""
 
 
 class Profile(NamedTuple):
@@ -115,6 +121,7 @@ def _bound(slack: Array, reserve: Array, step: float, cap: Array) -> Array:
         own = slack[end].copy()
         # Drag at the plan's speed: it is small, and no motion is faster.
         own[:, 0] += own[:, 2] * np.sqrt(cap[end]) - reserve[end]
+        own = np.unique(own[own[:, 0] < NEVER / 2], axis=0)
         rows = eliminate(own[:, [0, 1, 3, 4]])
         rows[:, 2] += end * 2 * step * rows[:, 1]
         found.append(rows)
@@ -122,9 +129,34 @@ def _bound(slack: Array, reserve: Array, step: float, cap: Array) -> Array:
 
 
 def find_range(rows: Array) -> tuple[float, float]:
-    """Least and largest b >= 0 with rows (1, b, a) >= 0 for some a; the least is larger if none."""
+    """Least and largest b >= 0 with rows (1, b, a) >= 0 for some a; the least is larger if none.
+
+    Rows bound a from below and from above. The room between is concave in b, so that Newton's
+    method from outside ends where it begins.
+    """
     size = np.abs(rows).max(axis=1, keepdims=True)
-    fixed, slope = eliminate(rows / np.where(size > 0, size, 1.0)).T
-    low = float((-fixed[slope > 0] / slope[slope > 0]).max(initial=0.0))
-    high = float((-fixed[slope < 0] / slope[slope < 0]).min(initial=np.inf))
-    return (low, high) if not (fixed[slope == 0] < 0).any() else (1.0, -1.0)
+    fixed, slope, rate = (rows / np.where(size > 0, size, 1.0)).T
+    flat, up, down = rate == 0, rate > 0, rate < 0
+    if (fixed[flat & (slope == 0)] < 0).any():
+        return 1.0, -1.0
+    rises, falls = flat & (slope > 0), flat & (slope < 0)
+    low = float((-fixed[rises] / slope[rises]).max(initial=0.0))
+    high = float((-fixed[falls] / slope[falls]).min(initial=np.inf))
+    if not up.any() or not down.any() or low > high:
+        return low, high
+    floors, roofs = (np.column_stack([fixed, slope])[own] / -rate[own, None] for own in (up, down))
+
+    def close(b: float, sign: float) -> float | None:
+        for _ in range(len(rows)):
+            room = roofs[(roofs @ [1.0, b]).argmin()] - floors[(floors @ [1.0, b]).argmax()]
+            if room[0] + room[1] * b >= -ROUNDING * np.abs(room * [1.0, b]).max():
+                return b
+            if room[1] * sign >= 0:
+                return None
+            b = float(-room[0] / room[1])
+        return b
+
+    ends = close(low, -1.0), close(min(high, HUGE), 1.0)
+    if ends[0] is None or ends[1] is None:
+        return 1.0, -1.0
+    return max(ends[0], low), min(ends[1], high)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from ..common.errors import InputError
 from ..common.require import require_number
+from ..scene.model import Friction, Scene
 
 
 @dataclass(frozen=True)
@@ -100,3 +103,43 @@ def spread_widths(given: Mapping[str, object], label: str) -> dict[str, float]:
 
 def _list_names(key: str) -> tuple[str, ...]:
     return GROUPS.get(key, (key,))
+
+
+def change_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:
+    """A scene whose numbers are off.
+
+    Parameters
+    ----------
+    scene : Scene
+    changes : mapping of str to float
+        By name of the parameter: relative, or in the parameter's unit. Those of torques and of the
+        start do nothing here.
+
+    Raises
+    ------
+    InputError
+        If a number makes no sense any more.
+    """
+
+    def change(name: str) -> float:
+        return changes.get(name, 0.0)
+
+    body = scene.polygon
+    assert body.inertia is not None
+    mass, inertia = body.mass * (1 + change("mass")), body.inertia * (1 + change("inertia"))
+    first, second = (
+        replace(
+            finger,
+            length=finger.length + change(f"length{number}"),
+            base=np.asarray(finger.base) + [change(f"base{number}_{axis}") for axis in "xy"],
+        )
+        for number, finger in enumerate(scene.fingers, start=1)
+    )
+    parts = ("palm", "finger1", "finger2")
+    mu = {part: getattr(scene.friction, part) * (1 + change(f"friction_{part}")) for part in parts}
+    return replace(
+        scene,
+        polygon=replace(body, mass=mass, inertia=inertia),
+        fingers=(first, second),
+        friction=Friction(**mu),
+    )

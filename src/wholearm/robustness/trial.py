@@ -19,7 +19,7 @@ from ..policy.policy import Policy
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
-from ..simulation.events import OutcomeKind
+from ..simulation.events import EventKind, OutcomeKind
 from .uncertainty import Uncertainty, change_problem, change_torques
 
 DISTANCE = 1e-3
@@ -191,7 +191,13 @@ class Trial:
         pause = PAUSE * self.problem.scene.scales.time
         began, losses, least = self.windows[0].start, list[tuple[float, int, str]](), math.inf
         for window in self.windows:
+            # A contact is gained when it is made, even if it bounces then.
             gains = [own.start for own in simulation.stretches if own.contact == window.gained]
+            gains += [
+                own.time
+                for own in simulation.events
+                if own.contact == window.gained and own.kind is EventKind.GAINED
+            ]
             gain = min((time for time in gains if time > began), default=math.inf)
             planned = window.stop + delay
             for name in window.contacts:

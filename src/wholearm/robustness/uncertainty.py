@@ -10,9 +10,8 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.require import require_number
 from ..problem.definition import Problem
-from ..problem.uncertainty import PARAMETERS, Parameter, read_widths
+from ..problem.uncertainty import PARAMETERS, Parameter, change_scene, read_widths
 from ..results.torque import TorqueProfile
-from ..scene.model import Friction
 
 TOLERANCE = 1e-6
 """Of the simulations of samples, if no other is given, relative to the scene."""
@@ -86,31 +85,7 @@ def change_problem(problem: Problem, changes: Mapping[str, float]) -> Problem:
     InputError
         If a number makes no sense any more.
     """
-    scene = problem.scene
-
-    def change(name: str) -> float:
-        return changes.get(name, 0.0)
-
-    body = scene.polygon
-    assert body.inertia is not None
-    mass, inertia = body.mass * (1 + change("mass")), body.inertia * (1 + change("inertia"))
-    first, second = (
-        replace(
-            finger,
-            length=finger.length + change(f"length{number}"),
-            base=np.asarray(finger.base) + [change(f"base{number}_{axis}") for axis in "xy"],
-        )
-        for number, finger in enumerate(scene.fingers, start=1)
-    )
-    parts = ("palm", "finger1", "finger2")
-    mu = {part: getattr(scene.friction, part) * (1 + change(f"friction_{part}")) for part in parts}
-    new = replace(
-        scene,
-        polygon=replace(body, mass=mass, inertia=inertia),
-        fingers=(first, second),
-        friction=Friction(**mu),
-    )
-    return replace(problem, scene=new)
+    return replace(problem, scene=change_scene(problem.scene, changes))
 
 
 def change_torques(

@@ -1,0 +1,172 @@
+"""The reference of a curve's law and its limits where the ranges of numbers are known.
+
+Limits hold in the worst corner of the ranges (`corners`) both under the torques of the motion and
+under those by which feedback makes the motion what it is to be. The worst corners depend on the
+motion, and how fast it may be depends on them: each is found from the other, a few times.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..geometry.curve import Curve
+from ..mechanics.dynamics import Directions, inverse
+from ..mechanics.limits import CONE, PRESS, make_limits
+from ..scene.model import Scene
+from .corners import Corners, Motion, find_corners, list_scenes
+from .curve_rows import LATE, LEAST, NEAR, NEVER, SPARE, Rows, find_squeeze, turn
+from .retime import retime
+
+ROUNDS = 3
+"""How many times worst corners and motion are found from one another."""
+KEPT = 1.5
+"""Reserve of forces of the reference, in units: feedback may use what is above one."""
+ENOUGH = 0.5
+"""Part of these reserves without which ranges are too wide."""
+CRAWLS = 0.02
+"""Part of the plan's b below which a motion is none."""
+LESS, TRIES = 0.85, 20
+"""Factor by which ranges shrink where they are too wide, and how often."""
+WIDEST = 0.9
+"""Largest relative range."""
+AUTHORITY = 2.0
+"""Reserve of torques, in those of `curve_rows`: feedback adds to the motion."""
+
+
+class Within(NamedTuple):
+    """Limits along a curve within ranges, at n places.
+
+    Attributes
+    ----------
+    s : ndarray, shape (n,), [m]
+    torque : ndarray, shape (n, 2, 5), [N m]
+    left : ndarray, shape (n, 4, 5), [N m]
+        How far torques are from their limits.
+    sides : tuple of Corners
+        With friction as it is before the nearest reversal and after it.
+    same : ndarray of bool, shape (n,)
+        Where these do not differ.
+    unit : ndarray, shape (m + 4,)
+        Reserves at level 1: of forces, and of torques.
+    scenes : tuple of Scene
+        In the corners of the ranges.
+    """
+
+    s: Array
+    torque: Array
+    left: Array
+    sides: tuple[Corners, Corners]
+    same: Array
+    unit: Array
+    scenes: tuple[Scene, ...]
+
+    def at(self, motion: Motion) -> tuple[Rows, Array, Array]:
+        """The law's limits near a motion; and those of a reference with their reserves."""
+        motions = self._spread(motion)
+        forces = self._pick(self.sides, motions)
+        closed = self._pick([own.close(self.left) for own in self.sides], motions)
+        count, n = len(self.unit) - 4, len(self.s)
+        slack = np.concatenate([forces, self.left], axis=1)
+        copies = forces.shape[1] // count
+        unit = np.concatenate([np.tile(self.unit[:count], copies), self.unit[count:]])
+        table, ends = np.tile(unit, (n, 1)), self.sides[0].rows[:, -1]
+        rows = Rows(self.s, self.torque, slack, table, forces.shape[1], ends, self.scenes)
+        own = np.concatenate([KEPT * self.unit[:count], AUTHORITY * self.unit[count:]])
+        wanted = np.concatenate(
+            [np.tile(own[:count], copies), own[count:], np.tile(own, len(motions) * 2)]
+        )
+        whole = np.concatenate([slack, closed], axis=1)
+        return rows, whole, np.tile(wanted, (n, 1))
+
+    def _pick(self, sides: tuple[Corners, ...] | list[Corners], motions: list[Motion]) -> Array:
+        """Limits on both sides of reversals in the corners worst for motions, (n, rows, 5)."""
+        found = [np.concatenate([side.pick(own) for own in motions], axis=1) for side in sides]
+        found[1][self.same] = np.array([NEVER, 0.0, 0.0, 0.0, 0.0])
+        return np.concatenate(found, axis=1)
+
+    def _spread(self, motion: Motion) -> list[Motion]:
+        """A motion with its squeeze, and with the least and the largest one that torques allow."""
+        a, b, squeeze = motion
+        known = np.column_stack([np.ones_like(a), b, np.sqrt(b), a])
+        base, press = np.einsum("nmq,nq->nm", self.left[..., :4], known), self.left[..., 4]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ends = -base / press
+        low = np.where(press > 0, ends, -np.inf).max(axis=1)
+        high = np.where(press < 0, ends, np.inf).min(axis=1)
+        low, high = (np.where(np.isfinite(own), own, squeeze) for own in (low, high))
+        return [motion, (a, b, np.minimum(low, squeeze)), (a, b, np.maximum(high, squeeze))]
+
+
+def find_within(
+    curve: Curve, s: Array, speed: Array, widths: Mapping[str, float], least: float
+) -> Within:
+    """Limits along a curve within ranges, with forces of at least so much [N]."""
+    formation, point = curve.formation, curve.evaluate(s)
+    mean, *sides = turn(curve, s, speed * NEAR)
+    late = s - (LATE + widths.get("delay", 0.0)) * speed
+    torques = _find_torques(curve, s, mean), _find_torques(curve, late, mean)
+    corners = [find_corners(formation, point, side, torques, widths) for side in sides]
+    most = np.tile(formation.scene.torque_limit, 2)
+    left = np.concatenate([-torques[0], torques[0]], axis=1)
+    left[:, :, 0] += most
+    same = (sides[0].Xi == sides[1].Xi).all(axis=1) & (sides[0].sigma == sides[1].sigma).all(axis=1)
+    scales = make_limits(formation, 0.0).only(PRESS, CONE).scales
+    unit = np.concatenate([np.maximum(LEAST * scales, least), SPARE * most])
+    scenes = list_scenes(formation.scene, widths)
+    return Within(s, torques[0], left, (corners[0], corners[1]), same, unit, scenes)
+
+
+def _find_torques(curve: Curve, s: Array, directions: Directions) -> Array:
+    """Torques at n places, shape (n, 2, 5)."""
+    point = curve.evaluate(np.clip(s, 0.0, curve.length))
+    own = inverse(curve.formation, *point[:3], directions, point.kinematics)
+    return np.stack([own.T0, own.Tb, own.Tv, own.Ta, own.Tl], axis=2)
+
+
+def retime_within(
+    curve: Curve, s: Array, plan: Motion, widths: Mapping[str, float], least: float
+) -> tuple[tuple[Rows, Array] | None, float]:
+    """The fastest motion that keeps its limits within ranges, or as large a part of them as can be.
+
+    Parameters
+    ----------
+    curve : Curve
+    s : ndarray, shape (n,), [m]
+        Nodes.
+    plan : tuple of ndarray, shape (n,)
+        a, b and squeeze of a plan there; no motion is faster.
+    widths : mapping of str to float
+        Half widths of the ranges; the delay is what torques are late by without being known to be.
+    least : float, [N]
+        Least normal force within them.
+
+    Returns
+    -------
+    tuple
+        The law's limits and b at the nodes, None if no part of the ranges has them; and that part.
+    """
+    share = 1.0
+    for _ in range(TRIES):
+        own = {name: min(share * width, WIDEST) for name, width in widths.items()}
+        found = _retime(find_within(curve, s, np.sqrt(plan[1]), own, least), plan)
+        if found is not None:
+            return found, share
+        share *= LESS
+    return None, 0.0
+
+
+def _retime(within: Within, plan: Motion) -> tuple[Rows, Array] | None:
+    """The motion within ranges, None if there is none."""
+    motion, cap = plan, plan[1]
+    for _ in range(ROUNDS):
+        rows, whole, wanted = within.at(motion)
+        found = retime(within.s, whole, wanted, cap)
+        if found.share.min() < ENOUGH or (found.b[1:-1] < CRAWLS * cap[1:-1]).any():
+            return None
+        a = np.gradient(found.b, within.s) / 2
+        motion = a, found.b, find_squeeze(rows, a, found.b)
+    return within.at(motion)[0], found.b
