@@ -22,6 +22,7 @@ from wholearm.robustness.sensitivity import measure_sensitivities
 from wholearm.robustness.study import Robustness, assess_robustness
 from wholearm.robustness.trial import Trial, Window, make_trial
 from wholearm.robustness.uncertainty import Uncertainty, change_problem
+from wholearm.simulation.events import EventKind
 
 PROBLEM = Path(__file__).parents[1] / "problems" / "heptagon_four_contacts.toml"
 NONE = dict.fromkeys(("inertia", "friction", "geometry", "start_x", "gain", "delay"), 0.0)
@@ -186,6 +187,9 @@ def follow(
         stretches=[
             SimpleNamespace(contact=name, start=start, stop=stop) for name, start, stop in stretches
         ],
+        # "c" is made at 0.45 and bounces, if it presses from 0.46 on.
+        events=[SimpleNamespace(contact="c", kind=EventKind.GAINED, time=0.45)]
+        * (("c", 0.46, 1) in stretches),
         outcome=SimpleNamespace(kind=None, text=""),
     )
     return trial.judge(simulation)
@@ -205,6 +209,8 @@ TWO = (Window(1, 0.5, ("a", "b"), "c"), Window(2, 1.0, ("b", "c"), ""))
         ([("a", 0, 0.5), ("b", 0, 1), ("c", 0.5, 1)], TWO, None),
         ([("a", 0, 0.47), ("b", 0, 1), ("c", 0.47, 1)], TWO, None),
         ([("a", 0, 0.5), ("b", 0, 1), ("c", 0.53, 1)], TWO, None),
+        ([("a", 0, 0.45), ("b", 0, 1), ("c", 0.46, 1)], TWO, None),
+        ([("a", 0, 0.44), ("b", 0, 1), ("c", 0.46, 1)], TWO, ("a", 1, 0.44)),
         ([("a", 0, 0.5), ("b", 0, 1), ("c", 0.5, 0.8)], TWO, ("c", 2, 0.8)),
         ([("a", 0, 0.5), ("b", 0, 1)], TWO, ("c", 1, 0.5)),
     ],

@@ -191,17 +191,18 @@ class Trial:
         pause = PAUSE * self.problem.scene.scales.time
         began, losses, least = self.windows[0].start, list[tuple[float, int, str]](), math.inf
         for window in self.windows:
-            # A contact is gained when it is made, even if it bounces then.
             gains = [own.start for own in simulation.stretches if own.contact == window.gained]
-            gains += [
+            gain = min((time for time in gains if time > began), default=math.inf)
+            # A phase ends when its contact is made, even if it bounces then.
+            makes = [
                 own.time
                 for own in simulation.events
                 if own.contact == window.gained and own.kind is EventKind.GAINED
             ]
-            gain = min((time for time in gains if time > began), default=math.inf)
+            made = min((time for time in makes if time > began), default=gain)
             planned = window.stop + delay
             for name in window.contacts:
-                time, force = _find_loss(simulation, name, began, min(planned, gain), pause)
+                time, force = _find_loss(simulation, name, began, min(planned, gain, made), pause)
                 least = min(least, force)
                 if time is not None:
                     losses.append((time, window.phase, name))
