@@ -16,7 +16,9 @@ MOST = 60
 
 
 class BorderBound(NamedTuple):
-    """A lower bound of what routes take that follow borders and stop where these meet.
+    """A lower bound of what routes take that follow borders.
+
+    Where these meet they stop, or go on at speed where the law of impacts lets them.
 
     Attributes
     ----------
@@ -34,20 +36,19 @@ class BorderBound(NamedTuple):
 def bound_borders(search: Search, enough: float) -> BorderBound:
     """Bound every route along borders from below, up to `enough` [s]."""
     number, settled = count(), set[Key]()
-    queue: list[tuple[float, int, Place, bool]] = [(0.0, next(number), search.start, False)]
+    queue: list[tuple[float, int, Place]] = [(0.0, next(number), search.start)]
     while queue:
-        cost, _, place, arrived = heapq.heappop(queue)
+        cost, _, place = heapq.heappop(queue)
         if cost >= enough:
             return BorderBound(enough, True)
-        if arrived or (cost > 0 and is_at(place, search.goal)):
+        if cost > 0 and is_at(place, search.goal):
             return BorderBound(cost, True)
         if place.key in settled:
             continue
         if len(settled) >= MOST:
             return BorderBound(cost, False)
         settled.add(place.key)
-        for border, link in search.chart.follow(place):
-            for own, ends in ((link, False), (search.chart.end_at(border, search.goal), True)):
-                if isinstance(own, Link):
-                    heapq.heappush(queue, (cost + own.bound, next(number), own.stop, ends))
+        for _, link in search.chart.list_along(place, search.goal):
+            if isinstance(link, Link):
+                heapq.heappush(queue, (cost + link.bound, next(number), link.stop))
     return BorderBound(enough, True)

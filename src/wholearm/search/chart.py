@@ -16,6 +16,7 @@ from ..planning.result import Plan
 from ..problem.definition import Problem, Until
 from ..problem.goal import Goal
 from .cells import Crossing, cross, go_to
+from .chains import Chain, list_chains
 from .goals import list_poses, measure_along
 from .links import (
     Blocked,
@@ -65,6 +66,7 @@ class Chart:
         self.plans: dict[object, Plan | str] = {}
         self.measured: dict[Link, Measured | str] = {}
         self._releases: dict[tuple[Key, int], Found] = {}
+        self._chains: dict[Key, list[tuple[Chain, Link | Blocked | None]]] = {}
 
     def follow(self, place: Place) -> list[tuple[Border, Link | Blocked | None]]:
         """Borders that lead on from a place, with the link along the whole of each."""
@@ -76,6 +78,30 @@ class Chart:
                 for border in (follow_borders(settled) if settled else [])
             ]
         return self._links[key]
+
+    def pass_on(self, place: Place) -> list[tuple[Chain, Link | Blocked | None]]:
+        """Borders passed one after the other from a place, with the link along each whole chain."""
+        if place.key not in self._chains:
+            borders = [border for border, _ in self.follow(place)]
+            chains = list_chains(borders, lambda there: [own for own, _ in self.follow(there)])
+            self._chains[place.key] = [
+                (chain, chain.link_whole(self.epsilon, self.least_minor)) for chain in chains
+            ]
+        return self._chains[place.key]
+
+    def list_along(self, place: Place, goal: Goal) -> Iterator[tuple[Border, Link | Blocked]]:
+        """Links along borders from a place to where these end or a goal is, with the first border.
+
+        Where borders are passed in motion, only those that a motion can take.
+        """
+        for border, link in self.follow(place):
+            for own in (link, self._end_chain(Chain((), (border,), (border.curve,)), goal)):
+                if own is not None:
+                    yield border, own
+        for chain, link in self.pass_on(place):
+            for own in (link, self._end_chain(chain, goal)):
+                if isinstance(own, Link):
+                    yield chain.borders[0], own
 
     def cross_cells(self, place: Place) -> Found:
         """Links from rest at a place through the cells around it."""
@@ -131,19 +157,16 @@ class Chart:
         stop = Place(self.scene, way.z, (*formation.contacts, way.gained), landed=True)
         return Link(start, stop, steps, spent + way.duration, 0.0, True)
 
-    def end_at(self, border: Border, goal: Goal) -> Link | Blocked | None:
-        """The link along a border to where it meets a goal; None if it does not."""
-        found = measure_along(border.curve, goal)
+    def _end_chain(self, chain: Chain, goal: Goal) -> Link | Blocked | None:
+        """The link along a chain to where its last border meets a goal; None if it does not."""
+        found = measure_along(chain.borders[-1].curve, goal)
         if found is None:
             return None
         s, until = found
-        curve = cut_curve(border.curve, s)
-        steps = (Step(border.formation.contacts, until),)
-        ahead = look_at((curve,), self.epsilon, self.least_minor)
-        if isinstance(ahead, str):
-            return Blocked(border.start, steps, ahead)
+        curve = cut_curve(chain.curves[-1], s / chain.curves[-1].speed_ratio)
         stop = make_place(self.scene, curve.end)
-        return Link(border.start, stop, steps, ahead.duration, ahead.bound)
+        last = Step(curve.formation.contacts, until)
+        return chain.link(last, curve, stop, self.epsilon, self.least_minor)
 
     def end_in_cell(self, place: Place, goal: Goal) -> Iterator[Link]:
         """Links from a place straight to a goal inside a cell around it."""

@@ -72,7 +72,7 @@ class Route:
 
     @property
     def bound(self) -> float:
-        """How long it takes at least [s], with a stop at each place."""
+        """How long it takes at least [s], with a stop where links meet."""
         return sum(link.bound for link in self.links)
 
     @property
@@ -84,6 +84,11 @@ class Route:
     def signature(self) -> tuple[object, ...]:
         """By which routes differ."""
         return tuple(part for link in self.links for part in link.signature)
+
+    @property
+    def key(self) -> object:
+        """What it is: its formations, and where it stops."""
+        return self.signature, tuple(step.end for link in self.links for step in link.steps)
 
 
 @dataclass(eq=False)
@@ -100,7 +105,7 @@ class Search:
     reached : set
         Keys of places that have been settled.
     found : set
-        Signatures of routes that have been found.
+        Keys of routes that have been found.
     limit : float
         Cost from which on nothing is of interest [s].
     """
@@ -142,8 +147,8 @@ class Search:
                 return
             if work is None:
                 if route.links and is_at(place, self.goal):
-                    if route.signature not in self.found:
-                        self.found.add(route.signature)
+                    if route.key not in self.found:
+                        self.found.add(route.key)
                         yield route
                     continue
                 key = place.key
@@ -169,12 +174,10 @@ class Search:
     ) -> list[Link | Blocked]:
         """Links along borders, whole or to a goal; releases on the way are put off."""
         time, links = self.chart.scene.scales.time, list[Link | Blocked]()
-        for index, (border, link) in enumerate(self.chart.follow(place)):
-            if self._is_back(route, border):
-                continue
-            ending = self.chart.end_at(border, self.goal)
-            links += [own for own in (link, ending) if own is not None]
-            if not place.landed:
+        for border, link in self.chart.list_along(place, self.goal):
+            links += [] if self._is_back(route, border) else [link]
+        for index, (border, _) in enumerate(self.chart.follow(place)):
+            if not place.landed and not self._is_back(route, border):
                 put(route, place, (border, index), leaving * time)  # type: ignore[operator]
         return links if first else [own for own in links if isinstance(own, Link)]
 

@@ -11,6 +11,7 @@ from ..planning.result import Plan
 from ..problem.definition import End, Problem
 from .bounds import BorderBound
 from .candidates import Failure
+from .chains import LONGEST
 from .find import EAGER, Route, Search
 from .links import Blocked, describe_steps
 
@@ -18,9 +19,9 @@ LISTED = 6
 """Most reasons that a message names."""
 NOT_CONSIDERED = (
     "not considered: rolling contacts, formations without the palm or without one of the fingers, "
-    "impacts, motions that pass crossings without a stop, those through cells that no straight way "
-    f"from rest shows to be possible, and what is further than {EAGER.most} places; phases may be "
-    "as many as it takes"
+    f"more than {LONGEST} borders passed without a stop, impacts out of or into cells, motions "
+    "through cells that no straight way from rest shows to be possible, and what is further than "
+    f"{EAGER.most} places; phases may be as many as it takes"
 )
 
 
@@ -105,7 +106,7 @@ class Answer:
         if not self.complete:
             lines.append("interrupted: the best route so far")
         if self.bound is not None:
-            text = "no route along borders, with stops where they meet, takes less than {} s{}"
+            text = "no route along borders, with stops or impacts, takes less than {} s{}"
             ended = "" if self.bound.complete else " (the search for such routes ended early)"
             gap = "" if self.gap is None else f": gap {100 * self.gap:.2g} %"
             lines.append(text.format(f"{self.bound.value:.6f}", gap + ended))

@@ -1,0 +1,94 @@
+"""Borders passed one after the other without a stop where they meet.
+
+At a crossing two borders share no velocity, so that the motion goes on at speed with an impact, if
+the law of plastic impacts lets it. Where one contact is only renamed borders go on along the same
+tangent. Either is known from the curves alone, and the speed after is in proportion to that before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..geometry.curve import Curve
+from ..planning.path_domain.impact_sequence import compute_curve_impact
+from ..problem.definition import End, Phase, Until
+from .links import Blocked, Border, Link, Step, look_at
+from .places import Place, make_place
+
+LONGEST = 6
+"""Most borders that are passed in one go."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """Borders that are followed whole and left in motion, and one after them.
+
+    Attributes
+    ----------
+    steps : tuple of Step
+        Phases along those that are followed whole.
+    borders : tuple of Border
+        These, and the last one.
+    curves : tuple of Curve
+        Of all borders, with such speed ratios that the speed is the same on both sides of a join.
+    """
+
+    steps: tuple[Step, ...]
+    borders: tuple[Border, ...]
+    curves: tuple[Curve, ...]
+
+    def extend(self, following: Border) -> Chain | None:
+        """The chain with another border passed into in motion; None where that is not possible."""
+        last, gained = self.borders[-1], self.borders[-1].gained
+        held, coming = {*last.formation.contacts, gained}, set(following.formation.contacts)
+        if gained not in coming or not held >= coming:
+            return None
+        for end in (End.SMOOTH, End.IMPACT):
+            phase = Phase(0, last.formation, Until(contact=gained), end)
+            join = compute_curve_impact(phase, last.curve, following.curve)
+            if join.possible and np.isfinite(join.ratio):
+                ratio = self.curves[-1].speed_ratio * join.ratio
+                return Chain(
+                    (*self.steps, Step(last.formation.contacts, phase.until, end)),
+                    (*self.borders, following),
+                    (*self.curves, following.curve.with_speed_ratio(ratio)),
+                )
+        return None
+
+    def link(
+        self, last: Step, curve: Curve, stop: Place, epsilon: float, least_minor: float
+    ) -> Link | Blocked:
+        """The link along the chain, at rest at the end of a last phase along its `curve`."""
+        start, steps = self.borders[0].start, (*self.steps, last)
+        ahead = look_at((*self.curves[:-1], curve), epsilon, least_minor)
+        if isinstance(ahead, str):
+            return Blocked(start, steps, ahead)
+        return Link(start, stop, steps, ahead.duration, ahead.bound)
+
+    def link_whole(self, epsilon: float, least_minor: float) -> Link | Blocked | None:
+        """The link along all of it; None where the last border ends at an obstacle."""
+        last = self.borders[-1]
+        if last.gained is None:
+            return None
+        step = Step(last.formation.contacts, Until(contact=last.gained))
+        stop = make_place(last.formation.scene, last.curve.end)
+        return self.link(step, self.curves[-1], stop, epsilon, least_minor)
+
+
+def list_chains(borders: list[Border], follow: Callable[[Place], list[Border]]) -> Iterator[Chain]:
+    """Chains of two and more borders that set out along some `borders` from a place."""
+    waiting = [Chain((), (border,), (border.curve,)) for border in borders]
+    while waiting:
+        chain = waiting.pop()
+        last = chain.borders[-1]
+        if last.gained is None or len(chain.borders) == LONGEST:
+            continue
+        place = make_place(last.formation.scene, last.curve.end)
+        for border in follow(place):
+            longer = chain.extend(border)
+            if longer is not None:
+                waiting.append(longer)
+                yield longer

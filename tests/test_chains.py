@@ -1,0 +1,48 @@
+"""Borders passed without a stop: what is looked at is what planning them as one finds."""
+
+from __future__ import annotations
+
+import pytest
+
+from shipped import HEPTAGON, IMPACTS, problem_of, solved
+from wholearm.problem.definition import End
+from wholearm.search.chart import Chart
+from wholearm.search.links import Link
+from wholearm.search.places import make_place
+
+
+def test_a_chain_of_impacts_is_bounded_as_its_plan_takes() -> None:
+    problem = problem_of(IMPACTS)
+    chart, phases = Chart(problem, 0.1), problem.phases[:3]
+    until = [str(phase.until) for phase in phases]
+    (own,) = (
+        link
+        for chain, link in chart.pass_on(make_place(problem.scene, problem.start))
+        if isinstance(link, Link) and [str(step.until) for step in link.steps] == until
+    )
+    assert [step.end for step in own.steps] == [End.IMPACT, End.IMPACT, End.REST]
+    took = sum(motion.duration for motion in solved(IMPACTS).trajectory.motions[:3])
+    assert own.bound <= took * (1 + 1e-6)
+    assert own.duration == pytest.approx(took, rel=1e-2)
+    # A stop at each crossing takes longer, by what the plan says that the impacts save.
+    alone, place = 0.0, make_place(problem.scene, problem.start)
+    for phase in phases:
+        (link,) = (
+            link
+            for border, link in chart.follow(place)
+            if isinstance(link, Link)
+            and set(border.formation.contacts) == set(phase.formation.contacts)
+            and link.steps[0].until == phase.until
+        )
+        alone, place = alone + link.duration, link.stop
+    assert alone > 1.2 * own.duration
+
+
+def test_no_chain_leads_through_an_impact_that_is_not_possible() -> None:
+    problem = problem_of(HEPTAGON)
+    chart = Chart(problem, 0.1)
+    place = make_place(problem.scene, problem.start)
+    # With little friction there the impact onto v3-finger1 would tip edge 0 off the palm.
+    assert [
+        chain for chain, _ in chart.pass_on(place) if str(chain.steps[0].until) == "v3-finger1"
+    ] == []
