@@ -48,7 +48,8 @@ def write_template(
     weight = _MASS * scale**2 if mass is None else require_number(mass, "--mass", positive=True)
     heavy, few = weight / _MASS, corners < 5
     angles = -math.pi / 2 + math.pi * (2 * np.arange(corners) - 1) / corners
-    vertices = size * np.column_stack([np.cos(angles), np.sin(angles)])
+    # Rounded, so that a corner above the centroid is at zero.
+    vertices = size * np.column_stack([np.cos(angles), np.sin(angles)]).round(12)
     finger = {
         "length": ((0.22 if few else 0.14) * scale, "m, joint to tip centre"),
         "radius": (0.005 * scale, "m, half thickness of the link"),
