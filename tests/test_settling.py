@@ -19,11 +19,13 @@ from wholearm.common.errors import InputError
 from wholearm.contacts.formation import Formation
 from wholearm.free_simulation.simulate import simulate_free
 from wholearm.mechanics.arrival import DRIVE, Standstill, find_hold, maximise_margin
+from wholearm.planning import shares
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.result import Plan
 from wholearm.planning.saved import load_plan, write_meta
 from wholearm.planning.settling import list_touching, settle_plans
 from wholearm.problem.definition import Problem
+from wholearm.problem.read import place_start
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import assemble
 from wholearm.simulation.closing import close_contacts
@@ -132,6 +134,37 @@ def test_a_start_that_is_short_makes_little_difference() -> None:
     assert end.position < 0.1 and end.angle < 0.1
 
 
+def test_shares_are_those_of_the_way_that_ends_best(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = solved(HEPTAGON)
+    problem = plain.problem.with_({"settle": "10 %", "phases[3].settle": 0.002})
+    motions = plain.trajectory.motions
+    plans = [PhasePlan(motion, plain.trajectory.torque, 0.0) for motion in motions]
+    tried = list[list[float]]()
+
+    def measure(*given: object) -> float:
+        tried.append(given[2])  # type: ignore[arg-type]
+        return problem.gap * (3.0, 2.9, 1.0, 0.9, 2.0)[len(tried) - 1]
+
+    monkeypatch.setattr(shares, "_measure", measure)
+    times = shares.share_time(problem, plans)
+    assert len(tried) == len(shares.WAYS) and times == tried[2]
+    for own in tried:
+        assert own[2] == 0.002
+        assert sum(own) == pytest.approx(0.002 + 0.1 * plain.duration, rel=1e-12)
+    first, second, _, fourth, fifth = tried[0]
+    assert first == pytest.approx(2 * second) and second == pytest.approx(fourth)
+    assert fifth == pytest.approx(shares.STOP * fourth)
+    assert tried[4][0] == 0
+
+
+def test_a_start_is_moved_with_its_fingers_closed() -> None:
+    problem = problem_of(HEPTAGON)
+    moved = shares.move_start(problem, 1e-3)
+    assert shares.move_start(problem, 0.0) is None and moved is not None
+    start = place_start(problem.scene, 0, float(problem.start[0]) + 1e-3)
+    np.testing.assert_allclose(moved, start, rtol=0, atol=1e-12)
+
+
 def test_held_ends_are_written_and_read(tmp_path: Path) -> None:
     plan = settled()
     plan.save(tmp_path / "plan.npz")
@@ -183,6 +216,9 @@ def test_keys_are_checked_and_kept() -> None:
     problem = plain.with_({"settle": 0.01, "settle_gap": 5e-5, "phases[2].settle": 0})
     assert [problem.settles(phase) for phase in problem.phases] == [0.01, 0, 0.01, 0.01, 0.01]
     assert problem.gap == 5e-5 and problem.table["phases"][1]["settle"] == 0
+    shared = plain.with_({"settle": "10 %", "phases[2].settle": 0.01})
+    assert shared.settle_share == pytest.approx(0.1) and shared.table["settle"] == "10 %"
+    assert [shared.settles(phase) for phase in shared.phases] == [None, 0.01, None, None, None]
     again = replace(problem, settle=0.02)
     assert again.table["settle"] == 0.02 and again.table["phases"][1]["settle"] == 0
 
@@ -192,6 +228,9 @@ def test_keys_are_checked_and_kept() -> None:
     [
         ({"settle": -1}, "settle", ">= 0"),
         ({"settle": 1e9}, "settle", "allowed are"),
+        ({"settle": "ten"}, "settle", "100 %"),
+        ({"settle": "0 %"}, "settle", "100 %"),
+        ({"settle": "10 %", "torque_rate_limit": 100.0}, "settle", "torque_rate_limit"),
         ({"settle_gap": 1.0}, "settle_gap", "allowed are"),
         ({"settle": 0.01, "torque_rate_limit": 100.0}, "settle", "torque_rate_limit"),
         ({"phases[1].settle": "x"}, "phases[1].settle", ">= 0"),

@@ -28,6 +28,18 @@ def require_number(
     return result
 
 
+def read_share(value: str, key: str) -> float:
+    """What a text such as "10 %" says, as a fraction, or raise `InputError` naming `key`."""
+    number, sign, rest = value.partition("%")
+    try:
+        share = float(number) / 100 if sign and not rest.strip() else math.nan
+    except ValueError:
+        share = math.nan
+    if not 1e-4 <= share <= 1:
+        raise InputError("", key, f'{value!r} given; allowed as a share is "0.01 %" to "100 %"')
+    return share
+
+
 def require_vector(value: object, key: str, size: int) -> Array:
     """Return `value` as a read-only float array of `size` finite numbers, or raise `InputError`."""
     if not isinstance(value, list | tuple | np.ndarray) or len(value) != size:

@@ -119,7 +119,7 @@ class Planning:
     def settled(self) -> Settled:
         """The plans with their ends held, where the problem asks for that."""
         plans, phases = self.plans, self.problem.phases
-        if not any(map(self.problem.settles, phases)):
+        if not self.problem.is_settled:
             return Settled(plans, (None,) * len(phases))
         from .settling import settle_plans
 

@@ -29,7 +29,7 @@ def require_quick_motors(problem: Problem, options: PlanOptions) -> None:
     why = ""
     if options.ranges:
         why = "ranges (--robust) are not kept with it yet"
-    elif any(map(problem.settles, problem.phases)):
+    elif problem.is_settled:
         why = "torques that settle the end of a phase (settle) step; leave one of the two out"
     else:
         for block in split_blocks(problem):

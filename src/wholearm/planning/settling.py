@@ -9,6 +9,7 @@ open, without telling which contacts hold.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +31,22 @@ CLOSED = 0.01
 """What is left of a gap that counts as closed, over the gap."""
 
 
+class End(NamedTuple):
+    """An end at rest that is held.
+
+    Attributes
+    ----------
+    place : Standstill
+    time : float, [s]
+    hold : Hold or None
+        None if no torques hold it.
+    """
+
+    place: Standstill
+    time: float
+    hold: Hold | None
+
+
 class _Trial(NamedTuple):
     """What torques do from where the contact is still open.
 
@@ -47,42 +64,73 @@ class _Trial(NamedTuple):
 
 def settle_plans(problem: Problem, plans: Plans) -> Settled:
     """Hold the ends of those phases that come to rest and are to be held."""
-    pairs = [_settle(problem, own, plan) for own, plan in zip(problem.phases, plans, strict=True)]
-    return Settled([plan for plan, _ in pairs], tuple(settling for _, settling in pairs))
+    if problem.settle_share:
+        from .shares import share_time
+
+        times = share_time(problem, plans)
+    else:
+        times = [problem.settles(phase) or 0.0 for phase in problem.phases]
+    ends = find_ends(problem, plans, times)
+    numbered = zip(problem.phases, ends, strict=True)
+    settlings = [None if end is None else _describe(problem, phase, end) for phase, end in numbered]
+    return Settled(hold_plans(plans, ends), tuple(settlings))
 
 
-def _settle(
-    problem: Problem, phase: Phase, plan: PhasePlan[Motion]
-) -> tuple[PhasePlan[Motion], Settling | None]:
-    time = problem.settles(phase)
-    if not time:
-        return plan, None
-    z, v = end_of(plan)
-    if not is_slower(problem.scene, v, SLOW):
-        return plan, None
-    place = Standstill(z, phase.formation, phase.until.contact, list_touching(problem, phase))
-    hold = find_hold(place, problem.epsilon, problem.gap, time)
+def find_places(problem: Problem, plans: Plans) -> list[Standstill | None]:
+    """Where phases come to rest; None for those that do not."""
+    found = list[Standstill | None]()
+    for phase, plan in zip(problem.phases, plans, strict=True):
+        z, v = end_of(plan)
+        touching = list_touching(problem, phase)
+        place = Standstill(z, phase.formation, phase.until.contact, touching)
+        found.append(place if is_slower(problem.scene, v, SLOW) else None)
+    return found
+
+
+def find_ends(problem: Problem, plans: Plans, times: Sequence[float]) -> list[End | None]:
+    """Torques for ends at rest that are held for some time [s]; None for all others."""
+    found = list[End | None]()
+    for place, time in zip(find_places(problem, plans), times, strict=True):
+        held = place is not None and time > 0
+        hold = find_hold(place, problem.epsilon, problem.gap, time) if place and held else None
+        found.append(End(place, time, hold) if place and held else None)
+    return found
+
+
+def hold_plans(plans: Plans, ends: Sequence[End | None]) -> Plans:
+    """The plans with their ends held."""
+    return [_hold(plan, end) for plan, end in zip(plans, ends, strict=True)]
+
+
+def _hold(plan: PhasePlan[Motion], end: End | None) -> PhasePlan[Motion]:
+    if end is None or end.hold is None:
+        return plan
+    motion = SettledMotion(plan.motion, end.time, end.hold.tau)
+    torque = TorqueProfile.chain([plan.torque, motion.torque])
+    return plan._replace(motion=motion, torque=torque)
+
+
+def _describe(problem: Problem, phase: Phase, end: End) -> Settling:
+    place, time, hold = end
     if hold is None:
         text = f"no torques hold {' '.join(place.touching.names)} at the end of phase"
         warning = f"{text} {phase.number} with c_n >= epsilon"
-        return plan, Settling(phase.number, 0.0, (0.0, 0.0), 0.0, warning=warning)
+        return Settling(phase.number, 0.0, (0.0, 0.0), 0.0, warning=warning)
     first, second = hold.tau.tolist()
     settling = Settling(phase.number, time, (first, second), hold.margin)
     trial = _close(problem, place, hold, time)
-    if trial is not None and place.gained is not None:
-        name, text = place.gained.name, f"that hold the end of phase {phase.number}"
-        settling = settling._replace(
-            contact=name,
-            gap=problem.gap,
-            closes=trial.closes,
-            left=trial.left,
-            speed=hold.speed,
-            parts=hold.parts,
-            warning="" if hold.speed else f"no torques {text} would drive it on to {name}",
-        )
-    motion = SettledMotion(plan.motion, time, hold.tau)
-    torque = TorqueProfile.chain([plan.torque, motion.torque])
-    return plan._replace(motion=motion, torque=torque), settling
+    if trial is None or place.gained is None:
+        return settling
+    name, text = place.gained.name, f"that hold the end of phase {phase.number}"
+    return settling._replace(
+        contact=name,
+        gap=problem.gap,
+        closes=trial.closes,
+        left=trial.left,
+        speed=hold.speed,
+        parts=hold.parts,
+        warning="" if hold.speed else f"no torques {text} would drive it on to {name}",
+    )
 
 
 def _close(problem: Problem, place: Standstill, hold: Hold, time: float) -> _Trial | None:

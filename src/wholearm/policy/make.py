@@ -135,8 +135,9 @@ def _end(
     problem: Problem, phase: Phase, plan: Trajectory, piece: Piece, after: Piece | None
 ) -> Array:
     """Torques at the end of a curve: those that the plan holds there, if it does."""
-    if problem.settles(phase):
-        return np.asarray(plan.tau[np.flatnonzero(plan.phase == phase.index)[-1]])
+    last = int(np.flatnonzero(plan.phase == phase.index)[-1])
+    if np.isnan(plan.c_n[last]).all():
+        return np.asarray(plan.tau[last])
     contact, push = phase.until.contact, None
     if contact is not None:
         push = find_push(piece.curve, contact, piece.rows, None if after is None else after.rows)

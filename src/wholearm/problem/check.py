@@ -45,9 +45,10 @@ def check_problem(problem: Problem) -> None:
     check_epsilon(problem.scene, epsilon)
     spread_widths(problem.uncertainty or {}, "uncertainty.{}")
     check_place(problem.scene, "start.x", float(require_vector(problem.start, "start", 5)[0]))
-    settle = require_number(problem.settle, "settle", nonnegative=True)
-    check_settle(problem.scene, "settle", settle)
-    if problem.scene.has_slow_motors and any(map(problem.settles, problem.phases)):
+    if not problem.settle_share:
+        settle = require_number(problem.settle, "settle", nonnegative=True)
+        check_settle(problem.scene, "settle", settle)
+    if problem.scene.has_slow_motors and problem.is_settled:
         text = "held ends step torques: with torque_rate_limit or actuator_lag allowed is 0"
         raise InputError("", "settle", text)
     if problem.settle_gap is not None:

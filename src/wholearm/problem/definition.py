@@ -10,6 +10,7 @@ from typing import Any
 
 from ..common.arrays import Array
 from ..common.errors import InputError, name_source
+from ..common.require import read_share
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..scene.model import Scene
@@ -144,9 +145,10 @@ class Problem:
     uncertainty : mapping or None
         Half widths of the ranges of what is not known exactly, by name; those that are left out
         have their defaults, see `problem.uncertainty`. None where the problem does not say.
-    settle : float, [s]
+    settle : float, [s], or str
         For how long phases that come to rest are held at their ends, so that contacts close that
-        are still open; a phase may have its own.
+        are still open; a phase may have its own. Or a share of the motion's time, as in "10 %",
+        for all of them that have none: the planner shares it out.
     settle_gap : float or None, [m]
         By how much they may be open; `SETTLE_GAP` of the scene's length if left out.
     checked : bool
@@ -174,7 +176,7 @@ class Problem:
     table: Mapping[str, Any] = field(default_factory=dict, repr=False)
     uncertainty: Mapping[str, float] | None = None
     checked: bool = field(default=False, repr=False)
-    settle: float = 0.0
+    settle: float | str = 0.0
     settle_gap: float | None = None
     goals: tuple[Goal, ...] = ()
 
@@ -224,9 +226,24 @@ class Problem:
             table = change_table(self.table, {**(changes or {}), **named}, NAMES)
         return build_problem(table, self.source)
 
-    def settles(self, phase: Phase) -> float:
-        """For how long the end of a phase is held, if it comes to rest there [s]."""
-        return self.settle if phase.settle is None else phase.settle
+    @property
+    def settle_share(self) -> float:
+        """Time for held ends that is shared out, over the motion's; zero if none is."""
+        return read_share(self.settle, "settle") if isinstance(self.settle, str) else 0.0
+
+    def settles(self, phase: Phase) -> float | None:
+        """For how long the end of a phase is held, if it comes to rest there [s].
+
+        None where that is shared out.
+        """
+        if phase.settle is None:
+            return None if isinstance(self.settle, str) else self.settle
+        return phase.settle
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether any end that comes to rest is held."""
+        return any(self.settles(phase) != 0 for phase in self.phases)
 
     @property
     def gap(self) -> float:
