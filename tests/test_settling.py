@@ -145,7 +145,7 @@ def test_shares_are_those_of_the_way_that_ends_best(monkeypatch: pytest.MonkeyPa
         tried.append(given[2])  # type: ignore[arg-type]
         return problem.gap * (3.0, 2.9, 1.0, 0.9, 2.0)[len(tried) - 1]
 
-    monkeypatch.setattr(shares, "_measure", measure)
+    monkeypatch.setattr(shares, "measure_times", measure)
     times = shares.share_time(problem, plans)
     assert len(tried) == len(shares.WAYS) and times == tried[2]
     for own in tried:

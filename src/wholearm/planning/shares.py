@@ -62,7 +62,7 @@ def share_time(problem: Problem, plans: Plans) -> list[float]:
     best, least = list[float](), math.inf
     for way in WAYS:
         times = _share(problem, plans, way)
-        off = _measure(problem, plans, times) if any(times) else 0.0
+        off = measure_times(problem, plans, times) if any(times) else 0.0
         if not best or off < BETTER * least:
             best, least = times, off
         if least <= ENOUGH * problem.gap:
@@ -87,7 +87,7 @@ def _share(problem: Problem, plans: Plans, way: Way) -> list[float]:
     return [own if time is None else time for own, time in zip(shares.tolist(), times, strict=True)]
 
 
-def _measure(problem: Problem, plans: Plans, times: Sequence[float]) -> float:
+def measure_times(problem: Problem, plans: Plans, times: Sequence[float]) -> float:
     """How far off the end is at most [m], turns counting by the scene's length."""
     held = hold_plans(plans, find_ends(problem, plans, times))
     torque = TorqueProfile.chain([plan.torque for plan in held])
