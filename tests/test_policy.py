@@ -13,7 +13,7 @@ from scipy.linalg import solve_continuous_are
 from scipy.optimize import linprog
 
 import wholearm
-from shipped import HEPTAGON, LANDING, SQUARE, plan_of, problem_of
+from shipped import HEPTAGON, IMPACTS, LANDING, SQUARE, plan_of, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.free_simulation.simulate import simulate_free
@@ -77,11 +77,11 @@ def test_the_fastest_motion_between_limits_of_the_acceleration() -> None:
     limits = np.array([[2.0, 0, 0, -1.0, 0], [2.0, 0, 0, 1.0, 0]])
     slack = np.tile(limits, (21, 1, 1))
     cap = 12 * np.minimum(s, 1 - s)
-    found = retime(s, slack, np.zeros((21, 2)), cap)
-    assert found.b == pytest.approx(4 * np.minimum(s, 1 - s), abs=1e-9)
+    b = retime(s, slack, np.zeros((21, 2)), cap).run(0.0)
+    assert b == pytest.approx(4 * np.minimum(s, 1 - s), abs=1e-9)
     # Half of it is kept in reserve.
-    found = retime(s, slack, np.ones((21, 2)), found.b)
-    assert found.b == pytest.approx(2 * np.minimum(s, 1 - s), abs=1e-9)
+    b = retime(s, slack, np.ones((21, 2)), b).run(0.0)
+    assert b == pytest.approx(2 * np.minimum(s, 1 - s), abs=1e-9)
 
 
 def test_one_place_gives_up_reserve_that_another_one_needs() -> None:
@@ -93,8 +93,9 @@ def test_one_place_gives_up_reserve_that_another_one_needs() -> None:
     slack[10, 2, :2] = -0.6 * cap[10], 1.0
     reserve = np.tile([1.0, 1.0, 0.0], (21, 1))
     found = retime(s, slack, reserve, cap)
-    a = np.diff(found.b) / (2 * np.diff(s))
-    assert found.b[10] >= 0.6 * cap[10] - 1e-9
+    b = found.run(0.0)
+    a = np.diff(b) / (2 * np.diff(s))
+    assert b[10] >= 0.6 * cap[10] - 1e-9
     # In each half |s''| has to be 1.2: all of the reserve cannot be kept, 0.8 of it could.
     assert 0.5 < found.share.min() <= 0.8
     assert np.abs(a).max() <= 2 - found.share.min() + 1e-9
@@ -112,6 +113,30 @@ def test_a_curve_without_a_reserve_is_run_more_slowly() -> None:
     heavier = problem.with_({"mass": 1.01 * whole.scene.polygon.mass})
     report = verify_policy(heavier, plan, policy)
     assert report.ok, report.failures
+
+
+def test_the_joints_show_an_impact() -> None:
+    one, two, *_ = problem_of(IMPACTS).table["phases"]
+    problem = problem_of(IMPACTS).with_({"phases": [one, {**two, "end": "rest"}]})
+    plan = wholearm.solve(problem, replay=False).trajectory
+    policy = make_policy(problem, plan)
+    first, second = policy.laws
+    assert isinstance(first, CurveLaw) and isinstance(second, CurveLaw)
+    # The reference goes on as fast as the impact of the plan leaves it.
+    k = int(np.flatnonzero(plan.phase == 1)[0])
+    ratio = np.linalg.norm(plan.theta_dot[k]) / np.linalg.norm(plan.theta_dot[k - 1])
+    speeds = [
+        np.sqrt(b) * np.hypot(*chord) / step
+        for b, chord, step in (
+            (first.b[-1], first.chords[-1], first.steps[-1]),
+            (second.b[0], second.chords[0], second.steps[0]),
+        )
+    ]
+    assert speeds[1] / speeds[0] == pytest.approx(ratio, rel=0.02)
+    report = verify_policy(problem, plan, policy)
+    assert report.ok, report.failures
+    made = min(own.start for own in report.whole.stretches if own.contact == "v3-finger1")
+    assert made <= report.phases[1].start <= made + 1.01 * policy.pace.period
 
 
 def test_without_a_reserve_it_is_as_fast_as_the_plan(problem: Problem, plan: Plan) -> None:

@@ -40,6 +40,10 @@ STARTING = 10
 """Periods in which the motion may start before standing still counts."""
 THERE = 1e-3
 """How much before its end the curve counts as run through, over its length."""
+NEAR = 0.1
+"""Part of the curve, at its end, in which an impact may be, where the end is passed at speed."""
+LATE = 5.0
+"""Periods after which it counts as over, where the joints do not show it."""
 SHORT = 4.0
 """How many times as long the joints have to stand still short of that."""
 
@@ -123,6 +127,7 @@ class CurveLaw:
         self.floor = self._find_floor()
         self.gain = CORRECTION / (pace.period + pace.delay)
         self.memory = MEMORY * self.gain**2 * pace.period
+        self.turn: tuple[float, float] | None = None
         self.begin()
 
     def begin(self, at_end: bool = False) -> None:
@@ -149,7 +154,9 @@ class CurveLaw:
         s += lead * (v + 0.5 * lead * self.a)
         v += lead * self.a
         if self.passes:
-            self.over = s >= self.length
+            self.over = self._has_turned(rates)
+            if self.over:
+                return self.push
         slow = self.v < pace.still and self.ran > STARTING * pace.period
         if (s >= self.length and v < 3.0 * pace.touch) or (slow and s > (1.0 - LAST) * self.length):
             self.pushes = True
@@ -186,6 +193,16 @@ class CurveLaw:
         h = self.steps[j]
         self.j, self.s = j, self.nodes[j] + share * h
         self.v = (rate_one * e + rate_two * f) / square * h
+
+    def _has_turned(self, rates: Sequence[float]) -> bool:
+        """Whether an impact has turned the joints' motion to where the next curve leads them."""
+        if self.s < (1.0 - NEAR) * self.length or self.turn is None:
+            return False
+        if self.s > self.length + LATE * self.pace.period * self.v:
+            return True
+        (e, f), (g, h), (one, two) = self.chords[-1], self.turn, rates
+        across = abs(one * f - two * e) / sqrt(self.squares[-1])
+        return bool(abs(one * h - two * g) / sqrt(g * g + h * h) < across)
 
     def _locate(self, j: int, s: float) -> tuple[int, float]:
         """Interval of a place, looked for from interval `j` on, and the share of it, 0 to 1."""

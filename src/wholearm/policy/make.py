@@ -20,7 +20,7 @@ from .curve_law import Pace
 from .curve_rows import leave_one
 from .policy import Policy
 from .push import find_push, find_still
-from .reference import TOUCH, Piece, Reserve, trace_piece
+from .reference import TOUCH, Piece, Reserve, trace_pieces
 from .regulator import follow
 from .replan import Planner, replan
 
@@ -93,10 +93,8 @@ def make_policy(
     starts = plan.phase_starts
     if reserve and planner is not None:
         plan = replan(planner, problem, blocks, curves, plan)
-    pieces = [
-        trace_piece(problem, own[0], plan, Reserve(reserve, ranges, delay)) if curve else None
-        for own, curve in zip(blocks, curves, strict=True)
-    ]
+    along = [own[0] if curve else None for own, curve in zip(blocks, curves, strict=True)]
+    pieces = trace_pieces(problem, along, plan, Reserve(reserve, ranges, delay))
     tables, about = list[dict[str, Array]](), list[dict[str, Any]]()
     for own, piece, after in zip(blocks, pieces, [*pieces[1:], None], strict=True):
         lasts = {phase.number: float(np.diff(starts)[phase.index]) for phase in own}
@@ -110,8 +108,9 @@ def make_policy(
                 one["duration"] = span
         else:
             tables.append(_tabulate(piece, _end(problem, own[0], plan, piece, after)))
-            found[0].update(duration=_time(piece), share=piece.share, reserves=piece.reserves)
-        found[-1]["duration"] += DWELL + delay
+            found[0].update(duration=piece.duration, share=piece.share, reserves=piece.reserves)
+        if piece is None or not piece.passes:
+            found[-1]["duration"] += DWELL + delay
         about += found
     whole = sum(own["duration"] for own in about)
     return Policy(tables, pace, {"name": problem.name, "duration": whole, "phases": about})
@@ -179,12 +178,6 @@ def _follow_motion(
     }
 
 
-def _time(piece: Piece) -> float:
-    """How long a reference takes [s]."""
-    speeds = np.sqrt(piece.b)
-    return float((2 * np.diff(piece.rows.s) / (speeds[1:] + speeds[:-1])).sum())
-
-
 def _tabulate(piece: Piece, push: Array) -> dict[str, Array]:
     """Arrays of `CurveLaw`."""
     rows, levels = piece.rows, piece.rows.levels
@@ -195,7 +188,7 @@ def _tabulate(piece: Piece, push: Array) -> dict[str, Array]:
         "levels": leave_one(np.stack([levels[:-1], levels[1:]], axis=1)),
         "torque": np.stack([rows.torque[:-1], rows.torque[1:]], axis=1),
         "push": push,
-        "passes": np.array([float(piece.passes)]),
+        "passes": np.array([piece.passes]),
     }
 
 

@@ -38,6 +38,8 @@ class MotionLaw:
         How many of the phases have been passed.
     """
 
+    passes = False
+
     def __init__(self, tables: Mapping[str, Any], pace: Pace) -> None:
         self.pace, self.starts = pace, tables["starts"].tolist()
         self.every, self.still = float(tables["step"][0]), float(tables["still"][0])

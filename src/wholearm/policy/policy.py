@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,9 @@ class Policy:
         self.laws = tuple(
             CurveLaw(own, pace) if "s" in own else MotionLaw(own, pace) for own in self.tables
         )
+        for law, after in pairwise(self.laws):
+            if isinstance(law, CurveLaw) and law.passes and isinstance(after, CurveLaw):
+                law.turn = after.chords[0]
         counts = [law.count for law in self.laws]
         self.firsts = [1 + sum(counts[:k]) for k in range(len(counts))]
         self.reset()
@@ -96,7 +100,7 @@ class Policy:
         """Begin anew with the phase of a number, at rest.
 
         What is before the first phase has no torques. Before another one the contact that it
-        starts with is closed, as at the end of the phase before.
+        starts with is closed, as at the end of the phase before, unless that comes by an impact.
 
         Raises
         ------
@@ -107,8 +111,9 @@ class Policy:
             allowed = f"allowed are {', '.join(map(str, self.firsts))}"
             raise InputError("", "phase", f"{phase} given; the policy can begin with: {allowed}")
         own = self.firsts.index(phase)
-        self.index = max(own - 1, 0)
-        self.laws[self.index].begin(at_end=own > 0)
+        closes = own > 0 and not self.laws[own - 1].passes
+        self.index = own - closes
+        self.laws[self.index].begin(at_end=closes)
 
     def step(
         self,

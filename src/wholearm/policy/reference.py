@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from ..mechanics.metric import metric_weights
 from ..problem.definition import End, Phase, Problem
 from ..results.trajectory import Trajectory
 from .curve_rows import Rows, find_directions, find_squeeze, make_rows, measure_levels
-from .retime import ENOUGH, retime
+from .retime import ENOUGH, Reach, retime
 from .within import retime_within
 
 INTERVALS = 120
@@ -41,16 +41,44 @@ REFINE = 2
 class Piece(NamedTuple):
     """A phase along a curve.
 
-    Its rows, the reference's b at their places, the least part of the reserve that it keeps, the
-    least level of each contact, in reserves of level 1, and whether the end is passed at speed.
+    Attributes
+    ----------
+    curve : Curve
+    rows : Rows
+    reach : Reach
+    share : float
+        Least part of the reserve that is kept.
+    begins : float, [m^2/s^2]
+        The plan's b at the start.
+    passes : float
+        By what b is multiplied in the impact at the end; zero if the motion ends at rest.
+    b : ndarray, shape (n,), [m^2/s^2]
+        The reference.
     """
 
     curve: Curve
     rows: Rows
-    b: Array
+    reach: Reach
     share: float
-    reserves: dict[str, float]
-    passes: bool
+    begins: float
+    passes: float
+    b: Array
+
+    @property
+    def duration(self) -> float:
+        """How long the reference takes [s]."""
+        speeds = np.sqrt(self.b)
+        return float((2 * np.diff(self.rows.s) / (speeds[1:] + speeds[:-1])).sum())
+
+    @property
+    def reserves(self) -> dict[str, float]:
+        """Least level of each contact's normal force along the reference."""
+        rows, names = self.rows, self.curve.formation.names
+        a = np.diff(self.b) / (2 * np.diff(rows.s))
+        count = len(make_limits(self.curve.formation, 0.0).of(PRESS, CONE))
+        levels = measure_levels(rows, np.append(a, a[-1]), self.b)[:, : rows.presses]
+        least = levels.min(axis=0).reshape(-1, count).min(axis=0)
+        return dict(zip(names, least[: len(names)].tolist(), strict=True))
 
 
 class Reserve(NamedTuple):
@@ -61,24 +89,48 @@ class Reserve(NamedTuple):
     delay: float
 
 
-def trace_piece(problem: Problem, phase: Phase, plan: Trajectory, reserve: Reserve) -> Piece:
-    """A phase's curve, with the motion that keeps a reserve, or most of it if none keeps enough."""
+def trace_pieces(
+    problem: Problem, phases: Sequence[Phase | None], plan: Trajectory, reserve: Reserve
+) -> list[Piece | None]:
+    """Phases along curves, with motions that keep a reserve, or most of it; None for None."""
+    pieces: list[Piece | None] = []
+    for phase in reversed(phases):
+        after = pieces[-1] if pieces else None
+        pieces.append(None if phase is None else _trace(problem, phase, plan, reserve, after))
+    pieces.reverse()
+    before: Piece | None = None
+    for k, piece in enumerate(pieces):
+        if piece is not None:
+            first = float(piece.reach.most[0])
+            if before is not None and before.passes:
+                first = float(before.b[-1]) * before.passes
+            piece = pieces[k] = piece._replace(b=piece.reach.run(first))
+        before = piece
+    return pieces
+
+
+def _trace(
+    problem: Problem, phase: Phase, plan: Trajectory, reserve: Reserve, after: Piece | None
+) -> Piece:
+    """A phase's curve, and the motions along it that keep a reserve."""
     own = np.flatnonzero((plan.phase == phase.index) & ~plan.held)
     curve = trace_phase(phase, plan.z[own[0]], problem.phases[phase.index + 1 :])
     places, *values = _follow(curve, plan, own)
     s = _place_nodes(curve)
     a, b, squeeze = (np.interp(s, places, value) for value in values)
-    if phase.end is not End.IMPACT:
-        touch = TOUCH * problem.scene.scales.speed
+    touch, begins, passes, end = TOUCH * problem.scene.scales.speed, float(b[0]), 0.0, None
+    if phase.end is End.IMPACT and after is not None and b[-1] > touch**2:
+        passes = after.begins / float(b[-1])
+        end = float(after.reach.least[0] / passes), float(after.reach.most[0] / passes)
+    else:
         b = np.minimum(b, (touch + (curve.length - s) / ARRIVAL) ** 2)
-    passes = phase.end is End.IMPACT
     if reserve.ranges is not None and reserve.size:
         widths = {name: reserve.size * width for name, width in reserve.ranges.items()}
         widths["delay"] = max(widths.get("delay", 0.0) - reserve.delay, 0.0)
-        within, share = retime_within(curve, s, (a, b, squeeze), widths, problem.epsilon)
+        within, share = retime_within(curve, s, (a, b, squeeze), widths, problem.epsilon, end)
         if within is not None:
-            return Piece(curve, *within, share, _list_reserves(curve, *within), passes)
-    best: tuple[float, Rows, Array] | None = None
+            return Piece(curve, *within, share, begins, passes, b)
+    best: tuple[Rows, Reach, float] | None = None
     for part in SLOWER:
         motion = part * a, part * b
         rows = make_rows(curve, s, (*motion, squeeze))
@@ -86,27 +138,15 @@ def trace_piece(problem: Problem, phase: Phase, plan: Trajectory, reserve: Reser
             rows = make_rows(curve, s, (*motion, find_squeeze(rows, *motion)))
         wanted = reserve.size * rows.unit
         wanted[:, rows.presses :] = AUTHORITY * rows.unit[:, rows.presses :]
-        found = retime(s, rows.slack, wanted, motion[1])
+        found = retime(s, rows.slack, wanted, motion[1], end)
         share = float(found.share.min())
-        if best is not None and share <= best[0]:
+        if best is not None and share <= best[2]:
             break
-        best = share, rows, found.b
+        best = rows, found, share
         if share >= ENOUGH:
             break
     assert best is not None
-    share, rows, b = best
-    return Piece(curve, rows, b, share, _list_reserves(curve, rows, b), passes)
-
-
-def _list_reserves(curve: Curve, rows: Rows, b: Array) -> dict[str, float]:
-    """Least level of each contact's normal force along a motion."""
-    a = np.diff(b) / (2 * np.diff(rows.s))
-    a = np.append(a, a[-1])
-    names = curve.formation.names
-    count = len(make_limits(curve.formation, 0.0).of(PRESS, CONE))
-    levels = measure_levels(rows, a, b)[:, : rows.presses]
-    least = levels.min(axis=0).reshape(-1, count).min(axis=0)
-    return dict(zip(names, least[: len(names)].tolist(), strict=True))
+    return Piece(curve, *best, begins, passes, b)
 
 
 def _follow(

@@ -33,15 +33,38 @@ HUGE = 1e12
 """Larger than any b."""
 
 
-class Profile(NamedTuple):
-    """A motion along a curve: b at the nodes, and the part of the reserve of each interval."""
+class Reach(NamedTuple):
+    """From where the end of a curve can be reached.
 
-    b: Array
+    `least` and `most` b at the nodes, shape (n,); `rows` (1, b, a) >= 0 of the intervals, from the
+    last one to the first; the part of the reserve of each interval.
+    """
+
+    s: Array
+    least: Array
+    most: Array
+    rows: list[Array]
     share: Array
 
+    def run(self, first: float) -> Array:
+        """The fastest motion from a b within its limits at the first node: b at all of them."""
+        b, steps = np.empty(len(self.s)), np.diff(self.s)
+        b[0] = first
+        for k, rows in enumerate(reversed(self.rows)):
+            falls = rows[:, 2] < 0
+            a = float(((rows[:, 0] + rows[:, 1] * b[k])[falls] / -rows[falls, 2]).min())
+            b[k + 1] = min(max(b[k] + 2 * steps[k] * a, self.least[k + 1]), self.most[k + 1])
+        return b
 
-def retime(s: Array, slack: Array, reserve: Array, cap: Array) -> Profile:
-    """Find the motion whose least part of the reserve is largest, as far as it makes a difference.
+
+def retime(
+    s: Array,
+    slack: Array,
+    reserve: Array,
+    cap: Array,
+    end: tuple[float, float] | None = None,
+) -> Reach:
+    """Find the motions whose least part of the reserve is largest, as far as it matters.
 
     Parameters
     ----------
@@ -52,12 +75,14 @@ def retime(s: Array, slack: Array, reserve: Array, cap: Array) -> Profile:
     reserve : ndarray, shape (n, m)
         What they have to have in reserve.
     cap : ndarray, shape (n,), [m^2/s^2]
-        Largest b; the motion begins with the first one, or less, and ends with the last one.
+        Largest b.
+    end : tuple of two float, optional, [m^2/s^2]
+        Least and largest b at the last node, if it is not the last of the largest.
     """
-    best: Profile | None = None
+    best: Reach | None = None
     for part in (1.0, *PARTS):
         # What one place keeps can be what another one lacks.
-        found = _pass(s, slack, reserve, cap, part)
+        found = _pass(s, slack, reserve, cap, end or (cap[-1], cap[-1]), part)
         if best is None or found.share.min() > best.share.min():
             best = found
         if best.share.min() >= min(NEAR * part, ENOUGH):
@@ -66,11 +91,13 @@ def retime(s: Array, slack: Array, reserve: Array, cap: Array) -> Profile:
     return best
 
 
-def _pass(s: Array, slack: Array, reserve: Array, cap: Array, part: float) -> Profile:
-    """The motion with as much of a part of the reserve as there can be on each interval."""
+def _pass(
+    s: Array, slack: Array, reserve: Array, cap: Array, end: tuple[float, float], part: float
+) -> Reach:
+    """Motions with as much of a part of the reserve as there can be on each interval."""
     steps, count = np.diff(s), len(s)
     least, most = SLOWEST * cap, cap.copy()
-    least[-1] = cap[-1]
+    least[-1], most[-1] = end
     shares = [part, *(own for own in SHARES if own < part)]
     share = np.empty(count - 1)
     bounds: list[Array] = []
@@ -92,13 +119,7 @@ def _pass(s: Array, slack: Array, reserve: Array, cap: Array, part: float) -> Pr
                 first = own + 1
         bounds.append(rows)
         least[k], most[k] = low, high
-    b = np.empty(count)
-    b[0] = most[0]
-    for k, rows in enumerate(reversed(bounds)):
-        falls = rows[:, 2] < 0
-        a = float(((rows[:, 0] + rows[:, 1] * b[k])[falls] / -rows[falls, 2]).min())
-        b[k + 1] = min(max(b[k] + 2 * steps[k] * a, least[k + 1]), most[k + 1])
-    return Profile(b, share)
+    return Reach(s, least, most, bounds, share)
 
 
 def eliminate(rows: Array) -> Array:

@@ -19,7 +19,7 @@ from ..mechanics.limits import CONE, PRESS, make_limits
 from ..scene.model import Scene
 from .corners import Corners, Motion, find_corners, list_scenes
 from .curve_rows import LATE, LEAST, NEAR, NEVER, SPARE, Rows, find_squeeze, turn
-from .retime import retime
+from .retime import Reach, retime
 
 ROUNDS = 3
 """How many times worst corners and motion are found from one another."""
@@ -27,8 +27,6 @@ KEPT = 1.5
 """Reserve of forces of the reference, in units: feedback may use what is above one."""
 ENOUGH = 0.5
 """Part of these reserves without which ranges are too wide."""
-CRAWLS = 0.02
-"""Part of the plan's b below which a motion is none."""
 LESS, TRIES = 0.85, 20
 """Factor by which ranges shrink where they are too wide, and how often."""
 WIDEST = 0.9
@@ -128,8 +126,13 @@ def _find_torques(curve: Curve, s: Array, directions: Directions) -> Array:
 
 
 def retime_within(
-    curve: Curve, s: Array, plan: Motion, widths: Mapping[str, float], least: float
-) -> tuple[tuple[Rows, Array] | None, float]:
+    curve: Curve,
+    s: Array,
+    plan: Motion,
+    widths: Mapping[str, float],
+    least: float,
+    end: tuple[float, float] | None = None,
+) -> tuple[tuple[Rows, Reach] | None, float]:
     """The fastest motion that keeps its limits within ranges, or as large a part of them as can be.
 
     Parameters
@@ -143,30 +146,35 @@ def retime_within(
         Half widths of the ranges; the delay is what torques are late by without being known to be.
     least : float, [N]
         Least normal force within them.
+    end
+        As of `retime`.
 
     Returns
     -------
     tuple
-        The law's limits and b at the nodes, None if no part of the ranges has them; and that part.
+        The law's limits and the motions, None if no part of the ranges has them; and that part.
     """
     share = 1.0
     for _ in range(TRIES):
         own = {name: min(share * width, WIDEST) for name, width in widths.items()}
-        found = _retime(find_within(curve, s, np.sqrt(plan[1]), own, least), plan)
+        found = _retime(find_within(curve, s, np.sqrt(plan[1]), own, least), plan, end)
         if found is not None:
             return found, share
         share *= LESS
     return None, 0.0
 
 
-def _retime(within: Within, plan: Motion) -> tuple[Rows, Array] | None:
+def _retime(
+    within: Within, plan: Motion, end: tuple[float, float] | None
+) -> tuple[Rows, Reach] | None:
     """The motion within ranges, None if there is none."""
-    motion, cap = plan, plan[1]
+    motion = plan
     for _ in range(ROUNDS):
         rows, whole, wanted = within.at(motion)
-        found = retime(within.s, whole, wanted, cap)
-        if found.share.min() < ENOUGH or (found.b[1:-1] < CRAWLS * cap[1:-1]).any():
+        found = retime(within.s, whole, wanted, plan[1], end)
+        b = found.run(float(found.most[0]))
+        if found.share.min() < ENOUGH:
             return None
-        a = np.gradient(found.b, within.s) / 2
-        motion = a, found.b, find_squeeze(rows, a, found.b)
-    return within.at(motion)[0], found.b
+        a = np.gradient(b, within.s) / 2
+        motion = a, b, find_squeeze(rows, a, b)
+    return within.at(motion)[0], found
