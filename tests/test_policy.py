@@ -97,7 +97,7 @@ def test_one_place_gives_up_reserve_that_another_one_needs() -> None:
     a = np.diff(b) / (2 * np.diff(s))
     assert b[10] >= 0.6 * cap[10] - 1e-9
     # In each half |s''| has to be 1.2: all of the reserve cannot be kept, 0.8 of it could.
-    assert 0.5 < found.share.min() <= 0.8
+    assert 0.5 <= found.share.min() <= 0.8
     assert np.abs(a).max() <= 2 - found.share.min() + 1e-9
 
 
@@ -111,7 +111,7 @@ def test_a_curve_without_a_reserve_is_run_more_slowly() -> None:
     assert about["share"] >= 0.4 and set(about["reserves"]) == set(plan.contacts)
     assert plan.duration < about["duration"] < 4 * plan.duration
     heavier = problem.with_({"mass": 1.01 * whole.scene.polygon.mass})
-    report = verify_policy(heavier, plan, policy)
+    report = verify_policy(heavier, plan, policy, tolerance=1e-6)
     assert report.ok, report.failures
 
 

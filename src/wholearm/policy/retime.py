@@ -15,12 +15,12 @@ import numpy as np
 from ..common.arrays import Array
 from .curve_rows import NEVER
 
-SHARES = (*(0.8**k for k in range(20)), 0.0, -0.05, -0.1, -0.2, -0.4, -0.8)
+SHARES = (*(0.8**k for k in range(12)), 0.04, 0.0, -0.1, -0.2, -0.4, -0.8)
 """Parts of the reserve that are tried, the largest first. A plan's limits hold between its own
 nodes, so that at others a little may lack."""
 SLOWEST = 0.1
 """Least part of the plan's b of a motion with a reserve: what crawls can stick."""
-PARTS = (0.6, 0.4, 0.25, 0.1, 0.0)
+PARTS = (0.5, 0.2, 0.0)
 """Parts of the reserve that all places are limited to, where some place has less."""
 NEAR, ENOUGH = 0.8, 0.4
 """Part of such a limit, and of the reserve, from which on the place with least is near enough."""
