@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shipped import HEPTAGON, LANDING, problem_of
+from shipped import HEPTAGON, problem_of
 from toys import LIMIT, Toy, constant
 from wholearm import InputError, Plan, Problem, simulate, solve, verify
 from wholearm.planning.table_check import make_table
@@ -118,10 +118,26 @@ def test_what_a_motor_cannot_follow_is_reported(heptagon: Problem) -> None:
     assert any("steps" in text for text in verify(slow, stepping).warnings)
 
 
-def test_phases_over_time_are_refused_by_the_key() -> None:
-    problem = problem_of(LANDING).with_(torque_rate_limit1=50.0)
-    with pytest.raises(InputError, match=r"fingers\.1\.torque_rate_limit: 50 given; phase 5"):
-        solve(problem)
+def test_phases_over_time_take_as_long_as_along_their_curves(heptagon: Problem) -> None:
+    problem = replace(heptagon.with_(torque_rate_limit=50.0), phases=heptagon.phases[:1])
+    along = solve(problem, replay=False, accuracy=1e-2)
+    over = solve(problem, replay=False, accuracy=1e-2, transcription="time", mode_search=False)
+    assert over.duration == pytest.approx(along.duration, rel=1e-2)
+    assert describe_motors(problem, over.trajectory.torque) == []
+    torque, contacts = over.trajectory.torque, problem.phases[0].formation.contacts
+    for t in (0.0, over.duration):
+        tau, z = torque.at(np.array([t]))[0], over.at(t).z[0]
+        assert balances(problem.scene, contacts, z, tau)
+        assert (
+            np.abs(over.at(t).z_ddot[0]).max()
+            < 1e-5 * np.abs(over.at(over.duration / 3).z_ddot[0]).max()
+        )
+
+
+def test_what_steps_is_refused_by_the_key(heptagon: Problem) -> None:
+    problem = heptagon.with_(torque_rate_limit1=50.0)
+    with pytest.raises(InputError, match=r"fingers\.1\.torque_rate_limit: 50 given; ranges"):
+        solve(problem.with_(uncertainty={"mass": 0.01}), robust=1.0)
 
 
 @pytest.mark.parametrize(("key", "value"), [("torque_rate_limit1", -1.0), ("actuator_lag", 1e6)])

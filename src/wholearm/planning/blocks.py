@@ -31,7 +31,7 @@ from ..scene.model import Scene
 from ..solvers.statistics import charge
 from .block_plan import BEGUN, FINEST, PLAIN, BlockPlan, Planning
 from .durations import share_again, share_duration
-from .motors import require_quick_motors
+from .motors import require_steps
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence
 from .path_domain.sequence_plan import plan_sequence, plan_slowly
@@ -76,7 +76,7 @@ def plan_blocks(
         If there is no plan.
     """
     with name_source(problem.source):
-        require_quick_motors(problem, options)
+        require_steps(problem, options)
     finer, none = [0] * len(split_blocks(problem)), list[float | None]([None] * len(problem.phases))
     planning = Planning(problem, curves, options, (), none, none)
     if options.goal is Objective.MARGIN:
@@ -258,11 +258,17 @@ def _plan_block(
     if not runs_along_curves(block, options):
         from .time_domain.impacts import plan_with_impacts
 
-        with charge(block[0].number):
+        def plan(duration: float | None) -> Plans:
             pinned = planning.pinned or leads_on(problem, block, options)
-            given = (problem, block, z, options, add_up(block, allowed))
-            plans += plan_with_impacts(*given, pinned=pinned, **over_time)
-        return plans, None
+            given = (problem, block, z, options, duration)
+            return plan_with_impacts(*given, pinned=pinned, **over_time)
+
+        with charge(block[0].number):
+            if problem.scene.has_slow_motors:
+                from .pauses import plan_with_pauses
+
+                return plan_with_pauses(planning, block, plan, add_up(block, allowed)), None
+            return plan(add_up(block, allowed)), None
     curves = []
     for phase in block:
         traced, later = phase.index < len(known), problem.phases[phase.index + 1 :]
@@ -271,7 +277,9 @@ def _plan_block(
     chain = make_sequence(block, curves)
     parts = chain.split()
     if problem.scene.has_slow_motors:
-        beside = planning.find_curve_before(block), planning.find_curve_after(block)
+        from .pauses import find_beside
+
+        beside = find_beside(planning, block, chain.curves[-1].end, options)
         longest = [add_up(part.phases, allowed) for part in parts]
         return plan_slowly(parts, beside, problem.epsilon, options, longest), chain
     for part in parts:

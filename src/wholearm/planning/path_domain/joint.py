@@ -20,14 +20,15 @@ from ...common.errors import InfeasibleError
 from ...contacts.formation import Formation
 from ...geometry.curve import Curve
 from ...mechanics.wedging import find_static_torques
+from ...results.modes import ModeSpan
 from ...results.torque import TorqueProfile
-from ...results.trajectory import Samples
+from ...results.trajectory import Motion, Samples
+from ...scene.model import Scene
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
 from .data import PhaseData, prepare
 from .first_guess import find_squeeze_range
 from .mesh import Mesh
-from .motion import PathMotion
 
 _PLACES = 129
 """Squeezes that are looked at on each side of a joint."""
@@ -43,8 +44,15 @@ _SHARE = 0.5
 """Part of a torque limit that a command may be beyond its torque in a pause."""
 
 
+_VERGE = 1e-6
+"""Distance over the scene's torque beyond those that friction can hold, that is rounding."""
+
+
 class Joint(NamedTuple):
-    """Squeezes [N] and torques, shape (2,) [N m], of both sides, and the pause between [s]."""
+    """Squeezes [N] and torques, shape (2,) [N m], of both sides, and the pause between [s].
+
+    Squeezes are NaN of what is planned over time.
+    """
 
     ends: float
     begins: float
@@ -53,37 +61,57 @@ class Joint(NamedTuple):
     pause: float
 
 
-def choose_joint(ending: Curve, beginning: Curve, epsilon: float, phase: int) -> Joint:
+def choose_joint(
+    ending: Curve | Array, beginning: Curve | Formation, z: Array, epsilon: float, phase: int
+) -> Joint:
     """The torques that change in the least time where phase number `phase` begins.
+
+    Parameters
+    ----------
+    ending : Curve or ndarray, shape (2,), [N m]
+        What ends there, or the torques that it ends with if it is planned over time.
+    beginning : Curve or Formation
+        What begins there, or its formation if it is planned over time: then the torques to end with
+        are those that friction holds most firmly in it.
+    z : ndarray, shape (5,)
+    epsilon, phase : float, int
 
     Raises
     ------
     InfeasibleError
         If no torques hold the object there in both formations.
     """
-    (before, ends), (after, begins) = (
-        _list_torques(curve, epsilon, number, place)
-        for curve, number, place in ((ending, phase - 1, -1), (beginning, phase, 0))
+    before, ends = (
+        _list_torques(ending, epsilon, phase - 1, -1)
+        if isinstance(ending, Curve)
+        else (ending[None], np.full(1, np.nan))
     )
-    scene, static = (
-        beginning.formation.scene,
-        find_static_torques([beginning.formation], ending.end),
-    )
-    held = static.measure(before) <= 0
+    formation = beginning.formation if isinstance(beginning, Curve) else beginning
+    scene, static = formation.scene, find_static_torques([formation], z)
+    beyond = static.measure(before)
+    held = beyond <= _VERGE * scene.scales.torque
     if not held.any():
         raise InfeasibleError(
             f"phase {phase}: torques may not step, and none that hold the object at rest where "
             f"phase {phase - 1} ends hold it in the contacts of phase {phase}, too"
         )
+    if not isinstance(beginning, Curve):
+        firmest = int(beyond.argmin())
+        return Joint(float(ends[firmest]), np.nan, before[firmest], before[firmest], 0.0)
+    after, begins = _list_torques(beginning, epsilon, phase, 0)
+    times = find_pauses(scene, after[None] - before[held][:, None])
+    p, q = np.unravel_index(int(times.argmin()), times.shape)
+    given = float(ends[held][p]), float(begins[q]), before[held][p], after[q]
+    return Joint(*given, float(times[p, q]))
+
+
+def find_pauses(scene: Scene, steps: Array) -> Array:
+    """How long torques take to change by `steps`, shape (..., 2) [N m], as (...) [s]."""
     with np.errstate(divide="ignore"):
         lagged = _SHARE * scene.torque_limit / scene.actuator_lag
-    rates = np.minimum(scene.torque_rate_limit, lagged)
-    steps = np.abs(after[None] - before[held][:, None])
-    times = (steps / rates).max(axis=2)
-    p, q = np.unravel_index(int(times.argmin()), times.shape)
-    much = (steps[p, q] > _STEP * scene.torque_limit).any()
-    pause = float(times[p, q]) if much else 0.0
-    return Joint(float(ends[held][p]), float(begins[q]), before[held][p], after[q], pause)
+    rates, steps = np.minimum(scene.torque_rate_limit, lagged), np.abs(steps)
+    much = (steps > _STEP * scene.torque_limit).any(axis=-1)
+    return np.asarray(np.where(much, (steps / rates).max(axis=-1), 0.0))
 
 
 def _list_torques(curve: Curve, epsilon: float, phase: int, place: int) -> tuple[Array, Array]:
@@ -121,7 +149,7 @@ class PausedMotion:
 
     Attributes
     ----------
-    motion : PathMotion
+    motion : Motion
     pause : float, [s]
     first : ndarray, shape (2,), [N m]
         Torques at its start.
@@ -129,7 +157,7 @@ class PausedMotion:
         c_n and c_t there.
     """
 
-    motion: PathMotion
+    motion: Motion
     pause: float
     first: Array
     forces: Array
@@ -144,6 +172,14 @@ class PausedMotion:
         """Names of the phase's contacts."""
         return self.motion.contacts
 
+    @property
+    def modes(self) -> tuple[ModeSpan, ...]:
+        """Its contact modes, if it is planned over time: the first begin with the pause."""
+        own = getattr(self.motion, "modes", ())
+        late = (span._replace(start=span.start + self.pause) for span in own)
+        late = (span._replace(stop=span.stop + self.pause) for span in late)
+        return tuple(s._replace(start=0.0) if k == 0 else s for k, s in enumerate(late))
+
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
         t = np.asarray(t, dtype=float)
@@ -155,12 +191,11 @@ class PausedMotion:
 
 
 def add_pause(
-    plan: PhasePlan[PathMotion], joint: Joint, curve: Curve, options: PlanOptions
-) -> PhasePlan[PausedMotion] | PhasePlan[PathMotion]:
-    """The plan of a phase with the pause before it."""
+    plan: PhasePlan[Motion], joint: Joint, formation: Formation, z: Array, options: PlanOptions
+) -> PhasePlan[Motion]:
+    """The plan of a phase that begins at `z`, with the pause before it."""
     if not joint.pause:
         return plan
-    formation, z = curve.formation, curve.start
     forces = find_static_forces(formation, z, joint.before)
     middle, half = (joint.after + joint.before) / 2, (joint.after - joint.before) / 2
     ramp = TorqueProfile(np.array([0.0, joint.pause]), np.stack([middle, half], axis=1)[None])
@@ -171,7 +206,7 @@ def add_pause(
     }[options.goal]
     motion = PausedMotion(plan.motion, joint.pause, joint.before, forces)
     torque = TorqueProfile.chain([ramp, plan.torque])
-    return plan._replace(motion=motion, torque=torque, value=value)  # type: ignore[arg-type]
+    return plan._replace(motion=motion, torque=torque, value=value)
 
 
 def find_static_forces(formation: Formation, z: Array, tau: Array) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ...common.arrays import Array
+from ...contacts.formation import Formation
 from ...geometry.curve import Curve
 from ...mechanics.metric import measure_speed
 from ...problem.definition import End
@@ -15,7 +16,7 @@ from ..options import PlanOptions
 from ..phase_plan import PhasePlan
 from ..stops import PlanPart, Plans, end_of
 from .impact_sequence import ImpactSequence
-from .joint import add_pause, choose_joint
+from .joint import Joint, add_pause, choose_joint
 from .motion import PathMotion
 from .plan import plan_curves
 from .task import Pins
@@ -50,7 +51,7 @@ def plan_sequence(
 
 def plan_slowly(
     parts: Sequence[ImpactSequence],
-    beside: tuple[Curve | None, Curve | None],
+    beside: tuple[Curve | Array | None, Curve | Formation | None],
     epsilon: float,
     options: PlanOptions,
     durations: Sequence[float | None],
@@ -60,29 +61,34 @@ def plan_slowly(
     Parameters
     ----------
     parts : sequence of ImpactSequence
-    beside : tuple of Curve or None
-        The curves before and after all of them, where there are any.
+    beside : tuple
+        The curves before and after all of them, or where these are planned over time, the torques
+        that hold the object before, and the formation after; None where there is nothing.
     epsilon : float, [N]
     options : PlanOptions
     durations : sequence of float or None, [s]
         The longest duration of each, for the objective `margin`.
     """
     plans: Plans = []
-    firsts = [*(part.curves[0] for part in parts[1:]), beside[1]]
-    joint, before = None, beside[0]
+    firsts: list[Curve | Formation | None] = [*(part.curves[0] for part in parts[1:]), beside[1]]
+    joint: Joint | None = None
+    before: Curve | Array | None = beside[0]
     for part, after, duration in zip(parts, firsts, durations, strict=True):
         number = part.phases[0].number
         if before is not None and joint is None:
-            joint = choose_joint(before, part.curves[0], epsilon, number)
-        last = part.curves[-1]
-        coming = choose_joint(last, after, epsilon, part.phases[-1].number + 1) if after else None
+            first = part.curves[0]
+            joint = choose_joint(before, first, first.start, epsilon, number)
+        last, following, coming = part.curves[-1], part.phases[-1].number + 1, None
+        if after is not None:
+            coming = choose_joint(last, after, last.end, epsilon, following)
         pins = joint.begins if joint else None, coming.ends if coming else None
         if duration is not None and joint is not None:
             duration -= joint.pause
         with charge(number):
             own: Plans = [*plan_sequence(part, epsilon, options, duration, pins=pins)]
         if joint is not None:
-            own[0] = add_pause(own[0], joint, part.curves[0], options)  # type: ignore[arg-type]
+            first = part.curves[0]
+            own[0] = add_pause(own[0], joint, first.formation, first.start, options)
         plans += own
         joint, before = coming, last
     return plans

@@ -179,7 +179,8 @@ def solve_attempt(search: Search, attempt: Attempt) -> Solution:
         if not found.success:
             return found
         stages, least = found.stages, found.cost
-    solution = search.solve(stages, attempt.before, SPLIT if attempt.gradual else ATTEMPT)
+    patience = SPLIT if attempt.gradual else ATTEMPT
+    solution = search.solve(stages, attempt.before, search.wait(patience))
     if solution.success and solution.margin < -ROUNDING:
         # A way that presses too little may be far from one that presses enough.
         return solution._replace(success=False, status="the largest c_n is below epsilon")

@@ -14,8 +14,10 @@ from ...common.minima import find_minima
 from ...mechanics.limits import PRESS, LimitSet, make_limits
 from ...results.trajectory import Samples
 from .equations import SLIDING, least_senses
-from .limits import bound_by_limits
+from .layout import StageLayout
+from .limits import LimitRows, bound_by_limits
 from .motion import StageMotion
+from .motors import find_relieved
 from .nlp import TimeNLP
 from .stage import Stage
 
@@ -30,6 +32,8 @@ CHECKS = 25
 """Places per interval at which limits are checked."""
 _OVER = 1.5
 """Factor on the miss by which a limit is tightened at first."""
+_AMPLE = 1e3
+"""Slack, over what is much for a limit, of what does not count."""
 _MOST = (_OVER, 4.0, 4.0)
 """The same at most, of forces, gaps and senses, where tightening has made the miss little less:
 forces have a price."""
@@ -155,8 +159,9 @@ def find_misses(
     # What a stage is short of where it starts, no bound within it can mend.
     values = check.limits[:, list(stage.monitored)]
     values = values - np.minimum(values[:1], 0.0)
+    relieved = np.repeat(np.where(find_relieved(stage, limits), _AMPLE, 0.0), CHECKS, axis=0)
     tables = (
-        _find_slack(stage, limits, samples, margin) - swings,
+        _find_slack(stage, limits, samples, margin) - swings + relieved,
         values - clear,
         _measure_senses(stage, samples) - 0.5 * least_senses(stage, check.places),
     )
@@ -213,14 +218,19 @@ def raise_bounds(
         kept = own.limits.limits
         rows, signs, values = kept.sides
         more = raised.held * kept.scales[rows]
+        # What passes from or to no force keeps that alone.
+        more = np.where(find_relieved(stage, kept), -signs * values, more)
         pressed = own.limits.pressed
         floor = values[pressed] + more[:, pressed]
         # Where rows hold c_n at the points too, its own bounds must not.
-        if own.limits.presses.shape[1] <= 2:
+        if own.limits.alone:
             low_x[layout.forces[..., : stage.formation.n_contacts]] = floor[:, None]
         low[own.limits.presses] = floor[:, None]
         others = own.limits.sides
         low[own.limits.others] = ((signs * values)[others] + more[:, others])[:, None]
+        for held in (layout.begin, layout.finish):
+            low_x[held[: stage.formation.n_contacts]] = values[pressed][: len(held)]
+        _free_equal(stage, own.limits, layout, (low_x, low))
         bound_by_limits(own.limits, layout, bounds, more)
         low[own.monitor_rows] += raised.gap[:, None]
         low[own.senses] += raised.sense[:, None, list(stage.formation.rubbing_rows)]
@@ -229,3 +239,21 @@ def raise_bounds(
             low_x[rates] += faster * (sigma > 0)
             high_x[rates] -= faster * (sigma < 0)
     return low, high
+
+
+def _free_equal(
+    stage: Stage, rows: LimitRows, layout: StageLayout, lows: tuple[Array, Array]
+) -> None:
+    """Take bounds away, in place, where equations say what a force is."""
+    if not stage.formation.scene.has_slow_motors:
+        return
+    low_x, low = lows
+    for contact, slips in stage.fading:
+        if slips:
+            names = [rows.limits.limits[k].part for k in rows.limits.owners]
+            own = [names[k] == stage.formation.names[contact] for k in rows.limits.sides[0]]
+            low[rows.others[-1, -1, np.array(own)[rows.sides]]] = -np.inf
+        else:
+            low_x[layout.forces[-1, -1, contact]] = -np.inf
+            low[rows.presses[-1, 1:2, contact]] = -np.inf
+    low[rows.presses[0, 0, list(stage.growing)]] = -np.inf

@@ -44,6 +44,10 @@ _DEARER = 0.2
 """Largest relative cost increase accepted from tightening."""
 DEARER = "a plan that keeps limits between points is much dearer"
 """Status of solutions whose limits between points cannot be kept by tightening them."""
+_UNKNOWN = 0.01
+"""Error with limited rates where none is known."""
+_SLOWLY = 0.5
+"""Share of the error that intervals halved at once are to leave, with limited rates."""
 _HOPELESS = 1.0
 """Price of all that limits miss, over the cost, from which on no finer intervals are tried."""
 _COARSE = 0.1
@@ -55,6 +59,7 @@ def enforce_between(search: Search, solution: Solution) -> Solution:
     refined, first = 0, solution.cost
     tries: list[float] = []
     raised = [Raised.none(stage) for stage in solution.stages]
+    coarse = math.nan
     for _ in range(ROUNDS):
         motions = make_motions(solution.stages, search.scheme)
         checks = [check_between(*pair) for pair in zip(solution.stages, motions, strict=True)]
@@ -71,18 +76,18 @@ def enforce_between(search: Search, solution: Solution) -> Solution:
             return solution._replace(status=DEARER, success=False)
         # Limits that are being tightened are looked at for their misses first.
         decided = worst <= 1 or not any(own.limits.worst for own in raised)
-        gains = list_gains(search, solution, motions) if decided else []
+        gains = _find_gains(search, solution, motions, coarse) if decided else []
         halved = decided and refined < REFINEMENTS
         times = _choose_halvings(search, solution, motions, misses, gains) if halved else []
         if any(mine.any() for mine in times):
             refined += 1
             stages = bisect_intervals(solution.stages, search.scheme, times)
-            finer = search.solve(stages, solution, most=_PATIENCE)
+            finer = search.solve(stages, solution, most=search.wait(_PATIENCE))
             if finer.success:
                 if finer.cost - first > _COARSE * abs(first):
                     status = "a plan on finer intervals is much dearer"
                     return finer._replace(status=status, success=False)
-                solution = finer
+                solution, coarse = finer, solution.cost
                 raised = [Raised.none(stage) for stage in solution.stages]
                 continue
             # What finer intervals do not lead to now they will not lead to later.
@@ -92,9 +97,9 @@ def enforce_between(search: Search, solution: Solution) -> Solution:
         raised = [own.further(miss) for own, miss in zip(raised, misses, strict=True)]
         tries.append(worst)
         limits = [own.limits for own in raised]
-        tighter = search.run(
-            solution.nlp, solution.stages, limits, solution.multipliers, solution.margin
-        )
+        # Where rates are limited a motion changes as a whole, and with it what is at its limit.
+        known = solution.multipliers
+        tighter = search.run(solution.nlp, solution.stages, limits, known, solution.margin)
         crept = len(tries) >= STALLED and worst > _CREEPS * tries[-STALLED]
         if not tighter.success or crept:
             tries.clear()
@@ -107,6 +112,27 @@ def enforce_between(search: Search, solution: Solution) -> Solution:
         solution = tighter
     status = f"limits are still missed {worst:.2g} times what is allowed between points"
     return solution._replace(status=status, success=False)
+
+
+def _find_gains(
+    search: Search, solution: Solution, motions: Sequence[StageMotion], coarse: float
+) -> list[Array]:
+    """What better torques would gain in each interval, over the objective, shape (K,) each.
+
+    With limited rates that is as much as halving some intervals has gained, from the cost that is
+    `coarse`. Each interval has a share in it by how much its torques bend: there they would rather
+    change their rate at once.
+    """
+    if not search.problem.scene.has_slow_motors:
+        return list_gains(search, solution, motions)
+    limit, shares = search.problem.scene.torque_limit, list[Array]()
+    for stage in solution.stages:
+        part = stage.guess
+        bends = np.abs(np.diff(part.tau, 2, axis=1) / limit).max(axis=(1, 2), initial=0.0)
+        shares.append(part.duration * part.fractions * bends)
+    gain = abs(coarse - solution.cost) / measure_cost(search, solution)
+    gain = _UNKNOWN if math.isnan(gain) else gain
+    return [own * (gain / max(sum(map(np.sum, shares)), 1e-300)) for own in shares]
 
 
 def is_hopeless(search: Search, solution: Solution) -> bool:
@@ -128,7 +154,7 @@ def list_misses(search: Search, solution: Solution, checks: Sequence[CheckPlaces
 def list_gains(search: Search, solution: Solution, motions: Sequence[StageMotion]) -> list[Array]:
     """What better torques would gain in each interval, over the objective, shape (K,) each."""
     epsilon, square = search.problem.epsilon, float(search.goal is Objective.EFFORT)
-    size = abs(solution.cost) + epsilon * (search.goal is Objective.MARGIN)
+    size = measure_cost(search, solution)
     found = []
     for k, (stage, motion) in enumerate(zip(solution.stages, motions, strict=True)):
         rows = solution.nlp.rows_of[k]
@@ -137,6 +163,11 @@ def list_gains(search: Search, solution: Solution, motions: Sequence[StageMotion
         limits = make_limits(stage.formation, epsilon)
         found.append(find_gains(stage, motion, costate, limits, solution.margin, square) / size)
     return found
+
+
+def measure_cost(search: Search, solution: Solution) -> float:
+    """What gains count over."""
+    return abs(solution.cost) + search.problem.epsilon * (search.goal is Objective.MARGIN)
 
 
 def price_misses(solution: Solution, misses: Sequence[Limits]) -> list[Array]:
@@ -175,8 +206,10 @@ def _choose_halvings(
     ]
     shares = [gain + price for gain, price in zip(gains, prices, strict=True)]
     fixed = options.time_intervals is not None
+    slow = _SLOWLY * search.problem.scene.has_slow_motors
     if not fixed and sum(own.sum() for own in shares) > options.accuracy:
-        more = spread_halvings(shares, _SPARE * options.accuracy)
+        left = max(_SPARE * options.accuracy, slow * sum(own.sum() for own in shares))
+        more = spread_halvings(shares, left)
         times = [np.maximum(*pair) for pair in zip(times, more, strict=True)]
     return cap_halvings(times, most)
 

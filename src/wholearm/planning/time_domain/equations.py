@@ -21,6 +21,7 @@ from .kernels import (
 )
 from .layout import MARGIN, StageLayout, V, Z
 from .limits import LimitRows, Target, add_limits
+from .motors import MotorRows, add_motors, join_motors
 from .rows import Rows
 from .stage import Stage
 
@@ -52,6 +53,8 @@ class StageRows:
     limits : LimitRows
     monitor_rows : ndarray of int, shape (K, d, m)
         Limits of the formation.
+    motors : MotorRows or None
+        If motors are not quick.
     """
 
     chain: Indices
@@ -63,6 +66,7 @@ class StageRows:
     senses: Indices
     limits: LimitRows
     monitor_rows: Indices
+    motors: MotorRows | None
 
     @property
     def even(self) -> tuple[Indices, ...]:
@@ -90,10 +94,13 @@ def add_stage(
         chain = np.hstack([chain, own])
     monitor_rows = _add_monitor_rows(rows, stage, layout, scheme)
     gained = [formation.limits[k].gained for k in stage.released]
+    slow = formation.scene.has_slow_motors
+    # What is let go while torques go on has no acceleration at first.
+    opening = stage.opening * (scheme.points[:, None] if slow else 1.0)
     for contact in [c for c in gained if c is not None and stage.opens]:
         kernel = opening_kernel(formation, contact)
         columns = kernel.x.join(z=layout.z[0], v=layout.v[0], a=layout.a[0])
-        own = rows.nonlinear(scheme.degree, kernel.outputs, low=stage.opening, high=np.inf)
+        own = rows.nonlinear(scheme.degree, kernel.outputs, low=opening, high=np.inf)
         rows.add_copies(kernel, columns, own)
     until = stage.until
     if stage.stop is not None:
@@ -105,7 +112,9 @@ def add_stage(
         end = layout.nodes[-1]
         rows.add_copies(goal, goal.x.join(z=end[Z], v=end[V]), rows.nonlinear(goal.outputs))
     limits = add_limits(rows, stage, layout, scheme, target)
-    return StageRows(chain, states, bases, shares, points, balance, senses, limits, monitor_rows)
+    motors = add_motors(rows, stage, layout, scheme) if slow else None
+    given = chain, states, bases, shares, points, balance, senses
+    return StageRows(*given, limits, monitor_rows, motors)
 
 
 def _list_free_turns(stage: Stage) -> tuple[int, ...]:
@@ -249,10 +258,16 @@ def _add_monitor_rows(rows: Rows, stage: Stage, layout: StageLayout, scheme: Sch
 
 
 def join_stages(
-    rows: Rows, stage: Stage, coming: Stage, layout: StageLayout, first: Indices
+    rows: Rows,
+    pair: tuple[Stage, Stage],
+    layouts: tuple[StageLayout, StageLayout],
+    scheme: Scheme,
 ) -> None:
     """Position and velocity go on from one stage to the next; an impact changes the velocity."""
-    last = layout.nodes[-1]
+    (stage, coming), layout = pair, layouts[0]
+    last, first = layout.nodes[-1], layouts[1].nodes[0]
+    if stage.formation.scene.has_slow_motors:
+        join_motors(rows, stage, layouts, scheme)
     same = np.delete(np.arange(len(first)), V) if stage.ends_in_impact else slice(None)
     own = rows.linear(len(first[same]))
     rows.add_entries(own, first[same], 1.0)

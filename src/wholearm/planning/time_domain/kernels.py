@@ -68,7 +68,7 @@ def share(size: int) -> Callable[[Callable[..., _K]], Callable[..., _K]]:
     return decorate
 
 
-def _name(x: Symbols, p: Symbols, **y: Expression) -> NamedKernel:
+def name_kernel(x: Symbols, p: Symbols, **y: Expression) -> NamedKernel:
     """Build the kernel of named expressions `y` of symbols."""
     columns = Columns(**{name: int(block.numel()) for name, block in y.items()})
     own = build_kernel(x.every, p.every, columns.write(**y))
@@ -101,7 +101,7 @@ def point_kernel(formation: Formation, controls: int, gradual: bool = False) -> 
         - ca.DM(scene.dry) * ca.vertcat(0, 0, 0, sigma)
         + build_force_rows(formation, P, A_t, Xi).T @ s.forces
     )
-    return _name(
+    return name_kernel(
         s,
         p,
         gaps=gaps,
@@ -120,7 +120,7 @@ def end_kernel(formation: Formation) -> NamedKernel:
     gaps, P, _, _ = formation.build_constraints(x.z, x.v)
     if formation.rolling:
         gaps[formation.n_contacts :] -= formation.roll_function(x.first, x.v)[0]
-    return _name(x, _NOTHING, gaps=gaps, rates=P @ x.v)
+    return name_kernel(x, _NOTHING, gaps=gaps, rates=P @ x.v)
 
 
 @lru_cache(maxsize=32)
@@ -138,7 +138,7 @@ def collocation_kernel(name: str, degree: int, freedoms: int) -> NamedKernel:
     here = ca.reshape(ca.vertcat(s.points, s.end), 5, rungs)
     rates, N = ca.reshape(s.rates, 5, degree), ca.reshape(p.N, 5, freedoms)
     steps = here - ca.repmat(s.start, 1, rungs) - s.h * (rates @ ca.DM(table).T)
-    return _name(s, p, steps=N.T @ steps)
+    return name_kernel(s, p, steps=N.T @ steps)
 
 
 @share(64)
@@ -146,7 +146,7 @@ def monitor_kernel(formation: Formation, monitored: tuple[int, ...]) -> NamedKer
     """Limits of a formation."""
     x = Columns(z=5).make_symbols(z=build_features(formation.scene).z)
     values = ca.vertcat(*(formation.limits[k].value for k in monitored))
-    return _name(x, _NOTHING, values=values)
+    return name_kernel(x, _NOTHING, values=values)
 
 
 @share(64)
@@ -154,7 +154,7 @@ def opening_kernel(formation: Formation, contact: Contact) -> NamedKernel:
     """Second derivative of a contact's gap."""
     x = Columns(z=5, v=5, a=5).make_symbols()
     _, A, _, A_dot_v = Formation(formation.scene, (contact,)).function(x.z, x.v)
-    return _name(x, _NOTHING, opening=A @ x.a + A_dot_v)
+    return name_kernel(x, _NOTHING, opening=A @ x.a + A_dot_v)
 
 
 @share(64)
@@ -182,7 +182,7 @@ def goal_kernel(
     if gained is not None:
         P = gained.build_constraints(z, v)[1]
         parts += [P[i, :] @ v for i in new_rows(formation, gained)]
-    return _name(x, _NOTHING, goals=ca.vertcat(*parts)) if parts else None
+    return name_kernel(x, _NOTHING, goals=ca.vertcat(*parts)) if parts else None
 
 
 def new_rows(formation: Formation, following: Formation) -> list[int]:
@@ -202,7 +202,7 @@ def effort_kernel(controls: int) -> NamedKernel:
         for i in range(controls)
     ]
     tau = ca.reshape(x.tau, 2, controls)
-    return _name(x, _NOTHING, effort=x.h * ca.trace(tau @ ca.DM(products) @ tau.T))
+    return name_kernel(x, _NOTHING, effort=x.h * ca.trace(tau @ ca.DM(products) @ tau.T))
 
 
 @lru_cache(maxsize=8)
@@ -211,7 +211,7 @@ def bend_kernel(controls: int) -> NamedKernel:
     x, p = Columns(tau=2 * controls, h=1).make_symbols(), Columns(weight=2).make_symbols()
     tau = ca.reshape(x.tau, 2, controls)
     bends = tau[:, 2:] - 2 * tau[:, 1:-1] + tau[:, :-2]
-    return _name(x, p, cost=x.h * ca.dot(p.weight, ca.sum2(bends**2)))
+    return name_kernel(x, p, cost=x.h * ca.dot(p.weight, ca.sum2(bends**2)))
 
 
 def find_leaving(formation: Formation, following: Formation) -> list[int]:
@@ -234,7 +234,7 @@ def impact_kernel(formation: Formation, following: Formation) -> NamedKernel:
     A = formation.function(x.z, x.after)[1]
     rolling = list(following.rolling_rows)
     grip = ca.DM(following.friction)[rolling, :] * x.impulses[rolling, :]
-    return _name(
+    return name_kernel(
         x,
         p,
         jump=ca.DM(scene.mass_diagonal) * (x.after - x.before) - push,

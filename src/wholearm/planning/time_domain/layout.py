@@ -38,6 +38,9 @@ class StageLayout:
         Shortfalls of limits in each interval.
     impulses : ndarray of int
         Of the impact that leads to the next stage, if one does.
+    begin, finish : ndarray of int
+        Forces that hold the object at rest before the first stage and after the last one, if
+        torques must not step there.
     """
 
     nodes: Indices
@@ -49,6 +52,8 @@ class StageLayout:
     forces: Indices
     short: Indices
     impulses: Indices
+    begin: Indices
+    finish: Indices
 
     @property
     def stop(self) -> int:
@@ -61,6 +66,7 @@ def lay_out(
     scheme: Scheme,
     with_margin: bool = False,
     shortfalls: Sequence[int] | None = None,
+    held: bool = False,
 ) -> list[StageLayout]:
     """Lay out the unknowns of stages that follow one another.
 
@@ -72,6 +78,8 @@ def lay_out(
         Whether nodes have a margin.
     shortfalls : sequence of int, optional
         How many shortfalls each interval of a stage has, if any.
+    held : bool
+        Whether torques must not step at both ends.
     """
     layouts: list[StageLayout] = []
     stop, d = 0, scheme.degree
@@ -80,7 +88,8 @@ def lay_out(
         end, short = (0 if scheme.ends else STATE), shortfalls[k] if shortfalls else 0
         sizes = {"h": 1, "tau": 2 * scheme.controls, "points": d * point.count}
         interval = Columns(**sizes, end=end, short=short, m=int(with_margin))
-        first = stop + np.arange(STATE + with_margin)
+        begin = stop + np.arange(point.sizes["forces"] * (held and not layouts))
+        first = stop + len(begin) + np.arange(STATE + with_margin)
         starts = first[-1] + 1 + interval.count * np.arange(stage.intervals)
         own = {
             name: starts[:, None] + np.arange(part.start, part.stop)
@@ -101,9 +110,11 @@ def lay_out(
                 **at,
                 short=own["short"],
                 impulses=stop + np.arange(extra),
+                begin=begin,
+                finish=stop + np.arange(point.sizes["forces"] * (held and coming is None)),
             )
         )
-        stop += extra
+        stop += extra + len(layouts[-1].finish)
     return layouts
 
 
@@ -117,6 +128,8 @@ def pack(points: Sequence[StagePoints], layouts: Sequence[StageLayout], margin: 
         x[layout.nodes[:, Z]], x[layout.nodes[:, V]] = part.nodes[:, 0], part.nodes[:, 1]
         x[layout.nodes[:, MARGIN:]] = margin
         x[layout.impulses] = part.impulses
+        x[layout.begin] = part.forces[0, 0, : len(layout.begin)]
+        x[layout.finish] = part.forces[-1, -1, : len(layout.finish)]
     return x
 
 

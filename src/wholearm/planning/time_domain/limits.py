@@ -18,6 +18,10 @@ from .layout import MARGIN, StageLayout
 from .rows import Rows
 from .stage import Stage
 
+_WITHIN = np.array([0.3, 0.4, 0.5, 0.75, 0.85, 0.93])
+"""Places between points at which c_n is bounded too where rates of torques are limited: there it
+turns within an interval."""
+
 
 class Target(NamedTuple):
     """What an NLP is to find.
@@ -68,6 +72,8 @@ class LimitRows:
         Which sides of the limits these are.
     bounded : tuple of int
         Sides that are bounds of an unknown.
+    alone : bool
+        Whether c_n are bounded at the points themselves.
     """
 
     limits: LimitSet
@@ -75,6 +81,7 @@ class LimitRows:
     others: Indices
     sides: NDArray[np.int64]
     bounded: tuple[int, ...]
+    alone: bool
 
     @property
     def pressed(self) -> NDArray[np.int64]:
@@ -111,7 +118,8 @@ def add_limits(
     own, signs, bounds = limits.sides
     single = find_single(limits, stage.formation.n_constraints)[own]
     others = np.flatnonzero(~np.isin(own, presses) & (single < 0))
-    pressed = _add_presses(rows, limits, layout, scheme, [gives[row] for row in presses])
+    given = [gives[row] for row in presses], stage.formation.scene.has_slow_motors
+    pressed = _add_presses(rows, limits, layout, scheme, *given)
     added = rows.linear(*layout.z.shape[:2], len(others), high=np.inf)
     for k, side in enumerate(others):
         row = own[side]
@@ -126,7 +134,8 @@ def add_limits(
         soft = rows.linear(*unknowns.shape, low=signs[side] * bounds[side], high=np.inf)
         rows.add_entries(soft, unknowns, signs[side])
         _add_gives(rows, soft, gives[own[side]])
-    return LimitRows(limits, pressed, added, others, tuple(bounded))
+    alone = not any(given[0])
+    return LimitRows(limits, pressed, added, others, tuple(bounded), alone)
 
 
 def bound_by_limits(
@@ -193,9 +202,12 @@ def _add_presses(
     layout: StageLayout,
     scheme: Scheme,
     gives: list[_Gives | None],
+    slow: bool,
 ) -> Indices:
     """Normal forces by the polynomials through the points, shape (K, m, n_c)."""
     places = np.zeros(1) if scheme.ends else np.array([0.0, 1.0])
+    if slow:
+        places = np.append(places, _WITHIN)
     if any(gives):
         places = np.append(places, scheme.points)
     c_n = layout.forces[:, :, limits.rows[limits.of(PRESS)].argmax(axis=1)]

@@ -82,15 +82,16 @@ def in_mode(stage: Stage, mode: Mode) -> Stage:
 
 def link(stages: Sequence[Stage]) -> list[Stage]:
     """Stages of which each ends as its mode and that of the next one ask for."""
-    linked = []
+    linked = list[Stage]()
     for stage, coming in zip(stages, [*stages[1:], None], strict=True):
         turns: tuple[int, ...] = ()
-        gained = None
+        gained, fading = None, tuple[tuple[int, float], ...]()
+        growing = find_fresh(linked[-1], stage) if linked and not linked[-1].ends_in_impact else ()
         if coming is not None and not stage.ends_in_impact:
-            turns = find_turns(stage, coming)
+            turns, fading = find_turns(stage, coming), find_passing(stage, coming)
             fresh = new_rows(stage.formation, coming.formation)
             gained = coming.formation if fresh else None
-        linked.append(replace(stage, turns=turns, gained=gained))
+        linked.append(replace(stage, gained=gained, growing=growing, fading=fading, turns=turns))
     return linked
 
 
@@ -104,6 +105,24 @@ def find_turns(stage: Stage, coming: Stage) -> tuple[int, ...]:
     joints = coming.directions.sigma
     turns += [n_c + k for k in range(2) if stage.directions.sigma[k] * joints[k] < 0]
     return tuple(turns)
+
+
+def find_passing(stage: Stage, coming: Stage) -> tuple[tuple[int, float], ...]:
+    """Contacts that a stage lets go at its end, with 0, or lets slip, with their direction then."""
+    formation, passing = stage.formation, list[tuple[int, float]]()
+    for k, contact in enumerate(formation.contacts):
+        if contact not in coming.formation.contacts:
+            passing.append((k, 0.0))
+        elif contact in formation.rolling and contact not in coming.formation.rolling:
+            row = coming.formation.contacts.index(contact)
+            passing.append((k, float(coming.directions.Xi[row])))
+    return tuple(passing)
+
+
+def find_fresh(stage: Stage, coming: Stage) -> tuple[int, ...]:
+    """Contacts of the coming stage that a stage does not have."""
+    known = stage.formation.contacts
+    return tuple(k for k, c in enumerate(coming.formation.contacts) if c not in known)
 
 
 def split(stage: Stage, scheme: Scheme, begin: int, stop: int, mode: Mode) -> list[Stage]:
@@ -140,9 +159,12 @@ def merge(stages: Sequence[Stage]) -> list[Stage]:
 def release_earlier(stages: Sequence[Stage], index: int) -> list[Stage] | None:
     """Stages of which one belongs to the next phase, or None if that cannot be.
 
-    It has to be the last but not the only one of a phase that ends by a release.
+    It has to be the last but not the only one of a phase that ends by a release. Where torques must
+    not step what is let go earlier goes on next to the contact: nothing is gained.
     """
     stage = stages[index]
+    if stage.formation.scene.has_slow_motors:
+        return None
     coming = stages[index + 1] if index + 1 < len(stages) else None
     before = stages[index - 1] if index else None
     if coming is None or before is None or before.phase != stage.phase:

@@ -42,6 +42,7 @@ from .equations import StageRows, add_stage, find_still, join_stages, least_sens
 from .kernels import bend_kernel, effort_kernel
 from .layout import MARGIN, STATE, StageLayout, V, Z, lay_out
 from .limits import Target, bound_by_limits
+from .motors import hold_ends
 from .rows import Rows
 from .stage import Stage
 
@@ -124,7 +125,9 @@ def build_time_nlp(
     """
     started = time.perf_counter()
     shortfalls = [target.count_shortfalls(stage) for stage in stages]
-    layouts = lay_out(stages, scheme, target.chained, shortfalls)
+    # Friction that sets in gradually holds nothing at rest.
+    held = stages[0].formation.scene.has_slow_motors and not stages[0].onset
+    layouts = lay_out(stages, scheme, target.chained, shortfalls, held)
     rows, cost = Rows(), np.zeros(layouts[-1].stop)
     start = stages[0].guess.nodes[0].ravel()
     rows.add_entries(rows.linear(STATE, low=start, high=start), layouts[0].nodes[0, :STATE], 1.0)
@@ -132,9 +135,12 @@ def build_time_nlp(
     for k, (stage, layout) in enumerate(zip(stages, layouts, strict=True)):
         rows_of.append(add_stage(rows, stage, layout, scheme, stage is stages[-1], target))
         if k + 1 < len(stages):
-            join_stages(rows, stage, stages[k + 1], layout, layouts[k + 1].nodes[0])
+            pair, own = (stage, stages[k + 1]), (layout, layouts[k + 1])
+            join_stages(rows, pair, own, scheme)
         _add_costs(rows, cost, stage, layout, scheme, target)
     duration_row, last, end = -1, stages[-1], layouts[-1].nodes[-1]
+    if held:
+        hold_ends(rows, stages, layouts, target.epsilon)
     if target.chained:
         cost[end[MARGIN]] = -1.0 if target.objective is Objective.MARGIN else 1.0
         total = rows.linear(1, high=np.inf)

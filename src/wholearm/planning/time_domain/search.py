@@ -28,6 +28,8 @@ from .warm_start import FIRST_SIZE, Multipliers, carry_multipliers, first_multip
 
 _ITERATIONS = {Objective.ELASTIC: 90, Objective.RELAX: 50}
 """Most iterations of one solve, if not 150."""
+_SLOWER = 2
+"""Factor on the most iterations of one solve, where rates of torques are limited."""
 _CAP = 1.1
 """Largest margin that is looked for, over the one from which on more decides nothing."""
 
@@ -177,6 +179,10 @@ class Search:
         scheme = make_scheme(name, degree, 2 if straight else degree)
         own = replace(self, goal=goal, relaxation=relaxation, scheme=scheme)
         return replace(own, duration=None, to_go=None, price=None)
+
+    def wait(self, iterations: int) -> int:
+        """Iterations to wait for the solver: where rates of torques are limited it takes more."""
+        return iterations * (_SLOWER if self.problem.scene.has_slow_motors else 1)
 
     def charge(self, z: Array) -> float:
         """What it costs to end at `z`, shape (5,)."""

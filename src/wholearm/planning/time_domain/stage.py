@@ -74,6 +74,10 @@ class Stage:
         Rows of (contacts, joints) whose rate is zero at the end.
     gained : Formation or None
         The next stage's formation where that has a constraint more, which is gained softly.
+    fading : tuple of (int, float)
+        Contacts that the next stage lets go, with 0, or lets slip, with their direction then.
+    growing : tuple of int
+        Contacts that the stage before does not have.
     ends_in_impact : bool
         Whether an impact leads to the next stage.
     monitored : tuple of int
@@ -105,6 +109,8 @@ class Stage:
     until: Until | None = None
     turns: tuple[int, ...] = ()
     gained: Formation | None = None
+    fading: tuple[tuple[int, float], ...] = ()
+    growing: tuple[int, ...] = ()
     ends_in_impact: bool = False
     monitored: tuple[int, ...] = ()
     released: tuple[int, ...] = ()
@@ -124,11 +130,14 @@ class Stage:
     def list_clearances(self, places: Array, after: float) -> Array:
         """Least values of monitored limits at `places`, shape (n,), of the stage: (n, n_monitored).
 
-        From the share `after` of the stage on, but for contacts that were let go before it.
+        From the share `after` of the stage on, but for contacts that were let go before it. Where
+        torques go on, so do accelerations, and gaps open with the third power of time.
         """
-        late = (places > after)[:, None]
+        slow = self.formation.scene.has_slow_motors
+        late = (np.minimum(places / after, 1.0) ** 3 if slow else places > after)[:, None]
         released, apart = (np.isin(self.monitored, own) for own in (self.released, self.apart))
-        return np.asarray(self.clearance * (released & (late | (not self.opens)) | apart & late))
+        opened = np.where(self.opens, late, 1.0)
+        return np.asarray(self.clearance * np.maximum(released * opened, apart * late))
 
     def measure_senses(self, z: Array, v: Array) -> Array:
         """Rates of contacts and joints in the stage's directions, shape (n, n_c + 2) [rad/s].

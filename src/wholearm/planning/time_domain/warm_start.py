@@ -10,8 +10,9 @@ from ...common.arrays import Array
 from .assembly import Indices
 from .collocation import Scheme
 from .equations import StageRows
+from .motors import MotorRows
 from .nlp import TimeNLP
-from .stage import Stage
+from .stage import Stage, StagePoints
 
 FIRST_SIZE = 1e-2
 """Multipliers of a first guess."""
@@ -67,6 +68,8 @@ def carry_multipliers(
         for mine, theirs in zip(rows.even, known.even, strict=True):
             values = on_g[theirs[parent]]
             lam_g[mine] = values * share.reshape(-1, *[1] * (values.ndim - 1))
+        if rows.motors is not None and known.motors is not None:
+            _carry_motors(lam_g, on_g, (known.motors, rows.motors), (part, finer), parent)
         costate = find_costate(known, on_g, scheme)[parent]
         places = (finer.places(scheme.points) - part.breaks[parent, None]) / part.fractions[
             parent, None
@@ -85,7 +88,25 @@ def find_costate(rows: StageRows, on_g: Array, scheme: Scheme) -> Array:
     return np.asarray(np.einsum("kdf,ksjf->ksjd", rows.bases, shares))
 
 
+def _carry_motors(
+    lam_g: Array,
+    on_g: Array,
+    rows: tuple[MotorRows, MotorRows],
+    parts: tuple[StagePoints, StagePoints],
+    parent: Indices,
+) -> None:
+    """Multipliers of rates and commands, and of torques that go on: their costate."""
+    known, own = rows
+    lam_g[own.rates], lam_g[own.commands] = on_g[known.rates[parent]], on_g[known.commands[parent]]
+    old, new = (part.breaks[1:-1] for part in parts)
+    if len(old):
+        for joint in range(2):
+            lam_g[own.joins[:, joint]] = np.interp(new, old, on_g[known.joins[:, joint]])
+
+
 def _list_once(nlp: TimeNLP) -> Indices:
     """Rows that are there once, and not in each interval."""
     own = [part.ravel() for r in nlp.rows_of for part in (*r.even, r.states, r.shares)]
+    slow = [r.motors for r in nlp.rows_of if r.motors is not None]
+    own += [part.ravel() for m in slow for part in (m.joins, m.rates, m.commands)]
     return np.delete(np.arange(len(nlp.rows.bounds[0])), np.concatenate(own))
