@@ -19,12 +19,14 @@ from wholearm.common.errors import InputError
 from wholearm.free_simulation.simulate import simulate_free
 from wholearm.geometry.tracing import trace_phase
 from wholearm.planning.result import Plan
-from wholearm.policy.curve_law import CurveLaw, Pace, choose_squeeze
+from wholearm.policy.curve_law import CurveLaw
 from wholearm.policy.make import hold_end, make_policy
 from wholearm.policy.motion_law import MotionLaw
+from wholearm.policy.pace import Pace
 from wholearm.policy.policy import Policy
 from wholearm.policy.regulator import RATE, Linear, regulate
 from wholearm.policy.retime import eliminate, retime
+from wholearm.policy.squeeze import choose_squeeze
 from wholearm.problem.definition import Problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.results.trajectory import Trajectory
@@ -200,7 +202,7 @@ def test_joints_are_led_along_a_motion() -> None:
         {
             "starts": np.array([0.0, 0.1]), "step": t[1:2], "theta": theta, "rates": rates,
             "tau": inertia * bent, "gain": np.tile(gains, (201, 1, 1)), "push": np.zeros(2),
-            "still": np.array([1e-3]),
+            "still": np.array([1e-3]), "ways": np.eye(2),
         },
         pace,
     )  # fmt: skip
@@ -264,8 +266,9 @@ def test_no_policy_is_written_that_does_not_carry_out_its_plan(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     plan.save(tmp_path / "plan.npz")
-    # Torques that let go at the end of the first phase.
-    weak = Policy([{**policy.tables[0], "push": np.zeros(2)}, policy.tables[1]], policy.pace)
+    # Torques that let go where the second phase begins.
+    first, last = policy.tables
+    weak = Policy([first, {**last, "torque": 0.2 * last["torque"]}], policy.pace)
     weak.about = policy.about
     monkeypatch.setattr("wholearm.policy.make.make_policy", lambda *_, **__: weak)
     output = tmp_path / "policy.npz"

@@ -9,8 +9,10 @@ last two are affine in a, b, s' and the squeeze (`curve_rows`). A step
 * takes the squeeze with the largest least level of all limits, and where that is below `LEVEL`
   goes back from a towards the reference as far as it takes.
 
-At the end, when the joints all but stand still at the place of the contact that is gained, torques
-that balance with it and drive on without it hold until the joints have stood still for a while.
+At the end the motion goes on at touching speed, a little faster the longer it takes, until the
+joints stop and stay so while the drive rises, or until they are well beyond: the contact is made.
+From then on torques are those of the next law with no speed wanted, until the joints have stood
+still. Without a next law along a curve, torques that were found before hold in the same way.
 
 Plain numbers and lists are several times as fast as arrays that are as short as these.
 """
@@ -19,11 +21,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from math import sqrt
-from typing import Any, NamedTuple
+from typing import Any
+
+from .pace import Pace
+from .squeeze import choose_squeeze, find_motion
 
 LEVEL, PART = 1.0, 0.5
 """Level of limits below which feedback gives way, in reserves: at most the first, and at most the
 second times that of the reference, which may have less."""
+LEAST = 0.3
+"""Level of limits at an arrival, of all contacts, that is worth another squeeze."""
 IGNORED = 1e6
 """Level from which on a limit is none."""
 CORRECTION = 0.25
@@ -46,41 +53,23 @@ LATE = 5.0
 """Periods after which it counts as over, where the joints do not show it."""
 SHORT = 4.0
 """How many times as long the joints have to stand still short of that."""
-
 CATCH = 10.0
 """Way in which the reference's place becomes the motion's, over how far off the start is."""
-SAME = 1e-12
-"""Difference of levels that is none."""
-
-
-class Pace(NamedTuple):
-    """What the laws of all phases have in common.
-
-    Attributes
-    ----------
-    period : float, [s]
-        Of the control loop.
-    delay : float, [s]
-        Time from measuring to when torques take effect, as far as it is known.
-    touch : float, [m/s]
-        Speed s' at which contacts are made.
-    still : float, [m/s]
-        Speed s' that counts as none.
-    dwell : float, [s]
-        How long the joints stand still before the next phase begins.
-    most : float, [m/s^2]
-        Largest a of the integral.
-    limit : tuple of two float, [N m]
-        Of the torques.
-    """
-
-    period: float
-    delay: float
-    touch: float
-    still: float
-    dwell: float
-    most: float
-    limit: tuple[float, float]
+GROWTH, FASTEST = 0.01, 4.0
+"""Time over which the wanted speed grows with the way beyond the end [s], up to so many times the
+touching speed."""
+STOPPED = 0.3
+"""Part of the touching speed below which the joints have been stopped."""
+DRIVE, RISE = 0.3, 2
+"""Drive that joints withstand where a contact is made, over the largest a of the integral, and the
+periods in which it rises to that."""
+LONGEST = 3.0
+"""Times the least time of standing still after which joints are let creep."""
+BARRED = 0.1
+"""Deceleration along the next curve, likewise, from which on a contact stops the joints."""
+SOON, AHEAD, FAR = 0.02, 0.05, 0.3
+"""How far beyond the end a contact is surely made, in the way at touching speed in these times [s]:
+one that does not stop the joints, one that is there at the beginning, one that stops them."""
 
 
 Rows = list[list[float]]
@@ -94,7 +83,8 @@ class CurveLaw:
     tables : mapping of str to ndarray
         `s`, (n,); `theta`, (n, 2); `b`, (n,), at nodes; `levels`, (n - 1, 2, m, 5), and `torque`,
         (n - 1, 2, 2, 5), at both ends of the intervals; `push`, (2,); `passes`, (1,), not zero
-        where the end is passed at speed.
+        where the end is passed at speed; `arrival`, (k, 5), levels of all contacts where they are
+        made.
     pace : Pace
 
     Attributes
@@ -103,6 +93,8 @@ class CurveLaw:
         Whether the next phase may begin.
     pushes : bool
         Whether the contact is being pressed.
+    after : CurveLaw or None
+        The law of the next phase, if it is along a curve.
     s, v, level : float
         Place and speed along the curve, and the least level, at the last step.
     """
@@ -115,6 +107,7 @@ class CurveLaw:
         self.length = self.nodes[-1]
         self.theta, self.b = tables["theta"].tolist(), tables["b"].tolist()
         self.push = tuple(tables["push"].tolist())
+        self.arrival = tables["arrival"].tolist()
         pairs = list(zip(self.nodes, self.nodes[1:], strict=False))
         self.steps = [after - before for before, after in pairs]
         self.chords = [
@@ -128,13 +121,30 @@ class CurveLaw:
         self.gain = CORRECTION / (pace.period + pace.delay)
         self.memory = MEMORY * self.gain**2 * pace.period
         self.turn: tuple[float, float] | None = None
+        self.after: CurveLaw | None = None
+        self.beyond = 0.0
         self.begin()
+
+    def lead_to(self, after: CurveLaw) -> None:
+        """Let another law follow.
+
+        Where the torques with which a contact is made would go on along the next curve, the joints
+        are not stopped by it, and the way beyond the end that tells it is short.
+        """
+        if self.passes:
+            self.turn = after.chords[0]
+            return
+        self.after = after
+        tau = self._act(len(self.steps) - 1, 1.0, 0.0, 0.0, self.gain * self.pace.touch, True)
+        a, _ = find_motion(after.torque[0], tau)
+        self.beyond = (FAR if a < -BARRED * self.pace.most else SOON) * self.pace.touch
 
     def begin(self, at_end: bool = False) -> None:
         """Start anew, at the beginning or just before the end."""
         self.j = len(self.steps) - 1 if at_end else 0
         self.over = self.pushes = False
-        self.sum = self.a = self.ran = self.rested = 0.0
+        self.sum = self.a = self.ran = self.rested = self.drive = self.held = 0.0
+        self.limit = AHEAD * self.pace.touch if at_end else self.beyond
         self.s, self.v, self.level = self.nodes[self.j], 0.0, 0.0
         self.off, self.fresh = 0.0, not at_end
 
@@ -145,7 +155,7 @@ class CurveLaw:
         self._measure(float(theta[0]), float(theta[1]), float(rates[0]), float(rates[1]))
         pace, s, v, j = self.pace, self.s, self.v, self.j
         if self.pushes:
-            return self._press()
+            return self._press(theta, rates)
         if self.fresh:
             self.fresh, self.off = False, s
         self.ran += pace.period
@@ -157,15 +167,16 @@ class CurveLaw:
             self.over = self._has_turned(rates)
             if self.over:
                 return self.push
-        slow = self.v < pace.still and self.ran > STARTING * pace.period
-        if (s >= self.length and v < 3.0 * pace.touch) or (slow and s > (1.0 - LAST) * self.length):
-            self.pushes = True
-            return self._press()
+        if self._is_made(s, v):
+            self.pushes, self.a = True, 0.0
+            return self._press(theta, rates)
         # The reference begins where the motion does.
         off = self.off
         place = s - off * max(1.0 - (s - off) / (CATCH * abs(off)), 0.0) if off else s
         b = self._look(j, place)
         wanted = max(sqrt(b) if b > 0.0 else 0.0, pace.touch)
+        if self.after is not None:
+            wanted += min(max(s - self.length, 0.0) / GROWTH, FASTEST * pace.touch)
         error = wanted - v
         way = half * max(v, pace.touch)
         planned = (self._look(j, place + way) - self._look(j, place - way)) / (4.0 * way)
@@ -173,9 +184,31 @@ class CurveLaw:
         if planned < 0.0 and v < SLOW * wanted:
             planned = 0.0
         self.sum = min(max(self.sum + self.memory * error, -pace.most), pace.most)
-        a = planned + self.gain * error + self.sum
+        a = planned + self.gain * error + self.sum + self.drive
         slowest = (LEAST_SPEED * pace.touch - (v - half * self.a)) / (pace.period + pace.delay)
-        return self._act(j, share, v, planned, max(a, slowest))
+        return self._act(j, share, v, planned, max(a, slowest), s >= self.length)
+
+    def hold(self, theta: Sequence[float], rates: Sequence[float]) -> tuple[float, float]:
+        """Torques that press this law's contacts and bring the joints to rest [N m]."""
+        self._measure(float(theta[0]), float(theta[1]), float(rates[0]), float(rates[1]))
+        v = self.v + (self.pace.delay + 0.5 * self.pace.period) * self.a
+        j, share = self._locate(self.j, self.s)
+        return self._act(j, share, v, 0.0, -self.gain * v)
+
+    def _is_made(self, s: float, v: float) -> bool:
+        """Whether the contact is made, or the end is reached; `s` and `v` are predicted."""
+        touch, near = self.pace.touch, s > (1.0 - LAST) * self.length
+        started = self.ran > STARTING * self.pace.period
+        if self.after is None:
+            slow = started and near and self.v < self.pace.still
+            return slow or (s >= self.length and v < 3.0 * touch)
+        rise = DRIVE * self.pace.most
+        if started and near and self.v < STOPPED * touch:
+            self.drive += rise / RISE
+        else:
+            self.drive = 0.0
+        limit, self.limit = self.limit, self.beyond
+        return self.drive > rise or self.s > self.length + limit
 
     def _measure(self, one: float, two: float, rate_one: float, rate_two: float) -> None:
         """Place and speed: the joints' projection on the chords next to the last one."""
@@ -225,19 +258,14 @@ class CurveLaw:
             b, after = self.b[j], self.b[j + 1]
             a, level = (after - b) / (2 * h), 1e30
             for share, own in ((0.0, b), (1.0, after)):
-                v, base, rates, press = sqrt(own), [], [], []
-                for (c, cb, cv, ca, cl), (d, db, dv, da, dl) in zip(
-                    self.levels[j], self.level_rises[j], strict=True
-                ):
-                    base.append(c + share * d + (cb + share * db) * own + (cv + share * dv) * v)
-                    rates.append(ca + share * da)
-                    press.append(cl + share * dl)
-                level = min(level, choose_squeeze(base, rates, press, a)[0])
+                level = min(level, choose_squeeze(*self._list_levels(j, share, sqrt(own)), a)[0])
             found.append(min(LEVEL, PART * level))
         return found
 
-    def _act(self, j: int, share: float, v: float, planned: float, a: float) -> tuple[float, float]:
-        """Torques for an acceleration, as far as limits allow it."""
+    def _list_levels(
+        self, j: int, share: float, v: float
+    ) -> tuple[list[float], list[float], list[float]]:
+        """Levels at a place and a speed without a and squeeze, and their changes with these."""
         b = v * v
         base, rates, press = [], [], []
         for (c, cb, cv, ca, cl), (d, db, dv, da, dl) in zip(
@@ -246,6 +274,14 @@ class CurveLaw:
             base.append(c + share * d + (cb + share * db) * b + (cv + share * dv) * v)
             rates.append(ca + share * da)
             press.append(cl + share * dl)
+        return base, rates, press
+
+    def _act(
+        self, j: int, share: float, v: float, planned: float, a: float, beyond: bool = False
+    ) -> tuple[float, float]:
+        """Torques for an acceleration, as far as limits allow it; those of the arrival `beyond`."""
+        b = v * v
+        base, rates, press = self._list_levels(j, share, v)
         level, squeeze = choose_squeeze(base, rates, press, a)
         floor = self.floor[j]
         if level < floor:
@@ -256,6 +292,14 @@ class CurveLaw:
                 level, squeeze = choose_squeeze(base, rates, press, a)
             elif safe > level:
                 a, level, squeeze = planned, safe, other
+        elif beyond:
+            for c, cb, cv, ca, cl in self.arrival:
+                base.append(c + cb * b + cv * v)
+                rates.append(ca)
+                press.append(cl)
+            both, other = choose_squeeze(base, rates, press, a)
+            if both > LEAST:
+                level, squeeze = both, other
         self.a, self.level = a, level
         tau = []
         for (c, cb, cv, ca, cl), (d, db, dv, da, dl) in zip(
@@ -266,14 +310,19 @@ class CurveLaw:
         one, two = self.pace.limit
         return min(max(tau[0], -one), one), min(max(tau[1], -two), two)
 
-    def _press(self) -> tuple[float, float]:
+    def _press(self, theta: Sequence[float], rates: Sequence[float]) -> tuple[float, float]:
         """The torques at the end, until the joints have stood still."""
-        pace = self.pace
-        self.a = 0.0
-        self.rested = self.rested + pace.period if abs(self.v) < pace.still else 0.0
-        there = self.s > (1.0 - THERE) * self.length
-        self.over = self.rested > (1.0 if there else SHORT) * pace.dwell + pace.delay
-        return self.push[0], self.push[1]
+        pace, tau, v, dwell = self.pace, self.push, self.v, self.pace.dwell
+        if self.after is not None:
+            tau = self.after.hold(theta, rates)
+            # Where friction is less than it may be, the joints creep on.
+            self.held += pace.period
+            v = 0.0 if self.held > LONGEST * dwell else self.after.v
+        elif self.s < (1.0 - THERE) * self.length:
+            dwell *= SHORT
+        self.rested = self.rested + pace.period if abs(v) < pace.still else 0.0
+        self.over = self.rested > dwell + pace.delay
+        return tau
 
 
 def _split(table: Any, most: float | None = None) -> tuple[list[Rows], list[Rows]]:
@@ -285,40 +334,3 @@ def _split(table: Any, most: float | None = None) -> tuple[list[Rows], list[Rows
     pairs = zip(first, rises, counts, strict=True)
     kept = [(rows[own].tolist(), rise[own].tolist()) for rows, rise, own in pairs]
     return [rows for rows, _ in kept], [rise for _, rise in kept]
-
-
-def choose_squeeze(
-    base: Sequence[float], rates: Sequence[float], press: Sequence[float], a: float
-) -> tuple[float, float]:
-    """The largest least level of limits base + rates a + press squeeze, and its squeeze.
-
-    Of two limits that the squeeze moves to and fro, no squeeze has a larger least level than where
-    they meet. The limit that is least there takes the place of one of them, until it is one.
-    """
-    lines = [(p + rate * a, q) for p, rate, q in zip(base, rates, press, strict=True)]
-    ups, downs = [own for own in lines if own[1] > 0.0], [own for own in lines if own[1] < 0.0]
-    flat = min([p for p, q in lines if q == 0.0], default=1e30)
-    if not ups or not downs:
-        return flat, 0.0
-    # Begun with those that meet where the squeeze is what it would be without either.
-    (p, q), (u, w) = min(ups), min(downs)
-    level, squeeze = 1e30, 0.0
-    while True:
-        meets = (u * q - p * w) / (q - w)
-        if meets >= level:
-            break
-        level, squeeze = meets, (u - p) / (q - w)
-        least = level
-        for c, d in lines:
-            value = c + d * squeeze
-            if value < least:
-                least, last = value, (c, d)
-        if least > level - SAME * (1.0 + abs(level)):
-            break
-        if last[1] > 0.0:
-            p, q = last
-        elif last[1] < 0.0:
-            u, w = last
-        else:
-            break
-    return min(level, flat), squeeze

@@ -20,7 +20,7 @@ from ..mechanics.limits import CONE, PRESS, LimitSet, make_limits
 from ..problem.uncertainty import change_scene
 from ..scene.model import Scene
 from .corners import respond
-from .curve_law import choose_squeeze
+from .squeeze import choose_squeeze
 
 DOUBTS = {"mass": 0.05, "inertia": 0.05} | {
     f"friction_{part}": 0.1 for part in ("palm", "finger1", "finger2")

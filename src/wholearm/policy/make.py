@@ -13,13 +13,14 @@ from ..common.require import require_number
 from ..contacts.formation import Formation
 from ..geometry.tracing import runs_on_curve
 from ..mechanics.arrival import Standstill, find_hold
+from ..mechanics.metric import metric_weights
 from ..problem.definition import End, Phase, Problem
 from ..problem.uncertainty import read_widths
 from ..results.trajectory import Trajectory
-from .curve_law import Pace
 from .curve_rows import leave_one
+from .pace import Pace
 from .policy import Policy
-from .push import find_push, find_still
+from .push import find_arrival, find_push, find_still
 from .reference import TOUCH, Piece, Reserve, trace_pieces
 from .regulator import follow
 from .replan import Planner, replan
@@ -32,6 +33,8 @@ DWELL = 3e-3
 """How long joints stand still before the next phase begins [s]."""
 CLOSING = 0.02
 """Time in which held torques are to close a contact [s]."""
+SHOWN = 1e-3
+"""Part of a displacement that joints have to show, over what they show at most."""
 MOST = 0.5
 """Largest acceleration of the integral, over the scene's."""
 
@@ -107,7 +110,7 @@ def make_policy(
             for one, span in zip(found, np.diff(ends).tolist(), strict=True):
                 one["duration"] = span
         else:
-            tables.append(_tabulate(piece, _end(problem, own[0], plan, piece, after)))
+            tables.append(_tabulate(piece, own[0], _end(problem, own[0], plan, piece, after)))
             found[0].update(duration=piece.duration, share=piece.share, reserves=piece.reserves)
         if piece is None or not piece.passes:
             found[-1]["duration"] += DWELL + delay
@@ -175,12 +178,28 @@ def _follow_motion(
         "gain": found.gains,
         "push": samples.tau[-1] if hold is None else hold,
         "still": np.array([STILL * problem.scene.scales.rate]),
+        "ways": _list_ways(problem, last, samples.z[-1:]),
     }
 
 
-def _tabulate(piece: Piece, push: Array) -> dict[str, Array]:
+def _list_ways(problem: Problem, phase: Phase, z: Array) -> Array:
+    """What joints show of displacements that all contacts at the end leave, orthonormal, (f, 2)."""
+    own, contact = phase.formation, phase.until.contact
+    contacts = own.contacts if contact is None else (*own.contacts, contact)
+    both = Formation(problem.scene, contacts, own.rolling)
+    units = np.sqrt(metric_weights(problem.scene))
+    P = both.evaluate(z, np.zeros_like(z)).P[0] / units
+    left = np.linalg.svd(P)[2][len(P) :] / units
+    basis, sizes, _ = np.linalg.svd(left[:, 3:].T, full_matrices=False)
+    return np.asarray(basis.T[sizes > SHOWN * (1.0 / units[3])])
+
+
+def _tabulate(piece: Piece, phase: Phase, push: Array) -> dict[str, Array]:
     """Arrays of `CurveLaw`."""
-    rows, levels = piece.rows, piece.rows.levels
+    rows, levels, contact = piece.rows, piece.rows.levels, phase.until.contact
+    arrival = np.zeros((0, 5))
+    if contact is not None and not piece.passes:
+        arrival = find_arrival(piece.curve, contact, rows)
     return {
         "s": rows.s,
         "theta": piece.curve.evaluate(rows.s).z[:, 3:],
@@ -189,6 +208,7 @@ def _tabulate(piece: Piece, push: Array) -> dict[str, Array]:
         "torque": np.stack([rows.torque[:-1], rows.torque[1:]], axis=1),
         "push": push,
         "passes": np.array([piece.passes]),
+        "arrival": arrival,
     }
 
 

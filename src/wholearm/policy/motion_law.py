@@ -2,7 +2,8 @@
 
 The gains are those of a linear-quadratic regulator (`regulator`). Time counts from when the phases
 begin, which is when the contact before them is made. At the end torques hold what is reached until
-the joints have stood still.
+the joints have stood still. From then on only what contacts leave free counts: where numbers are
+off, joints that press an object between them are never where they were planned.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from .curve_law import Pace
+from .pace import Pace
 
 SHARE = 0.3
 """Part of the torque limits that feedback adds at most."""
@@ -27,7 +28,8 @@ class MotionLaw:
     tables : mapping of str to ndarray
         `starts`, (m,), of the phases [s]; `step`, (1,), of the samples that follow [s]; `theta`,
         `rates`, `tau`, (n, 2); `gain`, (n, 2, 4), torques over what angles and speeds are off;
-        `push`, (2,); `still`, (1,), the joint speed that counts as none [rad/s].
+        `push`, (2,); `still`, (1,), the joint speed that counts as none [rad/s]; `ways`, (f, 2),
+        what the joints show of displacements that contacts leave at the end, orthonormal.
     pace : Pace
 
     Attributes
@@ -46,6 +48,7 @@ class MotionLaw:
         self.theta, self.rates = tables["theta"].tolist(), tables["rates"].tolist()
         self.tau, self.gain = tables["tau"].tolist(), tables["gain"].tolist()
         self.push = tuple(tables["push"].tolist())
+        self.ways = tables["ways"].tolist()
         self.end = self.every * (len(self.theta) - 1)
         self.begin()
 
@@ -59,7 +62,7 @@ class MotionLaw:
         self.clock = self.end if at_end else 0.0
         self.passed = len(self.starts) - 1 if at_end else 0
         self.over, self.rested = False, 0.0
-        self.left_one = self.left_two = 0.0
+        self.settled, self.left = False, [0.0] * len(self.ways)
 
     def step(
         self, theta: Sequence[float], rates: Sequence[float], forces: Mapping[str, float] | None
@@ -74,6 +77,7 @@ class MotionLaw:
             stands = max(abs(rates[0]), abs(rates[1])) < self.still
             self.rested = self.rested + pace.period if stands else 0.0
             self.over = self.rested > pace.dwell + pace.delay
+            self.settled = self.settled or self.over
         lead = pace.delay + 0.5 * pace.period
         k, share = self._locate(now)
         (p, q), (u, w) = self.theta[k], self.theta[k + 1]
@@ -84,11 +88,8 @@ class MotionLaw:
         two = theta[1] - q - share * (w - q) + lead * fast_two
         k, share = self._locate(now + lead)
         found = []
-        if now >= self.end:
-            # What is left at the end adds up until it is gone.
-            self.left_one += MEMORY * pace.period * one
-            self.left_two += MEMORY * pace.period * two
-            one, two = one + self.left_one, two + self.left_two
+        if self.settled:
+            one, two = self._find_left(one, two)
         for row in (0, 1):
             first, after = self.tau[k][row], self.tau[k + 1][row]
             if now >= self.end:
@@ -100,6 +101,16 @@ class MotionLaw:
             tau = first + share * (after - first) - feedback
             found.append(min(max(tau, -most), most))
         return found[0], found[1]
+
+    def _find_left(self, one: float, two: float) -> tuple[float, float]:
+        """What is left of angles that are off, and what it adds up to until it is gone."""
+        found_one = found_two = 0.0
+        for k, (p, q) in enumerate(self.ways):
+            off = p * one + q * two
+            self.left[k] += MEMORY * self.pace.period * off
+            found_one += p * (off + self.left[k])
+            found_two += q * (off + self.left[k])
+        return found_one, found_two
 
     def _locate(self, t: float) -> tuple[int, float]:
         """Sample before a time, and the share of the way to the next one."""

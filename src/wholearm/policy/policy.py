@@ -14,21 +14,24 @@ from ..common.archive import read_arrays
 from ..common.errors import InputError
 from ..common.files import require_ending, write_whole
 from ..common.require import require_number
-from .curve_law import CurveLaw, Pace
+from .curve_law import CurveLaw
 from .motion_law import MotionLaw
+from .pace import Pace
 
 FORMAT = 1
 """Version of the files."""
 CURVE = {
     "s": (-1,), "theta": (-1, 2), "b": (-1,), "levels": (-1, 2, -1, 5), "torque": (-1, 2, 2, 5),
-    "push": (2,), "passes": (1,),
+    "push": (2,), "passes": (1,), "arrival": (-1, 5),
 }  # fmt: skip
 """Arrays of a phase along a curve and their shapes; -1 is any."""
 MOTION = {
     "starts": (-1,), "step": (1,), "theta": (-1, 2), "rates": (-1, 2), "tau": (-1, 2),
-    "gain": (-1, 2, 4), "push": (2,), "still": (1,),
+    "gain": (-1, 2, 4), "push": (2,), "still": (1,), "ways": (-1, 2),
 }  # fmt: skip
 """Arrays of phases that are followed over time."""
+LATER = ("arrival", "ways")
+"""Arrays that earlier versions did not write; empty ones stand for them."""
 KINDS: Mapping[str, Mapping[str, tuple[int, ...]]] = {"curve": CURVE, "motion": MOTION}
 Law = CurveLaw | MotionLaw
 
@@ -43,6 +46,8 @@ class Policy:
     pace : Pace
     about : mapping, optional
         What the policy is of: name of the problem, duration, contacts that end phases.
+    laws : int, optional
+        How many of the laws are carried out; all if left out. One more says how the end is held.
 
     Attributes
     ----------
@@ -69,22 +74,24 @@ class Policy:
         tables: Sequence[Mapping[str, Any]],
         pace: Pace,
         about: Mapping[str, Any] | None = None,
+        laws: int | None = None,
     ) -> None:
         self.tables, self.pace, self.about = tuple(tables), pace, dict(about or {})
         self.laws = tuple(
             CurveLaw(own, pace) if "s" in own else MotionLaw(own, pace) for own in self.tables
         )
         for law, after in pairwise(self.laws):
-            if isinstance(law, CurveLaw) and law.passes and isinstance(after, CurveLaw):
-                law.turn = after.chords[0]
-        counts = [law.count for law in self.laws]
+            if isinstance(law, CurveLaw) and isinstance(after, CurveLaw):
+                law.lead_to(after)
+        self.last = len(self.laws) - 1 if laws is None else laws - 1
+        counts = [law.count for law in self.laws[: self.last + 1]]
         self.firsts = [1 + sum(counts[:k]) for k in range(len(counts))]
         self.reset()
 
     @property
     def count(self) -> int:
         """Number of phases."""
-        return sum(law.count for law in self.laws)
+        return sum(law.count for law in self.laws[: self.last + 1])
 
     @property
     def phase(self) -> int:
@@ -133,7 +140,7 @@ class Policy:
         """
         law = self.laws[self.index]
         tau = law.step(theta, theta_dot, forces)
-        if law.over and self.index + 1 < len(self.laws):
+        if law.over and self.index < self.last:
             self.index += 1
             law = self.laws[self.index]
             law.begin()
@@ -142,12 +149,13 @@ class Policy:
 
     def with_(self, **changes: Any) -> Policy:
         """The policy with another `period`, `delay` or other values of `Pace`."""
-        return Policy(self.tables, self.pace._replace(**changes), self.about)
+        pace = self.pace._replace(**changes)
+        return Policy(self.tables, pace, self.about, self.last + 1)
 
     def cut(self, last: int) -> Policy:
         """The policy of the phases up to the `last`, with those that it passes into in motion."""
         kept = sum(first <= last for first in self.firsts)
-        return Policy(self.tables[:kept], self.pace, self.about)
+        return Policy(self.tables, self.pace, self.about, kept)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the policy to a ``.npz`` file.
@@ -221,6 +229,9 @@ def _pick(
     found = {}
     for name, shape in shapes.items():
         key = f"{name}_{number}"
+        if key not in arrays and name in LATER:
+            found[name] = np.zeros([max(n, 0) for n in shape])
+            continue
         if key not in arrays:
             raise InputError(source, key, "array is missing")
         array = arrays[key]

@@ -13,8 +13,8 @@ from ..geometry.curve import Curve
 from ..mechanics.dynamics import Directions, force_rows, inverse
 from ..mechanics.limits import PRESS, TORQUE, make_limits
 from ..mechanics.sides import SideTerms
-from .curve_law import choose_squeeze
 from .curve_rows import Rows
+from .squeeze import choose_squeeze
 
 ENOUGH = 5.0
 """Reserves beyond which more normal force is not asked for."""
@@ -29,6 +29,22 @@ FRICTION = (0.7, 1.0, 1.2)
 """Parts of all friction with which the torques have to balance."""
 FULL = 0.98
 """Part of the torque limits that is used."""
+
+
+def find_arrival(curve: Curve, gained: Contact, rows: Rows) -> Array:
+    """Levels of all contacts, the gained one too, that balance at the end of a curve, (k, 5).
+
+    Affine as torques are there; there are none where forces at rest are not the only ones.
+    """
+    formation = curve.formation
+    both = Formation(formation.scene, (*formation.contacts, gained), formation.rolling)
+    reserves = rows.unit[-1, : formation.n_contacts]
+    reserves, found = np.append(reserves, reserves.max()), [np.zeros((0, 5))]
+    for own in _list_balances(curve, both, rows):
+        forces = own[: both.n_contacts, 1:] @ rows.torque[-1]
+        forces[:, 0] += own[: both.n_contacts, 0]
+        found.append(forces / reserves[:, None])
+    return np.vstack(found)
 
 
 def find_push(curve: Curve, gained: Contact, rows: Rows, after: Rows | None) -> Array | None:
@@ -49,14 +65,8 @@ def find_push(curve: Curve, gained: Contact, rows: Rows, after: Rows | None) -> 
     """
     formation, scene = curve.formation, curve.formation.scene
     both = Formation(scene, (*formation.contacts, gained), formation.rolling)
-    if both.n_constraints != 5:
-        return None
-    try:
-        balances = [_balance(curve, both, part) for part in FRICTION]
-        balances += [
-            _balance(curve, replace(both, scene=own), 1.0) for own in rows.scenes if own != scene
-        ]
-    except np.linalg.LinAlgError:
+    balances = _list_balances(curve, both, rows)
+    if not balances:
         return None
     count, unit = both.n_contacts, scene.scales.acceleration
     reserves = rows.unit[-1, : formation.n_contacts]
@@ -97,6 +107,18 @@ def _find_best(rows: Array, limit: Array) -> Array | None:
     bounds = [*((-own, own) for own in most), (LEAST, ENOUGH), (0.0, 1.0)]
     answer = linprog([0, 0, -1, 1], A_ub=-table[:, 1:], b_ub=table[:, 0], bounds=bounds)
     return np.asarray(answer.x[:2]) if answer.status == 0 else None
+
+
+def _list_balances(curve: Curve, both: Formation, rows: Rows) -> list[Array]:
+    """Balances with friction, or scenes, that may be; none where forces are not the only ones."""
+    if both.n_constraints != 5:
+        return []
+    try:
+        found = [_balance(curve, both, part) for part in FRICTION]
+        scenes = [own for own in rows.scenes if own != curve.formation.scene]
+        return found + [_balance(curve, replace(both, scene=own), 1.0) for own in scenes]
+    except np.linalg.LinAlgError:
+        return []
 
 
 def _balance(curve: Curve, both: Formation, part: float) -> Array:
