@@ -9,10 +9,12 @@ import pytest
 
 import wholearm
 from shipped import HEPTAGON, problem_of
+from wholearm.common.errors import InputError
 from wholearm.geometry.tracing import trace_phase
 from wholearm.mechanics.dynamics import build_forward
 from wholearm.policy.corners import list_scenes
 from wholearm.policy.make import make_policy
+from wholearm.policy.widest import find_widest
 from wholearm.policy.within import find_within, retime_within
 from wholearm.problem.definition import Problem
 from wholearm.results.trajectory import Trajectory
@@ -76,7 +78,7 @@ def test_contacts_are_kept_in_corners_of_the_ranges(problem: Problem, plan: Traj
     assert record["reached"] and record["kept"], (record["lost"], record["time"])
 
 
-def test_ranges_that_are_too_wide_are_kept_in_part(problem: Problem) -> None:
+def test_ranges_that_are_too_wide_are_kept_in_part(problem: Problem, plan: Trajectory) -> None:
     curve = trace_phase(problem.phases[0], problem.start, ())
     s = np.linspace(0.0, curve.length, 11)
     b = 0.05 * (4 * s * (curve.length - s) / curve.length**2)
@@ -84,3 +86,22 @@ def test_ranges_that_are_too_wide_are_kept_in_part(problem: Problem) -> None:
     found, share = retime_within(curve, s, motion, {"mass": 0.5, "friction_palm": 1.0}, 0.2)
     assert 0.0 < share < 1.0 and found is not None
     assert (found[1].run(0.0) <= b + 1e-12).all()
+    with pytest.raises(InputError, match="uncertainty: is missing"):
+        find_widest(replace(problem, uncertainty=None), plan, 0.0)
+
+
+def test_geometry_and_gains_count_to_first_order(problem: Problem) -> None:
+    curve = trace_phase(problem.phases[0], problem.start, ())
+    s, motion = np.array([0.1 * curve.length]), (np.ones(1), np.full(1, 0.1), np.full(1, 2.0))
+    known = np.array([1.0, 0.1, np.sqrt(0.1), 1.0, 2.0])
+
+    def measure(widths: dict[str, float]) -> np.ndarray:
+        rows, _, _ = find_within(curve, s, np.zeros(1), widths, 0.05).at(motion)
+        return np.asarray(rows.slack[0, :4] @ known)
+
+    # Forces are affine in torques: what a gain takes away is in proportion to it.
+    exact, off = measure({}), measure({"gain1": 0.02})
+    assert (off < exact).all()
+    assert exact - measure({"gain1": 0.01}) == pytest.approx((exact - off) / 2, abs=1e-12)
+    both = exact - measure({"gain1": 0.02, "base1_x": 2e-4})
+    assert both == pytest.approx(2 * exact - off - measure({"base1_x": 2e-4}), abs=1e-9)

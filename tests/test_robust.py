@@ -23,13 +23,13 @@ from wholearm.planning.path_domain.plan import plan_path
 from wholearm.planning.path_domain.widest import find_widest
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.robust.rows import Guide
-from wholearm.planning.robust.sensitivities import find_force_slopes, find_slopes_at
 from wholearm.planning.robust.start import list_holds, measure_holds
 from wholearm.planning.time_domain.plan import plan_phases
 from wholearm.problem.definition import Problem
 from wholearm.problem.uncertainty import NAMES, PARAMETERS
 from wholearm.results.trajectory import Motion, Samples
 from wholearm.robustness.uncertainty import change_problem
+from wholearm.sensitivity.slopes import find_force_slopes, find_slopes_at
 
 FOLDER = Path(__file__).parents[1] / "problems"
 EPSILON = 0.05

@@ -14,10 +14,8 @@ def add_policy(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("plan", help="trajectory file (.npz)")
     text = "policy to write (.npz; default: NAME_policy.npz)"
     parser.add_argument("-o", "--output", metavar="FILE", help=text)
-    text = (
-        "normal force that is kept in reserve along the way: where plan or problem have ranges of "
-    )
-    text += "numbers, for so many times these (1); otherwise over what usual errors of masses, "
+    text = "normal force that is kept in reserve along the way: where plan or problem have ranges "
+    text += "of numbers, for so many times these (1); otherwise over what usual errors of masses, "
     text += "friction and torques take away (2.5); 0 is as fast as the plan"
     parser.add_argument("--reserve", type=float, help=text)
     text = "of the control loop [s] (1e-3)"
@@ -26,6 +24,8 @@ def add_policy(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--delay", type=float, default=5e-4, help=text)
     text = "of both fingers, if it is more than the plan was made with [N m] (default: the same)"
     parser.add_argument("--torque-limit", type=float, help=text)
+    text = "also look for how many times as wide ranges a policy can keep contacts in"
+    parser.add_argument("--largest", action="store_true", help=text)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     parser.set_defaults(run=_policy)
 
@@ -35,6 +35,7 @@ def _policy(options: argparse.Namespace) -> int:
     from ..common.files import require_ending, require_writable
     from ..planning.plan import solve
     from ..policy.make import make_policy
+    from ..policy.widest import find_widest
     from ..problem.read import read_own_problem
     from ..results.report_text import align
     from ..results.trajectory_file import load_trajectory
@@ -52,6 +53,9 @@ def _policy(options: argparse.Namespace) -> int:
             problem, plan, **given, planner=lambda own: solve(own, replay=False).trajectory
         )
         report = verify_policy(problem, plan, policy)
+        if options.largest:
+            each = find_widest(problem, plan, options.delay)
+            policy.about["largest"] = {str(number): factor for number, factor in each.items()}
     if not report.ok:
         failures = "; ".join(report.failures)
         raise ReplayError(
@@ -69,5 +73,9 @@ def _policy(options: argparse.Namespace) -> int:
         rows.append([str(own["number"]), *times, share, ", ".join(kept)])
     header = ["phase", "plan [s]", "policy [s]", "reserve", "least of each contact"]
     print("\n".join(align(header, rows, {4})))
+    if largest := policy.about.get("largest"):
+        factors = ", ".join(f"{factor:.3g}" for factor in largest.values())
+        text = f"a policy exists for ranges {min(largest.values()):.3g} times as wide as the plan's"
+        print(f"{text} (by phase: {factors})")
     print(f"{policy.duration:.6f} s in all, the plan {plan.duration:.6f} s; wrote {output}")
     return 0

@@ -25,11 +25,17 @@ from ..contacts.formation import Formation
 from ..geometry.curve import CurvePoint
 from ..mechanics.dynamics import Directions, PathForces, inverse
 from ..mechanics.limits import CONE, PRESS, make_limits
-from ..problem.uncertainty import change_scene
+from ..problem.uncertainty import GROUPS, change_scene
 from ..scene.model import Scene
+from ..sensitivity.slopes import find_force_slopes
 
 CORNERS = ("mass", "inertia", "friction_palm", "friction_finger1", "friction_finger2")
 """Numbers whose ranges have corners."""
+
+OTHERS = (*GROUPS["geometry"], *GROUPS["gain"])
+"""Numbers whose ranges count to first order. The start is measured, and a delay is in torques."""
+_ORDER = [0, 2, 4, 1, 3]
+"""Columns of derivatives, of 1, a, b, squeeze and s', in the order used here."""
 
 Motion = tuple[Array, Array, Array]
 """a, b and squeeze at n places."""
@@ -103,13 +109,12 @@ def find_corners(
         moves.append(motion[:, 0])
     plain = inverse(formation, *point[:3], side, point.kinematics)
     limits = make_limits(formation, 0.0).only(PRESS, CONE)
-    base = respond(plain, torques[0])[0]
-    changed = [torques[1]]
-    for finger in range(2):
-        gain = np.ones(2)
-        gain[finger] += widths.get(f"gain{finger + 1}", 0.0)
-        changed.append(torques[0] * gain[:, None])
-    swings = [respond(plain, tau)[0] - base for tau in changed]
+    swings = [respond(plain, torques[1])[0] - respond(plain, torques[0])[0]]
+    others = [name for name in OTHERS if widths.get(name, 0.0) > 0]
+    if others:
+        radii = np.array([widths[name] for name in others])
+        slopes = find_force_slopes(formation, point, side, plain, others)[..., _ORDER]
+        swings += list((slopes * radii[:, None]).transpose(2, 0, 1, 3))
     return Corners(
         np.array(rows), np.array(moves), np.einsum("mi,pnij->pnmj", limits.columns[0], swings)
     )

@@ -77,7 +77,7 @@ def make_policy(
     InputError
         If a number is out of its range, or the plan is of another problem.
     """
-    ranges = _find_ranges(problem, plan)
+    ranges = find_ranges(problem, plan)
     reserve = (USUAL if ranges is None else 1.0) if reserve is None else reserve
     reserve = require_number(reserve, "reserve", nonnegative=True)
     period = require_number(period, "period", positive=True)
@@ -91,7 +91,7 @@ def make_policy(
     speeds = TOUCH * scales.speed, STILL * scales.speed
     most = MOST * scales.acceleration
     pace = Pace(period, delay, *speeds, DWELL, most, (limit[0], limit[1]))
-    blocks = _split(problem.phases)
+    blocks = split(problem.phases)
     curves = [len(own) == 1 and runs_on_curve(own[0]) for own in blocks]
     starts = plan.phase_starts
     if reserve and planner is not None:
@@ -119,7 +119,7 @@ def make_policy(
     return Policy(tables, pace, {"name": problem.name, "duration": whole, "phases": about})
 
 
-def _split(phases: Sequence[Phase]) -> list[tuple[Phase, ...]]:
+def split(phases: Sequence[Phase]) -> list[tuple[Phase, ...]]:
     """Phases that pass into one another in motion belong together, but for impacts along curves."""
     blocks: list[list[Phase]] = []
     for phase in phases:
@@ -212,7 +212,7 @@ def _tabulate(piece: Piece, phase: Phase, push: Array) -> dict[str, Array]:
     }
 
 
-def _find_ranges(problem: Problem, plan: Trajectory) -> Mapping[str, float] | None:
+def find_ranges(problem: Problem, plan: Trajectory) -> Mapping[str, float] | None:
     """Half widths that the plan was made for, or those of the problem; None if there are none."""
     figures = plan.meta.get("ranges")
     if figures:

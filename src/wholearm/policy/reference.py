@@ -88,6 +88,11 @@ class Reserve(NamedTuple):
     ranges: Mapping[str, float] | None
     delay: float
 
+    def scale(self) -> dict[str, float]:
+        """Half widths of the ranges that it is for; of the delay what is not known."""
+        widths = {name: self.size * width for name, width in (self.ranges or {}).items()}
+        return widths | {"delay": max(widths.get("delay", 0.0) - self.delay, 0.0)}
+
 
 def trace_pieces(
     problem: Problem, phases: Sequence[Phase | None], plan: Trajectory, reserve: Reserve
@@ -125,9 +130,8 @@ def _trace(
     else:
         b = np.minimum(b, (touch + (curve.length - s) / ARRIVAL) ** 2)
     if reserve.ranges is not None and reserve.size:
-        widths = {name: reserve.size * width for name, width in reserve.ranges.items()}
-        widths["delay"] = max(widths.get("delay", 0.0) - reserve.delay, 0.0)
-        within, share = retime_within(curve, s, (a, b, squeeze), widths, problem.epsilon, end)
+        planned = a, b, squeeze
+        within, share = retime_within(curve, s, planned, reserve.scale(), problem.epsilon, end)
         if within is not None:
             return Piece(curve, *within, share, begins, passes, b)
     best: tuple[Rows, Reach, float] | None = None
@@ -146,7 +150,10 @@ def _trace(
         if share >= ENOUGH:
             break
     assert best is not None
-    return Piece(curve, *best, begins, passes, b)
+    rows, found, share = best
+    # No part of ranges is kept by a reserve that knows of none.
+    share = share if reserve.ranges is None else 0.0
+    return Piece(curve, rows, found, share, begins, passes, b)
 
 
 def _follow(

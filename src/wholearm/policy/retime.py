@@ -8,6 +8,7 @@ reached, a pass forward goes as fast as that allows (reachability analysis, Pham
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -63,6 +64,7 @@ def retime(
     reserve: Array,
     cap: Array,
     end: tuple[float, float] | None = None,
+    parts: Sequence[float] = PARTS,
 ) -> Reach:
     """Find the motions whose least part of the reserve is largest, as far as it matters.
 
@@ -78,9 +80,11 @@ def retime(
         Largest b.
     end : tuple of two float, optional, [m^2/s^2]
         Least and largest b at the last node, if it is not the last of the largest.
+    parts : sequence of float
+        Of the reserve, that all places are limited to where some place has less.
     """
     best: Reach | None = None
-    for part in (1.0, *PARTS):
+    for part in (1.0, *parts):
         # What one place keeps can be what another one lacks.
         found = _pass(s, slack, reserve, cap, end or (cap[-1], cap[-1]), part)
         if best is None or found.share.min() > best.share.min():

@@ -27,8 +27,9 @@ KEPT = 1.5
 """Reserve of forces of the reference, in units: feedback may use what is above one."""
 ENOUGH = 0.5
 """Part of these reserves without which ranges are too wide."""
-LESS, TRIES = 0.85, 20
-"""Factor by which ranges shrink where they are too wide, and how often."""
+LESS, CLOSE, NONE = 0.8, 0.03, 0.02
+"""Factor by which ranges shrink where they are too wide, the error of how wide they may be, and a
+part of them that is as good as none."""
 WIDEST = 0.9
 """Largest relative range."""
 AUTHORITY = 2.0
@@ -154,14 +155,23 @@ def retime_within(
     tuple
         The law's limits and the motions, None if no part of the ranges has them; and that part.
     """
-    share = 1.0
-    for _ in range(TRIES):
+
+    def find(share: float) -> tuple[Rows, Reach] | None:
         own = {name: min(share * width, WIDEST) for name, width in widths.items()}
-        found = _retime(find_within(curve, s, np.sqrt(plan[1]), own, least), plan, end)
-        if found is not None:
-            return found, share
-        share *= LESS
-    return None, 0.0
+        return _retime(find_within(curve, s, np.sqrt(plan[1]), own, least), plan, end)
+
+    low, high, best = 0.0, 1.0, find(1.0)
+    if best is not None:
+        return best, 1.0
+    # Downwards first, as most that are too wide are so by little.
+    while high - low > CLOSE * high and high > NONE:
+        share = LESS * high if best is None else (low + high) / 2
+        found = find(share)
+        if found is None:
+            high = share
+        else:
+            low, best = share, found
+    return best, low
 
 
 def _retime(
@@ -171,7 +181,7 @@ def _retime(
     motion = plan
     for _ in range(ROUNDS):
         rows, whole, wanted = within.at(motion)
-        found = retime(within.s, whole, wanted, plan[1], end)
+        found = retime(within.s, whole, wanted, plan[1], end, ())
         b = found.run(float(found.most[0]))
         if found.share.min() < ENOUGH:
             return None

@@ -5,13 +5,13 @@ the same torques,
 
     h c - sum over p of |d(h c - low)/dp| r_p >= low.
 
-What is inside the bars is affine in 1, a = s'', b = s'^2, the squeeze and s' (`sensitivities`): the
-swings. So the left side is the least of rows that are affine too, one for each choice of signs. At
-a place with a known b, what all of them allow is a polygon of a and the squeeze. A fastest motion
-is in its corner with the largest a or in the one with the least. The rows that meet in these two
-are found by adding, corner by corner, the row that is missed most. They are `COPIES` rows for each
-limit, which all that knows of limits takes like any others; the bars themselves are what
-`PhaseData` evaluates, so that tightening makes up for signs that are others in between.
+What is inside the bars is affine in 1, a = s'', b = s'^2, the squeeze and s': the swings, see
+`sensitivity.slopes`. So the left side is the least of rows that are affine too, one for each choice
+of signs. At a place with a known b, what all of them allow is a polygon of a and the squeeze. A
+fastest motion is in its corner with the largest a or in the one with the least. The rows that meet
+in these two are found by adding, corner by corner, the row that is missed most. They are `COPIES`
+rows for each limit, which all that knows of limits takes like any others; the bars themselves are
+what `PhaseData` evaluates, so that tightening makes up for signs that are others in between.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from ...mechanics.dynamics import Directions, PathForces, inverse
 from ...mechanics.limits import CONE, PRESS, SPEED, LimitSet, make_limits
 from ...mechanics.sides import SideTerms
 from ...problem.uncertainty import PARAMETERS
+from ...sensitivity.slopes import COUNT, find_force_slopes
 from ..lower_bound.rows import Rows, eliminate
-from .sensitivities import COUNT, find_force_slopes
 
 COPIES = 5
 """Rows for each force limit: two for each corner, and one for the motion that is known."""

@@ -17,9 +17,9 @@ from ...common.errors import SolverError
 from ...mechanics.dynamics import Directions
 from ...mechanics.limits import CONE, PRESS, make_limits
 from ...problem.definition import Phase
+from ...sensitivity.slopes import find_slopes_at
 from ..advice import name_phases
 from ..robust.rows import find_edges
-from ..robust.sensitivities import find_slopes_at
 from .between import CHECKS, MISS, CheckPlaces, Limits, check_between, find_misses
 from .motion import StageMotion, make_motions
 from .search import Search, Solution

@@ -26,12 +26,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...common.arrays import Array
-from ...contacts.formation import Formation, Kinematics
-from ...geometry.curve import CurvePoint
-from ...mechanics.dynamics import Directions, PathForces, force_rows
-from ...mechanics.metric import metric_weights
-from ...results.trajectory import Samples
+from ..common.arrays import Array
+from ..contacts.formation import Formation, Kinematics
+from ..geometry.curve import CurvePoint
+from ..mechanics.dynamics import Directions, PathForces, force_rows
+from ..mechanics.metric import metric_weights
+from ..results.trajectory import Samples
 
 COUNT = 5
 """Number of coefficients: of 1, a, b, the squeeze and s'."""

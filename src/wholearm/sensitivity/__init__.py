@@ -1,0 +1,1 @@
+"""How forces change with numbers that are off."""
