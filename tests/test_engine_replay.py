@@ -12,11 +12,15 @@ import pytest
 from shipped import HEPTAGON, plan_of, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
+from wholearm.engines.closed import play_policy
+from wholearm.engines.drive import Drive
 from wholearm.engines.mjcf import write_mjcf
 from wholearm.engines.replay import list_settings, replay_in
 from wholearm.engines.report_text import to_dict, write
 from wholearm.engines.stretch import Setting
 from wholearm.planning.plan import solve
+from wholearm.policy.closed_loop import ClosedLoop
+from wholearm.policy.make import make_policy
 from wholearm.problem.definition import Problem
 from wholearm.results.narrow import require_same_phases
 from wholearm.results.trajectory import Trajectory
@@ -46,6 +50,44 @@ def test_an_engine_keeps_to_the_plan(engine: str) -> None:
     assert json.loads(json.dumps(figures)) == figures
     (stretch,) = figures["levels"][0]["stretches"]
     assert stretch["phases"] == [1] and len(stretch["t"]) == len(stretch["position"])
+
+
+@pytest.mark.parametrize("engine", EXTRAS)
+def test_a_policy_moves_the_hand_in_an_engine(engine: str) -> None:
+    pytest.importorskip(EXTRAS[engine], reason=f"wholearm[{engine}] is not installed")
+    problem, plan = slide()
+    policy = make_policy(problem, plan)
+    report = play_policy(engine, problem, plan, policy, setting=COARSE)
+    assert report.ok and report.exit_status == 0, report.to_text()
+    (arrival,) = report.arrivals
+    assert arrival.position < 1e-4 and arrival.gap < 1e-5
+    assert json.loads(json.dumps(report.to_dict()))["stretches"][0]["phases"] == [1]
+    # By feedback it ends where it is to end with other friction, too.
+    other = play_policy(engine, problem.with_(friction=0.12), plan, policy, setting=COARSE)
+    assert other.ok, other.to_text()
+
+
+def test_torques_of_a_policy_are_held_and_late() -> None:
+    class Loop(ClosedLoop):
+        def __init__(self) -> None:
+            self.period, self.delay, self.times = 1e-3, 4e-4, list[float]()
+
+        def held(self, t: float, *_: object) -> tuple[float, float]:
+            self.times.append(t)
+            return 1e3 * t, -1.0
+
+        over = False
+
+    scene, h, still = slide()[0].scene, 1e-4, np.zeros(2)
+    loop = Loop()
+    drive = Drive(scene, loop, h)
+    tau = [drive.step(k * h, still, still).tolist() for k in range(30)]
+    assert loop.times == pytest.approx([0.0, 1e-3, 2e-3])
+    assert [own[0] for own in tau] == pytest.approx([0.0] * 14 + [1.0] * 10 + [2.0] * 6)
+    assert {own[1] for own in tau} == {-1.0}
+    # Dry friction is against the motion.
+    fast = drive.step(30 * h, still, np.array([1.0, -1.0]))
+    assert fast == pytest.approx([2.0 - scene.dry[3], -1.0 + scene.dry[4]])
 
 
 def test_what_mujoco_opens_plays_the_plan() -> None:

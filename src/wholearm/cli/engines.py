@@ -10,6 +10,7 @@ from ..common.errors import InputError, name_source
 from .progress import clear_progress, show_progress
 
 if TYPE_CHECKING:
+    from ..engines.stretch import Setting
     from ..problem.definition import Problem
     from ..results.trajectory import Trajectory
 
@@ -37,11 +38,13 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--engine", required=True, help=text)
     text = "from start to end, instead of phase by phase from each planned start"
     parser.add_argument("--whole", action="store_true", help=text)
+    text = "torques by this policy (.npz), at its own period, instead of the plan's by the clock"
+    parser.add_argument("--policy", metavar="FILE", help=text)
     parser.add_argument("--step", type=float, help="longest time step [s] (from the scene)")
     text = "softness of contacts, over the default, which is in proportion to the step (1)"
     parser.add_argument("--softness", type=float, help=text)
     text = "how far a replay may be from the plan, over the object's radius of gyration, and in rad"
-    words = "3e-3 for mujoco, 1.5e-3 for drake"
+    words = "3e-3 for mujoco, 1.5e-3 for drake; of a policy's end, 3e-2"
     parser.add_argument("--departure", type=float, help=f"{text} ({words})")
     text = "also replay with steps of a half, a quarter, ... to N halvings (0)"
     parser.add_argument("--refine", type=int, metavar="N", default=0, help=text)
@@ -85,6 +88,8 @@ def _replay(options: argparse.Namespace) -> int:
         setting = setting._replace(step=_read_step(given["step"], time))
     if given["softness"] is not None:
         setting = setting._replace(softness=given["softness"])
+    if options.policy is not None:
+        return _play_policy(options, problem, plan, setting, given["departure"])
     with name_source(options.problem):
         report = replay_in(
             options.engine,
@@ -98,6 +103,35 @@ def _replay(options: argparse.Namespace) -> int:
         )
     clear_progress()
     print(json.dumps(to_dict(report), indent=2) if options.json else write(report))
+    return report.exit_status
+
+
+def _play_policy(
+    options: argparse.Namespace,
+    problem: Problem,
+    plan: Trajectory,
+    setting: Setting,
+    departure: float | None,
+) -> int:
+    from ..engines.closed import ALLOWED, play_policy
+    from ..policy.policy import Policy
+
+    if options.refine:
+        raise InputError("", "--refine", "is for plans by the clock, not with --policy")
+    policy = Policy.load(options.policy)
+    with name_source(options.policy):
+        report = play_policy(
+            options.engine,
+            problem,
+            plan,
+            policy,
+            whole=options.whole,
+            setting=setting,
+            allowed=ALLOWED if departure is None else departure,
+            progress=show_progress(),
+        )
+    clear_progress()
+    print(json.dumps(report.to_dict(), indent=2) if options.json else report.to_text())
     return report.exit_status
 
 

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 
 from ..common.arrays import Array
+from ..policy.closed_loop import ClosedLoop
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..scene.model import Scene
 from .departure import find_pairs
+from .drive import Drive
 from .pressing import press_in
 from .shapes import LINKS, OBJECT, PALM, Pair, Shape, find_rounding, list_pairs, list_shapes
 from .stretch import Run, Setting, Steps, Stretch, list_steps
@@ -30,7 +32,9 @@ _ROUGH = 1e12
 """Friction of vertices and edges, which makes that of a pair twice the other shape's."""
 
 
-def play(problem: Problem, stretch: Stretch, torque: TorqueProfile, setting: Setting) -> Run:
+def play(
+    problem: Problem, stretch: Stretch, torque: TorqueProfile | ClosedLoop, setting: Setting
+) -> Run:
     """Replay a stretch in Drake; an `Engine`.
 
     Raises
@@ -40,10 +44,12 @@ def play(problem: Problem, stretch: Stretch, torque: TorqueProfile, setting: Set
     """
     from pydrake.systems.analysis import Simulator
 
-    steps = list_steps(problem, stretch, torque, setting.step)
+    steps, drive = list_steps(problem, stretch, torque, setting.step), None
+    if isinstance(torque, ClosedLoop):
+        drive = Drive(problem.scene, torque, _EVERY * steps.h)
     setting = setting._replace(step=steps.h / problem.scene.scales.time)
     with _quiet():
-        diagram, plant, pairs = _build(problem.scene, steps, setting)
+        diagram, plant, pairs = _build(problem.scene, steps, setting, drive is None)
         simulator = Simulator(diagram)
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     plant.SetPositions(context, _press(problem, stretch, setting))
@@ -51,11 +57,16 @@ def play(problem: Problem, stretch: Stretch, torque: TorqueProfile, setting: Set
     simulator.Initialize()
     results = plant.get_contact_results_output_port()
     names = tuple(pair.name for pair in list_pairs(problem.scene))
-    states, press, start = [(stretch.z, stretch.z_dot)], [], 0
+    states, press, start, done = [(stretch.z, stretch.z_dot)], [], 0, 0
     for end in steps.ends:
         total = np.zeros(len(names))
         looks = range(end, start, -_EVERY)[::-1]
         for step in looks:
+            if drive is not None:
+                z, v = plant.GetPositions(context), plant.GetVelocities(context)
+                tau = drive.step(done * steps.h, z[3:], v[3:])
+                plant.get_actuation_input_port().FixValue(context, tau)
+                done = step
             # Half a step late: the step at that time is done then, whatever its rounding.
             simulator.AdvanceTo((step - 0.5) * steps.h)
             found = results.Eval(context)
@@ -67,9 +78,11 @@ def play(problem: Problem, stretch: Stretch, torque: TorqueProfile, setting: Set
         press.append(total / len(looks))
         states.append((plant.GetPositions(context), plant.GetVelocities(context)))
         start = end
-    z, z_dot = (np.array(part) for part in zip(*states, strict=True))
-    t = stretch.start + steps.h * np.array([0, *steps.ends])
-    return Run(t, z, z_dot, names, np.array(press))
+        if drive is not None and drive.over:
+            break
+    places, speeds = (np.array(part) for part in zip(*states, strict=True))
+    t = stretch.start + steps.h * np.array([0, *steps.ends[: len(press)]])
+    return Run(t, places, speeds, names, np.array(press))
 
 
 @contextmanager
@@ -84,8 +97,13 @@ def _quiet() -> Iterator[None]:
         log.setLevel(level)
 
 
-def _build(scene: Scene, steps: Steps, setting: Setting) -> tuple[Any, Any, dict[Any, int]]:
-    """Diagram, plant, and the numbers of pairs by the identities of their shapes."""
+def _build(
+    scene: Scene, steps: Steps, setting: Setting, plays: bool
+) -> tuple[Any, Any, dict[Any, int]]:
+    """Diagram, plant, and the numbers of pairs by the identities of their shapes.
+
+    If it `plays`, the torques of the steps are part of it.
+    """
     from pydrake.multibody.plant import (
         AddMultibodyPlantSceneGraph,
         ContactModel,
@@ -104,6 +122,8 @@ def _build(scene: Scene, steps: Steps, setting: Setting) -> tuple[Any, Any, dict
     pairs = _add_shapes(plant, graph, scene, setting)
     plant.Finalize()
     plant.set_stiction_tolerance(STICTION * scene.scales.speed)
+    if not plays:
+        return builder.Build(), plant, pairs
     # Held from half a step before each step on, so that rounding of times does not matter.
     breaks = steps.h * (np.arange(len(steps.tau) + 1) - 0.5)
     rows = np.vstack([steps.tau, steps.tau[-1:]]).T

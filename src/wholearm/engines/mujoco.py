@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
+from ..policy.closed_loop import ClosedLoop
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from .departure import find_pairs
+from .drive import Drive
 from .mjcf import Softness, write_mjcf
 from .pressing import press_in
 from .shapes import list_pairs
@@ -20,7 +22,9 @@ _LITTLE = 1e-6
 """Depth at which contacts are looked at, over the scene's length."""
 
 
-def play(problem: Problem, stretch: Stretch, torque: TorqueProfile, setting: Setting) -> Run:
+def play(
+    problem: Problem, stretch: Stretch, torque: TorqueProfile | ClosedLoop, setting: Setting
+) -> Run:
     """Replay a stretch in MuJoCo; an `Engine`.
 
     Raises
@@ -31,6 +35,7 @@ def play(problem: Problem, stretch: Stretch, torque: TorqueProfile, setting: Set
     import mujoco
 
     steps = list_steps(problem, stretch, torque, setting.step)
+    drive = Drive(problem.scene, torque, steps.h) if isinstance(torque, ClosedLoop) else None
     text = write_mjcf(problem, step=steps.h, softness=Softness().scale(setting.softness))
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
@@ -41,7 +46,10 @@ def play(problem: Problem, stretch: Stretch, torque: TorqueProfile, setting: Set
     for end in steps.ends:
         total = np.zeros(len(names))
         for step in range(start, end):
-            data.ctrl[:] = steps.tau[step]
+            tau = steps.tau[step]
+            if drive is not None:
+                tau = drive.step(step * steps.h, data.qpos[3:], data.qvel[3:])
+            data.ctrl[:] = tau
             mujoco.mj_step(model, data)
             if data.ncon:
                 contact = data.contact
@@ -52,8 +60,10 @@ def play(problem: Problem, stretch: Stretch, torque: TorqueProfile, setting: Set
         press.append(total / (end - start))
         states.append((data.qpos.copy(), data.qvel.copy()))
         start = end
+        if drive is not None and drive.over:
+            break
     z, z_dot = (np.array(part) for part in zip(*states, strict=True))
-    t = stretch.start + steps.h * np.array([0, *steps.ends])
+    t = stretch.start + steps.h * np.array([0, *steps.ends[: len(press)]])
     return Run(t, z, z_dot, names, np.array(press))
 
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..common.arrays import Array
+from ..policy.closed_loop import ClosedLoop
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
@@ -105,8 +106,8 @@ class Run(NamedTuple):
     press: Array
 
 
-Engine = Callable[[Problem, Stretch, TorqueProfile, Setting], Run]
-"""Replays a stretch under the torques that are applied."""
+Engine = Callable[[Problem, Stretch, TorqueProfile | ClosedLoop, Setting], Run]
+"""Replays a stretch under the torques that are applied, or by feedback until the motion is over."""
 
 
 def list_stretches(plan: Trajectory, whole: bool) -> list[Stretch]:
@@ -124,15 +125,27 @@ def list_stretches(plan: Trajectory, whole: bool) -> list[Stretch]:
     return found
 
 
-def list_steps(problem: Problem, stretch: Stretch, torque: TorqueProfile, step: float) -> Steps:
-    """Even steps that fit a stretch, none longer than `step` times the scene's time."""
+def list_steps(
+    problem: Problem, stretch: Stretch, torque: TorqueProfile | ClosedLoop, step: float
+) -> Steps:
+    """Even steps that fit a stretch, none longer than `step` times the scene's time.
+
+    Torques by feedback are zero here.
+    """
     duration = stretch.stop - stretch.start
     count = max(int(np.ceil(duration / (step * problem.scene.scales.time) - 1e-9)), FEWEST)
     h = duration / count
-    places = (np.arange(count * _LOOKS) + 0.5) * (h / _LOOKS) - h / 2
-    places = stretch.start + np.maximum(places, _LEAST * h)
-    tau = torque.at(places).reshape(count, _LOOKS, 2).mean(axis=1)
+    tau = np.zeros((count, 2))
+    if isinstance(torque, TorqueProfile):
+        tau = _average(torque, stretch.start, h, count)
     v = stretch.z_dot - h / 2 * stretch.z_ddot
     rows = min(count, ROWS * len(stretch.phases))
     ends = np.linspace(0, count, rows + 1)[1:].astype(int).tolist()
     return Steps(h, v, tau, ends)
+
+
+def _average(torque: TorqueProfile, start: float, h: float, count: int) -> Array:
+    """Torques of steps."""
+    places = (np.arange(count * _LOOKS) + 0.5) * (h / _LOOKS) - h / 2
+    places = start + np.maximum(places, _LEAST * h)
+    return np.asarray(torque.at(places).reshape(count, _LOOKS, 2).mean(axis=1))

@@ -46,6 +46,11 @@ class ClosedLoop:
         self.began: dict[int, float] = {}
         self.policy.reset(phase)
 
+    @property
+    def over(self) -> bool:
+        """Whether the last phase is."""
+        return self.policy.index == len(self.policy.laws) - 1 and self.policy.laws[-1].over
+
     def find_duration(self, last: int) -> float:
         """How long the phases up to the `last` take where nothing is off [s]."""
         phases = self.policy.about["phases"][self.first - 1 : last]

@@ -103,6 +103,12 @@ class Policy:
         """How long the motion takes where nothing is off [s]."""
         return float(self.about.get("duration", 0.0))
 
+    @property
+    def resting(self) -> list[int]:
+        """Numbers of the phases that begin at rest."""
+        pairs = zip(self.firsts[1:], self.laws, strict=False)
+        return [1, *(first for first, before in pairs if not before.passes)]
+
     def reset(self, phase: int = 1) -> None:
         """Begin anew with the phase of a number, at rest.
 

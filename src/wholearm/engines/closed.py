@@ -1,0 +1,205 @@
+"""Policies in physics engines: torques by feedback, and where the motion ends."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from importlib.metadata import version
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..common.errors import InputError
+from ..policy.closed_loop import ROOM, ClosedLoop
+from ..policy.policy import Policy
+from ..problem.definition import Problem
+from ..results.report_text import align
+from ..results.trajectory import Trajectory
+from .between import find_between
+from .replay import ENGINES, require_engine
+from .report_text import name_phases
+from .stretch import Run, Setting, Stretch, list_stretches
+
+ALLOWED = 3e-2
+"""How far from the plan's a motion may end, over the scene's length and in rad: landings that are
+planned anew may end two thirds of that away."""
+
+
+class Arrival(NamedTuple):
+    """A stretch that a policy carries out in an engine.
+
+    Attributes
+    ----------
+    stretch : Stretch
+    duration : float, [s]
+        Until the joints stand still at the end.
+    over : bool
+        Whether they do.
+    position, angle : float, [m] and [rad]
+        How far from the plan's the pose ends.
+    contact : str
+        The planned contact that opens most, from when its phase begins until the next contact.
+    gap : float, [m]
+        By how much.
+    """
+
+    stretch: Stretch
+    duration: float
+    over: bool
+    position: float
+    angle: float
+    contact: str
+    gap: float
+
+
+class PolicyReport(NamedTuple):
+    """What a policy does in an engine; `allowed` is over the scene's length and in rad."""
+
+    problem: Problem
+    title: str
+    allowed: float
+    arrivals: tuple[Arrival, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether every stretch ends, and where it is to end."""
+        return all(self.find_failure(own) is None for own in self.arrivals)
+
+    @property
+    def exit_status(self) -> int:
+        """Exit status of the command line."""
+        return 0 if self.ok else 1
+
+    def find_failure(self, own: Arrival) -> str | None:
+        """What is wrong with a stretch."""
+        far = max(own.position / self.problem.scene.scales.length, own.angle)
+        if not far <= self.allowed:
+            text = f"{own.position * 1e3:.3g} mm and {math.degrees(own.angle):.3g} degrees"
+            return f"phase {name_phases(own.stretch)} ends {text} away from the plan"
+        if not own.over:
+            return f"phase {name_phases(own.stretch)} does not end within {own.duration:.4g} s"
+        return None
+
+    def to_text(self) -> str:
+        """The report as lines of text; lengths in mm and angles in degrees."""
+        failures = [self.find_failure(own) for own in self.arrivals]
+        rows = [
+            [
+                name_phases(own.stretch),
+                f"{own.stretch.stop - own.stretch.start:.6f}",
+                f"{own.duration:.6f}",
+                f"{own.position * 1e3:.4f}",
+                f"{math.degrees(own.angle):.4f}",
+                f"{own.gap * 1e3:.4f} {own.contact}",
+            ]
+            for own in self.arrivals
+        ]
+        header = ["phase", "plan [s]", "policy [s]", "end off [mm]", "[deg]", "largest gap [mm]"]
+        lines = [
+            f"{self.problem.name} in {self.title}, by the policy: {'ok' if self.ok else 'FAILS'}",
+            *(failure for failure in failures if failure is not None),
+            "",
+            *align(header, rows, {5}),
+        ]
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report for machines, in m, rad and s."""
+        stretches = [
+            {
+                "phases": [index + 1 for index in own.stretch.phases],
+                **{key: value for key, value in own._asdict().items() if key != "stretch"},
+            }
+            for own in self.arrivals
+        ]
+        return {
+            "problem": self.problem.name,
+            "engine": self.title,
+            "ok": self.ok,
+            "allowed": self.allowed,
+            "stretches": stretches,
+        }
+
+
+def play_policy(
+    engine: str,
+    problem: Problem,
+    plan: Trajectory,
+    policy: Policy,
+    *,
+    whole: bool = False,
+    setting: Setting | None = None,
+    allowed: float = ALLOWED,
+    progress: Callable[[str], None] | None = None,
+) -> PolicyReport:
+    """Let a policy move the hand in an engine that is not told which contacts hold.
+
+    Parameters
+    ----------
+    engine : {"mujoco", "drake"}
+    problem : Problem
+    plan : Trajectory
+        Where phases start and end.
+    policy : Policy
+    whole : bool
+        From the start to the end; otherwise phase by phase, from rest where each is planned to
+        start, but for those that impacts or their own motion lead into.
+    setting, allowed, progress
+        As of `replay_in`.
+
+    Raises
+    ------
+    InputError
+        If the engine is unknown or not installed, or the policy is of other phases.
+    """
+    play = require_engine(engine)
+    if policy.count != len(problem.phases):
+        given = f"{policy.count} given; the problem has {len(problem.phases)}"
+        raise InputError("", "phases of the policy", given)
+    known = ENGINES[engine]
+    setting = known.setting if setting is None else setting
+    arrivals = []
+    for stretch in _join(list_stretches(find_between(plan), False), policy, whole):
+        if progress is not None:
+            progress(f"phase {name_phases(stretch)} in {known.title}")
+        last = stretch.phases[-1] + 1
+        loop = ClosedLoop(policy.cut(last), stretch.phases[0] + 1)
+        until = stretch.start + (1 + ROOM) * loop.find_duration(last)
+        run = play(problem, stretch._replace(stop=until), loop, setting)
+        arrivals.append(_judge(problem, plan, stretch, loop, run))
+    title = f"{known.title} {version(engine)}"
+    return PolicyReport(problem, title, allowed, tuple(arrivals))
+
+
+def _join(parts: list[Stretch], policy: Policy, whole: bool) -> list[Stretch]:
+    """Stretches at rest in the beginning, one after another; or all as one."""
+    begins = [1] if whole else policy.resting
+    found = []
+    for first, after in zip(begins, [*begins[1:], len(parts) + 1], strict=True):
+        own, still = parts[first - 1], np.zeros(5)
+        phases, stop = tuple(range(first - 1, after - 1)), parts[after - 2].stop
+        found.append(own._replace(phases=phases, stop=stop, z_dot=still, z_ddot=still))
+    return found
+
+
+def _judge(
+    problem: Problem, plan: Trajectory, stretch: Stretch, loop: ClosedLoop, run: Run
+) -> Arrival:
+    """Where a run ends, and which planned contact opens most on the way."""
+    goal = plan.z[np.flatnonzero(plan.phase == stretch.phases[-1])[-1]]
+    away, t = np.abs(run.z[-1] - goal), run.t - stretch.start
+    position, angle = float(np.hypot(*away[:2])), float(away[2])
+    begins = [loop.began.get(index + 1, np.inf) for index in stretch.phases]
+    contact, gap = "", 0.0
+    for index, start, stop in zip(stretch.phases, begins, [*begins[1:], np.inf], strict=True):
+        phase = problem.phases[index]
+        rows = np.flatnonzero((t >= start) & (t < stop))
+        gaps = phase.formation.evaluate(run.z[rows], run.z_dot[rows]).C
+        if phase.until.contact is not None:
+            until = phase.until.contact.name
+            made = run.press[np.maximum(rows - 1, 0), run.pairs.index(until)] > 0
+            gaps = gaps[: int(np.argmax(np.append(made, True)))]
+        if gaps.size and gaps.max() > gap:
+            gap = float(gaps.max())
+            contact = phase.formation.names[int(gaps.max(axis=0).argmax())]
+    return Arrival(stretch, float(t[-1]), loop.over, position, angle, contact, gap)
