@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from shipped import HEPTAGON, IMPACTS, problem_of, solved
+from shipped import HEPTAGON, IMPACTS, LANDING, problem_of, solved
+from wholearm.contacts.formation import Formation
+from wholearm.geometry.tracing import trace_phases
 from wholearm.problem.definition import End
+from wholearm.problem.goal import Goal
 from wholearm.search.chart import Chart
+from wholearm.search.goals import is_at
 from wholearm.search.links import Link
 from wholearm.search.places import make_place
 
@@ -46,3 +51,23 @@ def test_no_chain_leads_through_an_impact_that_is_not_possible() -> None:
     assert [
         chain for chain, _ in chart.pass_on(place) if str(chain.steps[0].until) == "v3-finger1"
     ] == []
+
+
+def test_a_landing_is_led_to_where_the_goal_is() -> None:
+    problem, goal = problem_of(LANDING), Goal(flush=1, x=0.022)
+    chart, curves = Chart(problem, 0.1), trace_phases(problem)
+    place = make_place(problem.scene, curves[3].end)
+    contacts = set(problem.phases[4].formation.contacts)
+    ((index, border),) = (
+        (k, own)
+        for k, (own, _) in enumerate(chart.follow(place))
+        if set(own.formation.contacts) == contacts
+    )
+    landings = chart.land_at(chart.release(border, index), goal)
+    assert landings
+    for link in landings:
+        assert is_at(link.stop, goal) and str(link.steps[-1].until) == "v2-palm at x = 0.022 m"
+        assert [step.end for step in link.steps] == [End.SMOOTH, End.REST]
+        gaps = Formation(problem.scene, link.stop.contacts).evaluate(*[link.stop.z[None]] * 2).C
+        assert np.abs(gaps).max() < 1e-8 * problem.scene.scales.length
+    assert chart.land_at(chart.release(border, index), Goal(flush=1)) == []

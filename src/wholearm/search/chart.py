@@ -12,12 +12,13 @@ from dataclasses import replace
 import numpy as np
 
 from ..contacts.formation import Formation
+from ..geometry.explore import close_contacts, is_inside
 from ..planning.result import Plan
-from ..problem.definition import Problem, Until
+from ..problem.definition import End, Problem, Until
 from ..problem.goal import Goal
 from .cells import Crossing, cross, go_to
 from .chains import Chain, list_chains
-from .goals import list_poses, measure_along
+from .goals import is_flush, list_pins, list_poses, measure_along
 from .links import (
     Blocked,
     Border,
@@ -34,6 +35,9 @@ from .places import Key, Place, list_formations_at, make_place, settle
 
 RELEASES = (0.15, 0.4, 0.6, 0.75, 0.88)
 """Shares of a border at which contacts may be let go."""
+
+NEAR = 1.0
+"""How far landings are moved to where a goal is, at most, in radii of gyration."""
 
 Found = list[Link | Blocked]
 
@@ -168,6 +172,29 @@ class Chart:
         last = Step(curve.formation.contacts, until)
         return chain.link(last, curve, stop, self.epsilon, self.least_minor)
 
+    def land_at(self, links: Found, goal: Goal) -> list[Link]:
+        """Links that land on the edge of a goal which gives x, as they land right there.
+
+        About as long as where they land otherwise; whether they can is for the planner to say. A
+        border before is left in motion: from rest at one place few others can be reached.
+        """
+        landings = [own for own in links if isinstance(own, Link) and own.in_cell]
+        if goal.flush is None or goal.x is None:
+            return []
+        found, near = list[Link](), NEAR * self.scene.scales.length
+        for link in landings:
+            *before, last = link.steps
+            if not is_flush(link.stop, goal.flush) or abs(link.stop.z[0] - goal.x) > near:
+                continue
+            formation = Formation(self.scene, link.stop.contacts)
+            z = close_contacts(formation, link.stop.z, np.zeros(0), ((0, goal.x),))
+            if z is not None and is_inside(formation, z):
+                step = last._replace(until=replace(last.until, pins=list_pins(goal)))
+                stop = replace(link.stop, z=z)
+                first = [Step(own.contacts, Until(), End.SMOOTH) for own in before]
+                found.append(replace(link, stop=stop, steps=(*first, step), left=None))
+        return found
+
     def end_in_cell(self, place: Place, goal: Goal) -> Iterator[Link]:
         """Links from a place straight to a goal inside a cell around it."""
         poses = list_poses(self.scene, place.z, goal)
@@ -177,7 +204,7 @@ class Chart:
             way = go_to(formation, place.z, poses, self.epsilon)
             if way is not None:
                 assert goal.phi is not None
-                until = Until(coordinate="phi", value=goal.phi)
+                until = Until(None, "phi", goal.phi, list_pins(goal))
                 steps = (Step(formation.contacts, until),)
                 stop = Place(self.scene, way.z, formation.contacts, landed=True)
                 yield Link(place, stop, steps, way.duration, 0.0, True)

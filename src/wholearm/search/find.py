@@ -161,8 +161,10 @@ class Search:
             elif isinstance(work, tuple):
                 border, index = work
                 links = self.chart.release(border, index)
+                links = [*links, *self.chart.land_at(links, self.goal)]
             else:
                 links = [*self.chart.cross_cells(place), *self.chart.end_in_cell(place, self.goal)]
+                links += self.chart.land_at(links, self.goal)
             for link in links:
                 if isinstance(link, Link):
                     put(Route((*route.links, link)), link.stop, None)

@@ -80,6 +80,11 @@ def _find_first(curve: Curve, row: int, value: float) -> float | None:
     return find_root(miss, float(grid[k]), float(grid[k + 1]))
 
 
+def list_pins(goal: Goal) -> tuple[tuple[str, float], ...]:
+    """What a phase through a cell has to pin where it ends at a goal."""
+    return () if goal.x is None else (("x", goal.x),)
+
+
 def list_poses(scene: Scene, z: Array, goal: Goal) -> Array:
     """Poses (x, phi) where a goal may be met in a cell near a configuration, shape (n, 2)."""
     if goal.phi is None:
