@@ -30,11 +30,11 @@ from wholearm.planning.path_domain.nlp import (
     Units,
     build_path_nlp,
     make_bounds,
-    move_multipliers,
     pack,
     parameters,
     unpack,
 )
+from wholearm.planning.path_domain.solving import move_multipliers
 from wholearm.planning.path_domain.terms import LimitShape
 
 EPSILON = 0.05

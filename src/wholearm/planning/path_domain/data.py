@@ -211,12 +211,10 @@ def prepare(
     grid: Grid,
     phase: int,
     spread: Spread | None = None,
-    quickness: float = 1.0,
 ) -> PhaseData:
     """Evaluate a curve's forces at the nodes of a grid and between them.
 
-    With a `spread`, force limits are those for all ranges. Rates of torques are limited to that
-    part of their limits which `quickness` is.
+    With a `spread`, force limits are those for all ranges.
 
     Raises
     ------
@@ -267,7 +265,7 @@ def prepare(
         nodes = _widen(spread, nodes, grid.s, grid.segment)
         checks = _widen(spread, checks, inside, owners)
     kept = limits.without(SPEED), limits.only(SPEED)
-    rates = quickness * formation.scene.torque_rate_limit
+    rates = formation.scene.torque_rate_limit
     return PhaseData(curve, epsilon, *kept, grid, nodes, sampling, knots, checks, rates, spread)
 
 
@@ -305,11 +303,18 @@ def join(parts: Sequence[PhaseData]) -> PhaseData:
             chain((part.grid.segment for part in parts), segments),
             (parts[0].grid.rests[0], parts[-1].grid.rests[1]),
             parts[0].grid.held,
+            _join_bends([part.grid for part in parts]),
         ),
         nodes=stack([part.nodes for part in parts]),
         knots=stack([part.knots for part in parts]),
         checks=stack([part.checks for part in parts]),
     )
+
+
+def _join_bends(grids: Sequence[Grid]) -> Array | None:
+    """Bends of the elements of grids one after the other."""
+    bends = [grid.bends for grid in grids if grid.bends is not None]
+    return np.concatenate(bends) if bends else None
 
 
 def cut(parts: Sequence[PhaseData], profile: Profile) -> list[Profile]:

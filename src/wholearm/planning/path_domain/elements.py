@@ -4,7 +4,10 @@ An element has `DEGREE` + 1 nodes, the Lobatto points of a local variable y from
 motion s is linear in y. Next to rest s is quadratic in it, measured from where the motion rests:
 there the speed, and with it viscous friction, goes with the root of the way, and is smooth in y.
 Where torques may not step the motion starts and ends without acceleration, and s is cubic in y.
-With b = s'^2 and b' = 2 s'' (dash: d/ds), b is a polynomial in y too.
+What follows such a start is bent: its part of the way is (1 - c) y + c y^2, with c such that the
+root of the way from about where a motion with acceleration at once would have started is linear
+in y; c is negative before such an end. With b = s'^2 and b' = 2 s'' (dash: d/ds), b is a
+polynomial in y too.
 """
 
 from __future__ import annotations
@@ -86,12 +89,15 @@ class Grid(NamedTuple):
         Whether the motion starts and ends at rest.
     held : bool
         Whether it does so without acceleration.
+    bends : ndarray or None
+        The c of each element, shape (E,), for elements of the kind `INSIDE`; None for zeros.
     """
 
     s: Array
     segment: NDArray[np.int64]
     rests: tuple[bool, bool] = (True, True)
     held: bool = False
+    bends: Array | None = None
 
     @property
     def steps(self) -> Array:
@@ -119,6 +125,28 @@ class Grid(NamedTuple):
         return kinds
 
     @property
+    def sizes(self) -> Array:
+        """What b at the nodes is like, over the largest, shape (N + 1,): 1 unless motions are held.
+
+        It goes with the way from rest and to rest, and there with the fourth power of y.
+        """
+        if not self.held:
+            return np.ones_like(self.s)
+        found = np.ones_like(self.s)
+        for rest, at, way in ((0, 0, self.s - self.s[0]), (1, -1, self.s[-1] - self.s)):
+            if self.rests[rest]:
+                first = np.diff(self.edges)[at, 0]
+                own = np.where(way < first, first * (way / first) ** (4 / 3), way)
+                found = np.minimum(found, 2 * own / (self.s[-1] - self.s[0]))
+        # The two ends are no unknowns.
+        return np.maximum(found, np.finfo(float).tiny)
+
+    @property
+    def link_sizes(self) -> Array:
+        """What the rows of b' = 2 a are over, shape (N,)."""
+        return np.asarray(np.maximum(self.sizes[1:], self.sizes[:-1]))
+
+    @property
     def weights(self) -> Array:
         """Length that each node stands for, shape (N + 1,) [m]."""
         steps = self.steps
@@ -141,7 +169,12 @@ class Grid(NamedTuple):
         """B at the nodes for s'' there, from rest, shape (N + 1,)."""
         lengths = np.diff(self.edges)
         table = a.reshape(-1, DEGREE + 1, 1)
-        rises = lengths * (find_basis().links[self.kinds] @ table)[..., 0]
+        links, kinds = find_basis().links, self.kinds
+        rises = (links[kinds] @ table)[..., 0]
+        if self.bends is not None:
+            bends = (self.bends * (kinds == INSIDE))[:, None]
+            rises += bends * ((links[FROM_REST] - links[INSIDE]) @ table)[..., 0]
+        rises *= lengths
         return np.cumsum(np.hstack([np.zeros_like(lengths), rises]).ravel())
 
 
@@ -150,12 +183,36 @@ def lay_out(
 ) -> Grid:
     """The grid of elements with these edges, shape (E, 2) [m], on segments of shape (E,)."""
     grid = Grid(np.repeat(edges[:, 0], DEGREE + 1), np.repeat(segment, DEGREE + 1), rests, held)
-    kinds = grid.kinds[:, None]
-    way = find_basis().y[grid.kinds] ** POWERS[kinds]
+    kinds, y = grid.kinds[:, None], find_basis().y[grid.kinds]
+    way = y ** POWERS[kinds]
     share = np.where(SIGNS[kinds] > 0, way, 1 - way)
+    if held:
+        grid = grid._replace(bends=_find_bends(edges, rests))
+        share = np.where(kinds == INSIDE, _bend(grid.bends, y), share)
     s = edges[:, :1] + share * np.diff(edges)
     s[:, -1] = edges[:, 1]
     return grid._replace(s=s.ravel())
+
+
+def _find_bends(edges: Array, rests: tuple[bool, bool]) -> Array:
+    """Bends of elements with these edges, each for the nearer one of the ends at rest."""
+    length, found = edges[-1, 1] - edges[0, 0], np.zeros(len(edges))
+    early = edges.mean(axis=1) - edges[0, 0] < length / 2
+    for sign, at, rest, own in ((1, 0, rests[0], early), (-1, -1, rests[1], ~early)):
+        if not rest:
+            continue
+        way = np.abs(edges[own] - edges[at, at])
+        # A ramp of s'' takes four thirds of the way that its end's speed takes with its end's s''.
+        way -= np.diff(edges)[at, 0] / 4
+        near, far = np.sqrt(np.maximum(way, 0.0))[:, ::sign].T
+        found[own] = sign * (far - near) / (far + near)
+    return found
+
+
+def _bend(bends: Array | None, y: Array) -> Array:
+    """The part of the way that is done at y of bent elements, shapes (E,) and (E, m)."""
+    c = np.zeros((len(y), 1)) if bends is None else bends[:, None]
+    return np.asarray((1 - c) * y + c * y**2)
 
 
 class Profile(NamedTuple):
@@ -164,6 +221,18 @@ class Profile(NamedTuple):
     a: Array
     b: Array
     squeeze: Array
+
+
+def follow(grid: Grid, a: Array, squeeze: Array) -> Profile:
+    """The motion with these s'' and squeezes at its nodes, s'' such that it comes to rest."""
+    spread = np.ones_like(a)
+    if grid.held:
+        spread = np.cbrt(np.maximum(grid.s * (grid.s[-1] - grid.s), 0.0))
+    a = a - grid.integrate(a)[-1] / grid.integrate(spread)[-1] * spread
+    # Where phases are joined at next to no speed, rounding can take b below zero.
+    b = np.maximum(grid.integrate(a), 0.0)
+    b[-1] = 0.0
+    return Profile(a, b, squeeze)
 
 
 class Elements:
@@ -194,19 +263,42 @@ class Elements:
         later = 6 * sign * a[:, 1:] / (powers[:-1] + 4)
         cubic = np.concatenate([later, np.zeros_like(a[:, :2])], axis=1)
         rooted = np.where(self._power[:, None, None] == 3, cubic, rooted)
-        self._b = np.where(self._rooted[:, None, None], rooted, plain)[..., 0]
+        found = np.where(self._rooted[:, None, None], rooted, plain)[..., 0]
+        self._bends = None if grid.bends is None else grid.bends * (kinds == INSIDE)
+        if self._bends is not None:
+            c = self._bends[:, None]
+            further = c * np.hstack([0 * first[..., 0], (4 * a / (powers + 2))[..., 0]])
+            found[:, 1:] *= 1 - c
+            found = np.hstack([found, np.zeros_like(c)])
+            found[:, 1:] += further
+        self._b = found
 
     @property
     def local(self) -> Array:
         """The local variable at the nodes, shape (N + 1,)."""
         return np.asarray(self._y)
 
+    @property
+    def stretch(self) -> Array:
+        """The way over the element's length that a rise of y takes at the nodes, (E, p + 1)."""
+        y = self._y.reshape(-1, DEGREE + 1)
+        c = 0.0 if self._bends is None else self._bends[:, None]
+        power = self._power[:, None]
+        return np.asarray(power * y ** (power - 1) * (1 - c + 2 * c * y))
+
     def find_y(self, k: NDArray[np.int64], done: Array, left: Array) -> Array:
         """Local variable where a part of an interval is done and one is left, which add up to 1."""
-        power = self._power[k // (DEGREE + 1)]
+        element = k // (DEGREE + 1)
+        power = self._power[element]
         y, later = self._y[k], self._y[k + 1]
         squares = np.sqrt(np.maximum(left * y**2 + done * later**2, 0.0))
         found = np.where(power == 2, squares, left * y + done * later)
+        if self._bends is not None:
+            c = self._bends[element]
+            way = left * ((1 - c) * y + c * y**2) + done * ((1 - c) * later + c * later**2)
+            root = np.sqrt(np.maximum((1 - c) ** 2 + 4 * c * way, 0.0))
+            bent = 2 * way / np.maximum(1 - c + root, np.finfo(float).tiny)
+            found = np.where(c != 0, bent, found)
         if self.grid.held:
             found = np.where(power == 3, np.cbrt(left * y**3 + done * later**3), found)
         return found
@@ -229,7 +321,7 @@ class Elements:
                 squeeze * y + (self._motion[element, power, 1]),
             )
         b = self._b[element, -1]
-        for power in reversed(range(DEGREE + 1)):
+        for power in reversed(range(self._b.shape[1] - 1)):
             b = b * y + self._b[element, power]
         speed = np.sqrt(np.maximum(b, 0.0)) * np.where(self._rooted[element], y, 1.0)
         if self.grid.held:

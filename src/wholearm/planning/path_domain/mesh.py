@@ -18,7 +18,6 @@ from ...geometry.curve import Curve
 from ..options import Objective
 from .data import PhaseData
 from .elements import Grid, Profile, lay_out
-from .motor_switches import find_motor_switches
 from .switches import Switch, find_switches
 
 START, SOFT = 10, 20
@@ -59,8 +58,10 @@ class Mesh(NamedTuple):
     weights: Array | None = None
 
     @staticmethod
-    def of(curve: Curve, switches: Sequence[Switch]) -> Mesh:
+    def of(curve: Curve, switches: Sequence[Switch], held: bool = False) -> Mesh:
         """The mesh for a motion that switches at some places."""
+        if held:
+            return Mesh(_space(switches, curve))
         return Mesh(_match(np.zeros(0), switches, curve)[0])
 
     def make_grid(
@@ -74,7 +75,7 @@ class Mesh(NamedTuple):
         ends = find_ends(curve, self.breaks)
         angles = np.arccos(1 - 2 * np.clip(ends / curve.length, 0.0, 1.0))
         weights = np.diff(angles) if self.weights is None else self.weights
-        if held and len(weights) > 2:
+        if held and len(weights) > 2 and self.weights is None:
             weights = weights * np.array([_ENDS, *[1.0] * (len(weights) - 2), _ENDS])
         counts = _share_out(elements, weights)
         places = np.repeat(np.arange(len(counts)), counts)
@@ -148,12 +149,9 @@ def adapt(
         The other one.
     """
     breaks, shift = before.breaks, 0.0
-    if goal in (Objective.TIME, Objective.MARGIN):
-        if part.grid.held:
-            breaks, shift = _renew(before.breaks, find_motor_switches(part, profile), part.curve)
-        else:
-            breaks, shift = _match(before.breaks, find_switches(part, profile, margin), part.curve)
-    if len(breaks) != len(before.breaks) or part.grid.held:
+    if goal in (Objective.TIME, Objective.MARGIN) and not part.grid.held:
+        breaks, shift = _match(before.breaks, find_switches(part, profile, margin), part.curve)
+    if len(breaks) != len(before.breaks):
         return Better(Mesh(breaks), shift, float(prices.sum()))
     ends = find_ends(part.curve, before.breaks)
     middles = part.grid.edges.mean(axis=1)
@@ -189,12 +187,10 @@ def _match(known: Array, switches: Sequence[Switch], curve: Curve) -> tuple[Arra
     return np.array(kept), shift
 
 
-def _renew(known: Array, switches: Sequence[Switch], curve: Curve) -> tuple[Array, float]:
-    """Breaks at switches alone, and how far these are from what was known."""
-    fixed, kept, shift = find_ends(curve, np.zeros(0)), list[float](), 0.0
-    for place, jumps in switches:
+def _space(switches: Sequence[Switch], curve: Curve) -> Array:
+    """Breaks at switches, but where there is an end close to it."""
+    fixed, kept = find_ends(curve, np.zeros(0)), list[float]()
+    for place, _ in switches:
         if np.abs(np.append(fixed, kept) - place).min() > _CLOSE * curve.length:
             kept.append(place)
-            far = float(np.abs(known - place).min(initial=np.inf)) / curve.length
-            shift = max(shift, min(far, _NEAR)) if jumps else shift
-    return np.array(sorted(kept)), shift
+    return np.array(sorted(kept))

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...common.arrays import Array
 from .data import PhaseData
-from .elements import Profile
+from .elements import DEGREE, Grid, Profile
 from .motion import PathMotion
 from .motor_data import find_hurry
 from .nlp import PathNLP, Tightening, Units
@@ -88,6 +88,8 @@ class Misses(NamedTuple):
         """Limits that are tightened by somewhat more than they miss."""
         reach = data.slack_at_neighbours(solution.profile, solution.margin, self.short)
         short, speeding = data.spread_to_nodes(self.short), data.spread_to_nodes(self.speeding)
+        if data.grid.held:
+            short = _taper(short, data.grid)
         return tightening.by(
             data.spread_to_nodes(reach),
             OVER * short,
@@ -113,6 +115,20 @@ class Misses(NamedTuple):
                 over = self.hurry.max()
                 missed = f"the torque rate limit is still exceeded by {over:.2g} of it"
         return f"after {ROUNDS} solves {missed}; plan with more intervals"
+
+
+def _taper(short: Array, grid: Grid) -> Array:
+    """Misses at nodes, shape (n, n_sides), so that they are the same where two elements meet.
+
+    Torques are, too, and a polynomial that is held back at one end alone would swing.
+    """
+    table = short.reshape(-1, DEGREE + 1, short.shape[1])
+    ends = np.zeros((len(table) + 1, short.shape[1]))
+    ends[:-1], ends[1:] = table[:, 0], np.maximum(ends[1:], table[:, -1])
+    ends[:-1] = np.maximum(ends[:-1], table[:, 0])
+    y = np.linspace(0, 1, DEGREE + 1)[:, None]
+    along = ends[:-1, None] * (1 - y) + ends[1:, None] * y
+    return np.asarray(np.maximum(table, along).reshape(short.shape))
 
 
 def anticipate(data: PhaseData, start: PathSolution, tightening: Tightening) -> Tightening:
@@ -142,7 +158,7 @@ def price(
     on_sides = np.maximum(-signs * on_limits[:, rows], 0.0) / units.of(data.limits)[rows]
     on_b = np.zeros(nlp.free.shape)
     on_b[nlp.free] = solution.multipliers["lam_x0"]
-    on_b = np.maximum(on_b[:, 0], 0.0) * solution.profile.b / units.profile[0]
+    on_b = np.maximum(on_b[:, 0], 0.0) * solution.profile.b / data.grid.sizes / units.profile[0]
     found = (on_sides * tightened[0]).sum(axis=1) + on_b * tightened[1]
     for kind, (name, joints) in enumerate(nlp.shape.motors._asdict().items()):
         on_rows = solution.multipliers["lam_g0"][nlp.columns.g[name]]

@@ -9,17 +9,13 @@ from numpy.polynomial import chebyshev
 
 from ...common.arrays import Array
 from .data import PhaseData
-from .elements import DEGREE, POWERS, Elements, Profile
+from .elements import DEGREE, Elements, Profile
 from .fitting import PLACES
 from .motion import PathMotion
 from .motor_terms import list_slopes
 
 _LOOKS = 21
 """Instants of each interval at which rates are looked at."""
-_SLOWEST = 400.0
-"""Rate, over the torque limit in the time of the motion, from which on slower ones come first."""
-_QUICKER = 6.0
-"""Ratio of one of them to the one before."""
 
 
 def find_torques(
@@ -53,7 +49,7 @@ def find_hurry(data: PhaseData, profile: Profile, motions: Sequence[PathMotion])
     Shape (n_solid, 2, 2): of rates, then of commands, of each joint.
     """
     scene = data.curve.formation.scene
-    if not scene.has_slow_motors:
+    if not data.grid.held:
         return np.zeros((len(data.nonempty), 2, 2))
     torques, rates = find_torques(data, profile, motions)
     rate = np.abs(rates).max(axis=1) / data.rate_limit
@@ -65,28 +61,14 @@ def find_hurry(data: PhaseData, profile: Profile, motions: Sequence[PathMotion])
 def exceeds_rates(data: PhaseData, profile: Profile) -> bool:
     """Whether torques change too fast, or commands are too large, at the nodes of a motion."""
     scene = data.curve.formation.scene
-    if not scene.has_slow_motors:
+    if not data.grid.held:
         return False
     grid, nodes = data.grid, DEGREE + 1
-    kinds, y = grid.kinds, Elements(grid, profile).local
-    power, length = POWERS[kinds][:, None], np.diff(grid.edges)
+    kinds, stretch = grid.kinds, Elements(grid, profile).stretch
     speed = np.sqrt(profile.b).reshape(-1, nodes)
-    inside = np.maximum(y.reshape(-1, nodes), 1e-3) ** (power - 1)
-    pace = speed / inside / power / length
+    pace = speed / np.maximum(stretch, 1e-6) / np.diff(grid.edges)
     tau = data.nodes.forces.tau(*profile).reshape(-1, nodes, 2)
     rates = np.stack(list_slopes())[kinds] @ tau * pace[..., None]
     command = np.abs(tau + scene.actuator_lag * rates)
     quick = (np.abs(rates) > data.rate_limit).any()
     return bool(quick or (command * (scene.actuator_lag > 0) > data.torque_limit).any())
-
-
-def list_quicknesses(data: PhaseData, lasts: float) -> list[float]:
-    """Parts of the largest rates to plan with, one after the other, for a motion that lasts so [s].
-
-    Where a torque takes its step in next to no time, that is found on the way from slower ones.
-    """
-    rates = data.rate_limit / data.torque_limit * lasts
-    least = float(np.min(rates, initial=np.inf))
-    steps = np.log(least / _SLOWEST) / np.log(_QUICKER) if np.isfinite(least) else 0.0
-    count = max(0, int(np.ceil(steps)))
-    return [_QUICKER**-k for k in reversed(range(count + 1))]

@@ -22,7 +22,7 @@ from ...solvers.ipopt import build_solver
 from ...solvers.statistics import SolverStatistics, book
 from ..options import Objective
 from .data import PhaseData
-from .elements import DEGREE, Grid, Profile
+from .elements import Grid, Profile, follow
 from .sure_start import SureStart
 from .terms import CHAINED, LEAST_B, SOFT, LimitShape, NLPColumns, list_columns, write_terms
 
@@ -169,6 +169,9 @@ def build_path_nlp(shape: LimitShape, intervals: int, objective: Objective) -> P
     # Started from nowhere near their optimum, these need the more robust strategy.
     strategy: dict[str, Any]
     strategy = {"mu_strategy": "monotone"} if objective in SOFT else {"mu_oracle": "probing"}
+    if shape.motors.slow:
+        # Next to rest slopes of the time are large, by which it would count for little.
+        strategy |= {"nlp_scaling_method": "none"}
     solver = build_solver("path_nlp", nlp, 1e-9, max_iter=300, **strategy)
     columns = list_columns(shape, intervals, objective)
     return PathNLP(solver, shape, intervals, columns, objective)
@@ -198,6 +201,7 @@ def parameters(
         scene, (rates, commands) = data.curve.formation.scene, map(list, motors)
         blocks["quick"] = (torque / units.time / data.rate_limit)[rates]
         blocks["lags"] = scene.actuator_lag[commands] / units.time
+        blocks |= {"bends": data.grid.bends, "sizes": data.grid.sizes}
     if relaxation is not None:
         parameter, step = relaxation
         gives = data.limits.weigh(parameter) * step / unit
@@ -231,9 +235,9 @@ def make_bounds(
     # Next to rest b goes with the way: of the least s'' it is twice as much.
     s, length = data.grid.s, data.grid.s[-1]
     low[:, 0] = LEAST_B * np.minimum(s, length - s) / length
-    if data.grid.held:  # There b goes with the fourth power of y.
-        low[: DEGREE + 1, 0] = low[-DEGREE - 1 :, 0] = LEAST_B**2
     high[:, 0] = np.maximum(b_max * speed_share / units.profile[0], 2 * LEAST_B)
+    if data.grid.held:
+        low[:, 0], high[:, 0] = LEAST_B, high[:, 0] / data.grid.sizes
     # From rest and to rest, with no way back.
     if nlp.shape.motors.slow:
         low[[0, -1], node["a"]] = high[[0, -1], node["a"]] = 0.0
@@ -284,14 +288,22 @@ def _bound_motors(
     return low, np.concatenate([within, joins, np.inf * begins, -begins])
 
 
-def pack(nlp: PathNLP, profile: Profile, units: Units, extra: float | Array) -> Array:
+def pack(
+    nlp: PathNLP,
+    profile: Profile,
+    units: Units,
+    extra: float | Array,
+    sizes: Array | float = 1.0,
+) -> Array:
     """Unknowns of the NLP, in its units, from a profile and what its objective adds.
 
-    That is the least margin [N], the relaxation, or shortfalls in the units of the limits.
+    That is the least margin [N], the relaxation, or shortfalls in the units of the limits. With
+    the `sizes` of b on its grid.
     """
     table = np.empty(nlp.free.shape)
     table[:, nlp.columns.node["extra"]] = extra / _margin_unit(nlp, units)
     table[:, :3] = np.column_stack([profile.b, profile.a, profile.squeeze]) / units.profile
+    table[:, 0] /= sizes
     return np.asarray(table[nlp.free])
 
 
@@ -307,44 +319,5 @@ def unpack(nlp: PathNLP, grid: Grid, x: Array, units: Units) -> tuple[Profile, f
     table = np.zeros(nlp.free.shape)
     table[nlp.free] = x
     a, squeeze = table[:, 1] * units.profile[1], table[:, 2] * units.profile[2]
-    spread = np.ones_like(a)
-    if grid.held:
-        spread = np.cbrt(np.maximum(grid.s * (grid.s[-1] - grid.s), 0.0))
-    a = a - grid.integrate(a)[-1] / grid.integrate(spread)[-1] * spread
-    b = grid.integrate(a)
-    # Where phases are joined at next to no speed, rounding can take b below zero.
-    b = np.maximum(b, 0.0)
-    b[-1] = 0.0
     margin = x[-1] * _margin_unit(nlp, units) if nlp.objective in CHAINED else 0.0
-    return Profile(a, b, squeeze), float(margin)
-
-
-def move_multipliers(
-    before: PathNLP, after: PathNLP, multipliers: dict[str, Array], old: Grid, new: Grid
-) -> dict[str, Array]:
-    """Interpolate multipliers from one grid to another of the same curves."""
-
-    def interpolate(table: Array, weights: tuple[Array, Array] | None = None) -> Array:
-        first, last = weights or (np.ones(len(old.s)), np.ones(len(new.s)))
-        columns = [last * old.interpolate(column / first, new) for column in table.T]
-        return np.column_stack(columns) if columns else np.zeros((len(new.s), 0))
-
-    on_x, on_g, rows = multipliers["lam_x0"], multipliers["lam_g0"], before.columns.g
-    weights = old.weights, new.weights
-    table = np.zeros(before.free.shape)
-    table[before.free] = on_x
-    blocks = {name: on_g[rows[name]] for name in rows.sizes}
-    for name in ("links", "chain"):
-        if rows.sizes[name]:
-            blocks[name] = interpolate(np.append(blocks[name], 0.0)[:, None])[:-1, 0]
-    limits = blocks["limits"].reshape(len(old.s), -1)
-    blocks["limits"] = interpolate(limits, weights).ravel()
-    for name in ("rates", "commands"):
-        if rows.sizes[name]:
-            blocks[name] = interpolate(blocks[name].reshape(-1, len(old.s)).T, weights).ravel("F")
-    if rows.sizes["joins"]:
-        joins = blocks["joins"].reshape(-1, len(old.edges) - 1)
-        places = new.edges[1:, 0], old.edges[1:, 0]
-        blocks["joins"] = np.concatenate([np.interp(*places, own) for own in joins])
-    table = interpolate(table, weights)
-    return {"lam_x0": table[after.free], "lam_g0": after.columns.g.join(**blocks)}
+    return follow(grid, a, squeeze), float(margin)

@@ -28,7 +28,6 @@ from .first_guess import guess_slowly
 from .fitting import StalledError
 from .misses import MISS, ROUNDS
 from .motion import PathMotion
-from .motor_data import list_quicknesses
 from .rounds import Plans, Round
 from .sure_start import WORTH, find_sure_start
 from .task import Pins, Task
@@ -283,20 +282,23 @@ def _plan(task: Task, finer: int = 1, insist: bool = True) -> _Solved | _Stuck:
 
     If that is not insisted on, only where a sweep has found a motion.
     """
-    round_, quicker = Round.begin(task, finer), list[float]()
-    if round_.data.grid.held:
-        lasts = sum(motion.duration for motion in round_.motions)
-        first, *quicker = list_quicknesses(round_.data, lasts)
-        round_ = round_.quicken(first)
+    round_ = Round.begin(task, finer)
     if not round_.is_kept and (not insist or is_hopeless(round_.data)):
         return _Stuck(round_.parts, f"{task.name}: no motion keeps the limits", between=False)
-    found = round_.solve()
-    if isinstance(found, str):
-        return _Stuck(round_.parts, f"{task.name}: {found}", between=False)
-    for quickness in quicker:
-        found = _suit(found).quicken(quickness).solve()
+    kept = _Stuck(round_.parts, "", between=False)
+    for found in round_.solve_first():
         if isinstance(found, str):
-            return _Stuck(round_.parts, f"{task.name}: {found}", between=False)
+            kept = _Stuck(round_.parts, f"{task.name}: {found}", between=False)
+            continue
+        refined = _refine(found)
+        if isinstance(refined, _Solved):
+            return refined
+        kept = refined
+    return kept
+
+
+def _refine(found: Round) -> _Solved | _Stuck:
+    """Suit the mesh to a solution until limits hold between nodes, at no more than it may cost."""
     best: _Solved | _Stuck | None = None
     for _ in range(_AGAIN):
         found = _suit(found)
@@ -304,7 +306,7 @@ def _plan(task: Task, finer: int = 1, insist: bool = True) -> _Solved | _Stuck:
         if best is not None and isinstance(kept, _Stuck):
             return best
         best = kept
-        if isinstance(kept, _Stuck) or kept.plans[0].error <= task.options.accuracy:
+        if isinstance(kept, _Stuck) or kept.plans[0].error <= found.task.options.accuracy:
             break
         better = found.adapt(dearer=True)[1]
         if better is not None and better.elements == found.elements and found.data.grid.held:

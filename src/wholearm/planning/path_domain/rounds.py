@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,23 +12,17 @@ from ...common.arrays import Array
 from ..options import Objective
 from ..phase_plan import PhasePlan
 from .data import PhaseData, cut
-from .elements import Elements
+from .elements import Elements, follow
 from .fastest import Fastest, find_fastest
 from .first_guess import guess
 from .fitting import fit_torque
 from .mesh import MOST, SHIFTED, SLOW_MOST, Mesh, adapt
 from .misses import Misses, PathSolution, anticipate, price
 from .motion import PathMotion
-from .nlp import (
-    PathNLP,
-    Tightening,
-    Units,
-    make_bounds,
-    move_multipliers,
-    pack,
-    parameters,
-    unpack,
-)
+from .motor_switches import find_motor_switches
+from .nlp import PathNLP, Tightening, Units
+from .ramps import ramp_up
+from .solving import center, move_multipliers, solve
 from .start import balance, start_at
 from .task import EARLY, Task
 
@@ -41,6 +36,12 @@ _LONGER = 0.2
 """Most that the NLP's duration may be allowed to be longer, relatively."""
 _SETTLED = 0.1
 """Share of the accuracy below which switches are not looked for again."""
+_FIRST_EASE = 1e-2
+"""By how much limits are tightened for a plan of quick motors, over what is much for each."""
+_EASE = 5e-4
+"""The same for a first plan of slow ones."""
+_EASIER = 10.0
+"""By how much more rates and commands are."""
 
 Plans = list[PhasePlan[PathMotion]]
 
@@ -70,6 +71,8 @@ class Round:
         What the NLP may take for the duration, which is longer than allowed if it errs so.
     shift : float
         How far switches seem to be from the mesh's breaks, over the curve's length.
+    eased : Round or None
+        What other meshes start from with slow motors: a solution inside the limits.
     """
 
     task: Task
@@ -84,10 +87,14 @@ class Round:
     fastest: Fastest | None
     duration: float | None
     shift: float = np.inf
+    eased: Round | None = None
 
     @staticmethod
     def begin(task: Task, finer: int) -> Round:
-        """A first guess on elements that know of nothing but reversals."""
+        """A first guess on elements that know of nothing but reversals, or a quick plan's."""
+        quick = Round._slow_down(task, finer) if task.is_held else None
+        if quick is not None:
+            return quick
         meshes = tuple(Mesh() for _ in task.curves)
         elements, parts, data, nlp = task.lay_out(meshes, finer * task.elements)
         profile, units = guess(data, task.options.time_weight)
@@ -105,29 +112,71 @@ class Round:
         meshes = task.place_breaks(found.switches)
         return begun._restart(meshes, finer * task.elements, shift)
 
+    @staticmethod
+    def _slow_down(task: Task, finer: int) -> Round | None:
+        """A first guess for slow motors from a plan of quick ones, if they are not too slow."""
+        begun = Round.begin(replace(task, quick=True, pins=(None, None)), finer)
+        quick = begun.ease_in(_FIRST_EASE).solve()
+        if isinstance(quick, str):
+            return None
+        lasts = sum(motion.duration for motion in quick.motions)
+        ramped = ramp_up(quick.data, quick.solution.profile, lasts, task.pins)
+        if ramped is None:
+            return None
+        starts = np.cumsum([0.0, *(curve.length for curve in task.curves)])
+        places = np.concatenate(
+            [mesh.breaks + start for mesh, start in zip(quick.meshes, starts, strict=False)]
+        )
+        meshes = task.place_breaks(ramped.find_breaks(places))
+        elements, parts, data, nlp = task.lay_out(meshes, finer * task.elements)
+        profile = ramped.guess(quick.data.grid, quick.solution.profile, data.grid)
+        old = quick.solution.multipliers
+        multipliers = move_multipliers(quick.nlp, nlp, old, quick.data.grid, data.grid)
+        none = Tightening.none(data, task.duration)
+        multipliers = center(nlp, data, quick.units, profile, multipliers, task)
+        start = PathSolution(profile, 0.0, multipliers)
+        known = elements, meshes, parts, data, nlp, quick.units, start, none
+        return Round(task, *known, None, task.duration)
+
+    def ease_in(self, share: float) -> Round:
+        """The round with limits that are tightened a little, which later ones start inside of."""
+        tight = self.tightening
+        limits, motors = (
+            tight.limits + share * self.data.spans,
+            tight.motors * (1 - _EASIER * share),
+        )
+        return replace(self, tightening=tight._replace(limits=limits, motors=motors))
+
+    def refit(self) -> Round:
+        """The round on a mesh for its solution, with limits as they are."""
+        pairs = zip(self.parts, self.motions, strict=True)
+        meshes = tuple(
+            Mesh.of(part.curve, find_motor_switches(part, motion.profile), True)
+            for part, motion in pairs
+        )
+        return replace(self, eased=self)._restart(meshes, self.elements, 0.0)
+
     def _restart(self, meshes: tuple[Mesh, ...], elements: int, shift: float) -> Round:
         """Start on other meshes, from the fastest motion if that is known, or from this one."""
-        task, solution = self.task, self.solution
+        task, source = self.task, self.eased or self
+        solution = source.solution
         elements, parts, data, nlp = task.lay_out(meshes, elements)
         allowed = self.allowed
         tightening = Tightening.none(data, allowed)
         if self.fastest is None:
-            old, new = self.data.grid, data.grid
-            start = solution._replace(
-                profile=Elements(old, solution.profile).move(new),
-                multipliers=move_multipliers(self.nlp, nlp, solution.multipliers, old, new),
-            )
+            old, new = source.data.grid, data.grid
+            profile = Elements(old, solution.profile).move(new)
+            multipliers = move_multipliers(source.nlp, nlp, solution.multipliers, old, new)
+            if new.held:
+                profile = follow(new, profile.a, profile.squeeze)
+                multipliers = center(nlp, data, self.units, profile, multipliers, task)
+            start = solution._replace(profile=profile, multipliers=multipliers)
         else:
             start, corners = start_at(nlp, data, self.units, self.fastest)
             if task.options.accuracy >= EARLY:
                 tightening = anticipate(data, start._replace(profile=corners), tightening)
         known = elements, meshes, parts, data, nlp, self.units, start, tightening
-        return Round(task, *known, self.fastest, allowed, shift)
-
-    def quicken(self, quickness: float) -> Round:
-        """The round on its mesh, with torques that may change at other rates."""
-        task = replace(self.task, quickness=quickness)
-        return replace(self, task=task)._restart(self.meshes, self.elements, np.inf)
+        return Round(task, *known, self.fastest, allowed, shift, self.eased)
 
     @cached_property
     def motions(self) -> list[PathMotion]:
@@ -209,8 +258,16 @@ class Round:
         """Solve on this mesh; in words how the solver ended if there is no solution."""
         weight = self.task.options.time_weight
         given = self.nlp, self.data, self.units, self.tightening, self.solution, weight
-        found = _solve(*given, self.task)
+        found = solve(*given, self.task)
         return found if isinstance(found, str) else replace(self, solution=found)
+
+    def solve_first(self) -> Iterator[Round | str]:
+        """First solutions; with slow motors also on a mesh for one with tighter limits."""
+        if self.data.grid.held:
+            eased = self.ease_in(_EASE).solve()
+            if not isinstance(eased, str):
+                yield eased.refit().solve()
+        yield self.solve()
 
     def tighten(self, ease: bool) -> Round:
         """The round with limits tightened by what they miss, and to `ease` no more than needed."""
@@ -236,7 +293,7 @@ class Round:
         # Once switches have settled they need not be looked for, and where much is missed they are
         # not better known than by a sweep.
         settled = SHIFTED * self.shift < _SETTLED * most
-        settled = settled or (self.fastest is not None and dear and coarse)
+        settled = settled or self.data.grid.held or (self.fastest is not None and dear and coarse)
         goal = None if settled else task.options.goal
         found = [
             adapt(goal, part, motion.profile, self.solution.margin, share, mesh)
@@ -248,6 +305,7 @@ class Round:
         moved = SHIFTED * shift > _SHARE * most
         # What is missed where elements do not end at switches yet says little.
         begun = dearer or self.is_split or not np.isinf(shift)
+        moved = moved and not self.data.grid.held
         dear = dear and begun and coarse
         if not (moved or dear):
             if self.unspent <= _SHARE * most:
@@ -274,31 +332,3 @@ class Round:
             error = float(self.paid.sum() + SHIFTED * min(self.shift, 1.0) + self.unspent)
             plans.append(PhasePlan(motion, torque, value, error=error))
         return plans
-
-
-def _solve(
-    nlp: PathNLP,
-    data: PhaseData,
-    units: Units,
-    tightening: Tightening,
-    start: PathSolution,
-    time_weight: float,
-    task: Task,
-) -> PathSolution | str:
-    """Solve once; the solution, or in words how the solver ended."""
-    bounds = make_bounds(nlp, data, units, tightening, start=task.start, pins=task.pins)
-    if (bounds["lbg"] > bounds["ubg"]).any():
-        return "limits that hold between the nodes too leave nothing"
-    result = nlp.solver(
-        x0=pack(nlp, start.profile, units, start.margin),
-        p=parameters(nlp, data, units, time_weight),
-        **bounds,
-        **start.multipliers,
-    )
-    stats = nlp.solver.stats()
-    if not stats["success"]:
-        return f"Ipopt stopped with {stats['return_status']}"
-    profile, margin = unpack(nlp, data.grid, result["x"].full()[:, 0], units)
-    multipliers = {f"{key}0": result[key].full()[:, 0] for key in ("lam_x", "lam_g")}
-    lasts = float(result["g"][-1]) * units.time if tightening.duration else 0.0
-    return PathSolution(profile, margin, multipliers, float(result["f"]), lasts)

@@ -16,7 +16,7 @@ from .data import PhaseData, join, prepare
 from .elements import DEGREE
 from .mesh import SOFT, START, Mesh, find_ends
 from .misses import MISS
-from .motor_terms import MotorShape
+from .motor_terms import QUICK, MotorShape
 from .nlp import PathNLP, build_path_nlp
 from .sure_start import SureStart
 from .switches import Switch
@@ -27,14 +27,17 @@ Pins = tuple[float | None, float | None]
 """Squeezes at the start and the end of a motion, where they are given [N]."""
 EARLY = 1e-5
 """Accuracy from which on few elements will do, and limits are tightened before all solves."""
+_BESIDES = 8
+"""Elements with slow motors beside the one of each stretch."""
+_STEPS = 5
+"""What numbers of elements are multiples of with slow motors."""
 
 
 @dataclass(frozen=True)
 class Task:
     """What is planned: see `plan_curves`; with ranges, near `guides`, one for each curve.
 
-    On the way to quick motors rates of torques are limited to a part, the `quickness`, of theirs.
-    The squeeze at both ends is as `pins` say [N], where they do.
+    Motors may be taken to be `quick`. The squeeze at both ends is as `pins` say [N], where they do.
     """
 
     curves: Sequence[Curve]
@@ -44,7 +47,7 @@ class Task:
     duration: float | None
     start: SureStart | None = None
     guides: tuple[Guide, ...] = ()
-    quickness: float = 1.0
+    quick: bool = False
     pins: Pins = (None, None)
 
     @cached_property
@@ -58,7 +61,7 @@ class Task:
     @property
     def is_held(self) -> bool:
         """Whether motions begin and end without acceleration, as torques may not step."""
-        return self.curves[0].formation.scene.has_slow_motors
+        return self.curves[0].formation.scene.has_slow_motors and not self.quick
 
     @property
     def name(self) -> str:
@@ -92,10 +95,15 @@ class Task:
         Each has as many elements, also returned, as are wanted if that is enough for its ends.
         """
         pairs = zip(self.curves, meshes, strict=True)
-        elements = max(wanted, *(len(find_ends(curve, mesh.breaks)) for curve, mesh in pairs))
+        ends = max(len(find_ends(curve, mesh.breaks)) for curve, mesh in pairs)
+        if self.is_held and self.options.intervals is None:
+            # Ramps take elements that the rest is not to lack; few numbers of them are built for.
+            ends = -(-(ends + _BESIDES) // _STEPS) * _STEPS
+        elements = max(wanted, ends)
         parts = self.prepare(meshes, elements)
         data = join(parts)
-        shape = LimitShape.of(data.limits, MotorShape.of(self.curves[0].formation.scene))
+        motors = MotorShape.of(self.curves[0].formation.scene) if self.is_held else QUICK
+        shape = LimitShape.of(data.limits, motors)
         nlp = build_path_nlp(shape, len(data.grid.steps), self.options.goal)
         return elements, parts, data, nlp
 
@@ -110,7 +118,7 @@ class Task:
         for k, curve in enumerate(self.curves):
             pairs = zip(switches, of_curve, strict=True)
             own = [Switch(place - starts[k], jumps) for (place, jumps), at in pairs if at == k]
-            meshes.append(Mesh.of(curve, own))
+            meshes.append(Mesh.of(curve, own, self.is_held))
             ends = find_ends(curve, meshes[-1].breaks)
             if self.options.intervals and len(ends) > self.elements:
                 meshes[-1] = Mesh()
@@ -121,6 +129,5 @@ class Task:
         found, last = [], len(meshes) - 1
         for k, (curve, mesh) in enumerate(zip(self.curves, meshes, strict=True)):
             grid = mesh.make_grid(curve, elements, (k == 0, k == last), self.is_held)
-            given = self.phases[k], self.spreads[k], self.quickness
-            found.append(prepare(curve, self.epsilon, grid, *given))
+            found.append(prepare(curve, self.epsilon, grid, self.phases[k], self.spreads[k]))
         return found

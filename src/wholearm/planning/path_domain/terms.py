@@ -26,7 +26,7 @@ from ...common.arrays import Expression
 from ...mechanics.limits import PRESS, TORQUE, LimitSet
 from ..columns import Columns, Symbols
 from ..options import Objective
-from .elements import DEGREE, POWERS, SIGNS, find_basis
+from .elements import DEGREE, FROM_REST, INSIDE, POWERS, SIGNS, find_basis
 from .motor_terms import QUICK, MotorShape, find_first_slopes, list_kinds, write_motor_rows
 
 CHAINED = (Objective.MARGIN, Objective.RELAX)
@@ -91,7 +91,8 @@ class NLPColumns(NamedTuple):
     Attributes
     ----------
     node : Columns
-        Unknowns of each node: b (none at the two ends), a, squeeze, and what the objective adds:
+        Unknowns of each node: b over its size (none at the two ends), a, squeeze, and what the
+        objective adds:
         shortfalls of the limits for `elastic`, the least margin, or the relaxation for `relax`.
     p : Columns
         The speeds at the `ends`; the `steps`; the `weight` of time; what the unit of squeeze counts
@@ -99,7 +100,7 @@ class NLPColumns(NamedTuple):
         for the constant ones, which are part of the bounds; for `effort` and slow motors the
         constant torques; for `effort` the weight of each joint; for `relax` by how much each limit
         gives way with the relaxation, and b's coefficients in the speed limit; for slow motors one
-        over their largest rates, and their lags.
+        over their largest rates, their lags, the bends of elements and the `sizes` of b.
     g : Columns
         The N of b' = 2 a; those that `chain` the margin or the relaxation; node by node the
         `limits`, side by side where they
@@ -126,6 +127,7 @@ def list_columns(shape: LimitShape, intervals: int, objective: Objective) -> NLP
         p |= {"gives": m + 1, "rates": n}
     if shape.motors.slow:
         p |= {"quick": len(shape.motors.rates), "lags": len(shape.motors.commands)}
+        p |= {"bends": n // (DEGREE + 1), "sizes": n}
     rows = (len(shape.sides) if objective in SOFT else m) + relax
     g = {"links": intervals, "chain": intervals * chained, "limits": n * rows}
     g |= {"duration": int(objective is Objective.MARGIN)} | shape.motors.list_sizes(intervals)
@@ -148,9 +150,12 @@ def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict
         given.steps,
         given.ends,
     )
-    b = ca.vertcat(ends[0] ** 2, b_inner, ends[1] ** 2)
-    speed = ca.vertcat(ends[0], ca.sqrt(b_inner), ends[1])
-    lengths, paces = _find_lengths(h), _find_paces(a, speed, h, bool(shape.motors.slow))
+    # Where motors are slow, b next to rest is many orders of magnitude below what it is elsewhere.
+    bends, sizes = (given.bends.T, given.sizes) if shape.motors.slow else (None, ca.DM.ones(n))
+    b = ca.vertcat(ends[0] ** 2, b_inner * sizes[1:-1], ends[1] ** 2)
+    speed = ca.vertcat(ends[0], ca.sqrt(b[1:-1]), ends[1])
+    largest = ca.fmax(sizes[1:], sizes[:-1])
+    lengths, paces = _find_lengths(h), _find_paces(a, speed, h, bends)
     times = ca.vec(ca.DM(find_basis().weights) @ lengths / paces)
     values = _write_values(shape, given, (a, b, squeeze, speed))
     torques = values[:, list(shape.torques)]
@@ -180,7 +185,7 @@ def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict
     else:
         node_costs[0] += extra[0]
         node_costs += 1e-5 * times
-    nodes = ca.horzcat(b, a, squeeze, extra).T
+    nodes = ca.horzcat(ca.vertcat(0, b_inner, 0), a, squeeze, extra).T
     chained, late = objective in CHAINED, objective is Objective.MARGIN
     rows = _write_limits(shape, objective, given, values, extra, b)
     return {
@@ -188,7 +193,7 @@ def write_terms(shape: LimitShape, intervals: int, objective: Objective) -> dict
         "p": given.every,
         "f": ca.sum1(node_costs),
         "g": columns.g.write(
-            links=b[1:] - b[:-1] - _write_rises(a, h, bool(shape.motors.slow)),
+            links=(b[1:] - b[:-1] - _write_rises(a, h, bends)) / largest,
             chain=extra[1:] - extra[:-1] if chained else ca.SX(0, 1),
             limits=rows.T,
             duration=ca.sum1(times) if late else ca.SX(0, 1),
@@ -202,24 +207,30 @@ def _find_lengths(h: Expression) -> Expression:
     return ca.sum1(ca.reshape(ca.vertcat(h, 0), DEGREE + 1, -1))
 
 
-def _write_rises(a: Expression, h: Expression, held: bool) -> Expression:
-    """By how much b rises from each node to the next, shape (N,)."""
+def _write_rises(a: Expression, h: Expression, bends: Expression | None) -> Expression:
+    """By how much b rises from each node to the next, shape (N,); `bends` where motors are slow."""
     table, lengths = ca.reshape(a, DEGREE + 1, -1), _find_lengths(h)
     count = lengths.numel()
-    links = [ca.DM(link) for link in find_basis().links]
-    rises = ca.horzcat(
-        *(links[kind] @ table[:, k] for k, kind in enumerate(list_kinds(count, held)))
-    )
+    links, kinds = find_basis().links, list_kinds(count, bends is not None)
+    rises = ca.horzcat(*(ca.DM(links[kind]) @ table[:, k] for k, kind in enumerate(kinds)))
+    if bends is not None:
+        inner = ca.DM(links[FROM_REST] - links[INSIDE]) @ table[:, 1:-1]
+        rises[:, 1:-1] += inner * ca.repmat(bends[1:-1], DEGREE, 1)
     rises = rises * ca.repmat(lengths, DEGREE, 1)
     return ca.vec(ca.vertcat(rises, ca.SX(1, count)))[:-1]
 
 
-def _find_paces(a: Expression, speed: Expression, h: Expression, held: bool) -> Expression:
+def _find_paces(
+    a: Expression, speed: Expression, h: Expression, bends: Expression | None
+) -> Expression:
     """How fast the local variable is at each node, times the element's length, (p + 1, E)."""
-    basis = find_basis()
+    basis, held = find_basis(), bends is not None
     lengths = _find_lengths(h)
     count = lengths.numel()
     paces = ca.reshape(speed, DEGREE + 1, -1)
+    if bends is not None:
+        c = ca.repmat(bends[1:-1], DEGREE + 1, 1)
+        paces[:, 1:-1] /= 1 - c + 2 * c * ca.repmat(ca.DM(basis.y[INSIDE]), 1, count - 2)
     slopes = find_first_slopes(a) if held else (a[0], a[-1])
     # Next to rest the speed is a power of the local variable but for a factor that is smooth.
     for e, kind in ((0, list_kinds(count, held)[0]), (count - 1, list_kinds(count, held)[-1])):
