@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from ..planning.phase_plan import combine
 from ..problem.uncertainty import PARAMETERS
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ def summarise(plan: Plan, output: str, table: Mapping[str, Any] | None = None) -
     lines += _list_modes(plan)
     lines += _list_transitions(plan)
     lines += _list_settlings(plan)
+    lines += _describe_held(plan)
     lines += [_describe_replay(plan.replay)]
     lines += [] if plan.certificate is None else _list_bounds(plan.certificate)
     lines += [] if plan.ranges is None else _describe_ranges(plan, plan.ranges)
@@ -51,6 +53,17 @@ def summarise(plan: Plan, output: str, table: Mapping[str, Any] | None = None) -
     value = f"{plan.status.value}: {plan.options.goal.value} = {plan.value:.6f} {plan.unit}"
     value += "" if math.isnan(plan.error) else f" (to {max(plan.error, _LEAST_ERROR):.0e})"
     return "\n".join([*lines, f"{value}, {plan.duration:.6f} s in all; wrote {output}"])
+
+
+def _describe_held(plan: Plan) -> list[str]:
+    """What it costs to hold torques over control periods."""
+    scene, free = plan.problem.scene, [own.unheld for own in plan.phases if own.unheld is not None]
+    if len(free) < len(plan.phases):
+        return []
+    value = combine(plan.options.goal, free)
+    text = f"torques {scene.control_hold} over {1e3 * scene.control_period:g} ms each:"
+    more = f"{plan.value / value - 1:+.2%} of the {plan.options.goal.value}"
+    return [f"{text} {more} with free ones, {value:.6f} {plan.unit}"]
 
 
 def _describe_replay(replay: ReplayFigures | None) -> str:

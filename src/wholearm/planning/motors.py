@@ -1,4 +1,4 @@
-"""What is not planned with motors that are not quick."""
+"""What is not planned with motors that are not quick, or with torques held over periods."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .options import PlanOptions
 
 
 def require_steps(problem: Problem, options: PlanOptions) -> None:
-    """Refuse what is not planned with torques that may not step.
+    """Refuse what is not planned with torques that may not step, or may only at some times.
 
     Raises
     ------
@@ -23,9 +23,16 @@ def require_steps(problem: Problem, options: PlanOptions) -> None:
         for key, free in (("torque_rate_limit", math.inf), ("actuator_lag", 0.0))
         if getattr(finger, key) != free
     ]
+    scene, why = problem.scene, ""
+    if scene.control_period:
+        if options.ranges:
+            why = "ranges (--robust) are not kept with it yet"
+        elif given and scene.control_hold == "constant":
+            why = f"torques held constant step, and {given[0][0]} is given; hold them linear"
+        if why:
+            raise InputError("", "control_period", f"{scene.control_period:g} given; {why}")
     if not given:
         return
-    why = ""
     if options.ranges:
         why = "ranges (--robust) are not kept with it yet"
     elif problem.is_settled:

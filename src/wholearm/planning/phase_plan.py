@@ -39,6 +39,8 @@ class PhasePlan(NamedTuple, Generic[M_co]):
         Estimate of how far the value of all phases in one NLP is from their best, relative to it.
     solution : object
         What the solver has found, of the first of the phases in one NLP that are only begun.
+    unheld : float
+        Its value with torques that are not held over control periods, if they are.
     """
 
     motion: M_co
@@ -50,6 +52,7 @@ class PhasePlan(NamedTuple, Generic[M_co]):
     stages: Sequence[object] = ()
     error: float = math.nan
     solution: object = None
+    unheld: float = math.nan
 
 
 class Settled(NamedTuple):

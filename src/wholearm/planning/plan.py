@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -108,6 +109,8 @@ def solve_with(
     require_phases(problem)
     report = progress or (lambda _: None)
     options = options.scale_ranges(problem.uncertainty or {})
+    if problem.scene.control_period:
+        options = replace(options, transcription="time")
     with open_ledger() as ledger:
         started = time.perf_counter()
         report("tracing the phases")
@@ -214,6 +217,7 @@ def _list_phases(
             ledger.of(phase.number),
             *(sure[phase.index] if sure else Sureness(None, None)),
             settled.settlings[phase.index],
+            None if math.isnan(plan.unheld) else plan.unheld,
         )
         for phase, plan, held in zip(
             planning.problem.phases, planning.plans, settled.plans, strict=True

@@ -77,6 +77,8 @@ class PlannedPhase(NamedTuple):
         For how long friction could hold everything at rest; None if it does not begin so.
     settling : Settling or None
         How its end is held, if it is to be; `duration` includes that.
+    unheld : float or None
+        `value` with torques that are not held over control periods, if they are.
     """
 
     number: int
@@ -92,6 +94,7 @@ class PlannedPhase(NamedTuple):
     minor: LeastMinor | None = None
     wedged: float | None = None
     settling: Settling | None = None
+    unheld: float | None = None
 
 
 class Timings(NamedTuple):

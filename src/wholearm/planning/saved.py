@@ -52,6 +52,7 @@ def write_meta(plan: Plan) -> dict[str, Any]:
         "least_minors": [None if own.minor is None else own.minor._asdict() for own in phases],
         "wedged": [phase.wedged for phase in phases],
         "settling": [own.settling and own.settling.to_dict() for own in phases],
+        "unheld": [own.unheld for own in phases],
         "phase_durations": [phase.duration for phase in phases],
         **{name: getattr(options, name) for name in _OPTIONS},
         "iterations": [phase.statistics.iterations for phase in phases],
@@ -141,6 +142,7 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
             _read_minor(column("least_minors", None)[k]),
             column("wedged", None)[k],
             _read_settling(column("settling", None)[k]),
+            column("unheld", None)[k],
         )
         for k in range(count)
     )

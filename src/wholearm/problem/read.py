@@ -20,7 +20,7 @@ from ..common.sharing import exclusive
 from ..contacts.closing import close_finger, place_flush
 from ..contacts.elemental import Contact, parse_contact
 from ..contacts.formation import Formation
-from ..scene.model import Finger, Friction, Scene
+from ..scene.model import HOLDS, Finger, Friction, Scene
 from ..scene.polygon import Polygon
 from ..scene.ranges import TURN, check_place, check_ranges
 from .definition import End, Phase, Problem, Until
@@ -39,6 +39,7 @@ ROLLING = " rolling"
 
 _OPTIONAL = {
     "name", "gravity", "fingers_collide", "phases", "goal", "settle", "settle_gap", "uncertainty",
+    "control_period", "control_hold",
 }  # fmt: skip
 _TOP = _OPTIONAL | {"epsilon", "object", "fingers", "friction", "start"}
 _OBJECT = {"vertices", "mass", "inertia"}
@@ -174,6 +175,8 @@ def _read_scene(table: Mapping[str, Any]) -> Scene:
         Friction(friction["palm"], friction["finger1"], friction["finger2"]),
         table.get("gravity", 9.81),
         table.get("fingers_collide", True),
+        table.get("control_period", 0.0),
+        table.get("control_hold", HOLDS[0]),
     )
 
 

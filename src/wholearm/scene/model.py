@@ -46,6 +46,8 @@ from .polygon import Polygon
 
 LIGHT = 1e-4
 """Weight, over what the weaker finger can press with, that is next to nothing."""
+HOLDS = ("constant", "linear")
+"""How torques may be held over control periods."""
 TOUCHING = 3e-6
 """Gap below which features count as touching, in radii of gyration of the object."""
 
@@ -195,6 +197,10 @@ class Scene:
         The right one, then the left one.
     friction : Friction
     gravity : float, [m/s^2]
+    control_period : float, [s]
+        Over which planned torques are held, from the start of each phase; 0 for free torques.
+    control_hold : {"constant", "linear"}
+        How they are held over it.
     fingers_collide : bool
         Whether the links are solid to each other; False for fingers in different planes.
 
@@ -209,6 +215,8 @@ class Scene:
     friction: Friction
     gravity: float = 9.81
     fingers_collide: bool = True
+    control_period: float = 0.0
+    control_hold: str = "constant"
 
     def __post_init__(self) -> None:
         value = require_number(self.gravity, "gravity", nonnegative=True)
@@ -216,6 +224,11 @@ class Scene:
         if not isinstance(self.fingers_collide, bool):
             given = f"{self.fingers_collide!r} given; allowed are true and false"
             raise InputError("", "fingers_collide", given)
+        period = require_number(self.control_period, "control_period", nonnegative=True)
+        object.__setattr__(self, "control_period", period)
+        if self.control_hold not in HOLDS:
+            given = f"{self.control_hold!r} given; allowed are {' and '.join(map(repr, HOLDS))}"
+            raise InputError("", "control_hold", given)
         # Messages name a finger by its place here, whatever it was made as.
         named = zip(self.fingers, ("fingers.1", "fingers.2"), strict=True)
         fingers = tuple(f if f.name == name else replace(f, name=name) for f, name in named)

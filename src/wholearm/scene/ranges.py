@@ -67,6 +67,8 @@ TORQUE_RATE = Range(1e-4, 1e9)
 """Limit of the torque's rate, over the torque limit in the scene's time."""
 LAG = Range(0.0, 1e2)
 """Time constant of a motor, over the scene's time."""
+CONTROL_PERIOD = Range(1e-3, 1e2)
+"""Period over which torques are held, over the scene's time."""
 EPSILON = Range(0.0, 1e3)
 """Least normal force, over the weight or what the stronger finger can press with."""
 
@@ -88,6 +90,9 @@ def check_ranges(scene: Scene) -> None:
         GRAVITY.check("gravity", scene.gravity, "m/s^2")
     for part in ("palm", "finger1", "finger2"):
         FRICTION.check(f"friction.{part}", getattr(scene.friction, part), "")
+    if scene.control_period:
+        given = scene.control_period, "s", scene.scales.time, "times the scene's time"
+        CONTROL_PERIOD.check("control_period", *given)
     for finger in scene.fingers:
         _check_shape(scene, finger)
         _check_joint(scene, finger)

@@ -198,4 +198,9 @@ def solve_attempt(search: Search, attempt: Attempt) -> Solution:
         # Modes that were found may have asked for more intervals than the guess has.
         if solution.success and sum(stage.intervals for stage in solution.stages) < wanted:
             solution = search.solve(halve(solution.stages, search.scheme), solution)
-    return enforce_between(search, solution) if solution.success else solution
+    solution = enforce_between(search, solution) if solution.success else solution
+    if solution.success and search.problem.scene.control_period:
+        from .held import hold_torques
+
+        return hold_torques(search, solution)
+    return solution

@@ -119,10 +119,12 @@ def _find_gains(
 ) -> list[Array]:
     """What better torques would gain in each interval, over the objective, shape (K,) each.
 
-    With limited rates that is as much as halving some intervals has gained, from the cost that is
-    `coarse`. Each interval has a share in it by how much its torques bend: there they would rather
-    change their rate at once.
+    None of torques that are held over periods. With limited rates it is as much as halving some
+    intervals has gained, from the cost that is `coarse`. Each interval has a share in it by how
+    much its torques bend: there they would rather change their rate at once.
     """
+    if solution.stages[0].periods:
+        return [np.zeros(stage.intervals) for stage in solution.stages]
     if not search.problem.scene.has_slow_motors:
         return list_gains(search, solution, motions)
     limit, shares = search.problem.scene.torque_limit, list[Array]()

@@ -158,7 +158,9 @@ def _collocate(
 
 
 def _share(rows: Rows, stage: Stage, layout: StageLayout) -> Indices:
-    """Intervals keep their shares of the stage."""
+    """Intervals keep their shares of the stage, unless they are parts of control periods."""
+    if stage.periods:
+        return np.zeros(0, dtype=np.int64)
     own = rows.linear(stage.intervals - 1)
     # In shares of an even interval, rows are of the size of others.
     shares = stage.intervals * stage.guess.fractions

@@ -43,6 +43,7 @@ from .kernels import bend_kernel, effort_kernel
 from .layout import MARGIN, STATE, StageLayout, V, Z, lay_out
 from .limits import Target, bound_by_limits
 from .motors import hold_ends
+from .periods import add_periods
 from .rows import Rows
 from .stage import Stage
 
@@ -139,6 +140,8 @@ def build_time_nlp(
             join_stages(rows, pair, own, scheme)
         _add_costs(rows, cost, stage, layout, scheme, target)
     duration_row, last, end = -1, stages[-1], layouts[-1].nodes[-1]
+    if stages[0].periods:
+        add_periods(rows, stages, layouts)
     if held:
         hold_ends(rows, stages, layouts, target.epsilon)
     if target.chained:

@@ -54,7 +54,9 @@ def _scale_scene(scene: Scene, scales: Scales) -> Scene:
 
     right, left = scene.fingers
     gravity = scene.gravity / scales.acceleration
-    return replace(scene, polygon=polygon, fingers=(scale(right), scale(left)), gravity=gravity)
+    period = scene.control_period / scales.time
+    fingers = scale(right), scale(left)
+    return replace(scene, polygon=polygon, fingers=fingers, gravity=gravity, control_period=period)
 
 
 def _scale_phase(phase: Phase, scene: Scene, scales: Scales) -> Phase:

@@ -37,7 +37,13 @@ def bisect_intervals(
 ) -> list[Stage]:
     """Stages with intervals halved so many times, each of shape (K,)."""
     return [
-        replace(stage, guess=bisect(stage.guess, scheme, mine)) if mine.any() else stage
+        replace(
+            stage,
+            guess=bisect(stage.guess, scheme, mine),
+            periods=tuple(np.repeat(stage.periods, 2**mine).tolist()) if stage.periods else (),
+        )
+        if mine.any()
+        else stage
         for stage, mine in zip(stages, times, strict=True)
     ]
 

@@ -60,6 +60,8 @@ class Solution(NamedTuple):
         What it ended with.
     error : float
         Estimate of what better torques would gain, over the cost; not known of all.
+    free : Solution or None
+        What it has come from, with torques that are not held over control periods.
     """
 
     stages: list[Stage]
@@ -70,6 +72,7 @@ class Solution(NamedTuple):
     nlp: TimeNLP
     multipliers: Multipliers
     error: float = math.nan
+    free: Solution | None = None
 
     @property
     def end(self) -> Array:

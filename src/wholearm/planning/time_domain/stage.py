@@ -97,6 +97,8 @@ class Stage:
         reached before, that would be the end.
     stop : ndarray or None, shape (5,)
         Where the last stage ends, if that is given: with two freedoms its end leaves one open.
+    periods : tuple of int
+        The control period of its phase that each interval is part of, if torques are held.
     onset : float
         Rate of contacts and joints, in the scene's unit, at which three quarters of their friction
         has set in, against whatever way they move; nothing if friction has the given directions.
@@ -120,6 +122,7 @@ class Stage:
     apart: tuple[int, ...] = ()
     ahead: tuple[int, float, float] | None = None
     stop: Array | None = None
+    periods: tuple[int, ...] = ()
     onset: float = 0.0
 
     @property
