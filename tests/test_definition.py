@@ -168,7 +168,7 @@ THREE = {
     "edit, key, text",
     [
         (put("epsilonn", 1), "epsilonn", "did you mean 'epsilon'"),
-        (put("zzz", 1), "zzz", "allowed are epsilon, fingers"),
+        (put("zzz", 1), "zzz", "epsilon, fingers, fingers_collide"),
         (put("object.mas", 1), "object.mas", "did you mean 'mass'"),
         (put("fingers.1.torque_limits", 1), "fingers.1.torque_limits", "'torque_limit'"),
         (put("fingers.3", {}), "fingers.3", "allowed are 1, 2"),
