@@ -15,9 +15,11 @@ from ..contacts.formation import Formation
 from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phase
 from ..problem.definition import Phase
-from .block_plan import BlockPlan, Planning
+from ..results.trajectory import Motion
+from .block_plan import Planning
 from .options import PlanOptions
 from .path_domain.joint import Joint, add_pause, choose_joint, find_pauses
+from .phase_plan import PhasePlan
 from .splitting import runs_along_curves, split_blocks
 from .stops import Plans
 
@@ -62,12 +64,11 @@ def plan_with_pauses(
 
 def _list_joints(planning: Planning, block: Sequence[Phase], plans: Plans) -> list[Joint | None]:
     """Where each of the phases begins, if torques change there."""
-    before = _find_torque_before(planning, block)
-    ends = [before, *(own.torque.at(own.torque.breaks[-1:])[0] for own in plans[:-1])]
+    ends = [_find_torque_before(planning, block), *map(_find_last, plans[:-1])]
     joints = list[Joint | None]()
     for end, own, phase in zip(ends, plans, block, strict=True):
-        begins = own.torque.at(np.zeros(1))[0]
-        pause = 0.0 if end is None else float(find_pauses(planning.problem.scene, begins - end))
+        begins, scene = own.torque.at(np.zeros(1))[0], planning.problem.scene
+        pause = 0.0 if end is None else float(find_pauses(scene, begins - end))
         if end is None or not pause:
             joints.append(None)
             continue
@@ -80,9 +81,8 @@ def _list_joints(planning: Planning, block: Sequence[Phase], plans: Plans) -> li
 def _find_torque_before(planning: Planning, block: Sequence[Phase]) -> Array | None:
     """The torques that the block before ends with, shape (2,) [N m], if that is planned."""
     known = [own for own in planning.blocks if own.phases[-1].index + 1 == block[0].index]
-    return _find_last(known[0]) if known else None
+    return _find_last(known[0].plans[-1]) if known else None
 
 
-def _find_last(block: BlockPlan) -> Array:
-    torque = block.plans[-1].torque
-    return np.asarray(torque.at(torque.breaks[-1:])[0])
+def _find_last(plan: PhasePlan[Motion]) -> Array:
+    return np.asarray(plan.torque.at(plan.torque.breaks[-1:])[0])

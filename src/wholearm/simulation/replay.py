@@ -9,6 +9,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import JammingError, SimulationError
+from ..contacts.formation import Formation
 from ..problem.definition import Phase, Problem
 from ..results.torque import TorqueProfile
 from .events import Event, EventKind, Outcome, OutcomeKind, Section
@@ -51,6 +52,8 @@ class Replay:
         Unit of the distance to the end of the phase.
     moving : bool
         Whether the motion goes on into the phase that is entered.
+    left : Formation or None
+        That of the last phase which has ended at rest.
     wanted : list of float
         Instants at which steps have to end; infinity is last.
     stuck : set of int
@@ -91,6 +94,7 @@ class Replay:
         self.held_until = self.settled_by = -math.inf
         self.impact = 0.0
         self.moving = False
+        self.left: Formation | None = None
         self.side = 1.0
         self.stuck: set[int] = set()
         self.has_slid = False

@@ -35,9 +35,13 @@ from .jumps import Arrival, Ending, Released, Rested, Switched, is_there
 from .moving import move
 from .replay import Replay
 from .starting import Departure
+from .statics import balances
 from .sticking import Collapse, Rest, find_rest
 from .transitions import collide, enter, go_on, set_off
 from .within import look_within
+
+_HELD_AT = 5
+"""Places of a piece of the torques at which they have to hold the object."""
 
 ROUNDS = 8
 """Most simulations, each with more steps that end where something showed within those before."""
@@ -187,7 +191,7 @@ def _arrive(run: Replay, arrival: Arrival, following: Phase | None) -> Outcome |
     run.moving = run.phase.end is End.SMOOTH
     if run.moving:
         return None
-    before = run.stored
+    before, run.left = run.stored, run.phase.formation
     run.y[5:10] = 0.0
     run.impact += before - run.stored
     # The torques of the phase that has ended go on until they step, or end.
@@ -250,7 +254,7 @@ def _rest(run: Replay) -> Departure | Arrival | Released | Switched | Outcome:
             if isinstance(change, Departure):
                 _advance(run, run.time(change.x))
                 return change
-            if isinstance(change, Collapse) and not _settles(run, change):
+            if isinstance(change, Collapse) and not _settles(run, change) and not _touches(run):
                 return _collapse(run, rest, change)
         stop = run.breaks[run.piece + 1]
         if run.t < run.settled_by < stop:
@@ -264,6 +268,21 @@ def _settles(run: Replay, change: Collapse) -> bool:
     """Whether the torques step, or become those of the next phase, before a contact could part."""
     t = run.time(change.x)
     return t < run.settled_by or run.coming_step - t <= run.tolerances.rest_window
+
+
+def _touches(run: Replay) -> bool:
+    """Whether contacts of the phase that has ended help to hold this piece of the torques.
+
+    That counts where torques do not step: they pass from the ones to the others.
+    """
+    if run.left is None or not run.problem.scene.has_slow_motors:
+        return False
+    contacts = dict.fromkeys((*run.phase.formation.contacts, *run.left.contacts))
+    coefficients = run.coefficients[run.piece]
+    x = np.linspace(run.fraction(run.t), 1.0, _HELD_AT)[:, None]
+    torques = x ** np.arange(coefficients.shape[1]) @ coefficients.T
+    given = run.problem.scene, tuple(contacts), run.y[:5]
+    return all(balances(*given, tau) for tau in torques)
 
 
 def _advance(run: Replay, stop: float) -> None:

@@ -76,10 +76,15 @@ def choose_joint(
     z : ndarray, shape (5,)
     epsilon, phase : float, int
 
+    Notes
+    -----
+    Where none of the torques hold the object in the formation that begins, contacts that it does
+    not have any more help to hold it until the motion begins.
+
     Raises
     ------
     InfeasibleError
-        If no torques hold the object there in both formations.
+        If no torques hold the object at the end of the one phase, or at the start of the other.
     """
     before, ends = (
         _list_torques(ending, epsilon, phase - 1, -1)
@@ -91,13 +96,11 @@ def choose_joint(
     beyond = static.measure(before)
     held = beyond <= _VERGE * scene.scales.torque
     if not held.any():
-        raise InfeasibleError(
-            f"phase {phase}: torques may not step, and none that hold the object at rest where "
-            f"phase {phase - 1} ends hold it in the contacts of phase {phase}, too"
-        )
+        held = beyond <= beyond.min()
     if not isinstance(beginning, Curve):
         firmest = int(beyond.argmin())
-        return Joint(float(ends[firmest]), np.nan, before[firmest], before[firmest], 0.0)
+        tau = before[firmest]
+        return Joint(float(ends[firmest]), np.nan, tau, tau, 0.0)
     after, begins = _list_torques(beginning, epsilon, phase, 0)
     times = find_pauses(scene, after[None] - before[held][:, None])
     p, q = np.unravel_index(int(times.argmin()), times.shape)
@@ -186,7 +189,10 @@ class PausedMotion:
         found = self.motion.evaluate(np.maximum(t - self.pause, 0.0))
         left = np.maximum(1 - t / self.pause, 0.0)[:, None]
         first = self.first, *self.forces
-        mixed = (left * own + (1 - left) * now for own, now in zip(first, found[3:], strict=True))
+        mixed = (
+            np.where(left > 0, left * own + (1 - left) * now, now)
+            for own, now in zip(first, found[3:], strict=True)
+        )
         return Samples(*found[:3], *mixed)
 
 
@@ -202,7 +208,7 @@ def add_pause(
     value = {
         Objective.TIME: plan.value + joint.pause,
         Objective.EFFORT: plan.value + ramp.integrate_squares() + options.time_weight * joint.pause,
-        Objective.MARGIN: min(plan.value, float(forces[0].min())),
+        Objective.MARGIN: float(np.fmin(plan.value, forces[0].min())),
     }[options.goal]
     motion = PausedMotion(plan.motion, joint.pause, joint.before, forces)
     torque = TorqueProfile.chain([ramp, plan.torque])
@@ -210,7 +216,10 @@ def add_pause(
 
 
 def find_static_forces(formation: Formation, z: Array, tau: Array) -> Array:
-    """Contact forces that hold a formation at rest with the largest least c_n, (2, n_c) [N]."""
+    """Contact forces that hold a formation at rest with the largest least c_n, (2, n_c) [N].
+
+    NaN where none do, as others that still touch help to hold it.
+    """
     from scipy.optimize import linprog
 
     scene, n_c = formation.scene, formation.n_contacts
@@ -234,4 +243,6 @@ def find_static_forces(formation: Formation, z: Array, tau: Array) -> Array:
         bounds=[*free * (2 * n_c), *dry, *free],
         method="highs",
     )
+    if answer.status:
+        return np.full((2, n_c), np.nan)
     return np.asarray(scene.scales.force * answer.x[: 2 * n_c].reshape(2, n_c))

@@ -63,7 +63,7 @@ def plan_slowly(
     parts : sequence of ImpactSequence
     beside : tuple
         The curves before and after all of them, or where these are planned over time, the torques
-        that hold the object before, and the formation after; None where there is nothing.
+        that the former end with, and the formation of the latter; None where there is nothing.
     epsilon : float, [N]
     options : PlanOptions
     durations : sequence of float or None, [s]
