@@ -13,12 +13,14 @@ design has seen.
 from __future__ import annotations
 
 import argparse
+import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -144,25 +146,37 @@ def list_policies(
         yield f"| {' | '.join((*cells, widest))} |"
 
 
+class Count(NamedTuple):
+    """What is counted: samples, processes, and the folder where records are kept, if they are."""
+
+    samples: int
+    jobs: int
+    records: Path | None
+
+
 def list_samples(
-    problem: Problem, plan: Plan, name: str, policy: Policy | None, samples: int, jobs: int
+    problem: Problem, plan: Plan, name: str, policy: Policy | None, count: Count
 ) -> Iterator[str]:
-    """Rows of the second table: of each phase."""
-    for phase in problem.phases:
-        ranges = RANGES | ({} if phase.index == 0 else {"start_x": 0.0})
+    """Rows of the second table: of each phase, and with a policy of the whole plan."""
+    whole = [] if policy is None else [None]
+    for phase in [*whole, *(own.number for own in problem.phases)]:
+        ranges = RANGES | ({} if phase in (None, 1) else {"start_x": 0.0})
+        text = "all" if phase is None else str(phase)
+        file = "_".join(re.findall(r"\w+", f"{name} {text} {count.samples}")) + ".jsonl"
         found = assess_robustness(
             problem,
             plan.trajectory,
-            samples=samples,
+            samples=count.samples,
             seed=SEED,
             uncertainty=Uncertainty(ranges, None),
-            phase=phase.number,
+            phase=phase,
             policy=policy,
-            start=partial(use_processes, jobs),
+            path=None if count.records is None else count.records / file,
+            start=partial(use_processes, count.jobs),
         )
         first = next(iter(found.first_lost.items()), None)
         lost = "-" if first is None else f"{first[0]}: {first[1]}"
-        cells = name, str(phase.number), str(found.reached), str(found.kept), lost
+        cells = name, text, str(found.reached), str(found.kept), lost
         yield f"| {' | '.join(cells)} |"
 
 
@@ -170,8 +184,13 @@ def main() -> int:
     """Write the tables and print their rows."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("problems", nargs="+", type=Path, help="problem files")
-    parser.add_argument("--samples", type=int, default=200)
+    text = "of each phase by the policy of the robust plan"
+    parser.add_argument("--samples", type=int, default=200, help=text)
+    text = "of each phase otherwise"
+    parser.add_argument("--compared", type=int, default=50, help=text)
     parser.add_argument("--jobs", type=int, default=1)
+    text = "folder of records: what was interrupted goes on where it was"
+    parser.add_argument("--records", type=Path, help=text)
     parser.add_argument("--output", type=Path, default=Path("results"))
     options = parser.parse_args()
     radii = ", ".join(f"{name} {width:g}" for name, width in RANGES.items() if width)
@@ -196,14 +215,18 @@ def main() -> int:
     policies = make_policies(problem, plans)
     for row in list_policies(plans, policies):
         add(row)
-    lines += ["", f"{problem.name}: {options.samples} samples of each phase, seed {SEED}"]
+    lines += ["", f"{problem.name}: samples of each phase from rest, and of the whole plan"]
+    lines[-1] += f", seed {SEED}"
     lines += ["", "| plan | phase | goal reached | and contacts kept | lost first |"]
     lines += ["|---|---:|---|---|---|"]
-    for name, plan in plans.items():
-        for row in list_samples(problem, plan, name, None, options.samples, options.jobs):
+    many = Count(options.samples, options.jobs, options.records)
+    for k, (text, name, policy) in enumerate(policies):
+        count = many if k == 0 else many._replace(samples=options.compared)
+        for row in list_samples(problem, plans[name], text, policy, count):
             add(row)
-    for text, name, policy in policies:
-        for row in list_samples(problem, plans[name], text, policy, options.samples, options.jobs):
+    few = many._replace(samples=options.compared)
+    for name, plan in plans.items():
+        for row in list_samples(problem, plan, name, None, few):
             add(row)
     write_text(str(options.output / "bench_robust.md"), "\n".join(lines) + "\n")
     return 0
