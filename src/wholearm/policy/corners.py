@@ -27,7 +27,7 @@ from ..mechanics.dynamics import Directions, PathForces, inverse
 from ..mechanics.limits import CONE, PRESS, make_limits
 from ..problem.uncertainty import GROUPS, change_scene
 from ..scene.model import Scene
-from ..sensitivity.slopes import find_force_slopes
+from ..sensitivity.slopes import find_force_slopes, find_shifts
 
 CORNERS = ("mass", "inertia", "friction_palm", "friction_finger1", "friction_finger2")
 """Numbers whose ranges have corners."""
@@ -86,7 +86,7 @@ def find_corners(
     formation: Formation,
     point: CurvePoint,
     side: Directions,
-    torques: tuple[Array, Array],
+    torques: tuple[Array, Array, Array],
     widths: Mapping[str, float],
 ) -> Corners:
     """Limits of forces in the corners of ranges.
@@ -96,7 +96,7 @@ def find_corners(
     formation, point, side
         Where and which way contacts slide.
     torques : tuple of ndarray, shape (n, 2, 5)
-        Those that are asked for, and those of a little earlier.
+        Those that are asked for, those of a little earlier, and how they change along the curve.
     widths : mapping of str to float
         Half widths of ranges, by name.
     """
@@ -110,11 +110,14 @@ def find_corners(
     plain = inverse(formation, *point[:3], side, point.kinematics)
     limits = make_limits(formation, 0.0).only(PRESS, CONE)
     swings = [respond(plain, torques[1])[0] - respond(plain, torques[0])[0]]
-    others = [name for name in OTHERS if widths.get(name, 0.0) > 0]
-    if others:
-        radii = np.array([widths[name] for name in others])
-        slopes = find_force_slopes(formation, point, side, plain, others)[..., _ORDER]
-        swings += list((slopes * radii[:, None]).transpose(2, 0, 1, 3))
+    for name in (own for own in OTHERS if widths.get(own, 0.0) > 0):
+        slopes = find_force_slopes(formation, point, side, plain, (name,))[:, :, 0, _ORDER]
+        if name in GROUPS["geometry"]:
+            # Torques are those of where joints seem to be.
+            shift = find_shifts(formation, point, side, plain, name)
+            moved = torques[0] + shift[:, None, None] * torques[2]
+            slopes = slopes + respond(plain, moved)[0] - respond(plain, torques[0])[0]
+        swings.append(widths[name] * slopes)
     return Corners(
         np.array(rows), np.array(moves), np.einsum("mi,pnij->pnmj", limits.columns[0], swings)
     )

@@ -91,7 +91,9 @@ class Reserve(NamedTuple):
     def scale(self) -> dict[str, float]:
         """Half widths of the ranges that it is for; of the delay what is not known."""
         widths = {name: self.size * width for name, width in (self.ranges or {}).items()}
-        return widths | {"delay": max(widths.get("delay", 0.0) - self.delay, 0.0)}
+        late = widths.get("delay", 0.0)
+        # Torques may be early as well: a delay is anything from none to its range.
+        return widths | {"delay": max(late - self.delay, self.delay) if late else 0.0}
 
 
 def trace_pieces(

@@ -32,6 +32,8 @@ LESS, CLOSE, NONE = 0.8, 0.03, 0.02
 part of them that is as good as none."""
 WIDEST = 0.9
 """Largest relative range."""
+STEP = 1e-4
+"""Step of differences along a curve, over its length."""
 AUTHORITY = 2.0
 """Reserve of torques, in those of `curve_rows`: feedback adds to the motion."""
 
@@ -107,7 +109,10 @@ def find_within(
     formation, point = curve.formation, curve.evaluate(s)
     mean, *sides = turn(curve, s, speed * NEAR)
     late = s - (LATE + widths.get("delay", 0.0)) * speed
-    torques = _find_torques(curve, s, mean), _find_torques(curve, late, mean)
+    asked, step = _find_torques(curve, s, mean), STEP * curve.length
+    ends = (_find_torques(curve, s + way * step, mean) for way in (-1, 1))
+    change = (-next(ends) + next(ends)) / (2 * step)
+    torques = asked, _find_torques(curve, late, mean), change
     corners = [find_corners(formation, point, side, torques, widths) for side in sides]
     most = np.tile(formation.scene.torque_limit, 2)
     left = np.concatenate([-torques[0], torques[0]], axis=1)

@@ -77,6 +77,26 @@ def find_force_slopes(
     ndarray, shape (n, n_c + R, len(names), COUNT)
         dc/dp = sum of coefficients times (1, a, b, squeeze, s') [N per unit of p].
     """
+    return _along(formation, point, directions, forces).find_slopes(names)
+
+
+def find_shifts(
+    formation: Formation, point: CurvePoint, directions: Directions, forces: PathForces, name: str
+) -> Array:
+    """By how much joints seem to be further along a curve than they are, where geometry is off.
+
+    Joint angles of the nearest place are others than on the curve; what is along it is taken for
+    progress. Per unit of the number of a name, shape (n,); as `find_force_slopes` otherwise.
+    """
+    dz, rates = _along(formation, point, directions, forces).displace(name), point.z_s[:, 3:]
+    square = np.maximum((rates**2).sum(axis=1), 1e-30)
+    return np.asarray((dz[:, 3:] * rates).sum(axis=1) / square)
+
+
+def _along(
+    formation: Formation, point: CurvePoint, directions: Directions, forces: PathForces
+) -> _State:
+    """The state of a formation at n places of a curve."""
     none = np.zeros_like(forces.C0)
     c = np.stack([forces.C0, forces.Ca, forces.Cb, forces.Cl, none], axis=-1)
     tau = np.stack([forces.T0, forces.Ta, forces.Tb, forces.Tl, forces.Tv], axis=-1)
@@ -85,7 +105,7 @@ def find_force_slopes(
     size = np.sqrt(point.z_s[:, :3] ** 2 @ metric_weights(formation.scene)[:3])[:, None]
     along = point.z_s / size, point.z_ss / size
     given = point.z, point.z_s, point.kinematics, directions, c, tau, acceleration
-    return _State(formation, *given, along).find_slopes(names)
+    return _State(formation, *given, along)
 
 
 def find_slopes_at(
@@ -169,11 +189,12 @@ class _State(NamedTuple):
         elif name == "start_x":
             return self._move("", *self.along)
         elif name.startswith(("base", "length")):
-            return self._deform(name)
+            dz = self.displace(name)
+            return self._move(name, dz, self.turn(name, dz))
         return _Change(load, bend)
 
-    def _deform(self, name: str) -> _Change:
-        """What moving a joint, or a longer link, changes."""
+    def displace(self, name: str) -> Array:
+        """The nearest place where a joint is moved or a link is longer: dz/dp, shape (n, 5)."""
         step, count = self._step, self.formation.n_contacts
         here, there = (self._evaluate(name, way * step, self.z) for way in (-1, 1))
         gap = np.zeros(self.kinematics.P.shape[:2])
@@ -181,8 +202,7 @@ class _State(NamedTuple):
         if self.formation.rolling and name.startswith("base"):
             axis = "xy".index(name[-1])
             gap[:, count:] = -(self._rows_of(name) * self.kinematics.P[..., axis])[:, count:]
-        dz = _move_least(self.kinematics.P, -gap, metric_weights(self.formation.scene))
-        return self._move(name, dz, self.turn(name, dz))
+        return _move_least(self.kinematics.P, -gap, metric_weights(self.formation.scene))
 
     @property
     def _step(self) -> float:
