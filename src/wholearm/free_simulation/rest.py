@@ -58,6 +58,8 @@ def _list_margins(run: Run) -> Array:
 
 def _find_breach(margins: Array, x: float) -> float:
     """Where from `x` on the first polynomial turns negative; at least 1 if none does before."""
+    if margins.shape[1] == 1:
+        return x if (margins < 0).any() else 2.0
     first = 2.0
     for row in margins:
         if row @ x ** np.arange(len(row)) < 0:

@@ -22,7 +22,7 @@ from .pace import Pace
 from .policy import Policy
 from .push import find_arrival, find_push, find_still
 from .reference import TOUCH, Piece, Reserve, trace_pieces
-from .regulator import follow
+from .regulator import RATE, follow
 from .replan import Planner, replan
 
 STILL = 1e-3
@@ -175,11 +175,17 @@ def _follow_motion(
         "theta": samples.z[:, 3:],
         "rates": samples.z_dot[:, 3:] * speed,
         "tau": found.tau,
-        "gain": found.gains,
+        "gain": np.concatenate([found.gains[:-1], _hold_joints(problem)[None]]),
         "push": samples.tau[-1] if hold is None else hold,
         "still": np.array([STILL * problem.scene.scales.rate]),
         "ways": _list_ways(problem, last, samples.z[-1:]),
     }
+
+
+def _hold_joints(problem: Problem) -> Array:
+    """Gains that lead each joint to its place, in contact or not, critically damped, (2, 4)."""
+    inertia = np.diag([own.inertia for own in problem.scene.fingers])
+    return np.hstack([RATE**2 * inertia, 2 * RATE * inertia])
 
 
 def _list_ways(problem: Problem, phase: Phase, z: Array) -> Array:

@@ -27,7 +27,8 @@ class MotionLaw:
     ----------
     tables : mapping of str to ndarray
         `starts`, (m,), of the phases [s]; `step`, (1,), of the samples that follow [s]; `theta`,
-        `rates`, `tau`, (n, 2); `gain`, (n, 2, 4), torques over what angles and speeds are off;
+        `rates`, `tau`, (n, 2); `gain`, (n, 2, 4), torques over what angles and speeds are off, the
+        last ones for when the end is held;
         `push`, (2,); `still`, (1,), the joint speed that counts as none [rad/s]; `ways`, (f, 2),
         what the joints show of displacements that contacts leave at the end, orthonormal.
     pace : Pace
@@ -94,7 +95,7 @@ class MotionLaw:
             first, after = self.tau[k][row], self.tau[k + 1][row]
             if now >= self.end:
                 first = after = self.push[row]
-            a, b, c, d = self.gain[k][row]
+            a, b, c, d = self.gain[-1 if now >= self.end else k][row]
             feedback = a * one + b * two + c * fast_one + d * fast_two
             most = pace.limit[row]
             feedback = min(max(feedback, -SHARE * most), SHARE * most)
