@@ -26,6 +26,7 @@ from wholearm.policy.pace import Pace
 from wholearm.policy.policy import Policy
 from wholearm.policy.regulator import RATE, Linear, regulate
 from wholearm.policy.retime import eliminate, retime
+from wholearm.policy.sensing import Sensing
 from wholearm.policy.squeeze import choose_squeeze
 from wholearm.problem.definition import Problem
 from wholearm.results.torque import TorqueProfile
@@ -60,6 +61,39 @@ def test_the_squeeze_has_the_largest_least_level() -> None:
         rows = np.column_stack([np.ones(8), -press])
         best = linprog([-1, 0], A_ub=rows, b_ub=values, bounds=[(None, None)] * 2)
         assert level == pytest.approx(-best.fun, abs=1e-9)
+
+
+def test_the_squeeze_makes_up_for_what_is_measured() -> None:
+    rng = np.random.default_rng(5)
+    moving = 0
+    for _ in range(20):
+        table = np.zeros((1, 2, 3, 5))
+        table[:, :, :, 0], table[:, :, :, 4] = rng.uniform(1, 2, 3), rng.normal(size=3)
+        sensing = Sensing(["a", "b", "c"], "d", table, 0.5)
+        place, ends = (0, 0.5, 0.0, 0.0, 0.1), (-9.0, 9.0)
+        plain = table[0, 0, :, 0] + 0.1 * table[0, 0, :, 4]
+        if plain.min() < 0.3 * plain.mean():
+            continue
+        assert sensing.shift(place, *ends) == 0.0
+        # What is expected is there, then one force has 0.1 N less for long.
+        sensing.measure(dict(zip("abc", plain, strict=True)))
+        assert sensing.shift(place, *ends) == pytest.approx(0.0, abs=1e-12)
+        off = np.array([-0.1, 0.0, 0.0])
+        change = 0.0
+        for _ in range(60):
+            found = plain + off + change * table[0, 0, :, 4]
+            sensing.measure(dict(zip("abc", found, strict=True)))
+            change = sensing.shift(place, *ends)
+        parts = (plain + off + change * table[0, 0, :, 4]) / plain
+        rows = np.column_stack([np.ones(3), -table[0, 0, :, 4] / plain])
+        best = linprog([-1, 0], A_ub=rows, b_ub=1 + off / plain, bounds=[(None, 1), (None, None)])
+        assert parts.min() == pytest.approx(-best.fun, abs=1e-6)
+        moving += change != 0.0
+        assert not sensing.feels
+        for _ in range(2):
+            sensing.measure({"d": 1.0})
+        assert sensing.feels
+    assert moving > 5
 
 
 def test_what_is_eliminated_is_still_possible() -> None:
@@ -169,7 +203,7 @@ def test_a_policy_keeps_contacts_where_numbers_are_off(
     problem: Problem, plan: Plan, policy: Policy
 ) -> None:
     off = problem.with_({"mass": 0.21, "friction": 0.09})
-    report = verify_policy(off, plan.trajectory, policy)
+    report = verify_policy(off, plan.trajectory, policy.with_sensor())
     assert report.ok, report.reason
     assert [phase.number for phase in report.phases] == [1, 2]
     end = report.phases[-1].deviation

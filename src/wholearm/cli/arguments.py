@@ -89,6 +89,8 @@ def add_verify(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--free", action="store_true", help=text)
     text = "with --free: torques by this policy (.npz) instead of the plan's, from the start on"
     parser.add_argument("--policy", metavar="FILE", help=text)
+    text = "with --policy: measured normal forces are handed to it, exact ones"
+    parser.add_argument("--sensor", action="store_true", help=text)
     text = "Poisson's coefficient of impacts, 0 to 1, with --free (0: plastic)"
     parser.add_argument("--restitution", type=float, help=text)
     text = "trajectory file to write (.npz) of the replayed motion, for plot"

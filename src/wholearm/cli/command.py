@@ -279,7 +279,8 @@ def _simulate_free(
 
     if isinstance(torques, TorqueProfile):
         raise InputError(options.torques, "", "torques alone given; --policy needs the plan (.npz)")
-    return verify_policy(problem, torques, Policy.load(options.policy), **given)
+    policy = Policy.load(options.policy).with_sensor(options.sensor)
+    return verify_policy(problem, torques, policy, **given)
 
 
 def _check_free(options: argparse.Namespace) -> None:
@@ -291,6 +292,8 @@ def _check_free(options: argparse.Namespace) -> None:
     for key, value in {"--restitution": options.restitution, "--policy": options.policy}.items():
         if value is not None and not options.free:
             raise InputError("", key, "needs --free")
+    if options.sensor and options.policy is None:
+        raise InputError("", "--sensor", "needs --policy")
 
 
 def _read_torques(path: str) -> Trajectory | TorqueProfile:

@@ -30,6 +30,8 @@ def add_robustness(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--phase", type=int, metavar="K", help=text)
     text = "torques by this policy (.npz), at its own period, instead of the plan's by the clock"
     parser.add_argument("--policy", metavar="FILE", help=text)
+    text = "with --policy: measured normal forces are handed to it, exact ones"
+    parser.add_argument("--sensor", action="store_true", help=text)
     text = (
         "half widths of ranges, instead of the problem's: mass, inertia (0.05), friction (0.1), "
         "gain of the torques (0.01), "
@@ -70,6 +72,9 @@ def _robustness(options: argparse.Namespace) -> int:
 
         require_writable(options.figure)
         plots.require_format(options.figure)
+    if options.sensor and options.policy is None:
+        raise InputError("", "--sensor", "needs --policy")
+    policy = None if options.policy is None else Policy.load(options.policy)
     plan = load_trajectory(options.plan)
     problem = read_problem(options.problem)
     problem = adopt_phases(problem, plan.meta, plan.q[-1], options.plan)
@@ -80,7 +85,7 @@ def _robustness(options: argparse.Namespace) -> int:
         seed=options.seed,
         uncertainty=_read_ranges(options, problem),
         phase=options.phase,
-        policy=None if options.policy is None else Policy.load(options.policy),
+        policy=None if policy is None else policy.with_sensor(options.sensor),
         path=output,
         fresh=options.fresh,
         start=_choose_executor(options),

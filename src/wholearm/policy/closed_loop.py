@@ -49,7 +49,8 @@ class ClosedLoop:
     @property
     def over(self) -> bool:
         """Whether the last phase is."""
-        return self.policy.index == len(self.policy.laws) - 1 and self.policy.laws[-1].over
+        last = self.policy.last
+        return self.policy.index == last and self.policy.laws[last].over
 
     def find_duration(self, last: int) -> float:
         """How long the phases up to the `last` take where nothing is off [s]."""
@@ -60,6 +61,9 @@ class ClosedLoop:
         self, t: float, theta: Array, theta_dot: Array, forces: Mapping[str, float]
     ) -> tuple[float, float]:
         """The torques that follow from a state; as `free_simulation.feedback.Law`."""
-        one, two = self.policy.step(theta.tolist(), theta_dot.tolist())
+        felt: dict[str, float] | None = None
+        if self.policy.sensor and t > 0.0:
+            felt = {name: forces.get(name, 0.0) for name in self.policy.contacts}
+        one, two = self.policy.step(theta.tolist(), theta_dot.tolist(), felt)
         self.began.setdefault(self.policy.phase, t)
         return one * self.gains[0], two * self.gains[1]

@@ -24,6 +24,7 @@ from math import sqrt
 from typing import Any
 
 from .pace import Pace
+from .sensing import Sensing
 from .squeeze import choose_squeeze, find_motion
 
 LEVEL, PART = 1.0, 0.5
@@ -123,7 +124,12 @@ class CurveLaw:
         self.turn: tuple[float, float] | None = None
         self.after: CurveLaw | None = None
         self.beyond = 0.0
+        self.sensing: Sensing | None = None
         self.begin()
+
+    def listen(self, names: Sequence[str], gained: str, table: Any) -> None:
+        """Let measured normal forces count: of contacts, and of the one that is gained."""
+        self.sensing = Sensing(names, gained, table, self.pace.delay / self.pace.period)
 
     def lead_to(self, after: CurveLaw) -> None:
         """Let another law follow.
@@ -147,6 +153,8 @@ class CurveLaw:
         self.limit = AHEAD * self.pace.touch if at_end else self.beyond
         self.s, self.v, self.level = self.nodes[self.j], 0.0, 0.0
         self.off, self.fresh = 0.0, not at_end
+        if self.sensing is not None:
+            self.sensing.begin()
 
     def step(
         self, theta: Sequence[float], rates: Sequence[float], forces: Mapping[str, float] | None
@@ -156,6 +164,8 @@ class CurveLaw:
         pace, s, v, j = self.pace, self.s, self.v, self.j
         if self.pushes:
             return self._press(theta, rates)
+        if self.sensing is not None:
+            self.sensing.measure(forces)
         if self.fresh:
             self.fresh, self.off = False, s
         self.ran += pace.period
@@ -167,7 +177,7 @@ class CurveLaw:
             self.over = self._has_turned(rates)
             if self.over:
                 return self.push
-        if self._is_made(s, v):
+        if self._is_made(s, v) or (self.sensing is not None and self.sensing.feels):
             self.pushes, self.a = True, 0.0
             return self._press(theta, rates)
         # The reference begins where the motion does.
@@ -301,14 +311,22 @@ class CurveLaw:
             if both > LEAST:
                 level, squeeze = both, other
         self.a, self.level = a, level
-        tau = []
+        tau, low, high = list[tuple[float, float]](), -1e30, 1e30
         for (c, cb, cv, ca, cl), (d, db, dv, da, dl) in zip(
             self.torque[j], self.torque_rises[j], strict=True
         ):
             moving = c + share * d + (cb + share * db) * b + (cv + share * dv) * v
-            tau.append(moving + (ca + share * da) * a + (cl + share * dl) * squeeze)
+            tau.append((moving + (ca + share * da) * a, cl + share * dl))
         one, two = self.pace.limit
-        return min(max(tau[0], -one), one), min(max(tau[1], -two), two)
+        if self.sensing is not None and self.sensing.heard and not beyond:
+            for (moving, by), most in zip(tau, (one, two), strict=True):
+                if by:
+                    ends = sorted(((-most - moving) / by, (most - moving) / by))
+                    low, high = max(low, ends[0] - squeeze), min(high, ends[1] - squeeze)
+            if low <= high:
+                squeeze += self.sensing.shift((j, share, v, a, squeeze), low, high)
+        first, second = (moving + by * squeeze for moving, by in tau)
+        return min(max(first, -one), one), min(max(second, -two), two)
 
     def _press(self, theta: Sequence[float], rates: Sequence[float]) -> tuple[float, float]:
         """The torques at the end, until the joints have stood still."""

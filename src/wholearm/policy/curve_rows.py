@@ -128,6 +128,15 @@ def _measure_base(rows: Rows, a: Array, b: Array) -> Array:
     return np.asarray(np.einsum("nmi,ni->nm", rows.levels[:, :, :4], known))
 
 
+def find_forces(curve: Curve, s: Array, speed: Array) -> Array:
+    """Normal forces at both ends of the intervals between places, (n - 1, 2, n_c, 5) [N]."""
+    formation, point = curve.formation, curve.evaluate(s)
+    own = inverse(formation, *point[:3], turn(curve, s, speed * NEAR)[0], point.kinematics)
+    of = np.stack([own.C0, own.Cb, np.zeros_like(own.C0), own.Ca, own.Cl], axis=2)
+    of = of[:, : formation.n_contacts]
+    return np.stack([of[:-1], of[1:]], axis=1)
+
+
 def find_directions(curve: Curve, s: Array) -> Directions:
     """Directions at n places."""
     ends = [part.stop for part in curve.segments[:-1]]

@@ -17,7 +17,7 @@ from ..mechanics.metric import metric_weights
 from ..problem.definition import End, Phase, Problem
 from ..problem.uncertainty import read_widths
 from ..results.trajectory import Trajectory
-from .curve_rows import leave_one
+from .curve_rows import find_forces, leave_one
 from .pace import Pace
 from .policy import Policy
 from .push import find_arrival, find_push, find_still
@@ -112,6 +112,8 @@ def make_policy(
         else:
             tables.append(_tabulate(piece, own[0], _end(problem, own[0], plan, piece, after)))
             found[0].update(duration=piece.duration, share=piece.share, reserves=piece.reserves)
+            gained = own[0].until.contact
+            found[0]["gained"] = "" if gained is None else gained.name
         if piece is None or not piece.passes:
             found[-1]["duration"] += DWELL + delay
         about += found
@@ -215,6 +217,7 @@ def _tabulate(piece: Piece, phase: Phase, push: Array) -> dict[str, Array]:
         "push": push,
         "passes": np.array([piece.passes]),
         "arrival": arrival,
+        "forces": find_forces(piece.curve, rows.s, np.sqrt(piece.b)),
     }
 
 

@@ -22,7 +22,7 @@ FORMAT = 1
 """Version of the files."""
 CURVE = {
     "s": (-1,), "theta": (-1, 2), "b": (-1,), "levels": (-1, 2, -1, 5), "torque": (-1, 2, 2, 5),
-    "push": (2,), "passes": (1,), "arrival": (-1, 5),
+    "push": (2,), "passes": (1,), "arrival": (-1, 5), "forces": (-1, 2, -1, 5),
 }  # fmt: skip
 """Arrays of a phase along a curve and their shapes; -1 is any."""
 MOTION = {
@@ -30,7 +30,7 @@ MOTION = {
     "gain": (-1, 2, 4), "push": (2,), "still": (1,), "ways": (-1, 2),
 }  # fmt: skip
 """Arrays of phases that are followed over time."""
-LATER = ("arrival", "ways")
+LATER = ("arrival", "ways", "forces")
 """Arrays that earlier versions did not write; empty ones stand for them."""
 KINDS: Mapping[str, Mapping[str, tuple[int, ...]]] = {"curve": CURVE, "motion": MOTION}
 Law = CurveLaw | MotionLaw
@@ -48,6 +48,8 @@ class Policy:
         What the policy is of: name of the problem, duration, contacts that end phases.
     laws : int, optional
         How many of the laws are carried out; all if left out. One more says how the end is held.
+    sensor : bool
+        Whether simulations hand it normal forces.
 
     Attributes
     ----------
@@ -75,6 +77,7 @@ class Policy:
         pace: Pace,
         about: Mapping[str, Any] | None = None,
         laws: int | None = None,
+        sensor: bool = False,
     ) -> None:
         self.tables, self.pace, self.about = tuple(tables), pace, dict(about or {})
         self.laws = tuple(
@@ -83,10 +86,24 @@ class Policy:
         for law, after in pairwise(self.laws):
             if isinstance(law, CurveLaw) and isinstance(after, CurveLaw):
                 law.lead_to(after)
+        self.sensor = sensor
         self.last = len(self.laws) - 1 if laws is None else laws - 1
         counts = [law.count for law in self.laws[: self.last + 1]]
         self.firsts = [1 + sum(counts[:k]) for k in range(len(counts))]
+        self.contacts = self._listen()
         self.reset()
+
+    def _listen(self) -> list[str]:
+        """Let laws use measured forces as far as it is known of which contacts; names of these."""
+        found = dict[str, None]()
+        phases = self.about.get("phases", [])
+        for own, law, first in zip(self.tables, self.laws, self.firsts, strict=False):
+            table, about = own.get("forces"), phases[first - 1] if first <= len(phases) else {}
+            names, gained = list(about.get("reserves", {})), about.get("gained", "")
+            if isinstance(law, CurveLaw) and table is not None and len(names) == table.shape[2]:
+                law.listen(names, gained, table)
+                found.update(dict.fromkeys([*names, gained] if gained else names))
+        return list(found)
 
     @property
     def count(self) -> int:
@@ -141,8 +158,10 @@ class Policy:
         theta, theta_dot : sequence of two float, [rad, rad/s]
             Of finger 1, the right one, and finger 2.
         forces : mapping of str to float, optional
-            Normal forces by name of the contact, as far as they are measured [N]; no law uses them
-            yet.
+            Normal forces when angles and speeds are measured [N], by names of contacts as in plans
+            (`v3-finger1`); those that do not touch have 0, those without a sensor are left out or
+            are NaN. With them squeezes follow what contacts along curves press with, and phases
+            end when their gained contact presses.
         """
         law = self.laws[self.index]
         tau = law.step(theta, theta_dot, forces)
@@ -156,12 +175,16 @@ class Policy:
     def with_(self, **changes: Any) -> Policy:
         """The policy with another `period`, `delay` or other values of `Pace`."""
         pace = self.pace._replace(**changes)
-        return Policy(self.tables, pace, self.about, self.last + 1)
+        return Policy(self.tables, pace, self.about, self.last + 1, self.sensor)
+
+    def with_sensor(self, sensor: bool = True) -> Policy:
+        """The policy with a sensor of normal forces in simulations, or without."""
+        return Policy(self.tables, self.pace, self.about, self.last + 1, sensor)
 
     def cut(self, last: int) -> Policy:
         """The policy of the phases up to the `last`, with those that it passes into in motion."""
         kept = sum(first <= last for first in self.firsts)
-        return Policy(self.tables, self.pace, self.about, kept)
+        return Policy(self.tables, self.pace, self.about, kept, self.sensor)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the policy to a ``.npz`` file.
@@ -257,6 +280,7 @@ def _check_lengths(source: str, number: int, tables: Mapping[str, Any]) -> None:
     others = ("theta", "b") if "s" in tables else ("theta", "rates", "tau", "gain")
     count = len(tables[others[0]])
     lengths = [len(tables[name]) for name in others] + [len(tables[name]) + 1 for name in spans]
+    lengths += [len(tables["forces"]) + 1] if spans and len(tables["forces"]) else []
     if count < 2 or set(lengths) != {count} or (spans and len(tables["s"]) != count):
         raise InputError(source, f"{others[0]}_{number}", "has not as many places as other arrays")
     if not (np.diff(tables[axis]) > 0).all() or not len(tables[axis]):

@@ -206,7 +206,7 @@ def _stamp(trial: Trial, samples: int, seed: int) -> dict[str, Any]:
     known = [trial.torque.breaks, trial.torque.coefficients, trial.state]
     if trial.policy is not None:
         known += [part for tables in trial.policy.tables for part in tables.values()]
-        known.append(np.array(trial.policy.pace[:-1]))
+        known.append(np.array([*trial.policy.pace[:-1], float(trial.policy.sensor)]))
     digest = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in known))
     return {
         "study": "robustness",
