@@ -95,6 +95,8 @@ class Planning:
     ahead : bool
         Whether blocks end with regard to what follows them. Plans that durations are shared out
         by do not, as blocks for the objective `margin` cannot.
+    sketches : bool
+        Whether least times of what follows a block are those of a sweep, where it ends by them.
     more : dict, [N]
         By how much normal forces of blocks, by their indices, have to exceed epsilon, if at all.
     """
@@ -108,6 +110,7 @@ class Planning:
     least: Plans = field(default_factory=list)
     pinned: bool = False
     ahead: bool = True
+    sketches: bool = False
     more: dict[int, float] = field(default_factory=dict)
 
     @property

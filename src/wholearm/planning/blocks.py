@@ -31,6 +31,8 @@ from ..scene.model import Scene
 from ..solvers.statistics import charge
 from .block_plan import BEGUN, FINEST, PLAIN, BlockPlan, Planning
 from .durations import share_again, share_duration
+from .lower_bound.lower_bound import look_along
+from .lower_bound.sweep import NoMotionError
 from .motors import require_steps
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence
@@ -45,6 +47,8 @@ COARSE = 80
 """Intervals along a curve that refining doubles where none are asked for."""
 AMPLE = 1.1
 """Ratio to the least normal force of other phases from which on more decides nothing."""
+SKETCH = 24
+"""Intervals on which what follows a block is looked at where it is only sketched."""
 MOVED = 1e-9
 """Distance from which on a block starts somewhere else, in radii of gyration or radians."""
 APART = 1e-6
@@ -142,7 +146,7 @@ def _plan_others(
     """Plan each block that is not `known`, by its index, as wanted."""
     made = replace(planning, blocks=(), allowed=list(planning.shares))
     for index, wanted in enumerate(finer):
-        made = _plan_next(made, wanted, known.get(index), report)
+        made = plan_next(made, wanted, known.get(index), report)
     return made
 
 
@@ -162,7 +166,7 @@ def _begin_each(planning: Planning, report: Callable[[str], None]) -> Planning:
         return planning
     for index in range(len(blocks)):
         try:
-            begun = _plan_next(begun, BEGUN, None, report)
+            begun = plan_next(begun, BEGUN, None, report)
         except WholearmError as error:
             if not any(over_time[:index]) or _is_clear(error):
                 raise
@@ -176,13 +180,14 @@ def _is_clear(error: WholearmError) -> bool:
     return max((own.share for own in shortfalls), default=0.0) > CLEAR
 
 
-def _plan_next(
+def plan_next(
     planning: Planning, finer: int, known: BlockPlan | None, report: Callable[[str], None]
 ) -> Planning:
     """Plan the block after those that are planned, unless it is `known` as wanted.
 
-    Where it starts from somewhere else than in the plans of least duration, the allowed durations
-    are shared out again.
+    What is known of it may only be begun, as `BEGUN` says: then it is gone on with. Where it starts
+    from somewhere else than in the plans of least duration, the allowed durations are shared out
+    again.
     """
     problem, options, least = planning.problem, planning.options, planning.least
     phases = split_blocks(problem)[len(planning.blocks)]
@@ -310,9 +315,19 @@ def _look_ahead(
         return None
 
     def value(z: Array) -> float:
+        if planning.sketches and options.goal is Objective.TIME:
+            return _sketch(phase, z, problem.epsilon)
         return sum(plan.value for plan in _plan_block(planning, following, z, options)[0])
 
     return CostToGo(phase, value)
+
+
+def _sketch(phase: Phase, z: Array, epsilon: float) -> float:
+    """About the least time of a phase along its curve from `z` [s]."""
+    try:
+        return look_along((trace_phase(phase, z),), epsilon, SKETCH).duration
+    except NoMotionError:
+        raise SolverError(f"phase {phase.number}: no motion keeps the limits") from None
 
 
 def _require_margin(planning: Planning) -> Planning:

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -32,6 +32,9 @@ from .phase_plan import combine
 from .result import Plan, PlannedPhase, Status, Timings
 from .saved import write_meta
 from .sureness import Sureness, check_sureness
+
+if TYPE_CHECKING:
+    from .self_check import Checked
 
 
 def solve(
@@ -117,30 +120,56 @@ def solve_with(
         curves = trace_phases(problem)
         traced = time.perf_counter()
         planning = _plan(problem, curves, options, report)
-        trajectory, figures = assemble_plan(planning), None
-        sure = check_sureness(problem, trajectory, options.least_minor)
-        planned = time.perf_counter()
-        if options.replay:
-            from .self_check import replay_plan
+        return finish_plan(planning, report, ledger, (started, traced))
 
-            first = trajectory
-            planning, trajectory, figures = replay_plan(planning, trajectory, assemble_plan, report)
-            if trajectory is not first:
-                sure = check_sureness(problem, trajectory, options.least_minor)
-        replayed = time.perf_counter()
-        transitions = _assess(planning, report)
-        assessed = time.perf_counter()
-        ranges = None
-        if options.robust:
-            from .range_cost import assess_ranges
 
-            ranges = assess_ranges(planning, report)
-        certificate = None
-        if options.certify:
-            from .certify import certify
+def finish_plan(
+    planning: Planning,
+    report: Callable[[str], None],
+    ledger: Ledger,
+    begun: tuple[float, float],
+    checked: Checked | None = None,
+) -> Plan:
+    """The plan that the plans of all blocks make, once its replay has shown that it holds.
 
-            report("bounding the least time from below")
-            certificate = certify(planning)
+    Parameters
+    ----------
+    planning : Planning
+    report : callable
+        Told in a few words what is being done.
+    ledger : Ledger
+        What solving has cost so far, and what is booked from here on.
+    begun : (float, float), [s]
+        When tracing the phases began and ended, by `time.perf_counter`.
+    checked : Checked, optional
+        The trajectory of the planning and what its replay has shown, if that is known.
+    """
+    problem, options = planning.problem, planning.options
+    trajectory, figures = checked.trajectory if checked else assemble_plan(planning), None
+    sure = check_sureness(problem, trajectory, options.least_minor)
+    planned = time.perf_counter()
+    if options.replay:
+        from .self_check import replay_plan
+
+        first = trajectory
+        given = planning, trajectory, assemble_plan, report, checked
+        planning, trajectory, figures = replay_plan(*given)
+        if trajectory is not first:
+            sure = check_sureness(problem, trajectory, options.least_minor)
+    replayed = time.perf_counter()
+    transitions = _assess(planning, report)
+    assessed = time.perf_counter()
+    ranges = None
+    if options.robust:
+        from .range_cost import assess_ranges
+
+        ranges = assess_ranges(planning, report)
+    certificate = None
+    if options.certify:
+        from .certify import certify
+
+        report("bounding the least time from below")
+        certificate = certify(planning)
     phases = _list_phases(planning, ledger, sure)
     plan = Plan(
         problem,
@@ -152,10 +181,10 @@ def solve_with(
         tuple(transitions),
         figures,
         Timings(
-            traced - started,
+            begun[1] - begun[0],
             sum(phase.statistics.build_time for phase in phases),
             sum(phase.statistics.solve_time for phase in phases),
-            planned - started,
+            planned - begun[0],
             replayed - planned,
             assessed - replayed,
         ),

@@ -117,11 +117,46 @@ class Check(NamedTuple):
         return self.failure[0]
 
 
+class Checked(NamedTuple):
+    """What the replay of a planning has shown.
+
+    Attributes
+    ----------
+    trajectory : Trajectory
+    strictly : Check
+        With some of what `verify` allows to spare.
+    usually : Check
+        By what it allows.
+    scales : Scales
+    """
+
+    trajectory: Trajectory
+    strictly: Check
+    usually: Check
+    scales: Scales
+
+    @staticmethod
+    def of(problem: Problem, trajectory: Trajectory) -> Checked:
+        """Replay a trajectory."""
+        usual, strict = Allowance(), Allowance().scale(STRICT)
+        strictly, usually = check_plan(problem, trajectory, strict, usual)
+        return Checked(trajectory, strictly, usually, problem.scene.scales)
+
+    @property
+    def culprit(self) -> int | None:
+        """Number of the phase to plan anew; None if the plan holds."""
+        if self.strictly.failure is None:
+            return None
+        durations = np.diff(self.trajectory.phase_starts)
+        return self.strictly.find_culprit(self.scales, Allowance().scale(STRICT), durations)
+
+
 def replay_plan(
     planning: Planning,
     trajectory: Trajectory,
     build: Callable[[Planning], Trajectory],
     report: Callable[[str], None],
+    checked: Checked | None = None,
 ) -> tuple[Planning, Trajectory, ReplayFigures]:
     """Replay a plan, refine the blocks that do not hold, and return what does, with its figures.
 
@@ -134,6 +169,8 @@ def replay_plan(
         Gives the trajectory of another planning.
     report : callable
         Told in a few words what is being done.
+    checked : Checked, optional
+        What the first replay has shown, if it is known. Then it is enough that it is accepted.
 
     Raises
     ------
@@ -141,18 +178,22 @@ def replay_plan(
         If a block does not hold with finer intervals either.
     """
     problem = planning.problem
-    usual, strict = Allowance(), Allowance().scale(STRICT)
     simulations, known = 0, None
     while True:
         simulations += 1
-        report("replaying the plan")
-        check, accepted = check_plan(problem, trajectory, strict, usual)
+        if checked is None:
+            report("replaying the plan")
+            found = Checked.of(problem, trajectory)
+        else:
+            usually = checked.usually
+            found = checked if usually.failure else checked._replace(strictly=usually)
+        checked, check, accepted = None, found.strictly, found.usually
         if check.failure is None:
             break
         if accepted.failure is None:
             known = planning, trajectory, accepted
-        durations = np.diff(trajectory.phase_starts)
-        number = check.find_culprit(problem.scene.scales, strict, durations)
+        number = found.culprit
+        assert number is not None
         better = _improve(planning, number, accepted.failure is not None, report)
         if better is None and accepted.failure is not None:
             better = _press_more(planning, number, accepted, report)

@@ -10,27 +10,15 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import InputError, WholearmError
 from ..contacts.formation import Formation
-from ..geometry.explore import STILL
 from ..geometry.path_guess import find_end
-from ..geometry.tracing import trace_phase
-from ..mechanics.metric import metric_weights
 from ..planning.advice import unadvised
-from ..planning.lower_bound.lower_bound import look_along
-from ..planning.lower_bound.sweep import NoMotionError
-from ..planning.options import Objective, PlanOptions
+from ..planning.options import PlanOptions
 from ..planning.plan import solve_with
 from ..planning.result import Plan
-from ..problem.definition import End, Phase, Problem, Until
+from ..problem.definition import Phase, Problem
 from .find import Route
-from .links import INTERVALS, Blocked, Link, Measured, Step, describe_steps, point_out
-
-FURTHER = 2
-"""Guesses of a phase that is planned alone, beyond the first one."""
-ROUGH = 1e-2
-"""Accuracy of plans of which only matters about how long they take."""
-
-SINGULAR = "its contacts depend on each other"
-"""Why there is no plan where the equations of motion have no single solution."""
+from .links import Blocked, Link, describe_steps, point_out
+from .measure import SINGULAR, Measured, make_phases
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,10 +78,7 @@ def make_candidate(
 
 def _make_phases(problem: Problem, index: int, link: Link, z: Array) -> tuple[list[Phase], Array]:
     """The phases of a link that starts at `z`, and where they end."""
-    phases = [
-        Phase(index + k, Formation(problem.scene, step.contacts), step.until, step.end)
-        for k, step in enumerate(link.steps)
-    ]
+    phases = make_phases(problem, link.steps, index)
     here = z
     for k, phase in enumerate(phases):
         end = find_end(phase, here, phases[k + 1 :])
@@ -108,57 +93,6 @@ def _make_phases(problem: Problem, index: int, link: Link, z: Array) -> tuple[li
 def _misses(end: Array, link: Link, last: bool) -> bool:
     length = link.stop.scene.scales.length
     return last and bool(np.abs((end - link.stop.z) / [length, length, 1, 1, 1]).max() > 1e-4)
-
-
-def measure_link(
-    problem: Problem, link: Link, steps: tuple[Step, ...], options: PlanOptions
-) -> Measured | str:
-    """Plan a link through a cell for itself, on few intervals and from one guess.
-
-    Parameters
-    ----------
-    problem : Problem
-    link : Link
-    steps : tuple of Step
-        Its own, or others that lead the same way.
-    options : PlanOptions
-
-    Returns
-    -------
-    Measured, or why there is no plan.
-    """
-    from ..planning.time_domain.plan import try_phases
-
-    rough = replace(
-        options, objective=Objective.TIME, duration=None, accuracy=ROUGH, mode_search=False
-    )
-    blank = replace(problem, goals=(), phases=())
-    z, spent = link.start.z, 0.0
-    try:
-        phases, _ = _make_phases(problem, 0, replace(link, steps=steps), z)
-        own = replace(blank, phases=tuple(phases))
-        if len(phases) > 1 and phases[0].end is End.REST:
-            ahead = look_along((trace_phase(phases[0], z),), problem.epsilon, INTERVALS)
-            spent, z, phases = ahead.duration, find_end(phases[0], z), phases[1:]
-        moved = find_end(phases[0], z, phases[1:]) - z
-        if metric_weights(problem.scene) @ moved**2 < (STILL * problem.scene.scales.length) ** 2:
-            return f"{phases[0].until} holds already where it starts"
-        plans = try_phases(own, phases, z, rough, FURTHER if len(phases) == 1 else 0)
-    except NoMotionError:
-        return "no motion keeps its limits along the border"
-    except WholearmError as error:
-        return str(error)
-    except np.linalg.LinAlgError:
-        return SINGULAR
-    if plans is None:
-        return "no guess leads to a plan"
-    return Measured(spent + sum(plan.motion.duration for plan in plans), steps)
-
-
-def leave_in_motion(steps: tuple[Step, ...]) -> tuple[Step, ...]:
-    """Phases that leave a border in motion, at a place that the planner chooses."""
-    first, *rest = steps
-    return (Step(first.contacts, Until(), End.SMOOTH), *rest)
 
 
 def explain_border(problem: Problem, blocked: Blocked, options: PlanOptions) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,7 +24,6 @@ from .links import (
     Blocked,
     Border,
     Link,
-    Measured,
     Step,
     cut_curve,
     follow_borders,
@@ -31,7 +31,11 @@ from .links import (
     look_at,
     point_out,
 )
+from .measure import Measured
 from .places import Key, Place, list_formations_at, make_place, settle
+
+if TYPE_CHECKING:
+    from .joining import PlannedLink
 
 RELEASES = (0.15, 0.4, 0.6, 0.75, 0.88)
 """Shares of a border at which contacts may be let go."""
@@ -56,6 +60,10 @@ class Chart:
     ----------
     plans : dict
         Plans of routes through it, or why there are none; see `candidates`.
+    others : dict
+        Slower plans of these.
+    joined : dict
+        Plans of links from rest to rest; see `joining`.
     polished : set of Link
         Those that were planned with borders left in motion, too.
     measured : dict
@@ -68,6 +76,8 @@ class Chart:
         self._links: dict[Key, list[tuple[Border, Link | Blocked | None]]] = {}
         self._cells: dict[Key, Found] = {}
         self.plans: dict[object, Plan | str] = {}
+        self.others: dict[Link, list[Measured]] = {}
+        self.joined: dict[tuple[object, ...], PlannedLink | str] = {}
         self.measured: dict[Link, Measured | str] = {}
         self._releases: dict[tuple[Key, int], Found] = {}
         self._chains: dict[Key, list[tuple[Chain, Link | Blocked | None]]] = {}

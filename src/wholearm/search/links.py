@@ -70,20 +70,6 @@ class Link:
         return tuple(tuple(sorted(c.name for c in step.contacts)) for step in self.steps)
 
 
-class Measured(NamedTuple):
-    """What came of planning a link for itself.
-
-    Attributes
-    ----------
-    duration : float, [s]
-    steps : tuple of Step
-        Its phases, in the way that was planned.
-    """
-
-    duration: float
-    steps: tuple[Step, ...]
-
-
 class Blocked(NamedTuple):
     """A link that no motion can take.
 

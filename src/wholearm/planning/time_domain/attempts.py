@@ -18,7 +18,7 @@ from .refinement import halve
 from .search import Search, Solution
 from .stage import Stage
 from .staging import guess_stages
-from .way_guess import PacedWay, list_ways
+from .way_guess import PacedWay, list_ways, pace_straight
 
 FIRST = 10
 """Most intervals of a phase to start with."""
@@ -99,8 +99,20 @@ class Attempts:
         first = found.stages[0].guess
         nodes = first.nodes.copy()
         nodes[0, 0] = self.first.stages[0].guess.nodes[0, 0]
-        moved = replace(found.stages[0], guess=first._replace(nodes=nodes))
-        return Attempt("", self._halvings, [moved, *found.stages[1:]], before=found)
+        stages = [replace(found.stages[0], guess=first._replace(nodes=nodes)), *found.stages[1:]]
+        return Attempt("", self._halvings, self._leave_room(stages), before=found)
+
+    def towards(self, goal: Array) -> Attempt | None:
+        """Straight to an end, shape (5,); None where no motion that way is near its limits."""
+        if len(self.phases) > 1:
+            return None
+        way = pace_straight(self.problem, self.phases[0], self.z, goal)
+        return None if way is None or way.margin <= NEAR else self._follow(way)
+
+    def _follow(self, way: PacedWay) -> Attempt:
+        """Along a way, in its modes."""
+        stages = self._guess(self._halvings, FALLS[0], way=way)
+        return Attempt(f"a way with the margin {way.margin:.3g}", self._halvings, stages)
 
     @cached_property
     def ways(self) -> list[PacedWay]:
@@ -123,14 +135,7 @@ class Attempts:
         if self.patient:
             yield self.first._replace(name=f"{self.first.name}{GRADUAL}", gradual=True)
         near = [way for way in self.ways if way.margin > NEAR] or self.ways[:1]
-        guesses = [
-            Attempt(
-                f"a way with the margin {way.margin:.3g}",
-                self._halvings,
-                self._guess(self._halvings, FALLS[0], way=way),
-            )
-            for way in near
-        ]
+        guesses = [self._follow(way) for way in near]
         sure = sum(way.margin > 0 for way in near)
         yield from guesses[:sure]
         for guess in [] if self.are_far else guesses:
@@ -164,9 +169,13 @@ class Attempts:
             replace(stage, opening=options.opening, clearance=options.clearance)
             for stage in guess_stages(*given, way=way)
         ]
-        if self.to_go is not None:
-            stages[-1] = keep_apart(stages[-1], self.to_go.phase.until.contact)
-        return stages
+        return self._leave_room(stages)
+
+    def _leave_room(self, stages: list[Stage]) -> list[Stage]:
+        """The stages, with an end from which what follows has a way to go."""
+        if self.to_go is None:
+            return stages
+        return [*stages[:-1], keep_apart(stages[-1], self.to_go.phase.until.contact)]
 
 
 def solve_attempt(search: Search, attempt: Attempt) -> Solution:

@@ -108,20 +108,49 @@ def plan_phases(
 
 
 def try_phases(
-    problem: Problem, phases: Sequence[Phase], z: Array, options: PlanOptions, further: int = 0
+    problem: Problem,
+    phases: Sequence[Phase],
+    z: Array,
+    options: PlanOptions,
+    goal: Array | None = None,
+    further: int = 0,
 ) -> list[PhasePlan[TimeMotion]] | None:
-    """Begin to plan phases from the first guess, and from a few further ones.
+    """Begin to plan phases from the first guesses, and from a few further ones if these fail.
 
-    As `plan_phases` with `only_begin`; None where these lead nowhere, without looking for reasons.
+    As `plan_phases` with `only_begin`, without a search for contact modes; None where these lead
+    nowhere, without looking for reasons.
+
+    Parameters
+    ----------
+    goal : ndarray, shape (5,), optional
+        A single phase is first guessed to go straight there; otherwise to its nearest end.
+    further : int
+        How many guesses are looked at beyond.
     """
-    search = Search.of(problem, options, None, None, math.inf, True)
+    own = replace(options, mode_search=False)
+    search = Search.of(problem, own, None, None, math.inf, True)
     attempts = Attempts(problem, phases, z, search, None, further > 0)
-    for attempt in chain([attempts.first], islice(attempts, further)):
+    straight = None if goal is None else attempts.towards(goal)
+    first = (attempts.first for _ in range(straight is None or further > 0))
+    for attempt in chain([straight] if straight else [], first, islice(attempts, further)):
         solution = solve_attempt(search, attempt)
         if solution.success:
-            return list_plans(problem, search, phases, solution, attempt.name)
+            return _list_begun(problem, search, phases, solution, attempt.name, options)
     moved = approach(search, problem, phases, z)
-    return None if moved is None else list_plans(problem, search, phases, moved, MOVED)
+    return moved and _list_begun(problem, search, phases, moved, MOVED, options)
+
+
+def _list_begun(
+    problem: Problem,
+    search: Search,
+    phases: Sequence[Phase],
+    solution: Solution,
+    name: str,
+    options: PlanOptions,
+) -> list[PhasePlan[TimeMotion]]:
+    """The plans of phases whose contact modes may yet have to be looked for."""
+    first, *others = list_plans(problem, search, phases, solution, name)
+    return [first._replace(complete=not options.mode_search), *others]
 
 
 def _look_further(
@@ -170,9 +199,11 @@ def _go_on(search: Search, attempts: Attempts, begun: PhasePlan[Motion]) -> Solu
     """Go on from plans that were only begun, in their modes; None if that leads to nothing."""
     if not isinstance(begun.solution, Solution):
         return None
-    search.tried.sequences, search.tried.complete = begun.sequences, begun.complete
-    settled = replace(search, options=replace(search.options, mode_search=False))
-    solution = solve_attempt(settled, attempts.resume(begun.solution))
+    own = search
+    if begun.complete or begun.sequences > 1:
+        search.tried.sequences, search.tried.complete = begun.sequences, begun.complete
+        own = replace(search, options=replace(search.options, mode_search=False))
+    solution = solve_attempt(own, attempts.resume(begun.solution))
     return solution if solution.success else None
 
 

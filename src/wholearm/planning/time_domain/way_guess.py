@@ -143,6 +143,21 @@ def list_ways(problem: Problem, phase: Phase, z: Array, most: int) -> list[Paced
     ]
 
 
+def pace_straight(problem: Problem, phase: Phase, z: Array, goal: Array) -> PacedWay | None:
+    """The straight way of a phase to an end, with the largest margin of a motion along it.
+
+    None where something is in the way, or along a phase that has not two freedoms.
+    """
+    if phase.until.is_release or tangent_basis(phase.formation, z).shape[1] != 2:
+        return None
+    way = split_way(connect(phase.formation, z, goal))
+    if not _is_free(way):
+        return None
+    forces = WayForces(way, problem.epsilon)
+    margin = forces.find_margin()
+    return PacedWay(way, margin, forces.find_pace(margin), forces) if margin > -np.inf else None
+
+
 def _list_headings(problem: Problem, phase: Phase, z: Array) -> list[Array]:
     """Ways in which motions begin at `z`, those that press most first."""
     own, scales = in_own_units(problem), problem.scene.scales

@@ -1,0 +1,145 @@
+"""Which of the routes that a search finds are planned: those first that seem best."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from ..planning.options import PlanOptions
+from ..planning.result import Plan
+from ..problem.definition import Problem
+from .candidates import Failure, make_candidate, plan_candidate
+from .find import CAREFUL, EAGER, Route, Rule, Search
+from .joining import can_join, join_route
+from .links import Link, describe_steps
+from .measure import Measured
+from .polishing import Polisher
+
+FASTER = 0.7
+"""Share of the time of straight ways through cells that plans take at least, by experience."""
+TRIED = 6
+"""Most routes that are looked at, or planned in vain, beyond those that are asked for."""
+OTHERS = 2
+"""Most slower ways through a cell that are tried where the plan of the fastest does not hold."""
+BEYOND = 1.1
+"""Times of routes, by the search, over that of the best one, from which on they are left out."""
+MEASURED, MORE = 24, 8
+"""Most links through cells that are planned for themselves, until there is a route and after it."""
+
+
+class Chooser:
+    """Routes of a search, and plans of those that seem best.
+
+    Parameters
+    ----------
+    problem : Problem
+    before : list of Route
+        To the goals before.
+    search : Search
+    options : PlanOptions
+
+    Attributes
+    ----------
+    found : list of Route
+        Whose ways through cells have plans.
+    made : list of (Plan, Route)
+    failures : list of Failure
+    """
+
+    def __init__(
+        self, problem: Problem, before: list[Route], search: Search, options: PlanOptions
+    ) -> None:
+        self.problem, self.before, self.search = problem, before, search
+        self.options, self.chart = options, search.chart
+        self.found: list[Route] = []
+        self.made: list[tuple[Plan, Route]] = []
+        self.failures: list[Failure] = []
+        self._polisher = Polisher(problem, search.chart, options)
+        self._measurements = 0
+
+    def run(self, wanted: int, report: Callable[[str], None]) -> None:
+        """Look for routes and plan them, for as long as there are fewer than `wanted` plans."""
+        for _ in range(TRIED):
+            failed = len(self.failures)
+            self._look_by(EAGER, wanted, report)
+            # Without a route by then, the other rule leads elsewhere, and as far.
+            most = CAREFUL.most if self.found else EAGER.most
+            self._look_by(CAREFUL._replace(most=most), wanted, report)
+            self.plan(wanted, report)
+            if len(self.made) >= wanted or len(self.failures) == failed:
+                return
+
+    def plan(self, wanted: int, report: Callable[[str], None]) -> None:
+        """Plan the routes that are found, the best first, until there are as many as wanted."""
+        for route in sorted(self.found, key=self._estimate):
+            if len(self.made) >= wanted or len(self.failures) >= TRIED:
+                return
+            self.found.remove(route)
+            self._polisher.polish(route, report)
+            report(f"planning a route of {sum(len(own.steps) for own in route.links)} phases")
+            plan = self._plan(route, report)
+            if isinstance(plan, str):
+                self.failures.append(Failure(route, plan))
+            else:
+                self.made.append((plan, route))
+
+    def _plan(self, route: Route, report: Callable[[str], None]) -> Plan | str:
+        routes, known = [*self.before, route], self.chart.measured
+        if can_join(self.problem, self.options):
+            links = [(link, self._list_ways(link)) for own in routes for link in own.links]
+            return join_route(self.problem, links, self.options, self.chart.joined, report)
+        candidate = make_candidate(self.problem, routes, known)
+        if isinstance(candidate, Failure):
+            return candidate.reason
+        return plan_candidate(candidate, self.options, self.chart.plans)
+
+    def _list_ways(self, link: Link) -> list[Measured]:
+        """Ways in which a link through a cell can be gone, the fastest first."""
+        best = self.chart.measured.get(link)
+        others = sorted(self.chart.others.get(link, []), key=lambda own: own.duration)
+        return [best, *others[:OTHERS]] if isinstance(best, Measured) else []
+
+    def _look_by(self, rule: Rule, wanted: int, report: Callable[[str], None]) -> None:
+        """Look at routes as one rule of thumb leads to them, while one may be better."""
+        looked, most = 0, self._measurements + MEASURED
+        for route in self.search.run(rule):
+            enough = len(self.found) >= wanted
+            if enough and self._estimate(route) > self._best:
+                return
+            if looked > wanted + TRIED or self._measurements >= most:
+                return
+            if self._measure(route, report):
+                looked += 1
+                self.found.append(route)
+                if len(self.found) >= wanted:
+                    self.search.limit = BEYOND * self._best
+                    most = min(most, self._measurements + MORE)
+
+    @property
+    def _best(self) -> float:
+        """About the least time of a route that is found [s]."""
+        return min((self._estimate(own) for own in self.found), default=float("inf"))
+
+    def _measure(self, route: Route, report: Callable[[str], None]) -> bool:
+        """Plan the links of a route that lead through cells; whether all have a plan."""
+        known = self.chart.measured
+        for link in route.links:
+            if not link.in_cell:
+                continue
+            if link not in known:
+                self._measurements += 1
+                report(f"planning {describe_steps(link.steps)}")
+                known[link] = self._polisher.measure(link)
+            if isinstance(known[link], str):
+                return False
+        return True
+
+    def _estimate(self, route: Route) -> float:
+        """About the least time that a plan along all routes may take [s]."""
+        total = 0.0
+        for link in (link for own in (*self.before, route) for link in own.links):
+            known = self.chart.measured.get(link)
+            if isinstance(known, Measured):
+                total += known.duration
+            else:
+                total += FASTER * link.duration if link.in_cell else link.duration
+        return total

@@ -1,0 +1,242 @@
+"""Routes put together from their links, each planned once from rest to rest, and kept.
+
+What ends at rest says nothing of what follows but where that starts, so that links are planned one
+by one. Where a link lands on a border is left open: it is chosen with regard to the next link.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, MutableMapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.errors import InputError, WholearmError, name_source
+from ..common.sharing import exclusive
+from ..geometry.curve import Curve
+from ..geometry.tracing import trace_phase
+from ..planning.advice import unadvised
+from ..planning.block_plan import BEGUN, BlockPlan, Planning
+from ..planning.blocks import plan_next
+from ..planning.options import PlanOptions
+from ..planning.plan import assemble_plan, finish_plan
+from ..planning.result import Plan
+from ..planning.self_check import Checked
+from ..planning.splitting import split_blocks
+from ..problem.definition import End, Phase, Problem
+from ..scene.model import Scene
+from ..solvers.statistics import open_ledger
+from .links import Link, Step, describe_steps, point_out
+from .measure import SINGULAR, Measured, make_phases
+
+OFF = 1e-4
+"""Distance from the end of a border's link from which on it is another end, in radii of gyration or
+radians."""
+SAME = 9
+"""Decimals of configurations that are one, in the same unit."""
+
+Key = tuple[object, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedLink:
+    """A link as it is planned.
+
+    Attributes
+    ----------
+    phases : tuple of Phase
+        Counted from the first of the link.
+    blocks : tuple of BlockPlan
+    """
+
+    phases: tuple[Phase, ...]
+    blocks: tuple[BlockPlan, ...]
+
+    @property
+    def end(self) -> Array:
+        """Where it ends, shape (5,)."""
+        return self.blocks[-1].end
+
+    @property
+    def duration(self) -> float:
+        """How long it takes [s]."""
+        return sum(plan.motion.duration for own in self.blocks for plan in own.plans)
+
+
+Kept = MutableMapping[Key, PlannedLink | str]
+
+
+def can_join(problem: Problem, options: PlanOptions) -> bool:
+    """Whether plans from rest to rest make a plan of least time: not where motors are slow."""
+    return options.goal.value == "time" and not problem.scene.has_slow_motors
+
+
+@exclusive
+def join_route(
+    problem: Problem,
+    links: Sequence[tuple[Link, Sequence[Measured]]],
+    options: PlanOptions,
+    kept: Kept,
+    report: Callable[[str], None],
+) -> Plan | str:
+    """The plan of a route, from plans of its links, or why there is none.
+
+    Parameters
+    ----------
+    problem : Problem
+    links : sequence of (Link, sequence of Measured)
+        One after the other from the problem's start, with the ways in which those through cells
+        can be gone, the best first. Where a plan does not hold, the next one is taken, and at last
+        one that is planned from guesses of its own.
+    options : PlanOptions
+    kept : mapping
+        Plans of links that were made before, to which others are added.
+    report : callable
+    """
+    options = options.scale_ranges(problem.uncertainty or {})
+    begun = time.perf_counter()
+    ways = [[*measured, None] for _, measured in links]
+    try:
+        with open_ledger() as ledger, unadvised():
+            while True:
+                own = [(link, way[0]) for (link, _), way in zip(links, ways, strict=True)]
+                planned = _plan_links(problem, own, options, kept, report)
+                if isinstance(planned, str):
+                    return planned
+                made, checked = _put_together(problem, planned, options), None
+                if not options.replay:
+                    break
+                report("replaying the plan")
+                checked = Checked.of(made.problem, assemble_plan(made))
+                owners = [k for k, own in enumerate(planned) for _ in own.phases]
+                if checked.culprit is None or len(ways[owners[checked.culprit - 1]]) == 1:
+                    break
+                ways[owners[checked.culprit - 1]].pop(0)
+            return finish_plan(made, report, ledger, (begun, begun), checked)
+    except WholearmError as error:
+        return str(error)
+    except np.linalg.LinAlgError:
+        return SINGULAR
+
+
+def _plan_links(
+    problem: Problem,
+    links: Sequence[tuple[Link, Measured | None]],
+    options: PlanOptions,
+    kept: Kept,
+    report: Callable[[str], None],
+) -> list[PlannedLink] | str:
+    """Plans of links one after the other, from what is begun of them; or why there is none."""
+    z, found = problem.start, list[PlannedLink]()
+    for k, (link, measured) in enumerate(links):
+        ahead = links[k + 1][0] if k + 1 < len(links) else None
+        own = (link if measured is None else replace(link, steps=measured.steps), ahead)
+        planned = _keep_link(problem, *own, measured, z, options, kept, report)
+        if isinstance(planned, str):
+            return f"{describe_steps(link.steps)}: {planned}"
+        found.append(planned)
+        z = planned.end
+    return found
+
+
+def _put_together(problem: Problem, links: Sequence[PlannedLink], options: PlanOptions) -> Planning:
+    """The planning of a route whose links are planned."""
+    phases, blocks = list[Phase](), list[BlockPlan]()
+    for link in links:
+        moved = [replace(own, index=own.index + len(phases)) for own in link.phases]
+        for block in link.blocks:
+            own = tuple(moved[phase.index] for phase in block.phases)
+            blocks.append(replace(block, phases=own))
+        phases += moved
+    whole = replace(problem, phases=tuple(phases), goals=())
+    none = list[float | None]([None] * len(phases))
+    return Planning(whole, (), options, tuple(blocks), none, none, ahead=False)
+
+
+def key_configuration(scene: Scene, z: Array) -> tuple[float, ...]:
+    """The same for configurations that are one."""
+    length = scene.scales.length
+    return tuple(np.round(z / [length, length, 1, 1, 1], SAME).tolist())
+
+
+def key_steps(steps: Sequence[Step]) -> Key:
+    """The same for phases that are the same."""
+    return tuple(
+        (tuple(c.name for c in own.contacts), str(own.until), own.until.value, own.end.value)
+        for own in steps
+    )
+
+
+def _keep_link(
+    problem: Problem,
+    link: Link,
+    ahead: Link | None,
+    begun: Measured | None,
+    z: Array,
+    options: PlanOptions,
+    kept: Kept,
+    report: Callable[[str], None],
+) -> PlannedLink | str:
+    """The plan of a link from `z`, made now, from what is begun, if it is not kept."""
+    follows = ahead.steps[:1] if link.in_cell and ahead and not ahead.in_cell else ()
+    place, own = key_configuration(problem.scene, z), repr(replace(options, samples=2))
+    key = (place, key_steps(link.steps), key_steps(follows), begun is None, own)
+    if key not in kept:
+        report(f"planning {describe_steps(link.steps)}")
+        try:
+            kept[key] = _plan_link(problem, link, follows, begun, z, options, report)
+        except WholearmError as error:
+            kept[key] = str(error)
+        except np.linalg.LinAlgError:
+            kept[key] = SINGULAR
+    return kept[key]
+
+
+def _plan_link(
+    problem: Problem,
+    link: Link,
+    follows: Sequence[Step],
+    measured: Measured | None,
+    z: Array,
+    options: PlanOptions,
+    report: Callable[[str], None],
+) -> PlannedLink:
+    steps = (*link.steps, *follows)
+    phases, curves = make_phases(problem, steps), list[Curve]()
+    if not link.in_cell:
+        phases[0], curve = _aim(phases[0], z, link)
+        curves.append(curve)
+    own = replace(problem, start=z, phases=tuple(phases), goals=())
+    count = len(phases) - len(follows)
+    none = list[float | None]([None] * len(phases))
+    made = Planning(own, tuple(curves), options, (), none, none, sketches=True)
+    for part in split_blocks(own):
+        if part[0].index >= count:
+            break
+        begun = None
+        if measured and (part[0].end is not End.REST or part[0].index == count - 1):
+            start = made.blocks[-1].end if made.blocks else z
+            begun = BlockPlan(part, start, BEGUN, None, [], list(measured.begun), None)
+        with name_source(problem.source):
+            made = plan_next(made, 0, begun, report)
+    return PlannedLink(tuple(phases[:count]), made.blocks)
+
+
+def _aim(phase: Phase, z: Array, link: Link) -> tuple[Phase, Curve]:
+    """The phase of a border's link from `z`, so that it ends where the link does, and its curve.
+
+    A contact may be gained both ways along a border; x or phi tells which is meant.
+    """
+    try:
+        curve = trace_phase(phase, z)
+        length = link.stop.scene.scales.length
+        off = np.abs((curve.end - link.stop.z) / [length, length, 1, 1, 1]).max()
+        if off <= OFF:
+            return phase, curve
+    except InputError:
+        pass
+    until = point_out(phase.formation.contacts, link.stop.z)
+    other = replace(phase, until=until)
+    return other, trace_phase(other, z)
