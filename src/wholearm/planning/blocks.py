@@ -29,10 +29,9 @@ from ..problem.definition import Phase, Problem
 from ..results.trajectory import Motion
 from ..scene.model import Scene
 from ..solvers.statistics import charge
+from .ahead import look_ahead
 from .block_plan import BEGUN, FINEST, PLAIN, BlockPlan, Planning
 from .durations import share_again, share_duration
-from .lower_bound.lower_bound import look_along
-from .lower_bound.sweep import NoMotionError
 from .motors import require_steps
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence
@@ -47,8 +46,6 @@ COARSE = 80
 """Intervals along a curve that refining doubles where none are asked for."""
 AMPLE = 1.1
 """Ratio to the least normal force of other phases from which on more decides nothing."""
-SKETCH = 24
-"""Intervals on which what follows a block is looked at where it is only sketched."""
 MOVED = 1e-9
 """Distance from which on a block starts somewhere else, in radii of gyration or radians."""
 APART = 1e-6
@@ -296,38 +293,7 @@ def _plan_block(
 def _look_ahead(
     planning: Planning, block: Sequence[Phase], options: PlanOptions
 ) -> CostToGo | None:
-    """What follows a block in the time domain, if that decides where on a curve it should end."""
-    problem = planning.problem
-    index = block[-1].index + 1
-    if runs_along_curves(block, options) or index == len(problem.phases):
-        return None
-    phase, ending = problem.phases[index], block[-1]
-    until = ending.until.contact
-    gained = set(phase.formation.contacts) - set(ending.formation.contacts)
-    following = next(own for own in split_blocks(problem) if own[0] is phase)
-    if (
-        options.goal is Objective.MARGIN
-        or until is None
-        or ending.until.pins
-        or gained != {until}
-        or not runs_along_curves(following, options)
-    ):
-        return None
-
-    def value(z: Array) -> float:
-        if planning.sketches and options.goal is Objective.TIME:
-            return _sketch(phase, z, problem.epsilon)
-        return sum(plan.value for plan in _plan_block(planning, following, z, options)[0])
-
-    return CostToGo(phase, value)
-
-
-def _sketch(phase: Phase, z: Array, epsilon: float) -> float:
-    """About the least time of a phase along its curve from `z` [s]."""
-    try:
-        return look_along((trace_phase(phase, z),), epsilon, SKETCH).duration
-    except NoMotionError:
-        raise SolverError(f"phase {phase.number}: no motion keeps the limits") from None
+    return look_ahead(planning, block, options, _plan_block)
 
 
 def _require_margin(planning: Planning) -> Planning:

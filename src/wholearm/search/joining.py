@@ -180,7 +180,9 @@ def _keep_link(
     report: Callable[[str], None],
 ) -> PlannedLink | str:
     """The plan of a link from `z`, made now, from what is begun, if it is not kept."""
-    follows = ahead.steps[:1] if link.in_cell and ahead and not ahead.in_cell else ()
+    # Where a link lands, the next one goes on along a border, looked at as if it stopped there.
+    lands = link.in_cell and ahead is not None and not ahead.in_cell
+    follows = (ahead.steps[0]._replace(end=End.REST),) if ahead is not None and lands else ()
     place, own = key_configuration(problem.scene, z), repr(replace(options, samples=2))
     key = (place, key_steps(link.steps), key_steps(follows), begun is None, own)
     if key not in kept:
@@ -205,7 +207,7 @@ def _plan_link(
 ) -> PlannedLink:
     steps = (*link.steps, *follows)
     phases, curves = make_phases(problem, steps), list[Curve]()
-    if not link.in_cell:
+    if not link.in_cell and len(phases) == 1:
         phases[0], curve = _aim(phases[0], z, link)
         curves.append(curve)
     own = replace(problem, start=z, phases=tuple(phases), goals=())
