@@ -26,12 +26,14 @@ from ..common.errors import InfeasibleError, WholearmError
 from ..planning.options import PlanOptions
 from ..planning.result import Plan
 from ..problem.definition import Problem
-from ..search.candidates import Candidate, make_candidate, measure_link, plan_candidate
+from ..search.candidates import Candidate, make_candidate, plan_candidate
 from ..search.chart import Chart
 from ..search.find import Route
 from ..search.goals import is_at
-from ..search.links import Link, Measured
+from ..search.links import Link
+from ..search.measure import Measured
 from ..search.places import Key, Place, make_place
+from ..search.polishing import Polisher
 from ..search.route import find_route, forget_charts
 from .queries import Query, draw_query
 
@@ -164,7 +166,7 @@ def enumerate_routes(
             break
         new = [own for own in route.links if own.in_cell and own not in chart.measured]
         for link in new:
-            chart.measured[link] = measure_link(problem, link, link.steps, options)
+            chart.measured[link] = Polisher(problem, chart, options).measure(link)
             record["planned"] += 1
         if new:
             continue
