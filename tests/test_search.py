@@ -26,6 +26,7 @@ from wholearm.search.find import Route, Search
 from wholearm.search.places import make_place
 from wholearm.search.result import describe_block
 from wholearm.search.route import find_route
+from wholearm.search.store import load_chart, require_folder, store_chart
 from wholearm.verification.verify import verify
 
 TABLE = {k: v for k, v in tomllib.loads(HEPTAGON.read_text()).items() if k != "phases"}
@@ -116,6 +117,26 @@ def test_a_problem_with_a_goal_is_planned() -> None:
     phases = tomllib.loads(answer.to_text())["phases"]
     again = build_problem({**TABLE, "phases": phases})
     assert again.phases[0].until == answer.problem.phases[0].until
+
+
+def test_charts_are_kept_in_files(tmp_path: Path) -> None:
+    _, route = to_edge_6()
+    folder = tmp_path / "new"
+    require_folder(folder)
+    store_chart(folder, "one", chart())
+    known = load_chart(folder, "one")
+    assert known is not None and load_chart(folder, "other") is None
+    problem = problem_of(HEPTAGON)
+    own = Search(known, make_place(problem.scene, problem.start), Goal(flush=6))
+    again = next(own.run())
+    assert again.signature == route.signature and again.duration == route.duration
+    (file,) = folder.iterdir()
+    written = file.read_bytes()
+    for damaged in (b"", written[:-1], written[:40] + b"x" + written[41:]):
+        file.write_bytes(damaged)
+        assert load_chart(folder, "one") is None
+    with pytest.raises(InputError, match="--cache"):
+        require_folder(file)
 
 
 def test_what_blocks_is_said() -> None:

@@ -1,7 +1,8 @@
 """Seeded queries from pose to pose: which are solved, how fast, and how near to the bound.
 
-``python -m wholearm.benchmark.queries [--queries 250] [--seed 0] [--jobs 2] [-o FILE.md]`` prints a
-line for each query and a table. A query has a start and a goal, each an edge on the palm and an x
+``python -m wholearm.benchmark.queries [--queries 250] [--seed 0] [--jobs 2] [--records FILE.jsonl]
+[-o FILE.md]`` prints a line for each query and a table. With a file of records the study goes on
+where it was stopped. A query has a start and a goal, each an edge on the palm and an x
 at which both fingers close on the object, drawn at random for the shipped scenes and for random
 polygons in the hexagon's hand. Each query is asked twice: first of a scene that nothing is known
 of, then again from the other end of the same border, with what is known.
@@ -10,6 +11,7 @@ of, then again from the other end of the same border, with what is known.
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import time
 from collections import Counter
@@ -177,6 +179,24 @@ def summarise(outcomes: Sequence[Outcome]) -> str:
     return "\n".join(lines)
 
 
+def read_records(path: Path | None, seed: int) -> dict[int, Outcome]:
+    """What is known of queries, by their numbers, from a file of records."""
+    if path is None or not path.exists():
+        return {}
+    lines = (json.loads(line) for line in path.read_text(encoding="utf-8").splitlines())
+    return {own["number"]: Outcome(*own["outcome"]) for own in lines if own["seed"] == seed}
+
+
+def _keep(path: Path | None, query: Query, outcome: Outcome) -> None:
+    """Add a query to a file of records, and print a line about it."""
+    line = f"{query.number} {outcome.scene}: {outcome.kind}, {outcome.seconds:.2f} s, then"
+    print(f"{line} {outcome.second:.2f} s: {outcome.text[:160]}", flush=True)
+    if path is not None:
+        record = {"seed": query.seed, "number": query.number, "outcome": list(outcome)}
+        with path.open("a", encoding="utf-8") as stream:
+            stream.write(f"{json.dumps(record)}\n")
+
+
 def main() -> int:
     """Print a line for each query and tables; the exit status is 1 if a plan fails."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -185,24 +205,25 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="number of the first query")
     parser.add_argument("--problems", type=Path, default=Path("problems"), help="folder of scenes")
     parser.add_argument("--jobs", type=int, default=1, help="worker processes")
+    parser.add_argument("--records", type=Path, help="JSON lines that the study goes on with")
     parser.add_argument("-o", "--output", type=Path, help="file for the tables")
     options = parser.parse_args()
     numbers = range(options.first, options.first + options.queries)
-    tasks = [Query(options.seed, number, options.problems) for number in numbers]
-    outcomes = []
+    known = read_records(options.records, options.seed)
+    outcomes = {number: known[number] for number in numbers if number in known}
+    tasks = [Query(options.seed, own, options.problems) for own in numbers if own not in known]
     for answer in run_tasks(run_query, tasks, options.jobs, 2 * BOUND):
         own = answer.result
         if answer.ended != "done":
             own = Outcome("", "no answer", answer.seconds, np.nan, np.nan, str(own)[-300:])
-        outcomes.append(own)
-        line = f"{answer.task.number} {own.scene}: {own.kind}, {own.seconds:.2f} s, then"
-        print(f"{line} {own.second:.2f} s: {own.text[:160]}", flush=True)
-    tables = summarise(outcomes)
+        outcomes[answer.task.number] = own
+        _keep(options.records, answer.task, own)
+    tables = summarise(list(outcomes.values()))
     print(tables)
     if options.output is not None:
         heading = f"# From pose to pose: {len(outcomes)} queries, seed {options.seed}\n\n"
         write_whole(options.output, lambda stream: stream.write(f"{heading}{tables}\n".encode()))
-    return int(any(own.kind == "plan that fails" for own in outcomes))
+    return int(any(own.kind == "plan that fails" for own in outcomes.values()))
 
 
 if __name__ == "__main__":

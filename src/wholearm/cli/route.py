@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .progress import clear_progress, show_progress
@@ -24,6 +25,9 @@ def add_route(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--alternatives", metavar="N", type=int, default=0, help=text)
     text = "of the plans: time, effort or margin (time); routes are looked for by time"
     parser.add_argument("--objective", default="time", help=text)
+    text = "folder to keep what is found out of the scene, for later searches (none); nobody else "
+    text += "may write there"
+    parser.add_argument("--cache", metavar="DIR", help=text)
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
 
 
@@ -43,7 +47,8 @@ def route(options: argparse.Namespace) -> int:
         plots.require_format(options.output)
         require_writable(options.output)
     problem = read_problem(options.problem)
-    answer = find(problem, PlanOptions(objective=options.objective), options.alternatives)
+    own = PlanOptions(objective=options.objective)
+    answer = find(problem, own, options.alternatives, options.cache)
     clear_progress()
     print(json.dumps(answer.to_dict(), indent=2) if options.json else answer.to_text(), end="")
     if options.json:
@@ -54,13 +59,16 @@ def route(options: argparse.Namespace) -> int:
     return 0
 
 
-def find(problem: Problem, options: PlanOptions, alternatives: int = 0) -> Answer:
+def find(
+    problem: Problem, options: PlanOptions, alternatives: int = 0, cache: str | None = None
+) -> Answer:
     """Find a route, with a progress line."""
     from ..common.errors import WholearmError
     from ..search.route import find_route_with
 
     try:
-        return find_route_with(problem, options, alternatives, show_progress())
+        folder = None if cache is None else Path(cache)
+        return find_route_with(problem, options, alternatives, show_progress(), folder)
     except WholearmError:
         clear_progress()
         raise

@@ -218,7 +218,11 @@ def _plan_link(
         if part[0].index >= count:
             break
         begun = None
-        if measured and (part[0].end is not End.REST or part[0].index == count - 1):
+        if (
+            measured
+            and measured.begun
+            and (part[0].end is not End.REST or part[0].index == count - 1)
+        ):
             start = made.blocks[-1].end if made.blocks else z
             begun = BlockPlan(part, start, BEGUN, None, [], list(measured.begun), None)
         with name_source(problem.source):

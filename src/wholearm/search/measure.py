@@ -39,11 +39,15 @@ class Measured(NamedTuple):
         Its phases, in the way that was planned.
     begun : list of PhasePlan
         Plans of those in the cell, and of the border that is left in motion, on few intervals.
+        Copies and files are without them, as they hold the solver.
     """
 
     duration: float
     steps: tuple[Step, ...]
     begun: list[PhasePlan[TimeMotion]]
+
+    def __reduce__(self) -> tuple[type[Measured], tuple[float, tuple[Step, ...], list[object]]]:
+        return Measured, (self.duration, self.steps, [])
 
 
 def make_phases(problem: Problem, steps: Sequence[Step], index: int = 0) -> list[Phase]:

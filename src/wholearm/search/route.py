@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import OrderedDict
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from ..common.errors import InfeasibleError, InputError
@@ -22,6 +23,7 @@ from .find import Route, Search
 from .goals import is_at
 from .places import make_place
 from .result import Alternative, Answer, describe_block, list_blocked
+from .store import load_chart, require_folder, store_chart
 
 CHARTS = 4
 """Scenes whose charts are kept."""
@@ -34,6 +36,7 @@ def find_route(
     *,
     alternatives: int = 0,
     progress: Callable[[str], None] | None = None,
+    cache: str | Path | None = None,
     **options: Any,
 ) -> Answer:
     """Find the contact formations that lead from a problem's start to its goals, and a plan.
@@ -48,6 +51,9 @@ def find_route(
         How many routes of other formations are planned beside the best one.
     progress : callable, optional
         Told in a few words what is being done.
+    cache : path-like, optional
+        Folder where what is known of the scene is kept, for other processes. Its files are pickles:
+        it has to be one that nobody else writes to.
     **options
         As `wholearm.solve` takes them.
 
@@ -58,9 +64,9 @@ def find_route(
     InfeasibleError
         If nothing leads to a goal; names what blocks the way.
     """
-    return find_route_with(
-        problem, PlanOptions(objective=objective, **options), alternatives, progress
-    )
+    own = PlanOptions(objective=objective, **options)
+    folder = None if cache is None else Path(cache)
+    return find_route_with(problem, own, alternatives, progress, folder)
 
 
 @exclusive
@@ -69,12 +75,15 @@ def find_route_with(
     options: PlanOptions,
     alternatives: int = 0,
     progress: Callable[[str], None] | None = None,
+    cache: Path | None = None,
 ) -> Answer:
     """Find a route with `options` given as one object; see `find_route`."""
     if not problem.goals:
         raise InputError(problem.source, "goal", "is missing; allowed is flush or phi_deg, and x")
     report = progress or (lambda _: None)
-    chart, before = get_chart(problem, options), list[Route]()
+    if cache is not None:
+        require_folder(cache)
+    chart, before = get_chart(problem, options, cache), list[Route]()
     for index, goal in enumerate(problem.goals):
         start = problem.start if not before else before[-1].links[-1].stop.z
         place = make_place(problem.scene, start)
@@ -85,14 +94,24 @@ def find_route_with(
         wanted = alternatives if index + 1 == len(problem.goals) else 0
         answer = _choose(problem, before, search, options, wanted, report)
         before = [*before, answer.route]
+    if cache is not None:
+        store_chart(cache, key_chart(problem, options), chart)
     return answer
 
 
-def get_chart(problem: Problem, options: PlanOptions) -> Chart:
-    """The chart of a problem's scene, kept from one search to the next."""
+def key_chart(problem: Problem, options: PlanOptions) -> str:
+    """What a chart depends on, in words."""
     known = describe_scene(problem.scene) | {"": (problem.epsilon, options.least_minor)}
-    key = json.dumps(known, sort_keys=True)
-    chart = _charts.pop(key, None) or Chart(problem, options.least_minor)
+    return json.dumps(known, sort_keys=True)
+
+
+def get_chart(problem: Problem, options: PlanOptions, cache: Path | None = None) -> Chart:
+    """The chart of a problem's scene, kept from one search to the next, in a folder if asked."""
+    key = key_chart(problem, options)
+    chart = _charts.pop(key, None)
+    if chart is None and cache is not None:
+        chart = load_chart(cache, key)
+    chart = chart or Chart(problem, options.least_minor)
     _charts[key] = chart
     while len(_charts) > CHARTS:
         _charts.popitem(last=False)
