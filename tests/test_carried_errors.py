@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import combinations
-
 import numpy as np
 import pytest
 
@@ -11,12 +9,14 @@ from shipped import HEPTAGON, solved
 from wholearm.benchmark import carried
 from wholearm.contacts.formation import Formation
 from wholearm.free_simulation.simulate import simulate_free
-from wholearm.mechanics.arrival import Standstill
+from wholearm.mechanics.arrival import Standstill, find_opening
 from wholearm.mechanics.wedging import find_static_torques
 from wholearm.planning.path_domain.motion import PathMotion
 from wholearm.planning.settling import list_touching
 from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.closing import close_contacts
+from wholearm.simulation.starting import RestDirection
+from wholearm.simulation.sticking import find_rest
 
 
 @pytest.mark.parametrize("number", [3, 5])
@@ -45,21 +45,24 @@ def test_the_least_growth_is_no_more_than_a_plan_s(monkeypatch: pytest.MonkeyPat
     assert 0 < least < 1.02 * carried.measure_growth(motion)
 
 
-def test_torques_that_leave_nothing_open_are_found() -> None:
-    """By the polygons themselves, at torques all over the first."""
+def test_no_torques_that_hold_close_a_contact_sooner() -> None:
+    """By the simulator's rows at rest, which are set up on their own, at torques all over."""
     plan = solved(HEPTAGON)
-    problem, rng = plan.problem, np.random.default_rng(5)
-    for phase in problem.phases[:1]:
-        z = plan.trajectory.motions[phase.index].curve.end  # type: ignore[attr-defined]
-        touching = list_touching(problem, phase)
-        place = Standstill(z, phase.formation, phase.until.contact, touching)
-        most = carried.find_clearance(place, problem.epsilon)
-        tau = rng.uniform(-1.0, 1.0, (20000, 2)) * problem.scene.torque_limit
-        tau = tau[find_static_torques([touching], z, problem.epsilon).measure(tau) <= 0]
-        stuck = [
-            find_static_torques([Formation(problem.scene, kept)], z).measure(tau)
-            for kept in combinations(touching.contacts, 4)
-        ]
-        found = float(np.min([own for own in stuck if np.isfinite(own).all()], axis=0).max())
-        assert len(tau) > 500 and found <= most + 1e-12
-        assert most - found < 0.3 * problem.scene.scales.torque
+    problem, rng, gap = plan.problem, np.random.default_rng(5), 1e-4
+    phase, motion = problem.phases[0], plan.trajectory.motions[0]
+    assert isinstance(motion, PathMotion) and phase.until.contact is not None
+    touching, end = list_touching(problem, phase), motion.curve.end
+    place = Standstill(end, phase.formation, phase.until.contact, touching)
+    least = carried.find_least_closing(place, problem.epsilon, gap)
+    opening = find_opening(place)
+    assert opening is not None
+    z = close_contacts(phase.formation, end + gap * opening)
+    normal = Formation(problem.scene, (phase.until.contact,)).evaluate(z[None], np.zeros((1, 5))).A
+    ways = [way for way in find_rest(phase.formation, z).ways if isinstance(way, RestDirection)]
+    way = next(way for way in ways if normal[0, 0] @ way.heading < 0)
+    held = find_static_torques([touching], end, problem.epsilon)
+    tau = rng.uniform(-1.0, 1.0, (20000, 2)) * problem.scene.torque_limit
+    tau = tau[held.measure(tau) <= 0]
+    swiftest = max(way.drive(own) for own in tau) * -float(normal[0, 0] @ way.heading)
+    assert len(tau) > 500
+    assert 0.8 < least / np.sqrt(2 * gap / swiftest) < 1.01
