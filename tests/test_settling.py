@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +24,8 @@ from wholearm.planning import shares
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.result import Plan
 from wholearm.planning.saved import load_plan, write_meta
-from wholearm.planning.settling import list_touching, settle_plans
+from wholearm.planning.settling import End, list_touching, settle_plans
+from wholearm.planning.stops import Plans
 from wholearm.problem.definition import Problem
 from wholearm.problem.read import place_start
 from wholearm.results.torque import TorqueProfile
@@ -139,22 +141,28 @@ def test_shares_are_those_of_the_way_that_ends_best(monkeypatch: pytest.MonkeyPa
     problem = plain.problem.with_({"settle": "10 %", "phases[3].settle": 0.002})
     motions = plain.trajectory.motions
     plans = [PhasePlan(motion, plain.trajectory.torque, 0.0) for motion in motions]
-    tried = list[list[float]]()
+    tried, chosen = list[list[float]](), list[Sequence[End | None]]()
 
-    def measure(*given: object) -> float:
-        tried.append(given[2])  # type: ignore[arg-type]
-        return problem.gap * (3.0, 2.9, 1.0, 0.9, 2.0)[len(tried) - 1]
+    def measure(_: Problem, __: Plans, ends: Sequence[End | None]) -> float:
+        tried.append([0.0 if end is None else end.time for end in ends])
+        chosen.append(ends)
+        return problem.gap * (4.0, 3.9, 1.2, 1.1, 2.0, last)[len(tried) - 1]
 
-    monkeypatch.setattr(shares, "measure_times", measure)
-    times = shares.share_time(problem, plans)
-    assert len(tried) == len(shares.WAYS) and times == tried[2]
+    monkeypatch.setattr(shares, "measure_off", measure)
+    last = 1.2
+    assert shares.share_time(problem, plans) == chosen[2]
+    assert len(tried) == len(shares.WAYS)
+    for way, ends in zip(shares.WAYS, chosen, strict=True):
+        for end in (end for end in ends if end is not None):
+            assert end.firm == way.firm and end.hold is not None
+            assert not (way.firm and end.hold.speed)
     for own in tried:
         assert own[2] == 0.002
         assert sum(own) == pytest.approx(0.002 + 0.1 * plain.duration, rel=1e-12)
     first, second, _, fourth, fifth = tried[0]
     assert first == pytest.approx(2 * second) and second == pytest.approx(fourth)
     assert fifth == pytest.approx(shares.STOP * fourth)
-    assert tried[4][0] == 0
+    assert tried[1][0] == 0
 
 
 def test_a_start_is_moved_with_its_fingers_closed() -> None:

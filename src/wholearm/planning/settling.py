@@ -40,11 +40,14 @@ class End(NamedTuple):
     time : float, [s]
     hold : Hold or None
         None if no torques hold it.
+    firm : bool
+        Whether they are the firmest ones, whether or not they drive on what is still open.
     """
 
     place: Standstill
     time: float
     hold: Hold | None
+    firm: bool
 
 
 class _Trial(NamedTuple):
@@ -67,10 +70,9 @@ def settle_plans(problem: Problem, plans: Plans) -> Settled:
     if problem.settle_share:
         from .shares import share_time
 
-        times = share_time(problem, plans)
+        ends = share_time(problem, plans)
     else:
-        times = [problem.settles(phase) or 0.0 for phase in problem.phases]
-    ends = find_ends(problem, plans, times)
+        ends = find_ends(problem, plans, [problem.settles(own) or 0.0 for own in problem.phases])
     numbered = zip(problem.phases, ends, strict=True)
     settlings = [None if end is None else _describe(problem, phase, end) for phase, end in numbered]
     return Settled(hold_plans(plans, ends), tuple(settlings))
@@ -87,13 +89,17 @@ def find_places(problem: Problem, plans: Plans) -> list[Standstill | None]:
     return found
 
 
-def find_ends(problem: Problem, plans: Plans, times: Sequence[float]) -> list[End | None]:
+def find_ends(
+    problem: Problem, plans: Plans, times: Sequence[float], firm: bool = False
+) -> list[End | None]:
     """Torques for ends at rest that are held for some time [s]; None for all others."""
     found = list[End | None]()
     for place, time in zip(find_places(problem, plans), times, strict=True):
-        held = place is not None and time > 0
-        hold = find_hold(place, problem.epsilon, problem.gap, time) if place and held else None
-        found.append(End(place, time, hold) if place and held else None)
+        if place is None or time <= 0:
+            found.append(None)
+            continue
+        goal = place._replace(gained=None) if firm else place
+        found.append(End(place, time, find_hold(goal, problem.epsilon, problem.gap, time), firm))
     return found
 
 
@@ -111,7 +117,7 @@ def _hold(plan: PhasePlan[Motion], end: End | None) -> PhasePlan[Motion]:
 
 
 def _describe(problem: Problem, phase: Phase, end: End) -> Settling:
-    place, time, hold = end
+    place, time, hold, firm = end
     if hold is None:
         text = f"no torques hold {' '.join(place.touching.names)} at the end of phase"
         warning = f"{text} {phase.number} with c_n >= epsilon"
@@ -129,7 +135,7 @@ def _describe(problem: Problem, phase: Phase, end: End) -> Settling:
         left=trial.left,
         speed=hold.speed,
         parts=hold.parts,
-        warning="" if hold.speed else f"no torques {text} would drive it on to {name}",
+        warning="" if hold.speed or firm else f"no torques {text} would drive it on to {name}",
     )
 
 

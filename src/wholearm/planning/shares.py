@@ -21,7 +21,7 @@ from ..free_simulation.simulate import simulate_free
 from ..mechanics.arrival import find_opening
 from ..problem.definition import Problem
 from ..results.torque import TorqueProfile
-from .settling import find_ends, find_places, hold_plans
+from .settling import End, find_ends, find_places, hold_plans
 from .stops import Plans, end_of
 
 
@@ -36,36 +36,44 @@ class Way(NamedTuple):
         What they have.
     last : float
         What the plan's last end has.
+    firm : bool
+        Whether torques are the firmest ones, whether or not they drive on what is still open.
     """
 
     first: int
     more: float
     last: float
+    firm: bool = False
 
 
-WAYS = (Way(1, 2.0, 1.0), Way(2, 3.5, 1.0), Way(2, 2.0, 1.0), Way(2, 2.0, 0.0), Way(1, 0.0, 0.0))
-"""Ways to share that are tried, the first one first."""
+WAYS = (
+    Way(1, 2.0, 1.0, firm=True),
+    Way(1, 0.0, 0.0, firm=True),
+    Way(1, 2.0, 1.0),
+    Way(2, 3.5, 1.0),
+    Way(2, 2.0, 1.0),
+    Way(1, 0.0, 0.0),
+)
+"""Ways to share that are tried, in this order, until a plan ends no farther off than its start."""
 STOP = 0.06
 """Time for an end where nothing has to close, over that for a contact."""
-ENOUGH = 0.5
-"""How far off a plan may end that needs no other way to share, over how far its start was."""
 BETTER = 0.8
 """How far off another way's end may be to be better, over that of the best one before."""
 
 
-def share_time(problem: Problem, plans: Plans) -> list[float]:
-    """For how long each end is held [s]: the way to share that ends best is taken.
+def share_time(problem: Problem, plans: Plans) -> list[End | None]:
+    """How each end is held: the way to share time that ends best is taken.
 
-    The one whose plan's end is least far off, at most, simulated by the clock from the exact start
-    and from starts moved along the palm by `problem.gap` to either side.
+    The first one whose plan's end is no farther off than `problem.gap`, simulated by the clock from
+    the exact start and from starts moved along the palm by that to either side, or the best one.
     """
-    best, least = list[float](), math.inf
+    best, least = list[End | None](), math.inf
     for way in WAYS:
-        times = _share(problem, plans, way)
-        off = measure_times(problem, plans, times) if any(times) else 0.0
+        ends = find_ends(problem, plans, _share(problem, plans, way), way.firm)
+        off = measure_off(problem, plans, ends) if any(ends) else 0.0
         if not best or off < BETTER * least:
-            best, least = times, off
-        if least <= ENOUGH * problem.gap:
+            best, least = ends, off
+        if least <= problem.gap:
             break
     return best
 
@@ -87,10 +95,9 @@ def _share(problem: Problem, plans: Plans, way: Way) -> list[float]:
     return [own if time is None else time for own, time in zip(shares.tolist(), times, strict=True)]
 
 
-def measure_times(problem: Problem, plans: Plans, times: Sequence[float]) -> float:
-    """How far off the end is at most [m], turns counting by the scene's length."""
-    held = hold_plans(plans, find_ends(problem, plans, times))
-    torque = TorqueProfile.chain([plan.torque for plan in held])
+def measure_off(problem: Problem, plans: Plans, ends: Sequence[End | None]) -> float:
+    """How far off plans end at most [m] with ends held, turns counting by the scene's length."""
+    torque = TorqueProfile.chain([plan.torque for plan in hold_plans(plans, ends)])
     goal, length = end_of(plans[-1])[0], problem.scene.scales.length
     most = 0.0
     for off in (0.0, problem.gap, -problem.gap):
