@@ -147,9 +147,10 @@ def list_policies(
 
 
 class Count(NamedTuple):
-    """What is counted: samples, processes, and the folder where records are kept, if they are."""
+    """Samples of a phase and of a whole plan, processes, and the folder of records, if any."""
 
     samples: int
+    whole: int
     jobs: int
     records: Path | None
 
@@ -159,14 +160,15 @@ def list_samples(
 ) -> Iterator[str]:
     """Rows of the second table: of each phase, and with a policy of the whole plan."""
     whole = [] if policy is None else [None]
-    for phase in [*whole, *(own.number for own in problem.phases)]:
+    for phase in [*(own.number for own in problem.phases), *whole]:
+        samples = count.whole if phase is None else count.samples
         ranges = RANGES | ({} if phase in (None, 1) else {"start_x": 0.0})
         text = "all" if phase is None else str(phase)
-        file = "_".join(re.findall(r"\w+", f"{name} {text} {count.samples}")) + ".jsonl"
+        file = "_".join(re.findall(r"\w+", f"{name} {text} {samples}")) + ".jsonl"
         found = assess_robustness(
             problem,
             plan.trajectory,
-            samples=count.samples,
+            samples=samples,
             seed=SEED,
             uncertainty=Uncertainty(ranges, None),
             phase=phase,
@@ -186,7 +188,9 @@ def main() -> int:
     parser.add_argument("problems", nargs="+", type=Path, help="problem files")
     text = "of each phase by the policy of the robust plan"
     parser.add_argument("--samples", type=int, default=200, help=text)
-    text = "of each phase otherwise"
+    text = "of the whole plan by the policy of the robust plan"
+    parser.add_argument("--whole", type=int, default=200, help=text)
+    text = "of each phase otherwise, and of the whole plan"
     parser.add_argument("--compared", type=int, default=50, help=text)
     parser.add_argument("--jobs", type=int, default=1)
     text = "folder of records: what was interrupted goes on where it was"
@@ -219,12 +223,12 @@ def main() -> int:
     lines[-1] += f", seed {SEED}"
     lines += ["", "| plan | phase | goal reached | and contacts kept | lost first |"]
     lines += ["|---|---:|---|---|---|"]
-    many = Count(options.samples, options.jobs, options.records)
+    many = Count(options.samples, options.whole, options.jobs, options.records)
+    few = many._replace(samples=options.compared, whole=options.compared)
     for k, (text, name, policy) in enumerate(policies):
-        count = many if k == 0 else many._replace(samples=options.compared)
+        count = many if k == 0 else few
         for row in list_samples(problem, plans[name], text, policy, count):
             add(row)
-    few = many._replace(samples=options.compared)
     for name, plan in plans.items():
         for row in list_samples(problem, plan, name, None, few):
             add(row)

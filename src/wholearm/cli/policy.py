@@ -73,6 +73,11 @@ def _policy(options: argparse.Namespace) -> int:
         rows.append([str(own["number"]), *times, share, ", ".join(kept)])
     header = ["phase", "plan [s]", "policy [s]", "reserve", "least of each contact"]
     print("\n".join(align(header, rows, {4})))
+    parts = {own["number"]: own["share"] for own in policy.about["phases"] if "reserves" in own}
+    if "ranges" in policy.about and parts:
+        short = [f"{part:.2f} of them in phase {k}" for k, part in parts.items() if part < 1]
+        text = f"contacts are kept within {policy.about['reserve']:g} times the plan's ranges"
+        print(f"{text}, {', '.join(short)}" if short else text)
     if largest := policy.about.get("largest"):
         factors = ", ".join(f"{factor:.3g}" for factor in largest.values())
         text = f"a policy exists for ranges {min(largest.values()):.3g} times as wide as the plan's"

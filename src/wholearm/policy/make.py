@@ -118,7 +118,10 @@ def make_policy(
             found[-1]["duration"] += DWELL + delay
         about += found
     whole = sum(own["duration"] for own in about)
-    return Policy(tables, pace, {"name": problem.name, "duration": whole, "phases": about})
+    known: dict[str, Any] = {"name": problem.name, "duration": whole, "phases": about}
+    if ranges is not None and reserve:
+        known.update(ranges=dict(ranges), reserve=reserve)
+    return Policy(tables, pace, known)
 
 
 def split(phases: Sequence[Phase]) -> list[tuple[Phase, ...]]:

@@ -23,7 +23,7 @@ from .retime import Reach, retime
 
 ROUNDS = 3
 """How many times worst corners and motion are found from one another."""
-KEPT = 1.5
+KEPT = 1.3
 """Reserve of forces of the reference, in units: feedback may use what is above one."""
 ENOUGH = 0.5
 """Part of these reserves without which ranges are too wide."""
@@ -32,6 +32,8 @@ LESS, CLOSE, NONE = 0.8, 0.03, 0.02
 part of them that is as good as none."""
 WIDEST = 0.9
 """Largest relative range."""
+WIDER = 1.01
+"""Least width of a reversal, over the distance to the next node."""
 STEP = 1e-4
 """Step of differences along a curve, over its length."""
 AUTHORITY = 2.0
@@ -107,7 +109,9 @@ def find_within(
 ) -> Within:
     """Limits along a curve within ranges, with forces of at least so much [N]."""
     formation, point = curve.formation, curve.evaluate(s)
-    mean, *sides = turn(curve, s, speed * NEAR)
+    # Between nodes limits are mixed: those next to a reversal have to know both directions.
+    gaps = np.pad(np.diff(s), 1)
+    mean, *sides = turn(curve, s, np.maximum(speed * NEAR, WIDER * np.maximum(gaps[1:], gaps[:-1])))
     late = s - (LATE + widths.get("delay", 0.0)) * speed
     asked, step = _find_torques(curve, s, mean), STEP * curve.length
     ends = (_find_torques(curve, s + way * step, mean) for way in (-1, 1))
