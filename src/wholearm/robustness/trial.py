@@ -28,6 +28,8 @@ ANGLE = math.radians(1.0)
 """How far from the planned angle [rad]."""
 PAUSE = 1e-3
 """Time for which a planned contact may be open, in the scene's unit of time, and still be kept."""
+CLOSING = 0.1
+"""Time, likewise, in which a contact that is open when its phase begins has to close for good."""
 SNAPSHOTS = 24
 """Poses of a motion that are kept for figures."""
 
@@ -186,9 +188,9 @@ class Trial:
         """The first planned contact that is lost, its phase and when, and the least c_n.
 
         A phase goes on from when the last one's contact was gained to when its own is, or to its
-        end by the clock.
+        end by the clock. Where a start is off, contacts are not closed yet, and are not lost so.
         """
-        pause = PAUSE * self.problem.scene.scales.time
+        unit = self.problem.scene.scales.time
         began, losses, least = self.windows[0].start, list[tuple[float, int, str]](), math.inf
         for window in self.windows:
             gains = [own.start for own in simulation.stretches if own.contact == window.gained]
@@ -202,7 +204,7 @@ class Trial:
             made = min((time for time in makes if time > began), default=gain)
             planned = window.stop + delay
             for name in window.contacts:
-                time, force = _find_loss(simulation, name, began, min(planned, gain, made), pause)
+                time, force = _find_loss(simulation, name, began, min(planned, gain, made), unit)
                 least = min(least, force)
                 if time is not None:
                     losses.append((time, window.phase, name))
@@ -219,7 +221,7 @@ class Trial:
 
 
 def _find_loss(
-    simulation: FreeSimulation, name: str, start: float, stop: float, pause: float
+    simulation: FreeSimulation, name: str, start: float, stop: float, unit: float
 ) -> tuple[float | None, float]:
     """When a contact opens for longer than a pause, None if it does not; and its least c_n."""
     column = simulation.contacts.index(name)
@@ -228,7 +230,9 @@ def _find_loss(
     known = c_n[here & (c_n == c_n)]
     least = float(known.min()) if len(known) else math.inf
     pauses = list_pauses(simulation.stretches, name, start, stop)
-    return next((first for first, after in pauses if after - first > pause), None), least
+    if pauses and pauses[0][0] <= start:
+        pauses = [own for own in pauses if own[1] > start + CLOSING * unit]
+    return next((first for first, after in pauses if after - first > PAUSE * unit), None), least
 
 
 def make_trial(
