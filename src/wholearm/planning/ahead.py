@@ -12,6 +12,7 @@ from ..problem.definition import Phase
 from .block_plan import Planning
 from .lower_bound.lower_bound import look_along
 from .lower_bound.sweep import NoMotionError
+from .motors import free_torques
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence
 from .splitting import runs_along_curves, split_blocks
@@ -28,8 +29,8 @@ def look_ahead(
     plan_block: Callable[..., tuple[Plans, ImpactSequence | None]],
 ) -> CostToGo | None:
     """What follows a block in the time domain, if that decides where on a curve it should end."""
-    problem = planning.problem
-    index = block[-1].index + 1
+    planning, options = free_torques(planning, options)
+    problem, index = planning.problem, block[-1].index + 1
     if runs_along_curves(block, options) or index == len(problem.phases):
         return None
     phase, ending = problem.phases[index], block[-1]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from ..common.errors import InputError
 from ..problem.definition import Problem
+from .block_plan import Planning
 from .options import PlanOptions
 
 
@@ -39,3 +41,17 @@ def require_steps(problem: Problem, options: PlanOptions) -> None:
         why = "torques that settle the end of a phase (settle) step; leave one of the two out"
     if why:
         raise InputError("", given[0][0], f"{given[0][1]:g} given; {why}")
+
+
+def free_torques(planning: Planning, options: PlanOptions) -> tuple[Planning, PlanOptions]:
+    """The same with motors that are quick, and torques that are not held.
+
+    How much more what follows a block costs from farther away is nearly the same, and known soon.
+    """
+    scene = planning.problem.scene
+    if scene.control_period:
+        options = replace(options, transcription="auto")
+    if scene.has_slow_motors or scene.control_period:
+        free = {"torque_rate_limit": None, "actuator_lag": None, "control_period": None}
+        planning = replace(planning, problem=planning.problem.with_(free))
+    return planning, options

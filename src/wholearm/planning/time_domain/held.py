@@ -21,13 +21,16 @@ from ...common.arrays import Array
 from .collocation import Scheme, make_scheme
 from .enforcing import enforce_between
 from .mesh import resample, with_controls
+from .modes import drop, link, merge
 from .search import Search, Solution
 from .stage import Stage, StagePoints
 
-_STRETCHES = (1.01, 1.03, 1.07, 1.15, 1.3, 1.6)
-"""Durations of phases with held torques to try, over those with free ones."""
-_PATIENCE = 120
+_TRIES = ((1.01, 2), (1.03, 2), (1.07, 3), (1.15, 4), (1.3, 6), (1.6, 8))
+"""Durations of phases with held torques to try, over those with free ones, and least periods."""
+_PATIENCE = 80
 """Most iterations of one solve."""
+_SLIVER = 0.5
+"""Duration of a stage, over a period, below which it is first left out."""
 _BRIEF = 1e-3
 """Share of a period below which it counts as nothing."""
 _SHORTER = 4
@@ -42,8 +45,11 @@ def hold_torques(search: Search, free: Solution) -> Solution:
     scene = search.problem.scene
     options, count = search.options, 2 if scene.control_hold == "linear" else 1
     held = replace(search, scheme=make_scheme(options.scheme, options.degree, count))
-    for stretch in _STRETCHES:
-        stages = cut_periods(free.stages, held.scheme, stretch)
+    whole = drop_brief(free.stages)
+    others = [free.stages] if len(whole) < len(free.stages) else []
+    tries = [(known, *own) for known in (whole, *others) for own in _TRIES]
+    for known, stretch, least in tries:
+        stages = cut_periods(known, held.scheme, stretch, least)
         solution = held.solve(stages, most=search.wait(_PATIENCE))
         if not solution.success:
             continue
@@ -89,13 +95,30 @@ def _drop_last(stage: Stage) -> Stage:
     return replace(stage, guess=guess, periods=stage.periods[:-1])
 
 
-def cut_periods(stages: Sequence[Stage], scheme: Scheme, stretch: float) -> list[Stage]:
-    """Stages whose intervals are periods, or parts of them, at a duration that is stretched."""
+def drop_brief(stages: Sequence[Stage]) -> list[Stage]:
+    """Stages without those that are much shorter than a period, as far as phases have others."""
+    left = list(stages)
+    for stage in stages:
+        if stage.guess.duration < _SLIVER * stage.formation.scene.control_period:
+            fewer = drop(left, left.index(stage))
+            left = left if fewer is None else fewer
+    return link(merge(left)) if len(left) < len(stages) else left
+
+
+def cut_periods(
+    stages: Sequence[Stage], scheme: Scheme, stretch: float, least: int = 1
+) -> list[Stage]:
+    """Stages whose intervals are periods, or parts of them, at a duration that is stretched.
+
+    From rest to rest they last at least as many periods as the `least` number, but for a half.
+    """
     cut = list[Stage]()
+    period = stages[0].formation.scene.control_period
+    whole = sum(stage.guess.duration for stage in stages)
+    stretch = max(stretch, (least - 0.5) * period / whole)
     for _, own in groupby(stages, key=lambda stage: stage.phase):
         start = 0.0
         for stage in own:
-            period = stage.formation.scene.control_period
             stop = start + stretch * stage.guess.duration
             cut.append(_cut(stage, scheme, (start, stop), period, stretch))
             start = stop
