@@ -163,10 +163,7 @@ def key_configuration(scene: Scene, z: Array) -> tuple[float, ...]:
 
 def key_steps(steps: Sequence[Step]) -> Key:
     """The same for phases that are the same."""
-    return tuple(
-        (tuple(c.name for c in own.contacts), str(own.until), own.until.value, own.end.value)
-        for own in steps
-    )
+    return tuple((tuple(c.name for c in own.contacts), own.until, own.end.value) for own in steps)
 
 
 def _keep_link(

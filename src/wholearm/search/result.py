@@ -104,7 +104,7 @@ class Answer:
             f"{plan.unit}, {plan.duration:.6f} s in all"
         ]
         if not self.complete:
-            lines.append("interrupted: the best route so far")
+            lines.append("the search ended early: the best route so far")
         if self.bound is not None:
             text = "no route along borders, with stops or impacts, takes less than {} s{}"
             ended = "" if self.bound.complete else " (the search for such routes ended early)"

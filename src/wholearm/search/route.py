@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..common.errors import InfeasibleError, InputError
 from ..common.interrupts import yielding
 from ..common.sharing import exclusive
@@ -148,6 +150,11 @@ def _choose(
             raise
         complete = False
         chooser.plan(1, report)
+    except np.linalg.LinAlgError:
+        # Contacts depend on each other at a place that the search came to.
+        complete = False
+        if not chooser.made:
+            chooser.plan(1, report)
     made, margin = chooser.made, options.goal is Objective.MARGIN
     if not made:
         advice = _advise(search, problem, options)
