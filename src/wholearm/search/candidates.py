@@ -9,7 +9,6 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError, WholearmError
-from ..contacts.formation import Formation
 from ..geometry.path_guess import find_end
 from ..planning.advice import unadvised
 from ..planning.options import PlanOptions
@@ -17,7 +16,7 @@ from ..planning.plan import solve_with
 from ..planning.result import Plan
 from ..problem.definition import Phase, Problem
 from .find import Route
-from .links import Blocked, Link, describe_steps, point_out
+from .links import Link, describe_steps, point_out
 from .measure import SINGULAR, Measured, make_phases
 
 
@@ -95,27 +94,12 @@ def _misses(end: Array, link: Link, last: bool) -> bool:
     return last and bool(np.abs((end - link.stop.z) / [length, length, 1, 1, 1]).max() > 1e-4)
 
 
-def explain_border(problem: Problem, blocked: Blocked, options: PlanOptions) -> str:
-    """What keeps a border from being followed, and what single change would let it be."""
-    (step,) = blocked.steps
-    phase = Phase(0, Formation(problem.scene, step.contacts), step.until)
-    own = replace(problem, start=blocked.start.z, phases=(phase,), goals=())
-    try:
-        solve_with(own, replace(options, replay=False))
-    except WholearmError as error:
-        return f"from {blocked.start} {error}"
-    except np.linalg.LinAlgError:
-        return f"from {blocked.start} {SINGULAR}"
-    return ""
-
-
 def plan_candidate(
     candidate: Candidate, options: PlanOptions, kept: dict[object, Plan | str]
 ) -> Plan | str:
     """The plan of a candidate, or why there is none; `kept` has those that were made before."""
     phases = tuple(
-        (phase.formation.names, str(phase.until), phase.until.value, phase.end)
-        for phase in candidate.problem.phases
+        (phase.formation.names, phase.until, phase.end) for phase in candidate.problem.phases
     )
     start = tuple(np.round(candidate.problem.start, 12).tolist())
     key = (start, phases, repr(options))

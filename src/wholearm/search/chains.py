@@ -65,7 +65,7 @@ class Chain:
         start, steps = self.borders[0].start, (*self.steps, last)
         ahead = look_at((*self.curves[:-1], curve), epsilon, least_minor)
         if isinstance(ahead, str):
-            return Blocked(start, steps, ahead)
+            return Blocked(start, steps, ahead, stop)
         return Link(start, stop, steps, ahead.duration, ahead.bound)
 
     def link_whole(self, epsilon: float, least_minor: float) -> Link | Blocked | None:

@@ -78,11 +78,13 @@ class Blocked(NamedTuple):
     start : Place
     steps : tuple of Step
     reason : str
+    stop : Place
     """
 
     start: Place
     steps: tuple[Step, ...]
     reason: str
+    stop: Place
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,7 +244,7 @@ def link_border(border: Border, epsilon: float, least_minor: float) -> Link | Bl
         return None
     steps = (Step(border.formation.contacts, Until(contact=border.gained)),)
     found = look_at((border.curve,), epsilon, least_minor)
-    if isinstance(found, str):
-        return Blocked(border.start, steps, found)
     stop = make_place(border.formation.scene, border.curve.end)
+    if isinstance(found, str):
+        return Blocked(border.start, steps, found, stop)
     return Link(border.start, stop, steps, found.duration, found.bound)

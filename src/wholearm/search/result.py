@@ -7,6 +7,7 @@ from typing import Any
 
 from ..contacts.formation import describe
 from ..mapping.walk import format_until
+from ..planning.options import Objective
 from ..planning.result import Plan
 from ..problem.definition import End, Problem
 from .bounds import BorderBound
@@ -14,6 +15,7 @@ from .candidates import Failure
 from .chains import LONGEST
 from .find import EAGER, Route, Search
 from .links import Blocked, describe_steps
+from .opening import list_cut
 
 LISTED = 6
 """Most reasons that a message names."""
@@ -79,9 +81,11 @@ class Answer:
     def gap(self) -> float | None:
         """How much longer the plan takes than the bound, over the bound.
 
-        None without a bound, and of a route through cells: the bound is of others.
+        None without a bound, of a route through cells, as the bound is of others, and of a plan
+        that is not of least time.
         """
-        if self.bound is None or self.bound.value <= 0 or self.route.in_cells:
+        timed = self.plan.options.goal is Objective.TIME
+        if self.bound is None or self.bound.value <= 0 or self.route.in_cells or not timed:
             return None
         return max(0.0, self.plan.duration / self.bound.value - 1.0)
 
@@ -153,23 +157,24 @@ def format_phases(problem: Problem) -> str:
     return "\n".join(lines)
 
 
-def list_blocked(search: Search) -> list[Blocked]:
-    """The ways that no motion can take, those nearest to the goal first."""
-    blocked = {(own.start.key, own.steps): own for own in search.blocked}
-    return sorted(blocked.values(), key=lambda own: search.measure(own.start))
-
-
-def describe_block(search: Search, failures: list[Failure], advice: str) -> str:
-    """Why nothing leads to a goal, with `advice` on the blocked way nearest to it."""
-    blocked = list_blocked(search)
-    reasons = [advice] if advice else []
-    reasons += [failure.reason for failure in failures[:2]]
-    reasons += [_describe_blocked(own) for own in blocked[: LISTED - len(reasons)]]
-    text = f"nothing leads from {search.start} to {search.goal}: {search.settled} places reached"
-    if not reasons:
-        return f"{text}, touching {describe(search.start.contacts)} at the start"
-    more = len(blocked) - LISTED + 1
-    return f"{text}; blocked are " + "; ".join(reasons) + (f"; and {more} more" if more > 0 else "")
+def describe_block(
+    search: Search, failures: list[Failure], advice: str = "", opening: str = ""
+) -> str:
+    """Why nothing leads to a goal: the cut, `advice` on it, and what would open it."""
+    cut = list_cut(search)
+    reasons = [failure.reason for failure in failures[:2]]
+    named = cut[: LISTED - len(reasons)]
+    reasons += [_describe_blocked(own) for own in named]
+    count = search.settled
+    text = f"nothing leads from {search.start} to {search.goal}: {count} place{'s'[: count != 1]}"
+    text += f" reached, touching {describe(search.start.contacts)} at the start; "
+    if not cut:
+        text += "no border leads on from there, and no way through a cell"
+    else:
+        text += f"{len(cut)} border{'s'[: len(cut) != 1]} on from there, all blocked"
+    parts = [text, *([opening] if opening else []), *reasons]
+    parts += [f"and {len(cut) - len(named)} more"] if len(cut) > len(named) else []
+    return "; ".join([*parts, *([advice] if advice else [])])
 
 
 def _describe_blocked(own: Blocked) -> str:

@@ -18,13 +18,14 @@ from ..problem.definition import Problem
 from ..problem.goal import name_goal
 from ..problem.table import describe_scene
 from .bounds import bound_borders
-from .candidates import explain_border
+from .candidates import Failure
 from .chart import Chart
 from .choosing import Chooser
 from .find import Route, Search
 from .goals import is_at
+from .opening import explain_cut, find_opening
 from .places import make_place
-from .result import Alternative, Answer, describe_block, list_blocked
+from .result import Alternative, Answer, describe_block
 from .store import load_chart, require_folder, store_chart
 
 CHARTS = 4
@@ -78,8 +79,12 @@ def find_route_with(
     alternatives: int = 0,
     progress: Callable[[str], None] | None = None,
     cache: Path | None = None,
+    trial: bool = False,
 ) -> Answer:
-    """Find a route with `options` given as one object; see `find_route`."""
+    """Find a route with `options` given as one object; see `find_route`.
+
+    As a `trial` of another scene it does not look in turn for changes that open the way.
+    """
     if not problem.goals:
         raise InputError(problem.source, "goal", "is missing; allowed is flush or phi_deg, and x")
     report = progress or (lambda _: None)
@@ -94,7 +99,7 @@ def find_route_with(
             raise InputError(problem.source, key, f"{goal} holds already where the motion starts")
         search = Search(chart, place, goal)
         wanted = alternatives if index + 1 == len(problem.goals) else 0
-        answer = _choose(problem, before, search, options, wanted, report)
+        answer = _choose(problem, before, search, options, wanted, report, trial)
         before = [*before, answer.route]
     if cache is not None:
         store_chart(cache, key_chart(problem, options), chart)
@@ -125,10 +130,23 @@ def forget_charts() -> None:
     _charts.clear()
 
 
-def _advise(search: Search, problem: Problem, options: PlanOptions) -> str:
-    """What single change would open the blocked way that is nearest to the goal."""
-    border = next((own for own in list_blocked(search) if len(own.steps) == 1), None)
-    return "" if border is None else explain_border(problem, border, options)
+def _refuse(
+    problem: Problem,
+    search: Search,
+    options: PlanOptions,
+    failures: list[Failure],
+    trial: bool,
+) -> InfeasibleError:
+    """Why nothing leads to a goal, and what would open the way."""
+    advice, changes = explain_cut(search, problem, options)
+    opening = ""
+    if not trial:
+
+        def find(changed: Problem) -> float:
+            return find_route_with(changed, options, trial=True).plan.duration
+
+        opening = find_opening(problem, changes, find)
+    return InfeasibleError(describe_block(search, failures, advice, opening), changes=changes)
 
 
 def _choose(
@@ -138,6 +156,7 @@ def _choose(
     options: PlanOptions,
     alternatives: int,
     report: Callable[[str], None],
+    trial: bool,
 ) -> Answer:
     """Plan routes to one goal, and say how good the best one is."""
     chooser, complete = Chooser(problem, before, search, options), True
@@ -157,8 +176,7 @@ def _choose(
             chooser.plan(1, report)
     made, margin = chooser.made, options.goal is Objective.MARGIN
     if not made:
-        advice = _advise(search, problem, options)
-        raise InfeasibleError(describe_block(search, chooser.failures, advice))
+        raise _refuse(problem, search, options, chooser.failures, trial)
     made.sort(key=lambda own: -own[0].value if margin else own[0].value)
     plan, route = made[0]
     bound = bound_borders(search, plan.duration) if complete and not before else None
