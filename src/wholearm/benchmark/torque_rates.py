@@ -36,7 +36,7 @@ ACCURACY = 1e-6
 """Accuracy that lines are planned with."""
 QUICK = (0.5, 60.0)
 """Range of the rate limit over the torque limit, in the time that a line takes without it."""
-GROWING = (20.0, 100.0, 500.0, 1000.0, 2500.0, 5000.0)
+GROWING = (20.0, 100.0, 500.0, 2500.0, 20_000.0, 100_000.0, 1_000_000.0)
 """Rate limits that the problem is planned with [N m/s]."""
 
 

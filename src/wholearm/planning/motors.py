@@ -9,6 +9,7 @@ from ..common.errors import InputError
 from ..problem.definition import Problem
 from .block_plan import Planning
 from .options import PlanOptions
+from .splitting import runs_along_curves, split_blocks
 
 
 def require_steps(problem: Problem, options: PlanOptions) -> None:
@@ -33,13 +34,9 @@ def require_steps(problem: Problem, options: PlanOptions) -> None:
             why = f"torques held constant step, and {given[0][0]} is given; hold them linear"
         if why:
             raise InputError("", "control_period", f"{scene.control_period:g} given; {why}")
-    if not given:
-        return
-    if options.ranges:
-        why = "ranges (--robust) are not kept with it yet"
-    elif problem.is_settled:
-        why = "torques that settle the end of a phase (settle) step; leave one of the two out"
-    if why:
+    along = all(runs_along_curves(block, options) for block in split_blocks(problem))
+    if given and options.ranges and not along:
+        why = "ranges (--robust) are not kept with it in phases over time yet"
         raise InputError("", given[0][0], f"{given[0][1]:g} given; {why}")
 
 

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..common.arrays import Array
 from ..common.errors import SimulationError
 from ..contacts.formation import Formation
 from ..free_simulation.simulate import simulate_free
@@ -22,8 +23,10 @@ from ..problem.definition import Phase, Problem
 from ..results.settling import SettledMotion, Settling
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion
+from ..scene.model import Scene
 from ..simulation.closing import close_contacts
 from ..simulation.tolerances import SLOW, is_slower
+from .path_domain.joint import begin_from, find_pauses
 from .phase_plan import PhasePlan, Settled
 from .stops import Plans, end_of
 
@@ -75,7 +78,7 @@ def settle_plans(problem: Problem, plans: Plans) -> Settled:
         ends = find_ends(problem, plans, [problem.settles(own) or 0.0 for own in problem.phases])
     numbered = zip(problem.phases, ends, strict=True)
     settlings = [None if end is None else _describe(problem, phase, end) for phase, end in numbered]
-    return Settled(hold_plans(plans, ends), tuple(settlings))
+    return Settled(hold_plans(problem, plans, ends), tuple(settlings))
 
 
 def find_places(problem: Problem, plans: Plans) -> list[Standstill | None]:
@@ -103,15 +106,26 @@ def find_ends(
     return found
 
 
-def hold_plans(plans: Plans, ends: Sequence[End | None]) -> Plans:
-    """The plans with their ends held."""
-    return [_hold(plan, end) for plan, end in zip(plans, ends, strict=True)]
+def hold_plans(problem: Problem, plans: Plans, ends: Sequence[End | None]) -> Plans:
+    """The plans with their ends held; torques that may not step change to what holds and back."""
+    held: Plans = []
+    before: Array | None = None
+    for phase, plan, end in zip(problem.phases, plans, ends, strict=True):
+        if before is not None and problem.scene.has_slow_motors:
+            plan = begin_from(plan, phase.formation, before)
+        held.append(_hold(problem.scene, plan, end))
+        before = end.hold.tau if end is not None and end.hold is not None else None
+    return held
 
 
-def _hold(plan: PhasePlan[Motion], end: End | None) -> PhasePlan[Motion]:
+def _hold(scene: Scene, plan: PhasePlan[Motion], end: End | None) -> PhasePlan[Motion]:
     if end is None or end.hold is None:
         return plan
-    motion = SettledMotion(plan.motion, end.time, end.hold.tau)
+    ramp = 0.0
+    if scene.has_slow_motors:
+        last = plan.torque.at(plan.torque.breaks[-1:])[0]
+        ramp = float(find_pauses(scene, end.hold.tau - last))
+    motion = SettledMotion(plan.motion, ramp + end.time, end.hold.tau, ramp)
     torque = TorqueProfile.chain([plan.torque, motion.torque])
     return plan._replace(motion=motion, torque=torque)
 

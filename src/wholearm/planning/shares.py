@@ -97,7 +97,7 @@ def _share(problem: Problem, plans: Plans, way: Way) -> list[float]:
 
 def measure_off(problem: Problem, plans: Plans, ends: Sequence[End | None]) -> float:
     """How far off plans end at most [m] with ends held, turns counting by the scene's length."""
-    torque = TorqueProfile.chain([plan.torque for plan in hold_plans(plans, ends)])
+    torque = TorqueProfile.chain([plan.torque for plan in hold_plans(problem, plans, ends)])
     goal, length = end_of(plans[-1])[0], problem.scene.scales.length
     most = 0.0
     for off in (0.0, problem.gap, -problem.gap):

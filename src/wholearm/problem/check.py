@@ -48,8 +48,8 @@ def check_problem(problem: Problem) -> None:
     if not problem.settle_share:
         settle = require_number(problem.settle, "settle", nonnegative=True)
         check_settle(problem.scene, "settle", settle)
-    if problem.scene.has_slow_motors and problem.is_settled:
-        text = "held ends step torques: with torque_rate_limit or actuator_lag allowed is 0"
+    if problem.scene.actuator_lag.any() and problem.is_settled:
+        text = "what holds an end may take all of a torque limit: with actuator_lag allowed is 0"
         raise InputError("", "settle", text)
     if problem.settle_gap is not None:
         gap = require_number(problem.settle_gap, "settle_gap", positive=True)

@@ -68,11 +68,22 @@ class Settling(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SettledMotion:
-    """A phase whose end is held at rest by constant torques; contact forces are not known there."""
+    """A phase whose end is held at rest by constant torques; contact forces are not known there.
+
+    Attributes
+    ----------
+    motion : Motion
+    held : float, [s]
+        How long, with the time in which torques change into these.
+    tau : ndarray, shape (2,), [N m]
+    ramp : float, [s]
+        That time: where torques may not step, they change linearly from those of the motion's end.
+    """
 
     motion: Motion
     held: float
     tau: Array
+    ramp: float = 0.0
 
     @property
     def duration(self) -> float:
@@ -87,19 +98,34 @@ class SettledMotion:
     @property
     def torque(self) -> TorqueProfile:
         """The torques of the end alone, from 0 on."""
-        return TorqueProfile(np.array([0.0, self.held]), self.tau[None, :, None])
+        if not self.ramp:
+            return TorqueProfile(np.array([0.0, self.held]), self.tau[None, :, None])
+        first = self.motion.evaluate(np.array([self.motion.duration])).tau
+        rows = np.concatenate([first, self.tau[None], self.tau[None]])
+        return TorqueProfile.join_rows(np.array([0.0, self.ramp, self.held]), rows)
 
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
         moves = np.minimum(t, self.motion.duration)
-        return _stop(self.motion.evaluate(moves), np.asarray(t > self.motion.duration), self.tau)
+        held = np.asarray(t > self.motion.duration)
+        return _stop(self.motion.evaluate(moves), held, self._hold(t))
 
     def sample(self, count: int) -> tuple[Array, Samples]:
-        """`count` even rows of the motion, and the two ends of the time in which it is held."""
+        """`count` even rows of the motion, and the two ends of the time in which it is held.
+
+        Between them where the torques are those that hold it, if that takes a while.
+        """
         end = self.motion.duration
-        t = np.append(np.linspace(0.0, end, count), [end, self.duration])
+        inner = [end + self.ramp] if self.ramp else []
+        t = np.append(np.linspace(0.0, end, count), [end, *inner, self.duration])
         samples = self.motion.evaluate(np.minimum(t, end))
-        return t, _stop(samples, np.asarray(np.arange(len(t)) >= count), self.tau)
+        return t, _stop(samples, np.asarray(np.arange(len(t)) >= count), self._hold(t))
+
+    def _hold(self, t: Array) -> Array:
+        """Torques at times from the start of the phase on, as if it were held then."""
+        if not self.ramp:
+            return self.tau
+        return self.torque.at(np.clip(t - self.motion.duration, 0.0, self.held))
 
 
 def _stop(samples: Samples, held: NDArray[np.bool_], tau: Array) -> Samples:

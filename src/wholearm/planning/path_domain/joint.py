@@ -157,7 +157,7 @@ class PausedMotion:
     first : ndarray, shape (2,), [N m]
         Torques at its start.
     forces : ndarray, shape (2, n_c), [N]
-        c_n and c_t there.
+        c_n and c_t there; NaN if other contacts may share in them.
     """
 
     motion: Motion
@@ -213,6 +213,27 @@ def add_pause(
     motion = PausedMotion(plan.motion, joint.pause, joint.before, forces)
     torque = TorqueProfile.chain([ramp, plan.torque])
     return plan._replace(motion=motion, torque=torque, value=value)
+
+
+def begin_from(plan: PhasePlan[Motion], formation: Formation, before: Array) -> PhasePlan[Motion]:
+    """The plan of a phase with other torques before it, shape (2,) [N m], and the pause from them.
+
+    Its value stays as it is.
+    """
+    motion, torque = plan.motion, plan.torque
+    if isinstance(motion, PausedMotion):
+        torque = TorqueProfile.chain([torque.cut(motion.pause, float(torque.breaks[-1]))])
+        motion = motion.motion
+    after = torque.at(np.zeros(1))[0]
+    pause = float(find_pauses(formation.scene, after - before))
+    if pause:
+        # What touches beside the phase's contacts may hold the object, too, until it moves.
+        forces = np.full((2, formation.n_contacts), np.nan)
+        rows = np.stack([before, after])
+        ramp = TorqueProfile.join_rows(np.array([0.0, pause]), rows)
+        motion = PausedMotion(motion, pause, before, forces)
+        torque = TorqueProfile.chain([ramp, torque])
+    return plan._replace(motion=motion, torque=torque)
 
 
 def find_static_forces(formation: Formation, z: Array, tau: Array) -> Array:

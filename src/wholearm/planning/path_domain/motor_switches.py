@@ -41,7 +41,7 @@ def find_motor_switches(part: PhaseData, profile: Profile) -> list[Switch]:
     first, last = motion.times[part.nonempty], motion.times[part.nonempty + 1]
     looks = np.linspace(0.0, 1.0, rates.shape[1])
     t = (first[:, None] + looks * (last - first)[:, None]).ravel()
-    most = np.maximum(np.abs(rates).max(axis=(0, 1)), np.finfo(float).tiny)
+    most = np.maximum(np.abs(rates).max(axis=(0, 1)), part.torque_limit / motion.duration)
     largest = np.where(np.isfinite(part.rate_limit), part.rate_limit, most)
     shares = (rates / largest).reshape(-1, 2)
     torques = torques.reshape(-1, 2)

@@ -40,6 +40,8 @@ _FIRST_EASE = 1e-2
 """By how much limits are tightened for a plan of quick motors, over what is much for each."""
 _EASE = 5e-4
 """The same for a first plan of slow ones."""
+_FINELY = 10.0
+"""Over how much less for a second one, where a high accuracy is asked for."""
 _EASIER = 10.0
 """By how much more rates and commands are."""
 
@@ -264,9 +266,15 @@ class Round:
     def solve_first(self) -> Iterator[Round | str]:
         """First solutions; with slow motors also on a mesh for one with tighter limits."""
         if self.data.grid.held:
-            eased = self.ease_in(_EASE).solve()
-            if not isinstance(eased, str):
-                yield eased.refit().solve()
+            finely = self.task.options.accuracy < EARLY
+            begun = self
+            for share in (_EASE, _EASE / _FINELY)[: 1 + finely]:
+                eased = begun.ease_in(share).solve()
+                if isinstance(eased, str):
+                    break
+                begun = eased.refit()
+            if begun is not self:
+                yield begun.solve()
         yield self.solve()
 
     def tighten(self, ease: bool) -> Round:
