@@ -84,16 +84,14 @@ class CurveLaw:
     tables : mapping of str to ndarray
         `s`, (n,); `theta`, (n, 2); `b`, (n,), at nodes; `levels`, (n - 1, 2, m, 5), and `torque`,
         (n - 1, 2, 2, 5), at both ends of the intervals; `push`, (2,); `passes`, (1,), not zero
-        where the end is passed at speed; `arrival`, (k, 5), levels of all contacts where they are
-        made.
+        where the end is passed at speed; `keeps`, (1,), not zero where `push` is held until the
+        next law begins; `arrival`, (k, 5), levels of all contacts where they are made.
     pace : Pace
 
     Attributes
     ----------
-    over : bool
-        Whether the next phase may begin.
-    pushes : bool
-        Whether the contact is being pressed.
+    over, pushes : bool
+        Whether the next phase may begin, and whether the contact is being pressed.
     after : CurveLaw or None
         The law of the next phase, if it is along a curve.
     s, v, level : float
@@ -108,6 +106,7 @@ class CurveLaw:
         self.length = self.nodes[-1]
         self.theta, self.b = tables["theta"].tolist(), tables["b"].tolist()
         self.push = tuple(tables["push"].tolist())
+        self.keeps = bool(tables.get("keeps", [0.0])[0])
         self.arrival = tables["arrival"].tolist()
         pairs = list(zip(self.nodes, self.nodes[1:], strict=False))
         self.steps = [after - before for before, after in pairs]
@@ -127,10 +126,6 @@ class CurveLaw:
         self.sensing: Sensing | None = None
         self.begin()
 
-    def listen(self, names: Sequence[str], gained: str, table: Any) -> None:
-        """Let measured normal forces count: of contacts, and of the one that is gained."""
-        self.sensing = Sensing(names, gained, table, self.pace.delay / self.pace.period)
-
     def lead_to(self, after: CurveLaw) -> None:
         """Let another law follow.
 
@@ -139,6 +134,7 @@ class CurveLaw:
         """
         if self.passes:
             self.turn = after.chords[0]
+        if self.passes or self.keeps:
             return
         self.after = after
         tau = self._act(len(self.steps) - 1, 1.0, 0.0, 0.0, self.gain * self.pace.touch, True)
@@ -177,7 +173,7 @@ class CurveLaw:
             self.over = self._has_turned(rates)
             if self.over:
                 return self.push
-        if self._is_made(s, v) or (self.sensing is not None and self.sensing.feels):
+        if self._is_made(s, v) or (self.sensing and self.sensing.feels):
             self.pushes, self.a = True, 0.0
             return self._press(theta, rates)
         # The reference begins where the motion does.

@@ -35,6 +35,8 @@ CLOSING = 0.02
 """Time in which held torques are to close a contact [s]."""
 SHOWN = 1e-3
 """Part of a displacement that joints have to show, over what they show at most."""
+WEAK = 10.0
+"""Torques over the dry friction of the joints, below which it decides what is at rest."""
 MOST = 0.5
 """Largest acceleration of the integral, over the scene's."""
 
@@ -208,7 +210,7 @@ def _list_ways(problem: Problem, phase: Phase, z: Array) -> Array:
 def _tabulate(piece: Piece, phase: Phase, push: Array) -> dict[str, Array]:
     """Arrays of `CurveLaw`."""
     rows, levels, contact = piece.rows, piece.rows.levels, phase.until.contact
-    arrival = np.zeros((0, 5))
+    arrival, dry = np.zeros((0, 5)), phase.formation.scene.dry[3:]
     if contact is not None and not piece.passes:
         arrival = find_arrival(piece.curve, contact, rows)
     return {
@@ -220,6 +222,7 @@ def _tabulate(piece: Piece, phase: Phase, push: Array) -> dict[str, Array]:
         "push": push,
         "passes": np.array([piece.passes]),
         "arrival": arrival,
+        "keeps": np.array([float((np.abs(push) < WEAK * dry).all())]),
         "forces": find_forces(piece.curve, rows.s, np.sqrt(piece.b)),
     }
 

@@ -17,12 +17,14 @@ from ..common.require import require_number
 from .curve_law import CurveLaw
 from .motion_law import MotionLaw
 from .pace import Pace
+from .sensing import Sensing
 
 FORMAT = 1
 """Version of the files."""
 CURVE = {
     "s": (-1,), "theta": (-1, 2), "b": (-1,), "levels": (-1, 2, -1, 5), "torque": (-1, 2, 2, 5),
     "push": (2,), "passes": (1,), "arrival": (-1, 5), "forces": (-1, 2, -1, 5),
+    "keeps": (1,),
 }  # fmt: skip
 """Arrays of a phase along a curve and their shapes; -1 is any."""
 MOTION = {
@@ -30,7 +32,7 @@ MOTION = {
     "gain": (-1, 2, 4), "push": (2,), "still": (1,), "ways": (-1, 2),
 }  # fmt: skip
 """Arrays of phases that are followed over time."""
-LATER = ("arrival", "ways", "forces")
+LATER = ("arrival", "ways", "forces", "keeps")
 """Arrays that earlier versions did not write; empty ones stand for them."""
 KINDS: Mapping[str, Mapping[str, tuple[int, ...]]] = {"curve": CURVE, "motion": MOTION}
 Law = CurveLaw | MotionLaw
@@ -101,7 +103,8 @@ class Policy:
             table, about = own.get("forces"), phases[first - 1] if first <= len(phases) else {}
             names, gained = list(about.get("reserves", {})), about.get("gained", "")
             if isinstance(law, CurveLaw) and table is not None and len(names) == table.shape[2]:
-                law.listen(names, gained, table)
+                late = self.pace.delay / self.pace.period
+                law.sensing = Sensing(names, gained, table, late)
                 found.update(dict.fromkeys([*names, gained] if gained else names))
         return list(found)
 
