@@ -5,8 +5,15 @@ from __future__ import annotations
 import argparse
 import json
 import os
+from typing import TYPE_CHECKING
 
 from ..common.errors import name_source
+from .progress import clear_progress, show_progress
+
+if TYPE_CHECKING:
+    from ..policy.policy import Policy
+    from ..problem.definition import Problem
+    from ..results.trajectory import Trajectory
 
 
 def add_policy(parser: argparse.ArgumentParser) -> None:
@@ -37,7 +44,6 @@ def _policy(options: argparse.Namespace) -> int:
     from ..policy.make import make_policy
     from ..policy.widest import find_widest
     from ..problem.read import read_own_problem
-    from ..results.report_text import align
     from ..results.trajectory_file import load_trajectory
     from ..verification.policy import verify_policy
 
@@ -48,23 +54,37 @@ def _policy(options: argparse.Namespace) -> int:
     plan = load_trajectory(options.plan)
     problem = read_own_problem(plan.meta, options.plan)
     given = {key: getattr(options, key) for key in ("reserve", "period", "delay", "torque_limit")}
+    say = show_progress() or (lambda _: None)
+
+    def plan_anew(own: Problem) -> Trajectory:
+        return solve(own, replay=False, progress=say).trajectory
+
     with name_source(options.plan):
-        policy = make_policy(
-            problem, plan, **given, planner=lambda own: solve(own, replay=False).trajectory
-        )
+        say("making the policy")
+        policy = make_policy(problem, plan, **given, planner=plan_anew)
+        say("simulating the policy")
         report = verify_policy(problem, plan, policy)
         if options.largest:
+            say("looking for the widest ranges")
             each = find_widest(problem, plan, options.delay)
             policy.about["largest"] = {str(number): factor for number, factor in each.items()}
+    clear_progress()
     if not report.ok:
         failures = "; ".join(report.failures)
         raise ReplayError(
             f"{options.plan}: no policy is written: in the free simulation, {failures}"
         )
     policy.save(output)
-    if options.json:
-        print(json.dumps(policy.about, indent=2))
-        return 0
+    print(json.dumps(policy.about, indent=2) if options.json else _describe(policy))
+    if not options.json:
+        print(f"{policy.duration:.6f} s in all, the plan {plan.duration:.6f} s; wrote {output}")
+    return 0
+
+
+def _describe(policy: Policy) -> str:
+    """How long the phases take, what reserve they keep, and within which ranges."""
+    from ..results.report_text import align
+
     rows = []
     for own in policy.about["phases"]:
         times = [f"{own[name]:.6f}" for name in ("plan", "duration")]
@@ -72,15 +92,14 @@ def _policy(options: argparse.Namespace) -> int:
         share = f"{own['share']:.2f}" if kept else ""
         rows.append([str(own["number"]), *times, share, ", ".join(kept)])
     header = ["phase", "plan [s]", "policy [s]", "reserve", "least of each contact"]
-    print("\n".join(align(header, rows, {4})))
+    lines = list(align(header, rows, {4}))
     parts = {own["number"]: own["share"] for own in policy.about["phases"] if "reserves" in own}
     if "ranges" in policy.about and parts:
         short = [f"{part:.2f} of them in phase {k}" for k, part in parts.items() if part < 1]
         text = f"contacts are kept within {policy.about['reserve']:g} times the plan's ranges"
-        print(f"{text}, {', '.join(short)}" if short else text)
+        lines.append(f"{text}, {', '.join(short)}" if short else text)
     if largest := policy.about.get("largest"):
         factors = ", ".join(f"{factor:.3g}" for factor in largest.values())
         text = f"a policy exists for ranges {min(largest.values()):.3g} times as wide as the plan's"
-        print(f"{text} (by phase: {factors})")
-    print(f"{policy.duration:.6f} s in all, the plan {plan.duration:.6f} s; wrote {output}")
-    return 0
+        lines.append(f"{text} (by phase: {factors})")
+    return "\n".join(lines)

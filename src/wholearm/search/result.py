@@ -171,7 +171,8 @@ def describe_block(
     if not cut:
         text += "no border leads on from there, and no way through a cell"
     else:
-        text += f"{len(cut)} border{'s'[: len(cut) != 1]} on from there, all blocked"
+        many = len(cut) != 1
+        text += f"{len(cut)} border{'s'[:many]} lead{'s'[many:]} on from there, all blocked"
     parts = [text, *([opening] if opening else []), *reasons]
     parts += [f"and {len(cut) - len(named)} more"] if len(cut) > len(named) else []
     return "; ".join([*parts, *([advice] if advice else [])])
