@@ -15,6 +15,7 @@ from wholearm import InputError, Plan, Problem, simulate, solve, verify
 from wholearm.planning.table_check import make_table
 from wholearm.problem.table import describe_scene
 from wholearm.results.torque import TorqueProfile, read_torque_csv
+from wholearm.results.torque_table import read_rows
 from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.simulation.statics import balances
 from wholearm.verification.motors import describe_motors, find_commands
@@ -82,6 +83,24 @@ def test_torques_of_a_plan_never_step_and_hold_the_object_between_phases(
     ahead = np.gradient(tau2, t) * 1e-3
     assert np.median(np.abs(command2 - tau2 - ahead)) < 1e-2 * np.abs(ahead).max()
     assert read_torque_csv(str(path)).duration == t[-1]
+
+
+def test_breaks_just_before_the_end_of_a_phase_do_not_end_it(slow: tuple[Problem, Plan]) -> None:
+    problem, plan = slow
+    torque, first = plan.trajectory.torque, float(plan.trajectory.phase_starts[1])
+    breaks = np.unique([*torque.breaks, *np.linspace(first - 1e-3, first, 41)[:-1]])
+    dense = TorqueProfile.fit(breaks, torque.at, torque.coefficients.shape[2] - 1)
+    found = simulate(problem, dense)
+    assert found.outcome.kind is OutcomeKind.GOAL_REACHED
+    came = next(event.time for event in found.events if event.kind is EventKind.ARRIVAL)
+    assert came == pytest.approx(first, abs=2e-5)
+
+
+def test_a_table_of_slow_torques_is_one_that_motors_can_follow(slow: tuple[Problem, Plan]) -> None:
+    problem, plan = slow
+    table = make_table(problem, plan.trajectory)
+    assert table.figures["replay"]["ok"]
+    assert describe_motors(problem, read_rows(table.rows)) == []
 
 
 def test_a_phase_that_ends_early_keeps_its_torques_until_it_was_to_end(

@@ -41,6 +41,22 @@ def test_fewer_errors_take_more_rows() -> None:
     assert counts[2] / counts[1] == pytest.approx(10, rel=0.1)
 
 
+@pytest.mark.parametrize("error", [1e-3, ERROR])
+def test_rows_are_no_steeper_than_the_torques_may_be(error: float) -> None:
+    def ramp(t: Array) -> Array:
+        bend = np.maximum(t - 0.5, 0.0)
+        return np.column_stack([4 * t - 20 * bend**2, 1 - 4 * t + 26 * bend**2])
+
+    torque = TorqueProfile.fit(np.linspace(0, 0.65, 14), ramp, 4)
+    limits = np.full(2, 4.0)
+    slopes = [
+        np.abs(np.diff(rows[:, 1:], axis=0) / np.diff(rows[:, 0])[:, None])
+        for rows in (place_rows(torque, error), place_rows(torque, error, limits))
+    ]
+    assert slopes[0].max() > 4 * (1 + 1e-6)
+    assert slopes[1].max() < 4 * (1 + 1e-9)
+
+
 def test_what_lines_miss_has_no_mean_and_no_moment() -> None:
 
     def rising(t: Array) -> Array:

@@ -14,7 +14,7 @@ from ..problem.definition import Problem
 from ..results.report import Report
 from ..results.torque_table import ERROR, format_rows, place_rows, read_rows, sample_rows
 from ..results.trajectory import Trajectory
-from ..verification.motors import find_commands
+from ..verification.motors import describe_motors, find_commands
 from ..verification.verdict import Allowance, find_least_force
 from ..verification.verify import judge, observe
 
@@ -71,18 +71,26 @@ def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) ->
     JammingError, SimulationError
         If the simulation cannot go on.
     """
-    rows = place_rows(trajectory.torque)
+    slow = problem.scene.has_slow_motors
+    rate_limit = problem.scene.torque_rate_limit if slow else None
+    least, error = ERROR / FINER ** (ATTEMPTS - 1), ERROR
+    rows = place_rows(trajectory.torque, error, rate_limit)
+    # Commands step where the slopes of lines do: what motors can follow is known without a replay.
+    while error > least and describe_motors(problem, read_rows(rows)):
+        error /= 2
+        rows = place_rows(trajectory.torque, error, rate_limit)
     if not replay:
         commands = _list_commands(problem, trajectory, rows)
         return Table(rows, {"rows": len(rows), "replay": None}, commands)
-    for attempt in range(ATTEMPTS):
-        rows = place_rows(trajectory.torque, ERROR / FINER**attempt)
+    for _ in range(ATTEMPTS):
         # The table has to keep the limits of the plan, and to stay near it.
         seen = observe(problem, read_rows(rows), trajectory)
         report = judge(seen, Allowance())
-        if report.ok:
+        if report.ok or error <= least:
             break
-    else:
+        error = max(error / FINER, least)
+        rows = place_rows(trajectory.torque, error, rate_limit)
+    if not report.ok:
         report = judge(seen._replace(plan=None), Allowance())
     if not report.ok:
         raise ReplayError(

@@ -30,7 +30,9 @@ COMMANDS = ("command1", "command2")
 """Columns of what motors that lag are told, so that they make the torques."""
 
 
-def place_rows(torque: TorqueProfile, error: float = ERROR) -> Array:
+def place_rows(
+    torque: TorqueProfile, error: float = ERROR, rate_limit: Array | None = None
+) -> Array:
     """Rows (t, tau_1, tau_2) whose straight lines give torques back, shape (n, 3) [s, N m, N m].
 
     Every break of the torques has a row, and two where they step.
@@ -40,6 +42,8 @@ def place_rows(torque: TorqueProfile, error: float = ERROR) -> Array:
     torque : TorqueProfile
     error : float
         What the lines may miss, relative to the largest torque.
+    rate_limit : ndarray, shape (2,), optional, [N m/s]
+        Largest rates, which lines keep if the torques do.
     """
     peak = np.abs(_sample(torque.coefficients)).max(axis=(0, 1))
     largest = float(peak.max())
@@ -58,6 +62,8 @@ def place_rows(torque: TorqueProfile, error: float = ERROR) -> Array:
     # Lines through a bend miss it on both sides; no limit is to be missed for that.
     peak = np.maximum(peak, np.abs(torque.at(knots)).max(axis=0))
     rows[:, 1:] = np.clip(rows[:, 1:], -peak, peak)
+    if rate_limit is not None:
+        _slow_down(rows, torque, rate_limit)
     return rows
 
 
@@ -131,6 +137,27 @@ def _divide(torque: TorqueProfile, error: float) -> Array:
         inside = np.interp(np.linspace(0.0, total[k, -1], count + 1)[1:-1], total[k], x)
         parts += [breaks[[k]], breaks[k] + h[k] * (inside + 1) / 2]
     return np.append(np.concatenate(parts), breaks[-1])
+
+
+def _slow_down(rows: Array, torque: TorqueProfile, rate_limit: Array) -> None:
+    """Give lines that are too steep the torques at their ends, in place.
+
+    Near a kink the nearest lines swing about the torques. Lines through points of these are no
+    steeper than they are.
+    """
+    t, h = rows[:, 0], np.diff(rows[:, 0])[:, None]
+    # At a step the earlier row has the torques before it.
+    before = np.append(h[:, 0] == 0, False)
+    exact = torque.at(np.where(before, np.nextafter(t, -np.inf), t))
+    while True:
+        steep = (h > 0) & (np.abs(np.diff(rows[:, 1:], axis=0)) > rate_limit * h)
+        wrong = np.zeros(exact.shape, dtype=bool)
+        wrong[:-1] |= steep
+        wrong[1:] |= steep
+        wrong &= rows[:, 1:] != exact
+        if not wrong.any():
+            return
+        rows[:, 1:][wrong] = exact[wrong]
 
 
 def _sample(coefficients: Array) -> Array:

@@ -25,7 +25,7 @@ from .jumps import (
 from .locate import find_first
 from .replay import Replay
 from .runge_kutta import ORDER
-from .tolerances import REACHED, SHORTEST_STEP, SLOW, measure_units
+from .tolerances import CREEPING, REACHED, SHORTEST_STEP, SLOW, measure_units
 
 _GROWTH = 40.0
 """Largest growth of a step: at order 8 an error of 1e-13 of the tolerance allows it."""
@@ -101,7 +101,7 @@ def _is_at_end(run: Replay, t: float) -> bool:
     motion that is about to stop instead may step its torques before it is there.
     """
     s = run.stepper
-    if t != run.breaks[run.piece + 1] or not is_there(run):
+    if t != run.breaks[run.piece + 1] or not is_there(run) or _comes_later(run):
         return False
     speed = abs(_measure_rate(run))
     if run.phase.end is End.SMOOTH:
@@ -114,6 +114,20 @@ def _is_at_end(run: Replay, t: float) -> bool:
         speed = float(np.abs(s.outputs[s.to.y][5:10] / units).max())
     pressing = s.outputs[s.to.events][s.rows.force]
     return speed < SLOW and bool(pressing.min() >= -run.tolerances.force) and not find_slipping(s)
+
+
+def _comes_later(run: Replay) -> bool:
+    """Whether a motion whose deceleration fades still comes nearer, at a break that is not its end.
+
+    It is slow, and near the end of its phase, long before it is there. What slow motors do not make
+    step may have breaks anywhere, as tables of torques do.
+    """
+    coming = run.piece + 1
+    if not run.problem.scene.has_slow_motors or run.phase.end is not End.REST:
+        return False
+    if coming + 1 >= len(run.breaks) or run.steps_at[coming]:
+        return False
+    return _measure_rate(run) < -CREEPING
 
 
 def _pass_break(run: Replay) -> Ending | None:

@@ -28,6 +28,9 @@ REACHED = 3e-5
 """Distance to the end of a phase that counts as there, when at rest."""
 SLOW = 2e-4
 """Speed that counts as rest at the end of a phase."""
+CREEPING = 1e-7
+"""Speed of a motion that fades at the end of its phase, from which on it is not yet there: more
+than what the integration and a table of torques leave there."""
 STANDING = 1e-9
 """Speed that counts as none where friction decides: the integration's error may give it either
 sign."""
