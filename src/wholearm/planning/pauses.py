@@ -15,10 +15,11 @@ from ..contacts.formation import Formation
 from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phase
 from ..problem.definition import Phase
+from ..results.torque_change import find_change_times
 from ..results.trajectory import Motion
 from .block_plan import Planning
 from .options import PlanOptions
-from .path_domain.joint import Joint, add_pause, choose_joint, find_pauses
+from .path_domain.joint import Joint, add_pause, choose_joint
 from .phase_plan import PhasePlan
 from .splitting import runs_along_curves, split_blocks
 from .stops import Plans
@@ -68,7 +69,7 @@ def _list_joints(planning: Planning, block: Sequence[Phase], plans: Plans) -> li
     joints = list[Joint | None]()
     for end, own, phase in zip(ends, plans, block, strict=True):
         begins, scene = own.torque.at(np.zeros(1))[0], planning.problem.scene
-        pause = 0.0 if end is None else float(find_pauses(scene, begins - end))
+        pause = 0.0 if end is None else float(find_change_times(scene, end, begins))
         if end is None or not pause:
             joints.append(None)
             continue

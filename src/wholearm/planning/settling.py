@@ -22,11 +22,12 @@ from ..mechanics.arrival import Hold, Standstill, find_hold, find_opening
 from ..problem.definition import Phase, Problem
 from ..results.settling import SettledMotion, Settling
 from ..results.torque import TorqueProfile
+from ..results.torque_change import change_torques
 from ..results.trajectory import Motion
 from ..scene.model import Scene
 from ..simulation.closing import close_contacts
 from ..simulation.tolerances import SLOW, is_slower
-from .path_domain.joint import begin_from, find_pauses
+from .path_domain.joint import begin_from
 from .phase_plan import PhasePlan, Settled
 from .stops import Plans, end_of
 
@@ -121,11 +122,11 @@ def hold_plans(problem: Problem, plans: Plans, ends: Sequence[End | None]) -> Pl
 def _hold(scene: Scene, plan: PhasePlan[Motion], end: End | None) -> PhasePlan[Motion]:
     if end is None or end.hold is None:
         return plan
-    ramp = 0.0
+    change, ramp = None, 0.0
     if scene.has_slow_motors:
-        last = plan.torque.at(plan.torque.breaks[-1:])[0]
-        ramp = float(find_pauses(scene, end.hold.tau - last))
-    motion = SettledMotion(plan.motion, ramp + end.time, end.hold.tau, ramp)
+        change = change_torques(scene, plan.torque.at(plan.torque.breaks[-1:])[0], end.hold.tau)
+        ramp = change.duration
+    motion = SettledMotion(plan.motion, ramp + end.time, end.hold.tau, change)
     torque = TorqueProfile.chain([plan.torque, motion.torque])
     return plan._replace(motion=motion, torque=torque)
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..common.arrays import Array
 from .torque import TorqueProfile
+from .torque_change import TorqueChange
 from .trajectory import Motion, Samples
 
 
@@ -76,14 +77,19 @@ class SettledMotion:
     held : float, [s]
         How long, with the time in which torques change into these.
     tau : ndarray, shape (2,), [N m]
-    ramp : float, [s]
-        That time: where torques may not step, they change linearly from those of the motion's end.
+    change : TorqueChange or None
+        Where torques may not step, how they change from those of the motion's end.
     """
 
     motion: Motion
     held: float
     tau: Array
-    ramp: float = 0.0
+    change: TorqueChange | None = None
+
+    @property
+    def ramp(self) -> float:
+        """The time in which torques change [s]."""
+        return self.change.duration if self.change else 0.0
 
     @property
     def duration(self) -> float:
@@ -98,11 +104,11 @@ class SettledMotion:
     @property
     def torque(self) -> TorqueProfile:
         """The torques of the end alone, from 0 on."""
-        if not self.ramp:
-            return TorqueProfile(np.array([0.0, self.held]), self.tau[None, :, None])
-        first = self.motion.evaluate(np.array([self.motion.duration])).tau
-        rows = np.concatenate([first, self.tau[None], self.tau[None]])
-        return TorqueProfile.join_rows(np.array([0.0, self.ramp, self.held]), rows)
+        steady = np.array([0.0, self.held - self.ramp])
+        hold = TorqueProfile(steady, self.tau[None, :, None])
+        if self.change is None or not self.ramp:
+            return hold
+        return TorqueProfile.chain([self.change.torque, hold])
 
     def evaluate(self, t: Array) -> Samples:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""

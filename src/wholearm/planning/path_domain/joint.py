@@ -3,9 +3,9 @@
 A motion begins and ends with torques that hold the object on the verge of it: with no acceleration
 and the friction of its directions. There the squeeze is free, so these torques are a line for the
 phase that ends and another one for the phase that begins. Those nearest to each other in time are
-taken, and torques change from the ones to the others at constant rates while everything rests. The
-former have to hold the object in the formation that begins, too; then so do all in between, as
-forces that balance and are within their cones make a convex set.
+taken, and torques go straight from the ones to the others while everything rests. The former have
+to hold the object in the formation that begins, too; then so do all in between, as forces that
+balance and are within their cones make a convex set.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from ...geometry.curve import Curve
 from ...mechanics.wedging import find_static_torques
 from ...results.modes import ModeSpan
 from ...results.torque import TorqueProfile
+from ...results.torque_change import TorqueChange, change_torques, find_change_times
 from ...results.trajectory import Motion, Samples
-from ...scene.model import Scene
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
 from .data import PhaseData, prepare
@@ -38,12 +38,6 @@ _INSIDE = 0.01
 """Part of the range at both of its ends that is left out."""
 _ELEMENTS = 3
 """Elements of a grid of which only the ends count."""
-_STEP = 1e-6
-"""Largest step of torques that needs no pause, over their limits."""
-_SHARE = 0.5
-"""Part of a torque limit that a command may be beyond its torque in a pause."""
-
-
 _VERGE = 1e-6
 """Distance over the scene's torque beyond those that friction can hold, that is rounding."""
 
@@ -102,19 +96,10 @@ def choose_joint(
         tau = before[firmest]
         return Joint(float(ends[firmest]), np.nan, tau, tau, 0.0)
     after, begins = _list_torques(beginning, epsilon, phase, 0)
-    times = find_pauses(scene, after[None] - before[held][:, None])
+    times = find_change_times(scene, before[held][:, None], after[None])
     p, q = np.unravel_index(int(times.argmin()), times.shape)
     given = float(ends[held][p]), float(begins[q]), before[held][p], after[q]
     return Joint(*given, float(times[p, q]))
-
-
-def find_pauses(scene: Scene, steps: Array) -> Array:
-    """How long torques take to change by `steps`, shape (..., 2) [N m], as (...) [s]."""
-    with np.errstate(divide="ignore"):
-        lagged = _SHARE * scene.torque_limit / scene.actuator_lag
-    rates, steps = np.minimum(scene.torque_rate_limit, lagged), np.abs(steps)
-    much = (steps > _STEP * scene.torque_limit).any(axis=-1)
-    return np.asarray(np.where(much, (steps / rates).max(axis=-1), 0.0))
 
 
 def _list_torques(curve: Curve, epsilon: float, phase: int, place: int) -> tuple[Array, Array]:
@@ -148,22 +133,24 @@ def require_hold(data: PhaseData, phase: int, place: int) -> tuple[float, float]
 
 @dataclass(frozen=True, eq=False)
 class PausedMotion:
-    """A motion that begins after a pause at rest, in which torques and forces change linearly.
+    """A motion that begins after a pause at rest, in which torques and forces change.
 
     Attributes
     ----------
     motion : Motion
-    pause : float, [s]
-    first : ndarray, shape (2,), [N m]
-        Torques at its start.
+    change : TorqueChange
     forces : ndarray, shape (2, n_c), [N]
-        c_n and c_t there; NaN if other contacts may share in them.
+        c_n and c_t before it; NaN if other contacts may share in them.
     """
 
     motion: Motion
-    pause: float
-    first: Array
+    change: TorqueChange
     forces: Array
+
+    @property
+    def pause(self) -> float:
+        """How long the pause lasts [s]."""
+        return self.change.duration
 
     @property
     def duration(self) -> float:
@@ -187,8 +174,8 @@ class PausedMotion:
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
         t = np.asarray(t, dtype=float)
         found = self.motion.evaluate(np.maximum(t - self.pause, 0.0))
-        left = np.maximum(1 - t / self.pause, 0.0)[:, None]
-        first = self.first, *self.forces
+        left = np.where(t < self.pause, 1 - self.change.share(t), 0.0)[:, None]
+        first = self.change.before, *self.forces
         mixed = (
             np.where(left > 0, left * own + (1 - left) * now, now)
             for own, now in zip(first, found[3:], strict=True)
@@ -203,14 +190,14 @@ def add_pause(
     if not joint.pause:
         return plan
     forces = find_static_forces(formation, z, joint.before)
-    middle, half = (joint.after + joint.before) / 2, (joint.after - joint.before) / 2
-    ramp = TorqueProfile(np.array([0.0, joint.pause]), np.stack([middle, half], axis=1)[None])
+    change = change_torques(formation.scene, joint.before, joint.after)
+    ramp = change.torque
     value = {
         Objective.TIME: plan.value + joint.pause,
         Objective.EFFORT: plan.value + ramp.integrate_squares() + options.time_weight * joint.pause,
         Objective.MARGIN: float(np.fmin(plan.value, forces[0].min())),
     }[options.goal]
-    motion = PausedMotion(plan.motion, joint.pause, joint.before, forces)
+    motion = PausedMotion(plan.motion, change, forces)
     torque = TorqueProfile.chain([ramp, plan.torque])
     return plan._replace(motion=motion, torque=torque, value=value)
 
@@ -225,14 +212,12 @@ def begin_from(plan: PhasePlan[Motion], formation: Formation, before: Array) -> 
         torque = TorqueProfile.chain([torque.cut(motion.pause, float(torque.breaks[-1]))])
         motion = motion.motion
     after = torque.at(np.zeros(1))[0]
-    pause = float(find_pauses(formation.scene, after - before))
-    if pause:
+    change = change_torques(formation.scene, before, after)
+    if change.duration:
         # What touches beside the phase's contacts may hold the object, too, until it moves.
         forces = np.full((2, formation.n_contacts), np.nan)
-        rows = np.stack([before, after])
-        ramp = TorqueProfile.join_rows(np.array([0.0, pause]), rows)
-        motion = PausedMotion(motion, pause, before, forces)
-        torque = TorqueProfile.chain([ramp, torque])
+        motion = PausedMotion(motion, change, forces)
+        torque = TorqueProfile.chain([change.torque, torque])
     return plan._replace(motion=motion, torque=torque)
 
 

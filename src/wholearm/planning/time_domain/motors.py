@@ -29,6 +29,7 @@ from ...common.arrays import Array, Expression
 from ...contacts.formation import Formation
 from ...mechanics.dynamics import build_force_rows
 from ...mechanics.limits import CONE, PRESS, LimitSet
+from ...scene.model import Scene
 from ..columns import Columns
 from .assembly import Indices
 from .collocation import Scheme
@@ -36,6 +37,9 @@ from .kernels import NamedKernel, name_kernel, opening_kernel, share
 from .layout import StageLayout, Z
 from .rows import Rows
 from .stage import Stage
+
+_ROOM = 0.05
+"""Most room between a torque that a lagging motor comes to at rest and its limit, over that."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,11 +126,22 @@ def hold_ends(
         given = kernel.p.join(Xi=stage.directions.Xi, sigma=stage.directions.sigma)
         rows.add_copies(kernel, columns, rows.nonlinear(kernel.outputs), given)
         formation = stage.formation
+        if not k and stage.phase:
+            _leave_room(rows, formation.scene, layout.tau[0, :2])
         for r, row in enumerate(formation.rolling_rows):
             mu = float(formation.friction[row])
             own = rows.linear(2, low=mu * epsilon, high=np.inf)
             rows.add_entries(own, forces[row], mu)
             rows.add_entries(own, forces[formation.n_contacts + r], np.array([1.0, -1.0]))
+
+
+def _leave_room(rows: Rows, scene: Scene, tau: Indices) -> None:
+    """Torques that are changed into at rest stay off limits that a command only creeps to."""
+    for joint in np.flatnonzero(scene.actuator_lag):
+        limit = scene.torque_limit[joint]
+        fastest = scene.torque_rate_limit[joint] * scene.actuator_lag[joint] / limit
+        most = 1 - min(_ROOM, float(fastest))
+        rows.add_entries(rows.linear(1, low=-most, high=most), tau[joint], 1 / limit)
 
 
 def find_relieved(stage: Stage, limits: LimitSet) -> NDArray[np.bool_]:
