@@ -12,7 +12,7 @@ from wholearm.problem.definition import End
 from wholearm.problem.goal import Goal
 from wholearm.search.chart import Chart
 from wholearm.search.goals import is_at
-from wholearm.search.links import Link
+from wholearm.search.links import Link, cut_curve, look_at, time_parts
 from wholearm.search.places import make_place
 
 
@@ -51,6 +51,32 @@ def test_no_chain_leads_through_an_impact_that_is_not_possible() -> None:
     assert [
         chain for chain, _ in chart.pass_on(place) if str(chain.steps[0].until) == "v3-finger1"
     ] == []
+
+
+def test_chains_are_followed_a_border_at_a_time_to_where_all_of_them_lead() -> None:
+    problem, goal = problem_of(IMPACTS), Goal(flush=1)
+    chart = Chart(problem, 0.1)
+    place = make_place(problem.scene, problem.start)
+    waiting, steps = list(chart.set_out(place, goal)), set()
+    while waiting:
+        own = waiting.pop()
+        if isinstance(own.link, Link):
+            steps.add(own.link.steps)
+            waiting += chart.go_on(own.chain, goal) if own.whole else []
+    every = [link for _, link in chart.list_along(place, goal) if isinstance(link, Link)]
+    assert steps == {link.steps for link in every} and len(steps) > 3
+
+
+def test_parts_of_a_border_take_as_long_together_as_one_by_one() -> None:
+    problem = problem_of(IMPACTS)
+    chart, shares = Chart(problem, 0.1), np.array([0.2, 0.5, 0.8])
+    for border in chart.trace(make_place(problem.scene, problem.start)):
+        times = time_parts(border.curve, shares, chart.epsilon, 0.1)
+        for share, took in zip(shares, times, strict=True):
+            part = cut_curve(border.curve, share * border.curve.length)
+            alone = look_at((part,), chart.epsilon, 0.1)
+            assert np.isfinite(took) == (not isinstance(alone, str))
+            assert isinstance(alone, str) or took == pytest.approx(alone.duration, rel=0.02)
 
 
 def test_a_landing_is_led_to_where_the_goal_is() -> None:

@@ -7,7 +7,6 @@ tangent. Either is known from the curves alone, and the speed after is in propor
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,6 +38,11 @@ class Chain:
     steps: tuple[Step, ...]
     borders: tuple[Border, ...]
     curves: tuple[Curve, ...]
+
+    @classmethod
+    def of(cls, border: Border) -> Chain:
+        """A border that others may follow."""
+        return cls((), (border,), (border.curve,))
 
     def extend(self, following: Border) -> Chain | None:
         """The chain with another border passed into in motion; None where that is not possible."""
@@ -76,19 +80,3 @@ class Chain:
         step = Step(last.formation.contacts, Until(contact=last.gained))
         stop = make_place(last.formation.scene, last.curve.end)
         return self.link(step, self.curves[-1], stop, epsilon, least_minor)
-
-
-def list_chains(borders: list[Border], follow: Callable[[Place], list[Border]]) -> Iterator[Chain]:
-    """Chains of two and more borders that set out along some `borders` from a place."""
-    waiting = [Chain((), (border,), (border.curve,)) for border in borders]
-    while waiting:
-        chain = waiting.pop()
-        last = chain.borders[-1]
-        if last.gained is None or len(chain.borders) == LONGEST:
-            continue
-        place = make_place(last.formation.scene, last.curve.end)
-        for border in follow(place):
-            longer = chain.extend(border)
-            if longer is not None:
-                waiting.append(longer)
-                yield longer

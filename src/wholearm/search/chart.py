@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from ..planning.result import Plan
 from ..problem.definition import End, Problem, Until
 from ..problem.goal import Goal
 from .cells import Crossing, cross, go_to
-from .chains import Chain, list_chains
+from .chains import LONGEST, Chain
 from .goals import is_flush, list_pins, list_poses, measure_along
 from .links import (
     Blocked,
@@ -28,8 +28,8 @@ from .links import (
     cut_curve,
     follow_borders,
     link_border,
-    look_at,
     point_out,
+    time_parts,
 )
 from .measure import Measured
 from .places import Key, Place, list_formations_at, make_place, settle
@@ -44,6 +44,23 @@ NEAR = 1.0
 """How far landings are moved to where a goal is, at most, in radii of gyration."""
 
 Found = list[Link | Blocked]
+
+
+class Ahead(NamedTuple):
+    """A link along borders.
+
+    Attributes
+    ----------
+    chain : Chain
+        The borders.
+    link : Link or Blocked
+    whole : bool
+        Whether it follows the last one whole, so that a motion may go on from there.
+    """
+
+    chain: Chain
+    link: Link | Blocked
+    whole: bool
 
 
 class Chart:
@@ -73,6 +90,7 @@ class Chart:
     def __init__(self, problem: Problem, least_minor: float) -> None:
         self.scene, self.epsilon, self.least_minor = problem.scene, problem.epsilon, least_minor
         self.polished: set[Link] = set()
+        self._borders: dict[Key, list[Border]] = {}
         self._links: dict[Key, list[tuple[Border, Link | Blocked | None]]] = {}
         self._cells: dict[Key, Found] = {}
         self.plans: dict[object, Plan | str] = {}
@@ -80,28 +98,46 @@ class Chart:
         self.joined: dict[tuple[object, ...], PlannedLink | str] = {}
         self.measured: dict[Link, Measured | str] = {}
         self._releases: dict[tuple[Key, int], Found] = {}
-        self._chains: dict[Key, list[tuple[Chain, Link | Blocked | None]]] = {}
+        self._longer: dict[tuple[Border, ...], list[tuple[Chain, Link | Blocked | None]]] = {}
+
+    def trace(self, place: Place) -> list[Border]:
+        """Borders that lead on from a place."""
+        key = place.key
+        if key not in self._borders:
+            settled = settle(place) if place.landed else place
+            self._borders[key] = follow_borders(settled) if settled else []
+        return self._borders[key]
 
     def follow(self, place: Place) -> list[tuple[Border, Link | Blocked | None]]:
         """Borders that lead on from a place, with the link along the whole of each."""
         key = place.key
         if key not in self._links:
-            settled = settle(place) if place.landed else place
             self._links[key] = [
                 (border, link_border(border, self.epsilon, self.least_minor))
-                for border in (follow_borders(settled) if settled else [])
+                for border in self.trace(place)
             ]
         return self._links[key]
 
-    def pass_on(self, place: Place) -> list[tuple[Chain, Link | Blocked | None]]:
-        """Borders passed one after the other from a place, with the link along each whole chain."""
-        if place.key not in self._chains:
-            borders = [border for border, _ in self.follow(place)]
-            chains = list_chains(borders, lambda there: [own for own, _ in self.follow(there)])
-            self._chains[place.key] = [
-                (chain, chain.link_whole(self.epsilon, self.least_minor)) for chain in chains
+    def extend(self, chain: Chain) -> list[tuple[Chain, Link | Blocked | None]]:
+        """Chains with one more border that is passed into in motion, with the link along each."""
+        key, last = chain.borders, chain.borders[-1]
+        if last.gained is None or len(key) == LONGEST:
+            return []
+        if key not in self._longer:
+            place = make_place(self.scene, last.curve.end)
+            longer = [chain.extend(border) for border in self.trace(place)]
+            self._longer[key] = [
+                (own, own.link_whole(self.epsilon, self.least_minor)) for own in longer if own
             ]
-        return self._chains[place.key]
+        return self._longer[key]
+
+    def pass_on(self, place: Place) -> Iterator[tuple[Chain, Link | Blocked | None]]:
+        """Borders passed one after the other from a place, with the link along each whole chain."""
+        waiting = [Chain.of(border) for border in self.trace(place)]
+        while waiting:
+            longer = self.extend(waiting.pop())
+            yield from longer
+            waiting += [chain for chain, _ in longer]
 
     def list_along(self, place: Place, goal: Goal) -> Iterator[tuple[Border, Link | Blocked]]:
         """Links along borders from a place to where these end or a goal is, with the first border.
@@ -109,13 +145,33 @@ class Chart:
         Where borders are passed in motion, only those that a motion can take.
         """
         for border, link in self.follow(place):
-            for own in (link, self._end_chain(Chain((), (border,), (border.curve,)), goal)):
+            for own in (link, self._end_chain(Chain.of(border), goal)):
                 if own is not None:
                     yield border, own
         for chain, link in self.pass_on(place):
             for own in (link, self._end_chain(chain, goal)):
                 if isinstance(own, Link):
                     yield chain.borders[0], own
+
+    def set_out(self, place: Place, goal: Goal) -> Iterator[Ahead]:
+        """Links along borders from a place; along more than one only where no stop is possible."""
+        for border, link in self.follow(place):
+            yield from self._list_ends(Chain.of(border), link, goal)
+
+    def go_on(self, chain: Chain, goal: Goal) -> Iterator[Ahead]:
+        """Links that pass the end of a chain in motion; along two more borders as in `set_out`."""
+        for longer, link in self.extend(chain):
+            for own in self._list_ends(longer, link, goal):
+                if isinstance(own.link, Link):
+                    yield own
+
+    def _list_ends(self, chain: Chain, link: Link | Blocked | None, goal: Goal) -> Iterator[Ahead]:
+        if link is not None:
+            yield Ahead(chain, link, True)
+        if (ending := self._end_chain(chain, goal)) is not None:
+            yield Ahead(chain, ending, False)
+        if isinstance(link, Blocked):
+            yield from self.go_on(chain, goal)
 
     def cross_cells(self, place: Place) -> Found:
         """Links from rest at a place through the cells around it."""
@@ -132,17 +188,12 @@ class Chart:
         key = border.start.key, number
         if key in self._releases:
             return self._releases[key]
-        curves, times = [], []
-        for share in RELEASES:
-            curve = cut_curve(border.curve, share * border.curve.length)
-            ahead = look_at((curve,), self.epsilon, self.least_minor)
-            if isinstance(ahead, str):
-                break
-            curves.append(curve)
-            times.append(ahead.duration)
+        shares = np.array(RELEASES)
+        times = time_parts(border.curve, shares, self.epsilon, self.least_minor)
+        shares, times = shares[np.isfinite(times)], times[np.isfinite(times)]
         best: dict[tuple[Formation, str], Link] = {}
-        if curves:
-            z = np.array([curve.end for curve in curves])
+        if len(shares):
+            z = border.curve.evaluate(shares * border.curve.length).z
             held = border.formation.contacts
             middle = make_place(self.scene, z[0])
             for formation in list_formations_at(middle, 3):
@@ -153,7 +204,7 @@ class Chart:
                     )
                     own = formation, str(link.steps[-1].until)
                     if own not in best or link.duration < best[own].duration:
-                        share = RELEASES[way.source]
+                        share = float(shares[way.source])
                         best[own] = replace(link, left=border.curve, share=share)
         self._releases[key] = list(best.values())
         return self._releases[key]

@@ -17,7 +17,8 @@ from itertools import count
 from typing import NamedTuple
 
 from ..problem.goal import Goal
-from .chart import Chart
+from .chains import Chain
+from .chart import Ahead, Chart
 from .goals import is_at, measure_turn
 from .links import Blocked, Border, Link
 from .places import Key, Place
@@ -138,6 +139,10 @@ class Search:
             least = cost + self.measure(place, rule.turning) + more
             heapq.heappush(queue, (least, next(number), cost, route, place, work))
 
+        def put_along(before: tuple[Link, ...], own: Ahead) -> None:
+            assert isinstance(own.link, Link)
+            put(Route((*before, own.link)), own.link.stop, own.chain if own.whole else None)
+
         put(Route(()), self.start, None)
         for _ in range(MOST):
             if not queue:
@@ -145,20 +150,32 @@ class Search:
             cost, _, _, route, place, work = heapq.heappop(queue)
             if cost > self.limit or len(times) > rule.most:
                 return
-            if work is None:
+            if work is None or isinstance(work, Chain):
                 if route.links and is_at(place, self.goal):
                     if route.key not in self.found:
                         self.found.add(route.key)
                         yield route
                     continue
+                if work is not None:
+                    for own in self.chart.go_on(work, self.goal):
+                        put_along(route.links[:-1], own)
                 key = place.key
                 if times[key] >= (1 if place.landed else OFTEN):
                     continue
                 times[key] += 1
                 self.reached.add(key)
-                links = self._follow(route, place, put, rule.leaving, times[key] == 1)
-                put(route, place, "cells", CROSSING * time) if not place.landed else None
-            elif isinstance(work, tuple):
+                for own in self._set_out(route, place):
+                    if isinstance(own.link, Link):
+                        put_along(route.links, own)
+                    elif times[key] == 1 and own.link not in self.blocked:
+                        self.blocked.append(own.link)
+                if not place.landed:
+                    for index, (border, _) in enumerate(self.chart.follow(place)):
+                        if not self._is_back(route, border):
+                            put(route, place, (border, index), rule.leaving * time)
+                    put(route, place, "cells", CROSSING * time)
+                continue
+            if isinstance(work, tuple):
                 border, index = work
                 links = self.chart.release(border, index)
                 links = [*links, *self.chart.land_at(links, self.goal)]
@@ -171,17 +188,13 @@ class Search:
                 elif link not in self.blocked:
                     self.blocked.append(link)
 
-    def _follow(
-        self, route: Route, place: Place, put: object, leaving: float, first: bool
-    ) -> list[Link | Blocked]:
-        """Links along borders, whole or to a goal; releases on the way are put off."""
-        time, links = self.chart.scene.scales.time, list[Link | Blocked]()
-        for border, link in self.chart.list_along(place, self.goal):
-            links += [] if self._is_back(route, border) else [link]
-        for index, (border, _) in enumerate(self.chart.follow(place)):
-            if not place.landed and not self._is_back(route, border):
-                put(route, place, (border, index), leaving * time)  # type: ignore[operator]
-        return links if first else [own for own in links if isinstance(own, Link)]
+    def _set_out(self, route: Route, place: Place) -> list[Ahead]:
+        """Links along borders from the end of a route, but not back."""
+        return [
+            own
+            for own in self.chart.set_out(place, self.goal)
+            if not self._is_back(route, own.chain.borders[0])
+        ]
 
     @staticmethod
     def _is_back(route: Route, border: Border) -> bool:

@@ -17,13 +17,16 @@ from ..mechanics.dynamics import Directions, reduced_inertia
 from ..mechanics.metric import metric_weights
 from ..mechanics.uniqueness import find_minors
 from ..planning.lower_bound.lower_bound import Outlook, look_along
-from ..planning.lower_bound.rows import evaluate_rows
+from ..planning.lower_bound.rows import Rows, evaluate_rows
 from ..planning.lower_bound.sweep import NoMotionError
 from ..problem.definition import End, Until
 from .places import Place, list_formations_at, make_place
+from .sweep import find_durations
 
 INTERVALS = 24
 """Intervals of the grid on which the fastest motion along curves is looked for."""
+PARTED = 16
+"""The same of parts of a curve, many at once."""
 CHECKED = 12
 """Places of a segment at which jamming and ambiguous forces are looked for."""
 
@@ -202,6 +205,38 @@ def look_at(curves: Sequence[Curve], epsilon: float, least_minor: float) -> Outl
             s -= curve.length
         place = curve.evaluate(np.array([min(s, curve.length)])).z[0]
         return f"no motion keeps its limits at {describe_pose(place)}"
+
+
+def time_parts(curve: Curve, shares: Array, epsilon: float, least_minor: float) -> Array:
+    """About the least times along first parts of a curve, from rest to rest, shape (n,) [s].
+
+    Infinite where no motion keeps the limits, or contact forces are not the only ones.
+
+    Parameters
+    ----------
+    curve : Curve
+    shares : ndarray, shape (n,)
+        Lengths of the parts, increasing, over that of the curve.
+    epsilon : float, [N]
+    least_minor : float
+    """
+    lengths = shares * curve.length
+    while len(lengths) and _find_ambiguity(cut_curve(curve, lengths[-1]), least_minor):
+        lengths = lengths[:-1]
+    times = np.full(len(shares), np.inf)
+    if not len(lengths):
+        return times
+    nodes = (1 - np.cos(np.linspace(0, np.pi, PARTED + 1))) / 2
+    places, steps = (nodes[1:] + nodes[:-1]) / 2, np.diff(nodes)
+    s, size = lengths[:, None] * places, lengths[:, None]
+    stops = np.array([part.stop for part in curve.segments[:-1]])
+    rows = evaluate_rows(curve, epsilon, s.ravel(), np.searchsorted(stops, s.ravel()))
+    # By the share of each part that is behind, not by its length.
+    a, b, v, one, cap = (part.reshape(*s.shape, *part.shape[1:]) for part in rows)
+    scale = size[..., None]
+    scaled = Rows(scale * a, scale**2 * b, scale * v, one, cap / size**2)
+    times[: len(lengths)] = find_durations(scaled, steps, (places - nodes[:-1]) / steps)
+    return times
 
 
 def _find_held(curve: Curve, epsilon: float, s: float) -> str:
