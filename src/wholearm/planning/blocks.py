@@ -32,7 +32,7 @@ from ..solvers.statistics import charge
 from .ahead import look_ahead
 from .block_plan import BEGUN, FINEST, PLAIN, BlockPlan, Planning
 from .durations import share_again, share_duration
-from .motors import require_steps
+from .motors import explain_motors, require_steps
 from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence
 from .path_domain.sequence_plan import plan_sequence, plan_slowly
@@ -265,12 +265,18 @@ def _plan_block(
             given = (problem, block, z, options, duration)
             return plan_with_impacts(*given, pinned=pinned, **over_time)
 
-        with charge(block[0].number):
-            if problem.scene.has_slow_motors:
-                from .pauses import plan_with_pauses
+        def plan_other(other: Planning, phases: Sequence[Phase], own: PlanOptions) -> Plans:
+            return _plan_block(other, phases, z, own, allowed)[0]
 
-                return plan_with_pauses(planning, block, plan, add_up(block, allowed)), None
-            return plan(add_up(block, allowed)), None
+        with charge(block[0].number):
+            try:
+                if problem.scene.has_slow_motors:
+                    from .pauses import plan_with_pauses
+
+                    return plan_with_pauses(planning, block, plan, add_up(block, allowed)), None
+                return plan(add_up(block, allowed)), None
+            except (InfeasibleError, SolverError) as error:
+                raise explain_motors(planning, block, options, error, plan_other) from None
     curves = []
     for phase in block:
         traced, later = phase.index < len(known), problem.phases[phase.index + 1 :]

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from ..common.errors import InputError
-from ..problem.definition import Problem
+from ..common.errors import InfeasibleError, InputError, SolverError, WholearmError
+from ..problem.definition import Phase, Problem
+from ..scene.model import Scene
+from .advice import name_phases
 from .block_plan import Planning
 from .options import PlanOptions
 from .splitting import runs_along_curves, split_blocks
+from .stops import Plans
+
+FREE = {"torque_rate_limit": None, "actuator_lag": None, "control_period": None}
+"""Changes of a problem after which motors are quick, and torques are not held."""
+_ROUGH = 1e-2
+"""Least accuracy of plans of which only matters that there are any."""
 
 
 def require_steps(problem: Problem, options: PlanOptions) -> None:
@@ -49,6 +58,61 @@ def free_torques(planning: Planning, options: PlanOptions) -> tuple[Planning, Pl
     if scene.control_period:
         options = replace(options, transcription="auto")
     if scene.has_slow_motors or scene.control_period:
-        free = {"torque_rate_limit": None, "actuator_lag": None, "control_period": None}
-        planning = replace(planning, problem=planning.problem.with_(free))
+        planning = replace(planning, problem=planning.problem.with_(FREE))
     return planning, options
+
+
+def name_motors(scene: Scene) -> str:
+    """The keys that keep torques from stepping when they like, with their values."""
+    given = list[str]()
+    if scene.control_period:
+        given.append(f"control_period = {scene.control_period:g} s ({scene.control_hold})")
+    kinds = (("torque_rate_limit", "N m/s", math.inf), ("actuator_lag", "s", 0.0))
+    for key, unit, free in kinds:
+        values = list(dict.fromkeys(getattr(finger, key) for finger in scene.fingers))
+        if values != [free]:
+            given.append(f"{key} = {' and '.join(f'{value:g}' for value in values)} {unit}")
+    return " and ".join(given)
+
+
+def explain_motors(
+    planning: Planning,
+    block: Sequence[Phase],
+    options: PlanOptions,
+    error: InfeasibleError | SolverError,
+    plan_block: Callable[[Planning, Sequence[Phase], PlanOptions], Plans],
+) -> InfeasibleError | SolverError:
+    """What an error says of phases without a plan, and whether they have one without these keys.
+
+    Parameters
+    ----------
+    planning : Planning
+    block : sequence of Phase
+    options : PlanOptions
+    error : InfeasibleError or SolverError
+    plan_block : callable
+        Plans the same phases of another problem; raises if there is no plan.
+    """
+    keys = name_motors(planning.problem.scene)
+    if not keys:
+        return error
+    where = name_phases([phase.number for phase in block])
+    if isinstance(error, InfeasibleError):
+        where += f" ({'; '.join(' '.join(phase.formation.names) for phase in block)})"
+    free, own = free_torques(replace(planning, curves=()), options)
+    own = replace(own, accuracy=max(own.accuracy, _ROUGH))
+    try:
+        found = plan_block(free, [free.problem.phases[phase.index] for phase in block], own)
+    except WholearmError as other:
+        return _say(error, f"{error}; without {keys} none was found either: {other}")
+    lasts = sum(plan.motion.duration for plan in found)
+    return _say(error, f"without {keys}, {where} has a plan of {lasts:.4g} s; with it: {error}")
+
+
+def _say(error: InfeasibleError | SolverError, text: str) -> InfeasibleError | SolverError:
+    """An error with another text."""
+    if not isinstance(error, InfeasibleError):
+        return SolverError(text)
+    other = InfeasibleError(text, error.shortfalls, error.changes)
+    other.motion = error.motion
+    return other
