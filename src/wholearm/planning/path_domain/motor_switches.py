@@ -8,10 +8,11 @@ step has to be where the line meets what goes on beside it.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...common.arrays import Array
 from .data import PhaseData
-from .elements import Profile
+from .elements import DEGREE, Profile
 from .motion import PathMotion
 from .motor_data import find_torques
 from .switches import Switch
@@ -45,7 +46,9 @@ def find_motor_switches(part: PhaseData, profile: Profile) -> list[Switch]:
     largest = np.where(np.isfinite(part.rate_limit), part.rate_limit, most)
     shares = (rates / largest).reshape(-1, 2)
     torques = torques.reshape(-1, 2)
-    steps = [_find_ramps(t, *own) for own in zip(torques.T, shares.T, largest, strict=True)]
+    owner = np.repeat(part.nonempty // (DEGREE + 1), len(looks))
+    given = zip(torques.T, shares.T, largest, strict=True)
+    steps = [_find_ramps(t, owner, *own) for own in given]
     ends = np.arange(len(looks) - 1, len(t) - 1, len(looks))
     jumps = np.abs(rates.reshape(-1, 2)[ends + 1] - rates.reshape(-1, 2)[ends])
     kinks = t[ends[(jumps * motion.duration > _KINK * part.torque_limit).any(axis=1)]]
@@ -58,8 +61,13 @@ def find_motor_switches(part: PhaseData, profile: Profile) -> list[Switch]:
     return [Switch(float(place), True) for place in _locate(part, motion, profile, found)]
 
 
-def _find_ramps(t: Array, tau: Array, shares: Array, largest: float) -> Array:
-    """When a torque begins and ends to change at its largest rate, of which rates are `shares`."""
+def _find_ramps(
+    t: Array, owner: NDArray[np.int64], tau: Array, shares: Array, largest: float
+) -> Array:
+    """When a torque begins and ends to change at its largest rate, of which rates are `shares`.
+
+    Instants lie in elements that are their `owner`.
+    """
     level = np.where(np.abs(shares) > _HALF, np.sign(shares), 0.0)
     ends = np.flatnonzero(np.diff(np.concatenate([[0.0], level, [0.0]])))
     starts, stops = ends[:-1], ends[1:] - 1
@@ -68,7 +76,7 @@ def _find_ramps(t: Array, tau: Array, shares: Array, largest: float) -> Array:
     borders = np.concatenate([[0], starts, stops, [len(t) - 1]])
     for first, last in zip(starts.tolist(), stops.tolist(), strict=True):
         k = first + int(np.abs(shares[first : last + 1]).argmax())
-        slope, middle = shares[k], (t[first] + t[last]) / 2
+        slope, middle = float(np.clip(shares[k], -1.0, 1.0)), (t[first] + t[last]) / 2
         level = np.interp(middle, t, tau)
         for end, step in ((first, -1), (last, 1)):
             beyond = borders[(borders - end) * step > 0]
@@ -76,7 +84,11 @@ def _find_ramps(t: Array, tau: Array, shares: Array, largest: float) -> Array:
                 continue
             looks = np.arange(end, beyond[np.abs(beyond - end).argmin()] + step, step)
             calm = np.abs(shares[looks])
-            beside = looks[int(np.argmax(calm < _SLOW) if (calm < _SLOW).any() else calm.argmin())]
+            # An element in which the line ends swings: others are believed first.
+            slow = calm < _SLOW
+            steady = slow & ~np.isin(owner[looks], owner[looks][~slow])
+            slow = steady if steady.any() else slow
+            beside = looks[int(np.argmax(slow) if slow.any() else calm.argmin())]
             rise = tau[beside] - level - slope * largest * (t[beside] - middle)
             change = (slope - shares[beside]) * largest
             if change:
