@@ -109,7 +109,7 @@ def _locate(part: PhaseData, motion: PathMotion, profile: Profile, t: Array) -> 
 def _clear_ends(t: Array, duration: float, quickest: float) -> Array:
     """Instants without those early in the ramps at both ends of a motion."""
     for left in (t, duration - t):
-        longest = left[left < quickest].max(initial=0.0)
+        longest = left[left < min(quickest, duration / 2)].max(initial=0.0)
         t = np.where(left < _LATE * longest, np.nan, t)
     return t[np.isfinite(t)]
 
