@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..contacts.formation import Formation
 from ..geometry.curve import Curve
 from ..planning.path_domain.impact_sequence import compute_curve_impact
 from ..problem.definition import End, Phase, Until
@@ -44,11 +45,16 @@ class Chain:
         """A border that others may follow."""
         return cls((), (border,), (border.curve,))
 
+    def can_enter(self, formation: Formation) -> bool:
+        """Whether a formation keeps what is gained at the end, and nothing touches that did not."""
+        last = self.borders[-1]
+        contacts, held = set(formation.contacts), set(last.formation.contacts)
+        return last.gained in contacts and contacts <= {*held, last.gained}
+
     def extend(self, following: Border) -> Chain | None:
         """The chain with another border passed into in motion; None where that is not possible."""
         last, gained = self.borders[-1], self.borders[-1].gained
-        held, coming = {*last.formation.contacts, gained}, set(following.formation.contacts)
-        if gained not in coming or not held >= coming:
+        if not self.can_enter(following.formation):
             return None
         for end in (End.SMOOTH, End.IMPACT):
             phase = Phase(0, last.formation, Until(contact=gained), end)

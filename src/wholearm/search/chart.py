@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..geometry.explore import close_contacts, is_inside
 from ..planning.result import Plan
@@ -25,6 +26,7 @@ from .links import (
     Border,
     Link,
     Step,
+    Unstopped,
     cut_curve,
     follow_borders,
     link_border,
@@ -90,7 +92,7 @@ class Chart:
     def __init__(self, problem: Problem, least_minor: float) -> None:
         self.scene, self.epsilon, self.least_minor = problem.scene, problem.epsilon, least_minor
         self.polished: set[Link] = set()
-        self._borders: dict[Key, list[Border]] = {}
+        self._borders: dict[tuple[Key, tuple[Contact, ...]], list[Border]] = {}
         self._links: dict[Key, list[tuple[Border, Link | Blocked | None]]] = {}
         self._cells: dict[Key, Found] = {}
         self.plans: dict[object, Plan | str] = {}
@@ -100,13 +102,16 @@ class Chart:
         self._releases: dict[tuple[Key, int], Found] = {}
         self._longer: dict[tuple[Border, ...], list[tuple[Chain, Link | Blocked | None]]] = {}
 
-    def trace(self, place: Place) -> list[Border]:
-        """Borders that lead on from a place."""
-        key = place.key
-        if key not in self._borders:
-            settled = settle(place) if place.landed else place
-            self._borders[key] = follow_borders(settled) if settled else []
-        return self._borders[key]
+    def trace(self, place: Place, chain: Chain | None = None) -> list[Border]:
+        """Borders that lead on from a place; only those that a chain may enter, if one is given."""
+        settled, found = settle(place) if place.landed else place, list[Border]()
+        for formation in list_formations_at(settled, 4) if settled else ():
+            if settled and (chain is None or chain.can_enter(formation)):
+                key = place.key, formation.contacts
+                if key not in self._borders:
+                    self._borders[key] = follow_borders(settled, formation)
+                found += self._borders[key]
+        return found
 
     def follow(self, place: Place) -> list[tuple[Border, Link | Blocked | None]]:
         """Borders that lead on from a place, with the link along the whole of each."""
@@ -125,7 +130,7 @@ class Chart:
             return []
         if key not in self._longer:
             place = make_place(self.scene, last.curve.end)
-            longer = [chain.extend(border) for border in self.trace(place)]
+            longer = [chain.extend(border) for border in self.trace(place, chain)]
             self._longer[key] = [
                 (own, own.link_whole(self.epsilon, self.least_minor)) for own in longer if own
             ]
@@ -133,11 +138,13 @@ class Chart:
 
     def pass_on(self, place: Place) -> Iterator[tuple[Chain, Link | Blocked | None]]:
         """Borders passed one after the other from a place, with the link along each whole chain."""
-        waiting = [Chain.of(border) for border in self.trace(place)]
+        waiting = [(Chain.of(border), link) for border, link in self.follow(place)]
         while waiting:
-            longer = self.extend(waiting.pop())
-            yield from longer
-            waiting += [chain for chain, _ in longer]
+            chain, link = waiting.pop()
+            if not _is_barred(link):
+                longer = self.extend(chain)
+                yield from longer
+                waiting += longer
 
     def list_along(self, place: Place, goal: Goal) -> Iterator[tuple[Border, Link | Blocked]]:
         """Links along borders from a place to where these end or a goal is, with the first border.
@@ -170,7 +177,7 @@ class Chart:
             yield Ahead(chain, link, True)
         if (ending := self._end_chain(chain, goal)) is not None:
             yield Ahead(chain, ending, False)
-        if isinstance(link, Blocked):
+        if isinstance(link, Blocked) and not _is_barred(link):
             yield from self.go_on(chain, goal)
 
     def cross_cells(self, place: Place) -> Found:
@@ -269,3 +276,8 @@ class Chart:
                 steps = (Step(formation.contacts, until),)
                 stop = Place(self.scene, way.z, formation.contacts, landed=True)
                 yield Link(place, stop, steps, way.duration, 0.0, True)
+
+
+def _is_barred(link: Link | Blocked | None) -> bool:
+    """Whether no motion can go on beyond a link either."""
+    return isinstance(link, Blocked) and not isinstance(link.reason, Unstopped)

@@ -20,7 +20,7 @@ from ..planning.lower_bound.lower_bound import Outlook, look_along
 from ..planning.lower_bound.rows import Rows, evaluate_rows
 from ..planning.lower_bound.sweep import NoMotionError
 from ..problem.definition import End, Until
-from .places import Place, list_formations_at, make_place
+from .places import Place, make_place
 from .sweep import find_durations
 
 INTERVALS = 24
@@ -29,6 +29,10 @@ PARTED = 16
 """The same of parts of a curve, many at once."""
 CHECKED = 12
 """Places of a segment at which jamming and ambiguous forces are looked for."""
+
+
+class Unstopped(str):
+    """Why no motion along curves ends at rest, though one that goes on beyond them may be."""
 
 
 class Step(NamedTuple):
@@ -112,15 +116,13 @@ class Border:
         return self.curve.formation
 
 
-def follow_borders(place: Place) -> list[Border]:
-    """Every border that leads on from a place, one way or the other."""
-    scene, found = place.scene, []
-    least = HELD * scene.scales.length
-    for formation in list_formations_at(place, 4):
-        for heading in find_headings(formation, place.z):
-            curve = trace_curve(formation, place.z, heading, Until())
-            if curve.length > least and _is_regular(curve):
-                found.append(Border(place, curve, _find_gained(curve)))
+def follow_borders(place: Place, formation: Formation) -> list[Border]:
+    """The border of a formation from a place, one way and the other, as far as it leads on."""
+    found, least = [], HELD * place.scene.scales.length
+    for heading in find_headings(formation, place.z):
+        curve = trace_curve(formation, place.z, heading, Until())
+        if curve.length > least and _is_regular(curve):
+            found.append(Border(place, curve, _find_gained(curve)))
     return found
 
 
@@ -189,10 +191,10 @@ def look_at(curves: Sequence[Curve], epsilon: float, least_minor: float) -> Outl
         reason = _find_ambiguity(curve, least_minor)
         if reason:
             return reason
-    if reason := _find_held(curves[0], epsilon, 0.0) or _find_held(
-        curves[-1], epsilon, curves[-1].length
-    ):
+    if reason := _find_held(curves[0], epsilon, 0.0):
         return reason
+    if reason := _find_held(curves[-1], epsilon, curves[-1].length):
+        return Unstopped(reason)
     try:
         return look_along(curves, epsilon, INTERVALS)
     except NoMotionError as error:
@@ -204,7 +206,7 @@ def look_at(curves: Sequence[Curve], epsilon: float, least_minor: float) -> Outl
                 break
             s -= curve.length
         place = curve.evaluate(np.array([min(s, curve.length)])).z[0]
-        return f"no motion keeps its limits at {describe_pose(place)}"
+        return Unstopped(f"no motion keeps its limits at {describe_pose(place)}")
 
 
 def time_parts(curve: Curve, shares: Array, epsilon: float, least_minor: float) -> Array:
