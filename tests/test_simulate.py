@@ -25,7 +25,7 @@ from wholearm.simulation import within
 from wholearm.simulation.events import EventKind, Glimpses, OutcomeKind, Simulation
 from wholearm.simulation.simulate import simulate
 from wholearm.simulation.statics import balances
-from wholearm.simulation.sticking import find_rest
+from wholearm.simulation.sticking import Collapse, find_rest
 
 
 def pick(index: int) -> tuple[Problem, CosineMotion]:
@@ -303,6 +303,19 @@ def test_balance_at_rest() -> None:
     # Fingers that open by less than their dry friction stay; by more, they do not.
     assert balances(problem.scene, contacts, problem.start, np.array([-0.0099, 0.0099]))
     assert not balances(problem.scene, contacts, problem.start, np.array([-0.0101, 0.0]))
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.004])
+def test_balance_is_lost_where_no_forces_are_left(bend: float) -> None:
+    problem, _ = plan()
+    formation, z = problem.phases[0].formation, problem.start
+    opening = np.array([-1.0, 1.0])
+    coefficients = np.outer(opening, [0.01, 0.01 + bend, 0.0, -bend])
+    lost = find_rest(formation, z).wait(coefficients, -1.0)
+    assert isinstance(lost, Collapse) and -0.1 < lost.x < 0.1
+    for x, holds in ((lost.x - 1e-8, True), (lost.x + 1e-8, False)):
+        tau = coefficients @ x ** np.arange(4)
+        assert balances(problem.scene, formation.contacts, z, tau) == holds
 
 
 def test_torque_steps_are_recorded_twice() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,28 @@ BALANCED = 1e-6
 
 def balances(scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array) -> bool:
     """Whether contact forces inside the friction cones balance gravity and torques at rest."""
-    return not find_pulls(scene, contacts, z, tau).max() > BALANCED * scene.scales.force
+    return measure_lack(scene, contacts, z, tau)[0] <= 0
+
+
+def measure_lack(
+    scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array
+) -> tuple[float, Array]:
+    """How much pull is needed beyond what counts as none, and its rise with the torques.
+
+    See `find_pulls`. The sum of the pulls is convex in the torques: elsewhere it is at least what
+    the rise, from the dual solution, makes of it.
+
+    Returns
+    -------
+    lack : float, [N]
+        Infinite if none balance.
+    rise : ndarray, shape (2,), [1/m]
+    """
+    answer, scales = _solve(scene, contacts, z, tau), scene.scales
+    if answer.status:
+        return np.inf, np.zeros(2)
+    lack = scales.force * (answer.fun - BALANCED)
+    return float(lack), -np.asarray(answer.eqlin.marginals)[3:] / scales.length
 
 
 def find_pulls(scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array) -> Array:
@@ -38,6 +60,12 @@ def find_pulls(scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array
     ndarray, shape (n,), [N]
         Pull of each contact, infinite if none balance; all zero if no contact has to pull.
     """
+    answer, n_c = _solve(scene, contacts, z, tau), len(contacts)
+    return scene.scales.force * answer.x[-n_c:] if answer.status == 0 else np.full(n_c, np.inf)
+
+
+def _solve(scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array) -> Any:
+    """Solve the linear programme of `find_pulls`, with forces in the scene's force."""
     from scipy.optimize import linprog
 
     touching, scales = _formation(scene, contacts), scene.scales
@@ -52,7 +80,7 @@ def find_pulls(scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array
     cone, unit, none = -np.diag(touching.friction), np.eye(n_c), np.zeros((n_c, 2 + n_c))
     within = np.vstack([np.hstack([cone, sign * unit, none]) for sign in (1.0, -1.0)])
     free, pressing = [(None, None)] * n_c, [(0.0, None)] * n_c
-    answer = linprog(
+    return linprog(
         np.repeat([0.0, 1.0], [2 * n_c + 2, n_c]),
         A_ub=within,
         b_ub=np.zeros(2 * n_c),
@@ -61,7 +89,6 @@ def find_pulls(scene: Scene, contacts: tuple[Contact, ...], z: Array, tau: Array
         bounds=[*pressing, *free, *((-d, d) for d in scene.dry[3:] / scales.torque), *pressing],
         method="highs",
     )
-    return scales.force * answer.x[-n_c:] if answer.status == 0 else np.full(n_c, np.inf)
 
 
 @lru_cache(maxsize=64)

@@ -26,14 +26,17 @@ from ..contacts.elemental import Contact
 from ..contacts.formation import Formation, Kinematics
 from ..mechanics.dynamics import Directions
 from .closing import close_contacts
+from .locate import find_root
 from .modes import Mode, share_mode
 from .starting import Departure, RestDirection, Way, find_patterns, respond_at_rest
-from .statics import balances, find_pulls
+from .statics import balances, find_pulls, measure_lack
 from .tolerances import find_tolerances, measure_units
 
 _AHEAD = 1e-5
 """Distance ahead along the free direction at which signs and gaps are found, in units of the
 scene."""
+_NARROW = 1e-10
+"""Width to which the place of a loss of balance is narrowed, over half a piece of the torques."""
 _CHECKS = 9
 """Number of places of a piece that is not linear at which forces at rest are checked."""
 _CLEAR = 1e3
@@ -188,10 +191,27 @@ class Rest:
         return None
 
     def _narrow(self, coefficients: Array, low: float, high: float) -> tuple[float, float]:
-        """Bisect to where balance is lost."""
-        while high - low > 1e-10:
-            middle = (low + high) / 2
-            low, high = (middle, high) if self._balances(coefficients, middle) else (low, middle)
+        """Where balance is lost between two places, to within `_NARROW`.
+
+        The pull that is needed is convex in the torques, so that where a supporting line of it
+        says that none is, the loss is not later: Newton's method comes from above, and as the pull
+        is linear but for a few kinks that takes few steps.
+        """
+        scene = self.formation.scene
+        while high - low > _NARROW:
+            tau = _evaluate(coefficients, high)
+            lack, rise = measure_lack(scene, self.touching, self.z, tau)
+            if lack <= 0:
+                return high, min(high + _NARROW / 2, 1.0)
+            place = (low + high) / 2
+            if np.isfinite(lack):
+                place = _find_loss(coefficients, low, high, lack, rise)
+            elif self._balances(coefficients, place):
+                low = place
+                continue
+            if high - place <= _NARROW:
+                return place, high
+            high = place
         return low, high
 
     def _collapse(self, coefficients: Array, high: float) -> Collapse:
@@ -212,6 +232,16 @@ class Rest:
         """Whether friction jams one of the two ways, or every choice of directions."""
         jammed = [way.ratio <= 0 for way in self.ways]
         return all(jammed) if self.formation.n_constraints < 4 else any(jammed)
+
+
+def _find_loss(coefficients: Array, low: float, high: float, lack: float, rise: Array) -> float:
+    """Where the line that supports the pull at `high` says that it is none, at `low` or later."""
+    tau = _evaluate(coefficients, high)
+
+    def spare(x: float) -> float:
+        return -lack - float(rise @ (_evaluate(coefficients, x) - tau))
+
+    return find_root(spare, high, spare(low), -lack, 1e-3 * _NARROW, 0.0, low)
 
 
 def find_rest(formation: Formation, z: Array) -> Rest:
