@@ -71,9 +71,13 @@ class Chain:
     def link(
         self, last: Step, curve: Curve, stop: Place, epsilon: float, least_minor: float
     ) -> Link | Blocked:
-        """The link along the chain, at rest at the end of a last phase along its `curve`."""
+        """The link along the chain, at rest at the end of a last phase along its `curve`.
+
+        What bars motions from the borders before has been looked for when these were the chain.
+        """
         start, steps = self.borders[0].start, (*self.steps, last)
-        ahead = look_at((*self.curves[:-1], curve), epsilon, least_minor)
+        curves = (*self.curves[:-1], curve)
+        ahead = look_at(curves, epsilon, least_minor, known=len(self.steps))
         if isinstance(ahead, str):
             return Blocked(start, steps, ahead, stop)
         return Link(start, stop, steps, ahead.duration, ahead.bound)

@@ -185,13 +185,18 @@ def cut_curve(curve: Curve, length: float) -> Curve:
     return replace(curve, length=length, ending="", reached=True)
 
 
-def look_at(curves: Sequence[Curve], epsilon: float, least_minor: float) -> Outlook | str:
-    """About how long motions along curves take, or why there are none, in words."""
-    for curve in curves:
+def look_at(
+    curves: Sequence[Curve], epsilon: float, least_minor: float, known: int = 0
+) -> Outlook | str:
+    """About how long motions along curves take, or why there are none, in words.
+
+    Of the first `known` curves it is known that motions begin there and forces are the only ones.
+    """
+    for curve in curves[known:]:
         reason = _find_ambiguity(curve, least_minor)
         if reason:
             return reason
-    if reason := _find_held(curves[0], epsilon, 0.0):
+    if not known and (reason := _find_held(curves[0], epsilon, 0.0)):
         return reason
     if reason := _find_held(curves[-1], epsilon, curves[-1].length):
         return Unstopped(reason)
