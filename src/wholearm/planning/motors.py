@@ -106,7 +106,8 @@ def explain_motors(
     except WholearmError as other:
         return _say(error, f"{error}; without {keys} none was found either: {other}")
     lasts = sum(plan.motion.duration for plan in found)
-    return _say(error, f"without {keys}, {where} has a plan of {lasts:.4g} s; with it: {error}")
+    found_one = f"without {keys} there is a plan of {lasts:.4g} s for {where}"
+    return _say(error, f"{found_one}; with that, {error}")
 
 
 def _say(error: InfeasibleError | SolverError, text: str) -> InfeasibleError | SolverError:
