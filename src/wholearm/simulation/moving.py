@@ -120,14 +120,16 @@ def _comes_later(run: Replay) -> bool:
     """Whether a motion whose deceleration fades still comes nearer, at a break that is not its end.
 
     It is slow, and near the end of its phase, long before it is there. What slow motors do not make
-    step may have breaks anywhere, as tables of torques do.
+    step may have breaks anywhere, as tables of torques do. What comes within the time for which
+    a formation is held at rest may as well be there.
     """
     coming = run.piece + 1
     if not run.problem.scene.has_slow_motors or run.phase.end is not End.REST:
         return False
     if coming + 1 >= len(run.breaks) or run.steps_at[coming]:
         return False
-    return _measure_rate(run) < -CREEPING
+    late = 2 * _time_to_stop(run) > run.tolerances.rest_window
+    return late and _measure_rate(run) < -CREEPING
 
 
 def _pass_break(run: Replay) -> Ending | None:
