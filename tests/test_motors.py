@@ -18,6 +18,7 @@ from wholearm.results.torque import TorqueProfile, read_torque_csv
 from wholearm.results.torque_table import read_rows
 from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.simulation.statics import balances
+from wholearm.simulation.tolerances import find_tolerances
 from wholearm.verification.motors import describe_motors, find_commands
 
 
@@ -93,7 +94,7 @@ def test_breaks_just_before_the_end_of_a_phase_do_not_end_it(slow: tuple[Problem
     found = simulate(problem, dense)
     assert found.outcome.kind is OutcomeKind.GOAL_REACHED
     came = next(event.time for event in found.events if event.kind is EventKind.ARRIVAL)
-    assert came == pytest.approx(first, abs=2e-5)
+    assert came == pytest.approx(first, abs=find_tolerances(problem.scene).rest_window)
 
 
 def test_a_table_of_slow_torques_is_one_that_motors_can_follow(slow: tuple[Problem, Plan]) -> None:
