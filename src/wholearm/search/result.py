@@ -17,7 +17,7 @@ from .find import EAGER, Route, Search
 from .links import Blocked, describe_steps
 from .opening import list_cut
 
-LISTED = 6
+LISTED = 3
 """Most reasons that a message names."""
 NOT_CONSIDERED = (
     "not considered: rolling contacts, formations without the palm or without one of the fingers, "
