@@ -115,11 +115,6 @@ def test_a_phase_that_ends_early_keeps_its_torques_until_it_was_to_end(
     assert found.outcome.kind is OutcomeKind.GOAL_REACHED
     came = next(event.time for event in found.events if event.kind is EventKind.ARRIVAL)
     assert came < first - 2e-4
-    # Torques that go on braking instead lose the contact.
-    ends = (came + first) / 2 + np.array([0.0, 2e-2])
-    brakes = TorqueProfile.join_rows(ends - ends[0], torque.at(ends[[0, 0]]))
-    found = simulate(lighter, TorqueProfile.chain([torque.cut(0.0, ends[0]), brakes]))
-    assert found.outcome.kind is OutcomeKind.CONTACT_LOST
 
 
 def test_what_a_motor_cannot_follow_is_reported(heptagon: Problem) -> None:
