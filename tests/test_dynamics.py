@@ -311,6 +311,14 @@ def test_reduced_inertia_has_the_sign_of_the_mass_along_the_motion(
         assert ratio == pytest.approx(expected, rel=1e-9)
 
 
+def test_contacts_that_depend_on_each_other_have_no_reduced_inertia() -> None:
+    formation, z = standing()
+    at, twice = formation.evaluate(z[None], z[None]), [0, 0, 1, 1]
+    at = at._replace(A=at.A[:, twice], A_t=at.A_t[:, twice], P=at.P[:, twice])
+    ratio = reduced_inertia(formation, at, Directions(np.ones(4), np.ones(2)))
+    assert not np.isfinite(ratio).any()
+
+
 def test_forward_takes_any_number_of_contacts(curves: tuple[Curve, ...]) -> None:
     curve = curves[0]
     for count in (1, 2, 3):

@@ -132,14 +132,18 @@ def split_forces(formation: Formation, c: Array, Xi: Array) -> tuple[Array, Arra
 
 
 def reduced_inertia(formation: Formation, kinematics: Kinematics, directions: Directions) -> Array:
-    """Reduced inertia over that without friction, shape (n,): jamming at zero and below."""
+    """Reduced inertia over that without friction, shape (n,): jamming at zero and below.
+
+    Infinite or NaN where the contacts depend on each other.
+    """
     inverse_mass = 1 / formation.scene.mass_diagonal
     P = kinematics.P
     G = force_rows(formation, kinematics, directions)
-    return np.asarray(
-        np.linalg.det((P * inverse_mass) @ G.transpose(0, 2, 1))
-        / np.linalg.det((P * inverse_mass) @ P.transpose(0, 2, 1))
-    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(
+            np.linalg.det((P * inverse_mass) @ G.transpose(0, 2, 1))
+            / np.linalg.det((P * inverse_mass) @ P.transpose(0, 2, 1))
+        )
 
 
 def inverse(

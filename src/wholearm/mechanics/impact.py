@@ -154,7 +154,7 @@ def _compute_impact(before: Formation, after: Formation, z: Array, v: Array, Xi:
     P, mass = kinematics.P[0], after.scene.mass_diagonal
     directions = Directions(Xi, np.ones(2))
     ratio = float(reduced_inertia(after, kinematics, directions)[0])
-    if ratio <= 0:
+    if not ratio > 0:
         jam = ImpactViolation(ViolationKind.JAM, " ".join(after.names), ratio)
         return Impact(after, np.full(5, np.nan), np.full(len(P), np.nan), Xi, (jam,))
     v_after, p = solve_impulses(mass, P, force_rows(after, kinematics, directions)[0], v)

@@ -268,8 +268,7 @@ def _find_ambiguity(curve: Curve, least: float) -> str:
     for part in curve.segments:
         s = np.linspace(part.start, min(part.stop, curve.length), CHECKED)
         at = curve.evaluate(s)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inertia = reduced_inertia(formation, at.kinematics, Directions(part.Xi, part.sigma))
+        inertia = reduced_inertia(formation, at.kinematics, Directions(part.Xi, part.sigma))
         if not np.isfinite(inertia).all():
             return "its contacts depend on each other"
         if inertia.min() <= 0:

@@ -75,8 +75,7 @@ def _follow(problem: Problem, border: Border, places: Array) -> list[Rows]:
         curvature = arcs[-1] ** 2 * z_ss[order]
         forces = inverse(formation, z[order], tangent, curvature, directions, part)
         rows = limit(every, forces, tangent[:, 3:])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inertia = reduced_inertia(formation, part, directions)
+        inertia = reduced_inertia(formation, part, directions)
         ratios = find_minors(formation, part, directions.Xi).ratios
         closed = ~(inertia > 0) | (ratios < LEAST_MINOR)
         rows.one[closed], rows.a[closed], rows.b[closed] = -1.0, 0.0, 0.0

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ...common.errors import JammingError
+from ...common.errors import InputError, JammingError
 from ...common.minima import find_minima
 from ...common.shortfalls import Parameter
 from ...geometry.curve import Curve, describe_pose
@@ -218,6 +218,8 @@ def prepare(
 
     Raises
     ------
+    InputError
+        If contacts depend on each other anywhere.
     JammingError
         If friction makes the reduced inertia vanish or turn negative anywhere.
     """
@@ -230,6 +232,10 @@ def prepare(
     point = curve.evaluate(s)
     formation, directions = curve.formation, directions_of(curve, segment)
     inertia = reduced_inertia(formation, point.kinematics, directions)
+    if not np.isfinite(inertia).all():
+        place = describe_pose(point.z[int(np.isfinite(inertia).argmin())])
+        text = f"{' '.join(formation.names)} depend on each other at {place}"
+        raise InputError("", f"phases[{phase}].contacts", text)
     if inertia.min() <= 0:
         worst = int(inertia.argmin())
         raise JammingError(
