@@ -10,6 +10,7 @@ import pytest
 
 from shipped import HEPTAGON, problem_of
 from wholearm.benchmark.enumeration import END, PHASES, Graph, summarise
+from wholearm.benchmark.queries import NOT_ASKED, Outcome
 from wholearm.problem.definition import Until
 from wholearm.search.chart import Chart
 from wholearm.search.links import Link, Step
@@ -60,11 +61,14 @@ def test_the_best_route_is_that_of_all_sequences(seed: int) -> None:
 
 
 def test_the_share_counts_what_the_search_has_missed() -> None:
-    record = {"scene": "square", "exhausted": True, "best": None, "search": "solved"}
-    records = [record | {"query": k, "duration": 1.0} for k in range(3)]
-    records.append(record | {"query": 3, "search": "blocked"})
-    assert "100.0 %" in summarise(records)
-    records.append(record | {"query": 4, "search": "blocked", "best": 0.5})
-    text = summarise(records)
-    assert "3 solved by the search, 1 more" in text and "75.0 %" in text
-    assert "missed: 4 (square), 0.5000 s" in text
+    solved = [Outcome("square", "solved", NOT_ASKED, duration=1.0, phases=k) for k in (2, 6, 7)]
+    blocked = [Outcome("square", "blocked", NOT_ASKED)] * 2
+    record = {"scene": "square", "exhausted": True, "best": None, "search": "blocked", "phases": 0}
+    records = [record | {"query": 3}]
+    # Longer than what is enumerated counts for neither.
+    assert "known for: the search has solved 2, 100.0 %" in summarise([*solved, *blocked], records)
+    records.append(record | {"query": 4, "best": 0.5})
+    text = summarise([*solved, *blocked], records)
+    assert "has solved 2, 66.7 %" in text and "missed: 4 (square), 0.5000 s" in text
+    records.append(record | {"query": 5, "exhausted": False})
+    assert "not to the end: 5" in summarise(solved, records)

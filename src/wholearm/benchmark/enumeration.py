@@ -1,13 +1,13 @@
 """Every route of up to six phases, to see what the search for routes leaves out.
 
-``python -m wholearm.benchmark.enumeration [--queries 250] [--first 0] [--seed 0] [-o FILE.jsonl]``
-takes the queries of `benchmark.queries`. For each it asks the search, and then looks at all
-sequences of phases that the map has, along borders, passed or with stops, and through cells, also
-from where cells have been left: no rule of thumb says which way to go, and none is left out for
-what it costs. As all links begin and end at rest, they are planned once, and a shortest path over
-them stands for all sequences. It goes on until a route is found where the search found none, or
-until nothing can be faster than the search's answer, for as long as a query may last. Lines of JSON
-are added to the file; queries that are there already are left out.
+``python -m wholearm.benchmark.enumeration RECORDS.jsonl [--unsolved] [-o FILE.jsonl]`` takes the
+queries of `benchmark.queries` from its file of records, or those of them that the search has not
+solved. For each it looks at all sequences of phases that the map has, along borders, passed or with
+stops, and through cells, also from where cells have been left: no rule of thumb says which way to
+go, and none is left out for what it costs. As all links begin and end at rest, they are planned
+once, and a shortest path over them stands for all sequences. It goes on until a route is found
+where the search found none, or until nothing can be faster than the search's answer, for as long as
+a query may last. Lines of JSON are added to the file; queries that are there already are left out.
 """
 
 from __future__ import annotations
@@ -17,12 +17,11 @@ import json
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..common.errors import InfeasibleError, WholearmError
 from ..planning.options import PlanOptions
 from ..planning.result import Plan
 from ..problem.definition import Problem
@@ -34,8 +33,7 @@ from ..search.links import Link
 from ..search.measure import Measured
 from ..search.places import Key, Place, make_place
 from ..search.polishing import Polisher
-from ..search.route import find_route, forget_charts
-from .queries import Query, draw_query
+from .queries import Outcome, Query, draw_query, read_records
 
 PHASES = 6
 """Most phases of a route."""
@@ -200,71 +198,84 @@ def _plan_route(
     return None, route.links[-1]
 
 
-def run_query(query: Query, charts: dict[str, Chart], seconds: float) -> dict[str, Any]:
-    """Ask the search, and then look at every route."""
+def run_query(
+    query: Query, outcome: Outcome, charts: dict[str, Chart], seconds: float
+) -> dict[str, Any]:
+    """Look at every route of a query, of which is known what came of its search."""
     problem = draw_query(query)
     chart = charts.setdefault(problem.name, Chart(problem, PlanOptions().least_minor))
     record: dict[str, Any] = {"query": query.number, "scene": problem.name}
-    forget_charts()
-    started, enough = time.process_time(), math.inf
-    try:
-        answer = find_route(problem)
-        record |= {"search": "solved", "duration": answer.plan.duration}
-        enough = FASTER * answer.plan.duration
-    except InfeasibleError:
-        record["search"] = "blocked"
-    except WholearmError as error:
-        record |= {"search": "no answer", "reason": str(error)}
-    record["searched"] = round(time.process_time() - started, 2)
+    record |= {"search": outcome.kind, "duration": outcome.duration, "phases": outcome.phases}
+    enough = FASTER * outcome.duration if outcome.kind == "solved" else math.inf
     started = time.process_time()
     record |= enumerate_routes(problem, chart, enough, seconds)
     return record | {"enumerated": round(time.process_time() - started, 2)}
 
 
-def summarise(records: list[dict[str, Any]]) -> str:
-    """Of how many queries that a route of up to six phases solves the search has an answer."""
-    solved = [own for own in records if own["search"] == "solved"]
+def summarise(outcomes: Sequence[Outcome], records: Sequence[dict[str, Any]]) -> str:
+    """Of how many queries that a route of up to six phases solves the search has an answer.
+
+    Parameters
+    ----------
+    outcomes : sequence of Outcome
+        What came of all searches.
+    records : sequence of dict
+        What came of looking at every route, of some of them.
+    """
+    short = [own for own in outcomes if own.kind == "solved" and own.phases <= PHASES]
     missed = [own for own in records if own["search"] != "solved" and own["best"] is not None]
-    sure = [own for own in records if own["exhausted"]]
-    faster = [own for own in solved if own["best"] is not None]
-    both = len(solved) + len(missed)
-    share = 100 * len(solved) / both if both else math.nan
+    shorter = [own for own in records if own["phases"] > PHASES and own["best"] is not None]
+    faster = [own for own in records if own["search"] == "solved" and own["best"] is not None]
+    known = len(short) + len(shorter)
+    both = known + len(missed)
+    share = 100 * known / both if both else math.nan
+    open_ones = [own["query"] for own in records if not own["exhausted"] and own["best"] is None]
     lines = [
-        f"{len(records)} queries, {len(solved)} solved by the search, {len(missed)} more by a "
-        f"route of up to {PHASES} phases: {share:.1f} %.",
-        f"{len(sure)} enumerated to the end; {len(faster)} answers with a faster route.",
+        f"{len(outcomes)} queries, {both} of which a route of up to {PHASES} phases is known for: "
+        f"the search has solved {known}, {share:.1f} %.",
+        f"{len(records)} enumerated, {len(records) - len(open_ones)} of them to the end; "
+        f"{len(faster)} answers with a faster route.",
     ]
     lines += [f"missed: {own['query']} ({own['scene']}), {own['best']:.4f} s" for own in missed]
     lines += [
         f"faster: {own['query']} ({own['scene']}), {own['best']:.4f} s, not {own['duration']:.4f} s"
         for own in faster
     ]
+    lines += [f"not to the end: {', '.join(map(str, open_ones))}"] if open_ones else []
     return "\n".join(lines)
 
 
 def main() -> int:
     """Add a line for each query to a file, and print a summary."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--queries", type=int, default=250)
-    parser.add_argument("--first", type=int, default=0, help="number of the first query")
-    parser.add_argument("--step", type=int, default=1, help="from one number to the next")
+    parser.add_argument("records", type=Path, help="what came of searches")
+    parser.add_argument("--unsolved", action="store_true", help="only what these have not solved")
+    parser.add_argument("--first", type=int, default=0, help="the first query that is looked at")
+    parser.add_argument("--step", type=int, default=1, help="from one to the next")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--problems", type=Path, default=Path("problems"), help="folder of scenes")
     parser.add_argument("--seconds", type=float, default=60.0, help="most, for each query")
     parser.add_argument("-o", "--output", type=Path, default=Path("enumeration.jsonl"))
     options = parser.parse_args()
+    outcomes = read_records(options.records, options.seed)
     text = options.output.read_text(encoding="utf-8") if options.output.exists() else ""
     records = [json.loads(line) for line in text.splitlines()]
     known, charts = {own["query"] for own in records}, dict[str, Chart]()
-    numbers = range(options.first, options.queries, options.step)
-    for number in (own for own in numbers if own not in known):
+    asked = [
+        number
+        for number, own in sorted(outcomes.items())
+        if not (options.unsolved and own.kind == "solved")
+    ]
+    for number in asked[options.first :: options.step]:
+        if number in known:
+            continue
         query = Query(options.seed, number, options.problems)
-        records.append(run_query(query, charts, options.seconds))
+        records.append(run_query(query, outcomes[number], charts, options.seconds))
         line = json.dumps(records[-1])
         print(line, flush=True)
         with options.output.open("a", encoding="utf-8") as stream:
             stream.write(f"{line}\n")
-    print(summarise(records))
+    print(summarise(list(outcomes.values()), records))
     return 0
 
 

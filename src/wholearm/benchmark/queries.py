@@ -1,11 +1,12 @@
 """Seeded queries from pose to pose: which are solved, how fast, and how near to the bound.
 
-``python -m wholearm.benchmark.queries [--queries 250] [--seed 0] [--jobs 2] [--records FILE.jsonl]
+``python -m wholearm.benchmark.queries [--queries 250] [--seed 0] [--jobs 1] [--records FILE.jsonl]
 [-o FILE.md]`` prints a line for each query and a table. With a file of records the study goes on
-where it was stopped. A query has a start and a goal, each an edge on the palm and an x
-at which both fingers close on the object, drawn at random for the shipped scenes and for random
-polygons in the hexagon's hand. Each query is asked twice: first of a scene that nothing is known
-of, then again from the other end of the same border, with what is known.
+where it was stopped. So many `jobs` are asked at once; times by the wall clock are of use with one
+job, on a machine that does nothing else. A query has a start and a goal, each an edge on the palm
+and an x at which both fingers close on the object, drawn at random for the shipped scenes and for
+random polygons in the hexagon's hand. Each query is asked twice: first of a scene that nothing is
+known of, then again from the other end of the same border, with what is known.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -52,6 +53,27 @@ class Query(NamedTuple):
     folder: Path
 
 
+class Spent(NamedTuple):
+    """Time that a query takes, by the wall clock and of its own process [s]."""
+
+    wall: float
+    processor: float
+
+
+NOT_ASKED = Spent(np.nan, np.nan)
+
+
+class Stopwatch:
+    """Time since it was made."""
+
+    def __init__(self) -> None:
+        self._wall, self._processor = time.perf_counter(), time.process_time()
+
+    def read(self) -> Spent:
+        """What has been spent since [s]."""
+        return Spent(time.perf_counter() - self._wall, time.process_time() - self._processor)
+
+
 class Outcome(NamedTuple):
     """What came of a query.
 
@@ -59,19 +81,24 @@ class Outcome(NamedTuple):
     ----------
     scene : str
     kind : {"solved", "blocked", "no answer", "plan that fails"}
-    seconds, second : float
-        Processor time of the query, and of the second one; NaN where it is not asked.
+    first, second : Spent
+        By the query, and by the second one; NaN where it is not asked.
     gap : float
         Of routes along borders alone, NaN for others.
+    duration : float
+        Of the plan [s]; NaN where there is none.
+    phases : int
     text : str
     """
 
     scene: str
     kind: str
-    seconds: float
-    second: float
-    gap: float
-    text: str
+    first: Spent
+    second: Spent = NOT_ASKED
+    gap: float = np.nan
+    duration: float = np.nan
+    phases: int = 0
+    text: str = ""
 
 
 def draw_scene(seed: int, number: int, folder: Path) -> Table:
@@ -122,35 +149,38 @@ def run_query(query: Query) -> Outcome:
     problem = draw_query(query)
     forget_charts()
     name = f"{problem.name}: {problem.table['start']} to {problem.goals[0]}"
-    started = time.process_time()
+    spent = Stopwatch()
     try:
         answer = find_route(problem)
-    except InfeasibleError as error:
-        seconds = time.process_time() - started
-        return Outcome(name, "blocked", seconds, np.nan, np.nan, str(error))
     except WholearmError as error:
-        seconds = time.process_time() - started
-        return Outcome(name, "no answer", seconds, np.nan, np.nan, str(error))
-    seconds = time.process_time() - started
+        kind = "blocked" if isinstance(error, InfeasibleError) else "no answer"
+        return Outcome(name, kind, spent.read(), text=str(error))
+    first = spent.read()
     failures = verify(answer.problem, answer.plan).failures
     if failures:
-        return Outcome(name, "plan that fails", seconds, np.nan, np.nan, failures[0])
-    gap = np.nan if answer.gap is None else answer.gap
-    text = f"{answer.plan.duration:.6f} s, {len(answer.problem.phases)} phases"
-    return Outcome(name, "solved", seconds, _ask_again(problem), gap, text)
+        return Outcome(name, "plan that fails", first, text=failures[0])
+    return Outcome(
+        name,
+        "solved",
+        first,
+        _ask_again(problem),
+        np.nan if answer.gap is None else answer.gap,
+        answer.plan.duration,
+        len(answer.problem.phases),
+    )
 
 
-def _ask_again(problem: Problem) -> float:
-    """Processor time of a query to nearly the same goal, with what is known of the scene [s]."""
+def _ask_again(problem: Problem) -> Spent:
+    """Time of a query to nearly the same goal, with what is known of the scene."""
     goal, step = problem.goals[0], SECOND * problem.scene.scales.length
     assert goal.x is not None
     table = {**problem.table, "goal": Goal(flush=goal.flush, x=goal.x + step).to_table()}
-    started = time.process_time()
+    spent = Stopwatch()
     try:
         find_route(build_problem(table))
     except WholearmError:
-        return float("nan")
-    return time.process_time() - started
+        return NOT_ASKED
+    return spent.read()
 
 
 def summarise(outcomes: Sequence[Outcome]) -> str:
@@ -158,18 +188,22 @@ def summarise(outcomes: Sequence[Outcome]) -> str:
     kinds = Counter(own.kind for own in outcomes)
     lines = ["| queries | " + " | ".join(kinds) + " |", "|---|" + "---|" * len(kinds)]
     lines.append(f"| {len(outcomes)} | " + " | ".join(str(n) for n in kinds.values()) + " |")
-    lines += ["", "| processor time | median [s] | 95 % [s] | most [s] |", "|---|---|---|---|"]
+    lines += ["", "| time | median [s] | 95 % [s] | most [s] | processor, median [s] |"]
+    lines += ["|---|---|---|---|---|"]
     solved = [own for own in outcomes if own.kind == "solved"]
+    again = [own for own in solved if own.second.wall == own.second.wall]
     rows = [
-        ("solved", [own.seconds for own in solved]),
-        ("second query", [own.second for own in solved if own.second == own.second]),
-        ("blocked", [own.seconds for own in outcomes if own.kind == "blocked"]),
+        ("all", [own.first for own in outcomes]),
+        ("solved", [own.first for own in solved]),
+        ("blocked", [own.first for own in outcomes if own.kind == "blocked"]),
+        ("second query", [own.second for own in again]),
     ]
-    for name, times in rows:
-        if times:
-            middle, most, last = np.percentile(times, [50, 95, 100])
-            lines.append(f"| {name} | {middle:.2f} | {most:.2f} | {last:.2f} |")
-    ratios = [own.second / own.seconds for own in solved if own.second == own.second]
+    for name, spent in rows:
+        if spent:
+            middle, most, last = np.percentile([own.wall for own in spent], [50, 95, 100])
+            processor = np.median([own.processor for own in spent])
+            lines.append(f"| {name} | {middle:.2f} | {most:.2f} | {last:.2f} | {processor:.2f} |")
+    ratios = [own.second.wall / own.first.wall for own in again]
     gaps = [own.gap for own in solved if own.gap == own.gap]
     if ratios:
         lines += ["", f"Second over first query: median {np.median(ratios):.3f}."]
@@ -184,13 +218,20 @@ def read_records(path: Path | None, seed: int) -> dict[int, Outcome]:
     if path is None or not path.exists():
         return {}
     lines = (json.loads(line) for line in path.read_text(encoding="utf-8").splitlines())
-    return {own["number"]: Outcome(*own["outcome"]) for own in lines if own["seed"] == seed}
+    return {own["number"]: _revive(own["outcome"]) for own in lines if own["seed"] == seed}
+
+
+def _revive(values: list[Any]) -> Outcome:
+    scene, kind, first, second, *others = values
+    return Outcome(scene, kind, Spent(*first), Spent(*second), *others)
 
 
 def _keep(path: Path | None, query: Query, outcome: Outcome) -> None:
     """Add a query to a file of records, and print a line about it."""
-    line = f"{query.number} {outcome.scene}: {outcome.kind}, {outcome.seconds:.2f} s, then"
-    print(f"{line} {outcome.second:.2f} s: {outcome.text[:160]}", flush=True)
+    first, second = outcome.first, outcome.second
+    line = f"{query.number} {outcome.scene}: {outcome.kind}, {first.wall:.2f} s, then"
+    text = outcome.text[:160] or f"{outcome.duration:.6f} s, {outcome.phases} phases"
+    print(f"{line} {second.wall:.2f} s: {text}", flush=True)
     if path is not None:
         record = {"seed": query.seed, "number": query.number, "outcome": list(outcome)}
         with path.open("a", encoding="utf-8") as stream:
@@ -204,7 +245,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0, help="number of the first query")
     parser.add_argument("--problems", type=Path, default=Path("problems"), help="folder of scenes")
-    parser.add_argument("--jobs", type=int, default=1, help="worker processes")
+    parser.add_argument("--jobs", type=int, default=1, help="queries at once")
     parser.add_argument("--records", type=Path, help="JSON lines that the study goes on with")
     parser.add_argument("-o", "--output", type=Path, help="file for the tables")
     options = parser.parse_args()
@@ -215,7 +256,7 @@ def main() -> int:
     for answer in run_tasks(run_query, tasks, options.jobs, 2 * BOUND):
         own = answer.result
         if answer.ended != "done":
-            own = Outcome("", "no answer", answer.seconds, np.nan, np.nan, str(own)[-300:])
+            own = Outcome("", "no answer", NOT_ASKED, text=str(own)[-300:])
         outcomes[answer.task.number] = own
         _keep(options.records, answer.task, own)
     tables = summarise(list(outcomes.values()))
