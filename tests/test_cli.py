@@ -430,6 +430,7 @@ def test_output_that_is_a_device(folder: Path) -> None:
             ["solve", str(HEPTAGON), "--certify", "--objective", "margin"],
             "is for the objective time",
         ),
+        (["solve", str(HEPTAGON), "--cache", "found"], "--cache: is for problems with [goal]"),
         (["plot", "a.npz"], "-o/--output"),
         (["verify", str(HEPTAGON), "a.npz", "--tolerance", "0"], "--tolerance: 0.0 is not a pos"),
     ],

@@ -16,6 +16,7 @@ from wholearm.common.interrupts import guard, yielding
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phase
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
+from wholearm.planning.saved import load_plan
 from wholearm.problem.definition import Phase, Problem
 from wholearm.problem.goal import Goal
 from wholearm.problem.read import build_problem
@@ -178,9 +179,14 @@ def test_route_prints_phases_that_load(tmp_path: Path, capsys: pytest.CaptureFix
     text = HEPTAGON.read_text(encoding="utf-8").split("[[phases]]")[0]
     path = tmp_path / "goal.toml"
     path.write_text(f"{text}[goal]\nflush = 0\nx = 0.03\n", encoding="utf-8")
-    assert main(["route", str(path)]) == 0
+    found = tmp_path / "found"
+    assert main(["route", str(path), "--cache", str(found)]) == 0
     (phase,) = tomllib.loads(capsys.readouterr().out)["phases"]
-    assert phase["until"] == {"x": 0.03}
+    assert phase["until"] == {"x": 0.03} and len(list(found.iterdir())) == 1
+    plan = tmp_path / "plan.npz"
+    assert main(["solve", str(path), "-o", str(plan), "--cache", str(found)]) == 0
+    assert phase["until"] == load_plan(plan).problem.table["phases"][0]["until"]
+    assert f"wrote {plan}" in capsys.readouterr().out
     assert main(["route", str(path), "--alternatives", "-1"]) == 2
     assert "--alternatives: -1 given" in capsys.readouterr().err
     # What needs phases says where they come from.

@@ -63,7 +63,15 @@ def add_solve(parser: argparse.ArgumentParser) -> None:
     text = "bound the least time along curves from below, and print the gap"
     parser.add_argument("--certify", action="store_true", help=text)
     _add_least_minor(parser)
+    add_cache(parser)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+
+
+def add_cache(parser: argparse.ArgumentParser) -> None:
+    """Add where searches for a goal keep what they find."""
+    text = "folder to keep what is found out of the scene, for later searches for a goal (none); "
+    text += "nobody else may write there"
+    parser.add_argument("--cache", metavar="DIR", help=text)
 
 
 def add_verify(parser: argparse.ArgumentParser) -> None:

@@ -165,9 +165,11 @@ def _solve(options: argparse.Namespace) -> int:
             require_ending(path, ending)
     _check_sampling(options)
     problem = load(options.problem)
+    if options.cache is not None and not problem.goals:
+        raise InputError("", "--cache", "is for problems with [goal]")
     try:
         if problem.goals:
-            answer = find(problem, plan_options)
+            answer = find(problem, plan_options, cache=options.cache)
             plan, found = answer.plan, answer.to_text()
         else:
             plan, found = solve_with(problem, plan_options, show_progress()), ""

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .arguments import add_cache
 from .progress import clear_progress, show_progress
 
 if TYPE_CHECKING:
@@ -25,9 +26,7 @@ def add_route(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--alternatives", metavar="N", type=int, default=0, help=text)
     text = "of the plans: time, effort or margin (time); routes are looked for by time"
     parser.add_argument("--objective", default="time", help=text)
-    text = "folder to keep what is found out of the scene, for later searches (none); nobody else "
-    text += "may write there"
-    parser.add_argument("--cache", metavar="DIR", help=text)
+    add_cache(parser)
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
 
 
