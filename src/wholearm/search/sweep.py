@@ -9,7 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 from ..common.arrays import Array
+from ..contacts.closing import Flags
 from ..planning.lower_bound.rows import Rows
+
+PAIRS = 200_000
+"""Pairs of rows that are looked at together."""
 
 
 def find_durations(rows: Rows, steps: Array, part: Array) -> Array:
@@ -22,10 +26,10 @@ def find_durations(rows: Rows, steps: Array, part: Array) -> Array:
     steps, part : ndarray, shape (n,)
         Lengths of the intervals, and which part of each is before its place.
     """
-    near = None
-    for _ in range(2):
-        b = _sweep(rows, steps, part, near)
+    b = _sweep(rows, steps, part, None)
+    if rows.v.any():
         near = np.maximum(b[:, :-1] + part * np.diff(b), 0.0)
+        b = _sweep(rows, steps, part, near)
     speeds = np.sqrt(np.maximum(b, 0.0))
     moving = (b[:, 1:-1] > 0).all(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -44,29 +48,42 @@ def _sweep(rows: Rows, steps: Array, part: Array, near: Array | None) -> Array:
     before = (1 - part)[:, None] * of_b - of_a
     after = part[:, None] * of_b + of_a
     count, ways = len(steps), len(of_b)
-    largest = np.zeros((ways, count + 1))
+    # A few ways at a time, so that their pairs of rows stay in the cache.
+    some = max(1, PAIRS // (count * before.shape[2] ** 2))
+    cuts = [slice(k, k + some) for k in range(0, ways, some)]
+    corners = [_find_corners(before[k], after[k], one[k]) for k in cuts]
+    most = np.minimum(np.concatenate(corners), rows.cap).T
+    largest = np.zeros((count + 1, ways))
+    # Rows that a small b' breaks let b be the larger, the larger b' may be.
+    starts, slopes = _solve(before, after, one, (before < 0) & (after > 0))
     for k in range(count - 1, -1, -1):
-        b = _find_corners(before[:, k], after[:, k], one[:, k], largest[:, k + 1])
-        largest[:, k] = np.minimum(b, rows.cap[:, k])
-    b = np.zeros((ways, count + 1))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for k in range(count):
-            ends = (before[:, k] * b[:, k, None] + one[:, k]) / -after[:, k]
-            pushed = np.where(after[:, k] < 0, ends, np.inf).min(axis=1)
-            b[:, k + 1] = np.maximum(np.minimum(pushed, largest[:, k + 1]), 0.0)
-    return b
+        bounds = (starts[k] + slopes[k] * largest[k + 1, :, None]).min(axis=1)
+        largest[k] = np.maximum(np.minimum(bounds, most[k]), 0.0)
+    b = np.zeros((count + 1, ways))
+    starts, slopes = _solve(after, before, one, after < 0)
+    for k in range(count):
+        bounds = (starts[k] + slopes[k] * b[k, :, None]).min(axis=1)
+        b[k + 1] = np.maximum(np.minimum(bounds, largest[k + 1]), 0.0)
+    return b.T
 
 
-def _find_corners(before: Array, after: Array, one: Array, following: Array) -> Array:
-    """Largest b, of each way, from which rows leave some b' from 0 to `following`."""
-    none, ways = np.zeros((len(before), 1)), len(before)
-    before = np.hstack([before, none, none])
-    after = np.hstack([after, none + 1, none - 1])
-    one = np.hstack([one, none, following[:, None]])
-    up, down = np.maximum(after, 0)[:, :, None], np.maximum(-after, 0)[:, None, :]
-    slope = down * before[:, :, None] + up * before[:, None, :]
-    value = down * one[:, :, None] + up * one[:, None, :]
-    bounded = (up > 0) & (down > 0) & (slope < 0)
+def _solve(own: Array, other: Array, one: Array, used: Flags) -> tuple[Array, Array]:
+    """Rows own p + other q + one >= 0 that are used, as p <= start + slope q, shape (n, w, m)."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = np.where(bounded, value / -slope, np.inf).reshape(ways, -1).min(axis=1)
-    return np.asarray(np.maximum(found, 0.0))
+        starts, slopes = np.where(used, one / -own, np.inf), np.where(used, other / -own, 0.0)
+    return np.ascontiguousarray(starts.swapaxes(0, 1)), np.ascontiguousarray(slopes.swapaxes(0, 1))
+
+
+def _find_corners(before: Array, after: Array, one: Array) -> Array:
+    """Largest b from which rows leave some b' >= 0, however large, shape (w, n)."""
+    none = np.zeros((*one.shape[:-1], 1))
+    rise, own, rest = (
+        np.concatenate([part, none + more], axis=-1)[..., :, None]
+        for part, more in ((after, 1), (before, 0), (one, 0))
+    )
+    rise, fall = np.maximum(rise, 0), np.maximum(-after, 0)[..., None, :]
+    slope = fall * own + rise * before[..., None, :]
+    value = fall * rest + rise * one[..., None, :]
+    bounded = (rise > 0) & (fall > 0) & (slope < 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where(bounded, value / -slope, np.inf).min(axis=(2, 3)))
