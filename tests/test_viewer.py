@@ -7,7 +7,6 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +15,7 @@ from PIL import Image
 from shipped import HEPTAGON, LANDING, chart, plan_of, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
+from wholearm.contacts.closing import contact_table, evaluate_contacts
 from wholearm.mapping.template import write_template
 from wholearm.viewer import page
 from wholearm.viewer.chart import describe_map
@@ -138,9 +138,10 @@ def open_in_browser(text: str, folder: Path, fragment: str = "") -> str:
 
 def test_slider_plots_and_map_respond_in_a_browser(tmp_path: Path) -> None:
     problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
-    places: Any = describe_map(chart(), plan)
+    drawn = describe_map(chart(), plan)
+    places = drawn.places["places"]
     motion = describe_motion(plan, problem, plan) | {"speed": 0.25}
-    parts = [page.write_player(motion), page.write_chart(*places)]
+    parts = [page.write_player(motion), page.write_chart(*drawn)]
     acts = """<script>
       const said = {}, output = document.querySelector("output");
       const read = () => [output.textContent, document.querySelector(".cursor").getAttribute("x1")];
@@ -152,8 +153,12 @@ def test_slider_plots_and_map_respond_in_a_browser(tmp_path: Path) -> None:
       plot.dispatchEvent(new PointerEvent("pointerdown",
         { clientX: box.left + box.width * (58 + 932 * 0.25) / 1000, clientY: box.top + 50 }));
       said.clicked = read();
-      document.querySelector(".map polyline").dispatchEvent(new MouseEvent("click"));
-      said.border = document.querySelector(".choice").textContent;
+      said.places = ["path", "polyline", "circle"].map((kind) => {
+        document.querySelector(`.map ${kind}.hit`).dispatchEvent(new MouseEvent("click"));
+        return [document.querySelector(".choice p").textContent,
+                document.querySelectorAll(".pose polygon").length,
+                document.querySelectorAll(".pose circle[visibility=visible]").length];
+      });
       document.body.append(JSON.stringify(said));
     </script></body>"""
     text = page.build_page("heptagon", parts).replace("</body>", acts)
@@ -167,7 +172,26 @@ def test_slider_plots_and_map_respond_in_a_browser(tmp_path: Path) -> None:
         assert float(said[key][0].split()[0]) == pytest.approx(t, abs=1e-3 * plan.duration)
         assert float(said[key][1]) == pytest.approx(x, abs=1.0)
     assert said["speed"] == "0.25"
-    assert said["border"] == places[1]["borders"][0]["text"]
+    # A cell, a border and a crossing, each with its contacts: the object and a dot for each.
+    for (text, objects, dots), n_contacts in zip(said["places"], (3, 4, 5), strict=True):
+        own = next(own for own in places if own["text"] in text)
+        assert text.startswith(" ".join(own["contacts"]) + ": ")
+        assert objects == 1 + dots and dots == len(own["contacts"]) >= n_contacts
+
+
+def test_what_touches_at_a_place_of_the_map_is_told() -> None:
+    places = describe_map(chart(), plan_of(HEPTAGON)).places["places"]
+    scene, freedoms = problem_of(HEPTAGON).scene, {"a cell": 3, "a border": 4, "a crossing": 5}
+    table = {contact.name: k for k, contact in enumerate(contact_table(scene))}
+    seen = set()
+    for own in places:
+        kind = next(kind for kind in freedoms if own["text"].startswith(kind))
+        assert len(own["contacts"]) >= freedoms[kind]
+        label = [table[name] for name in own["contacts"]]
+        # Poses are rounded to 1e-5 m and rad, and links are 0.2 m long.
+        assert np.abs(evaluate_contacts(scene, label, np.array(own["z"])).C).max() < 1e-5
+        seen.add(kind)
+    assert seen == set(freedoms)
 
 
 def test_a_gallery_shows_every_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,7 +6,7 @@ contacts touch (two freedoms), on its borders four (one freedom), at crossings f
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,16 +20,16 @@ from ..contacts.closing import (
     close_fingers,
     contact_table,
     evaluate_contacts,
-    lower,
 )
 from ..contacts.elemental import Contact
 from ..mechanics.uniqueness import LEAST_MINOR, require_minor
 from ..problem.definition import Problem
 from ..scene.model import Scene
-from .borders import NOWHERE, Piece, Window, label_cells, label_closed, list_tracks, name_contacts
+from .borders import NOWHERE, Piece, Window, label_cells, list_tracks, name_contacts
 from .pieces import cut
-from .quasistatic import WAYS, check_border, check_cell
-from .route import Stretch, list_formations, trace_problem
+from .quasistatic import check_border, check_cell
+from .route import Stretch, list_formations
+from .window import choose_window, label_grid
 
 Flush = tuple[int | None, int]
 """A finger (None for the palm) and an edge that lies flush on it."""
@@ -37,10 +37,6 @@ SAMPLES = 100
 """Places per radian of the window, and least across it, at which borders are looked for."""
 ARROWS = 24
 """Places across the map at which directions inside cells are checked."""
-BEYOND = np.radians(6.0)
-"""Reach of the window beyond the flush angles next to the plan [rad]."""
-BESIDE = 0.25
-"""The same over half the distance of these angles, at most."""
 CROSSED = -5
 """Cell of the places where the closed fingers would overlap."""
 SAME_PLACE = 3e-5
@@ -182,7 +178,7 @@ def build_map(
     report("map: cells")
     window = window or choose_window(problem)
     x, phi = np.linspace(*window.x, resolution), np.linspace(*window.phi, resolution)
-    labels, obstacle = _label_grid(scene, x, phi)
+    labels, obstacle = label_grid(scene, x, phi)
     triples = labels[..., [0, 2, 4]]
     known, cell = np.unique(triples[obstacle == 0], axis=0, return_inverse=True)
     if not len(known):
@@ -193,7 +189,7 @@ def build_map(
     report("map: borders")
     samples = round(SAMPLES * max(1.0, window.phi[1] - window.phi[0]))
     tracks = list(list_tracks(scene, window, samples))
-    borders = [_build_border(problem, piece, limit) for piece in cut(scene, tracks, window)]
+    borders = _build_borders(problem, cut(scene, tracks, window), limit)
     report("map: crossings and directions")
     directions = _check_cells(problem, window, limit)
     return FormationMap(
@@ -208,83 +204,43 @@ def build_map(
     )
 
 
-@exclusive
-def choose_window(problem: Problem, phi_deg: tuple[float, float] | None = None) -> Window:
-    """All x that both fingers reach, and phi one flush angle beyond what the phases cover.
-
-    Parameters
-    ----------
-    problem : Problem
-    phi_deg : (float, float), [deg]
-        Take this range of phi instead.
-
-    Raises
-    ------
-    InputError
-        If both fingers reach the object nowhere.
-    """
+def _build_borders(problem: Problem, pieces: Sequence[Piece], limit: float) -> list[Border]:
+    """Borders of pieces: what takes the same time for few places and many is done for all."""
+    if not pieces:
+        return []
     scene = problem.scene
-    low, high = _cover_phases(problem) if phi_deg is None else np.radians(phi_deg).tolist()
-    size = float(np.hypot(*scene.polygon.vertices.T).max())
-    reach = [size + f.length + f.radius for f in scene.fingers]
-    bases = [float(np.asarray(f.base)[0]) for f in scene.fingers]
-    left = max(base - r for base, r in zip(bases, reach, strict=True))
-    right = min(base + r for base, r in zip(bases, reach, strict=True))
-    grid = np.linspace(left, max(left, right), 60)
-    _, obstacle = _label_grid(scene, grid, np.linspace(low, high, 60))
-    reached = grid[(obstacle == 0).any(axis=0)]
-    if not len(reached):
-        raise InputError(problem.source, "fingers", "nowhere do both reach the object")
-    step = grid[1] - grid[0]
-    return Window((float(reached[0] - step), float(reached[-1] + step)), (low, high))
-
-
-def _cover_phases(problem: Problem) -> tuple[float, float]:
-    """Range of phi [rad] that reaches a little beyond the flush angles next to the phases."""
-    angles = [float(problem.start[2])]
-    angles += [float(phi) for path in trace_problem(problem) for phi in path[[0, -1], 1]]
-    for phase in problem.phases:
-        if phase.until.coordinate == "phi" and phase.until.value is not None:
-            angles.append(phase.until.value)
-    angles += [goal.find_angle(problem.scene, angles[-1]) for goal in problem.goals]
-    low, high = min(angles), max(angles)
-    around = Window((0.0, 0.0), (low - 2 * np.pi, high + 2 * np.pi)).flush_angles(problem.scene)
-    flush = np.array([angle for angle, _ in around])
-    # What is flush at an end of the plan is not yet the next edge.
-    before, after = float(flush[flush < low - 1e-6].max()), float(flush[flush > high + 1e-6].min())
-    # The next edge but one is not of interest, however many there are.
-    beyond = min(BEYOND, BESIDE * (after - before) / 2)
-    return before - beyond, after + beyond
-
-
-def _label_grid(scene: Scene, x: Array, phi: Array) -> tuple[Numbers, Numbers]:
-    """Labels (n_phi, n_x, 6) and obstacles (n_phi, n_x), 0 or as in `FormationMap.cell`."""
-    x, phi = (part.ravel() for part in np.meshgrid(x, phi))
-    closed = close_fingers(scene, x, phi)
-    labels = label_closed(closed, lower(scene, phi)[1])
-    both = closed.obstacle
-    codes = np.where(both > 0, 2 * both - 1 + np.array([0, 1]), 0)
-    obstacle = np.where(codes[:, 0] > 0, codes[:, 0], codes[:, 1])
-    shape = (len(np.unique(phi)), -1)
-    return labels.reshape(*shape, 6), obstacle.reshape(shape)
-
-
-def _build_border(problem: Problem, piece: Piece, limit: float) -> Border:
-    scene = problem.scene
-    x, phi = piece.track.pose(piece.places)
+    x, phi = (np.concatenate(part) for part in zip(*map(_place, pieces), strict=True))
     z = close_fingers(scene, x, phi).z
+    labels = np.concatenate([np.tile(own.label, (len(own.places), 1)) for own in pieces])
+    owner = np.repeat(np.arange(len(pieces)), [len(own.places) for own in pieces])
     # Right at an end, rounding may leave a finger no way to close.
     closed = np.isfinite(z).all(axis=1)
     x, phi, z = x[closed], phi[closed], z[closed]
+    labels, owner = labels[closed], owner[closed]
+    flush = np.array([own.track.flush is not None for own in pieces])[owner]
+    ways = np.zeros((3, len(z)), dtype=bool)
+    if flush.any():
+        rows = np.array([0 if _along(own) == "x" else 2 for own in pieces])[owner[flush]]
+        chosen = labels[flush][labels[flush] != NOWHERE].reshape(-1, 4)
+        ways[:, flush] = check_border(scene, problem.epsilon, chosen, z[flush], rows, limit)
+    table, found = contact_table(scene), []
+    for index, piece in enumerate(pieces):
+        mine = owner == index
+        contacts = name_contacts(table, piece.label[piece.label != NOWHERE])
+        points = np.column_stack([x[mine], phi[mine]])
+        own = Border(contacts, piece.track.flush, _along(piece), points, z[mine], *ways[:, mine])
+        found.append(own)
+    return found
+
+
+def _place(piece: Piece) -> tuple[Array, Array]:
+    return piece.track.pose(piece.places)
+
+
+def _along(piece: Piece) -> str:
+    """The coordinate that increases along a piece."""
     flush = piece.track.flush
-    along = "x" if flush is not None and flush[0] is None else "phi"
-    label = piece.label[piece.label != NOWHERE]
-    ways = (np.zeros(len(z), dtype=bool),) * 3
-    if flush is not None:
-        row = 0 if along == "x" else 2
-        ways = check_border(scene, problem.epsilon, label, z, row, limit)
-    contacts = name_contacts(contact_table(scene), label)
-    return Border(contacts, flush, along, np.column_stack([x, phi]), z, *ways)
+    return "x" if flush is not None and flush[0] is None else "phi"
 
 
 def _find_crossings(scene: Scene, borders: list[Border]) -> tuple[Crossing, ...]:
@@ -326,14 +282,7 @@ def _check_cells(problem: Problem, window: Window, limit: float) -> tuple[Array,
     labels = label_cells(scene, *places.T)
     places, labels = places[labels[:, 0] != NOWHERE], labels[labels[:, 0] != NOWHERE]
     z, triples = close_fingers(scene, *places.T).z, labels[:, [0, 2, 4]]
-    known, owner = np.unique(triples, axis=0, return_inverse=True)
-    possible = np.zeros((len(places), len(WAYS)), dtype=bool)
-    ambiguous = np.zeros(len(places), dtype=bool)
-    for index, label in enumerate(known):
-        mine = owner.ravel() == index
-        found = check_cell(scene, problem.epsilon, label, z[mine], limit)
-        possible[mine], ambiguous[mine] = found
-    return places, possible, ambiguous
+    return places, *check_cell(scene, problem.epsilon, triples, z, limit)
 
 
 __all__ = [

@@ -12,8 +12,9 @@ from __future__ import annotations
 import numpy as np
 
 from ..common.arrays import Array
-from ..contacts.closing import Flags, Numbers, contact_table, evaluate_contacts
+from ..contacts.closing import Flags, Numbers
 from ..contacts.formation import Formation, Kinematics
+from ..contacts.many import evaluate_each, group_alike
 from ..mechanics.dynamics import Directions, force_rows, inverse
 from ..mechanics.metric import metric_weights
 from ..mechanics.uniqueness import LEAST_MINOR, find_minors
@@ -33,7 +34,7 @@ def check_border(
     epsilon: float,
     label: Numbers,
     z: Array,
-    coordinate: int,
+    coordinate: int | Numbers,
     least_minor: float = LEAST_MINOR,
 ) -> tuple[Flags, Flags, Flags]:
     """Whether a quasistatic motion along a border is possible, each way.
@@ -42,11 +43,11 @@ def check_border(
     ----------
     epsilon : float, [N]
         Least normal force.
-    label : ndarray of int, shape (4,)
-        The four contacts, as indices into `closing.contact_table`.
+    label : ndarray of int, shape (4,) or (n, 4)
+        The four contacts, as indices into `closing.contact_table`: one border's, or each place's.
     z : ndarray, shape (n, 5)
-        Configurations on the border.
-    coordinate : {0, 2}
+        Configurations on borders.
+    coordinate : {0, 2} or ndarray of int, shape (n,)
         x or phi, whichever increases along the border.
     least_minor : float
         Limit on principal minors, as of `find_minors`.
@@ -58,17 +59,21 @@ def check_border(
     ambiguous : ndarray of bool, shape (n,)
         Whether it would be, one way or the other, if contact forces were the only ones.
     """
-    formation, kinematics = _pick(scene, label, z)
+    labels = np.broadcast_to(label, (len(z), 4))
+    kinematics = evaluate_each(scene, labels, z)
     weights = np.sqrt(metric_weights(scene))
     _, sizes, rows = np.linalg.svd(kinematics.A / weights)
     z_s = rows[:, -1] / weights
-    z_s *= np.where(z_s[:, [coordinate]] < 0, -1.0, 1.0)
+    along = z_s[np.arange(len(z)), coordinate]
+    z_s *= np.where(along < 0, -1.0, 1.0)[:, None]
     regular = sizes[:, -1] > REGULAR * sizes[:, 0]
-    part = Kinematics(*(array[regular] for array in kinematics))
     held, unique = (np.zeros((2, len(z)), dtype=bool) for _ in range(2))
-    for row, sole, way in zip(held, unique, (z_s[regular], -z_s[regular]), strict=True):
-        row[regular] = _check_path(formation, part, epsilon, z[regular], way)
-        sole[row] = _are_unique(formation, part, way, row[regular], least_minor)
+    for formation, mine in group_alike(scene, labels):
+        (own,) = np.nonzero(mine & regular)
+        part = Kinematics(*(array[own] for array in kinematics))
+        for row, sole, way in zip(held, unique, (z_s[own], -z_s[own]), strict=True):
+            row[own] = _check_path(formation, part, epsilon, z[own], way)
+            sole[own[row[own]]] = _are_unique(formation, part, way, row[own], least_minor)
     return held[0] & unique[0], held[1] & unique[1], np.any(held & ~unique, axis=0)
 
 
@@ -81,10 +86,10 @@ def check_cell(
     ----------
     epsilon : float, [N]
         Least normal force.
-    label : ndarray of int, shape (3,)
-        The three contacts, as indices into `closing.contact_table`.
+    label : ndarray of int, shape (3,) or (n, 3)
+        The three contacts, as indices into `closing.contact_table`: palm, finger 1, finger 2.
     z : ndarray, shape (n, 5)
-        Configurations in the cell.
+        Configurations in cells.
     least_minor : float
         As of `check_border`.
 
@@ -94,20 +99,22 @@ def check_cell(
     ambiguous : ndarray of bool, shape (n,)
         Whether one more of them would be, if contact forces were the only ones.
     """
-    formation, kinematics = _pick(scene, label, z)
+    labels = np.broadcast_to(label, (len(z), 3))
+    kinematics = evaluate_each(scene, labels, z)
+    held, unique = (np.zeros((len(z), len(WAYS)), dtype=bool) for _ in range(2))
     rows = np.zeros((2, 5))
     rows[[0, 1], [0, 2]] = 1.0
     matrix = np.concatenate([kinematics.A, np.broadcast_to(rows, (len(z), 2, 5))], axis=1)
-    held, unique = (np.zeros((len(z), len(WAYS)), dtype=bool) for _ in range(2))
     regular = np.abs(np.linalg.det(matrix)) > REGULAR * scene.scales.length**2
     part = Kinematics(*(array[regular] for array in kinematics))
-    for k, way in enumerate(_WAYS):
-        right = np.zeros((regular.sum(), 5, 1))
-        right[:, 3:, 0] = way
-        z_s = np.linalg.solve(matrix[regular], right)[..., 0]
-        held[regular, k] = _check_balance(formation, part, epsilon, z_s)
-        own = _are_unique(formation, part, z_s, held[regular, k], least_minor)
-        unique[held[:, k], k] = own
+    for formation, _ in group_alike(scene, labels):
+        for k, way in enumerate(_WAYS):
+            right = np.zeros((regular.sum(), 5, 1))
+            right[:, 3:, 0] = way
+            z_s = np.linalg.solve(matrix[regular], right)[..., 0]
+            held[regular, k] = _check_balance(formation, part, epsilon, z_s)
+            own = _are_unique(formation, part, z_s, held[regular, k], least_minor)
+            unique[held[:, k], k] = own
     return held & unique, np.any(held & ~unique, axis=1)
 
 
@@ -143,10 +150,3 @@ def _are_unique(
     part = Kinematics(*(array[rows] for array in kinematics))
     Xi = Directions.of(part, z_s[rows]).Xi
     return np.asarray(find_minors(formation, part, Xi).ratios >= least_minor)
-
-
-def _pick(scene: Scene, label: Numbers, z: Array) -> tuple[Formation, Kinematics]:
-    """A formation and its rows at configurations `z`, from those of its contacts."""
-    chosen = label.tolist()
-    formation = Formation(scene, tuple(contact_table(scene)[k] for k in chosen))
-    return formation, evaluate_contacts(scene, chosen, z)

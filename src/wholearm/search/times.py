@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..common.arrays import Array
-from ..contacts.closing import contact_table, evaluate_contacts
-from ..contacts.formation import Formation, Kinematics
+from ..contacts.closing import contact_table
+from ..contacts.formation import Kinematics
+from ..contacts.many import evaluate_each, group_alike
 from ..geometry.curve import solve_tangent
 from ..mapping.formation_map import Border
 from ..mechanics.dynamics import Directions, inverse, reduced_inertia
@@ -45,39 +46,57 @@ def time_borders(problem: Problem, borders: Sequence[Border]) -> Array:
         return np.zeros((0, 2))
     nodes = (1 - np.cos(np.linspace(0, np.pi, NODES + 1))) / 2
     places = (nodes[1:] + nodes[:-1]) / 2
-    ways = [own for border in borders for own in _follow(problem, border, places)]
-    rows = Rows(*(np.array(part) for part in zip(*ways, strict=True)))
+    rows = _follow(problem, borders, places)
     times = find_durations(rows, np.diff(nodes), (places - nodes[:-1]) / np.diff(nodes))
     return times.reshape(-1, 2)
 
 
-def _follow(problem: Problem, border: Border, places: Array) -> list[Rows]:
-    """Limits at places of a border, forth and back, by the share of it that is behind."""
-    scene = problem.scene
-    weights, formation = metric_weights(scene), Formation(scene, border.contacts)
-    label = [contact_table(scene).index(contact) for contact in border.contacts]
-    chords = np.diff(border.z, axis=0)
-    arcs = np.append(0.0, np.cumsum(np.sqrt(chords**2 @ weights)))
-    s = places * arcs[-1]
-    z = np.column_stack([np.interp(s, arcs, column) for column in border.z.T])
-    chords = chords[np.searchsorted(arcs, s) - 1]
+def _follow(problem: Problem, borders: Sequence[Border], places: Array) -> Rows:
+    """Limits at places of borders, each forth and back, by the share of it that is behind."""
+    scene, weights = problem.scene, metric_weights(problem.scene)
+    count, table = len(places), contact_table(scene)
+    z, chord, length = _interpolate(borders, places, weights)
+    own = [[table.index(contact) for contact in border.contacts] for border in borders]
+    labels = np.repeat(np.array(own), count, axis=0)
     # Straight between points of the map the contacts do not quite touch.
-    at = evaluate_contacts(scene, label, z)
+    at = evaluate_each(scene, labels, z)
     z -= (np.linalg.pinv(at.P) @ at.C[..., None])[..., 0]
-    way = arcs[-1] * chords / np.sqrt(chords**2 @ weights)[:, None]
-    at = evaluate_contacts(scene, label, z, way)
+    way = length * chord / np.sqrt(chord**2 @ weights)[:, None]
+    at = evaluate_each(scene, labels, z, way)
     z_s, z_ss = solve_tangent(at.P, at.P_dot_v, way, weights)
-    every, found = make_limits(formation, problem.epsilon), []
-    for sign, order in ((1.0, slice(None)), (-1.0, slice(None, None, -1))):
-        part = Kinematics(*(array[order] for array in at))
-        tangent = sign * arcs[-1] * z_s[order]
-        directions = Directions.of(part, tangent)
-        curvature = arcs[-1] ** 2 * z_ss[order]
-        forces = inverse(formation, z[order], tangent, curvature, directions, part)
-        rows = limit(every, forces, tangent[:, 3:])
-        inertia = reduced_inertia(formation, part, directions)
-        ratios = find_minors(formation, part, directions.Xi).ratios
-        closed = ~(inertia > 0) | (ratios < LEAST_MINOR)
-        rows.one[closed], rows.a[closed], rows.b[closed] = -1.0, 0.0, 0.0
-        found.append(rows)
-    return found
+    tangent, curvature = length * z_s, length**2 * z_ss
+    found = [np.empty(0)] * len(Rows._fields)
+    for formation, mine in group_alike(scene, labels):
+        part = Kinematics(*(array[mine] for array in at))
+        every = make_limits(formation, problem.epsilon)
+        for back, sign in enumerate((1.0, -1.0)):
+            directions = Directions.of(part, sign * tangent[mine])
+            turned = sign * tangent[mine]
+            forces = inverse(formation, z[mine], turned, curvature[mine], directions, part)
+            rows = limit(every, forces, turned[:, 3:])
+            inertia = reduced_inertia(formation, part, directions)
+            ratios = find_minors(formation, part, directions.Xi).ratios
+            closed = ~(inertia > 0) | (ratios < LEAST_MINOR)
+            rows.one[closed], rows.a[closed], rows.b[closed] = -1.0, 0.0, 0.0
+            chosen = mine.reshape(-1, count)[:, 0]
+            for k, values in enumerate(rows):
+                split = values.reshape(-1, count, *values.shape[1:])
+                if not found[k].size:
+                    found[k] = np.empty((len(borders), 2, *split.shape[1:]))
+                found[k][chosen, back] = split[:, ::-1] if back else split
+    return Rows(*(own.reshape(-1, *own.shape[2:]) for own in found))
+
+
+def _interpolate(
+    borders: Sequence[Border], places: Array, weights: Array
+) -> tuple[Array, Array, Array]:
+    """Configurations at places of borders, the chord of each there, and lengths, shape (n, 1)."""
+    every = []
+    for border in borders:
+        chords = np.diff(border.z, axis=0)
+        arcs = np.append(0.0, np.cumsum(np.sqrt(chords**2 @ weights)))
+        s = places * arcs[-1]
+        z = np.column_stack([np.interp(s, arcs, column) for column in border.z.T])
+        every.append((z, chords[np.searchsorted(arcs, s) - 1], np.full((len(s), 1), arcs[-1])))
+    z, chord, length = (np.concatenate(part) for part in zip(*every, strict=True))
+    return z, chord, length

@@ -1,96 +1,123 @@
-"""The map of contact formations as a picture, and what can be clicked on it."""
+"""The map of contact formations in a page, and what can be clicked on it."""
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
-import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
 
 from ..common.arrays import Array
 from ..common.sharing import exclusive
+from ..contacts.closing import close_fingers
 from ..contacts.elemental import Contact
-from ..figures.formation_map import draw_map
-from ..figures.style import STYLE
+from ..figures.map_lines import trace_plan
+from ..figures.regions import find_room, split
 from ..mapping.formation_map import Border, Crossing, FormationMap
+from ..mapping.route import trace_problem
 from ..results.trajectory import Trajectory
 from ..search.times import time_borders
+from .map_drawing import draw_legend, draw_map
+from .motion import describe_hand
 
-_RESOLUTION = 130
-"""Of the picture [dots per inch]."""
 _MOST = 40
 """Points of a line that is clicked; more cannot be told apart."""
+_DIGITS = 5
+"""Decimals of poses [m, rad]."""
+
+
+class Chart(NamedTuple):
+    """A map in a page.
+
+    Attributes
+    ----------
+    drawing, legend : str
+        SVG, and the HTML of what it means.
+    places : dict
+        Under "hand" the hand and the object; under "places", in the order in which the drawing
+        has them, for each thing that can be clicked its `contacts`, a `text` and its poses `z`.
+    """
+
+    drawing: str
+    legend: str
+    places: dict[str, Any]
 
 
 @exclusive
-def describe_map(
-    chart: FormationMap, plan: Trajectory | None = None
-) -> tuple[bytes, dict[str, Any]]:
-    """Draw a map, as PNG, and list its borders and crossings with what is to be known of them.
-
-    Places are fractions of the picture, from its upper left corner.
-    """
-    figure = draw_map(chart, plan)
-    with matplotlib.rc_context(STYLE):
-        stream = io.BytesIO()
-        figure.savefig(stream, format="png", dpi=_RESOLUTION)
-    axes = figure.axes[0]
+def describe_map(chart: FormationMap, plan: Trajectory | None = None) -> Chart:
+    """Draw a map with a plan, or the problem's own phases, and list what can be clicked on it."""
+    scene = chart.problem.scene
+    paths = trace_problem(chart.problem) if plan is None else trace_plan(plan)
+    parts = list(split(chart.cell))
+    step = np.array([np.ptp(chart.phi) / len(chart.phi), np.ptp(chart.x) / len(chart.x)])
+    rooms = [find_room(region, step / np.ptp(chart.x)) for _, region in parts]
+    middles = np.array([[chart.x[column], chart.phi[row]] for row, column, _ in rooms])
+    poses = close_fingers(scene, *middles.T).z
+    cells = [
+        _describe(chart.formations[index], _describe_cell(point), z[None])
+        for (index, _), point, z in zip(parts, middles, poses, strict=True)
+    ]
     held = [border for border in chart.borders if border.flush is not None]
+    few = [
+        np.unique(np.linspace(0, len(own.points) - 1, _MOST).round().astype(int)) for own in held
+    ]
     times = time_borders(chart.problem, held)
     borders = [
-        {"points": _place(axes, border.points), "text": _describe_border(border, own)}
-        for border, own in zip(held, times, strict=True)
+        _describe(border.contacts, _describe_border(border, own), border.z[rows])
+        for border, own, rows in zip(held, times, few, strict=True)
     ]
     crossings = [
-        {"point": _place(axes, own.point[None])[0], "text": _describe_crossing(own)}
-        for own in chart.crossings
+        _describe(own.contacts, _describe_crossing(own), own.z[None]) for own in chart.crossings
     ]
-    return stream.getvalue(), {"borders": borders, "crossings": crossings}
+    drawing = draw_map(
+        chart,
+        paths,
+        parts,
+        [border.points[rows] for border, rows in zip(held, few, strict=True)],
+        np.array([own.point for own in chart.crossings]).reshape(-1, 2),
+    )
+    places = {"hand": describe_hand(scene), "places": cells + borders + crossings}
+    return Chart(drawing, draw_legend(chart, bool(paths)), places)
 
 
-def _place(axes: Axes, points: Array) -> list[list[float]]:
-    """Fractions of the picture of points (x, phi), shape (n, 2) [m, rad]."""
-    few = np.linspace(0, len(points) - 1, min(len(points), _MOST)).round().astype(int)
-    values = np.column_stack([1e3 * points[few, 0], np.degrees(points[few, 1])])
-    shares = axes.figure.transFigure.inverted().transform(axes.transData.transform(values))
-    return [[round(float(x), 5), round(float(1.0 - y), 5)] for x, y in shares]
+def _describe(contacts: Iterable[Contact], text: str, z: Array) -> dict[str, Any]:
+    names = [contact.name for contact in contacts]
+    return {"contacts": names, "text": text, "z": np.round(z, _DIGITS).tolist()}
 
 
-def _list(contacts: Iterable[Contact]) -> str:
-    return " ".join(contact.name for contact in contacts)
+def _name_place(point: Array) -> str:
+    x, phi = point
+    return f"x = {1e3 * x:.2f} mm, phi = {math.degrees(phi):.2f} deg"
+
+
+def _describe_cell(point: Array) -> str:
+    return f"a cell, two freedoms; drawn at {_name_place(point)}"
 
 
 def _describe_border(border: Border, times: Array) -> str:
-    """Contacts of a border, where it runs, and what motions along it are possible each way."""
+    """Where a border runs, and what motions along it are possible each way."""
     ways = zip(("increasing", "decreasing"), (border.forth, border.back), times, strict=True)
     possible = [
-        f"{border.along} {way}: {_name_share(share.mean())}, {_name_time(time)}"
+        f"{border.along} {way}: {_name_time(time)}, slow motions {_name_share(share.mean())}"
         for way, share, time in ways
     ]
     (x, phi), (x_end, phi_end) = border.points[0], border.points[-1]
     return (
-        f"{_list(border.contacts)}: x {1e3 * x:.1f} to {1e3 * x_end:.1f} mm, phi "
+        f"a border, one freedom, x {1e3 * x:.1f} to {1e3 * x_end:.1f} mm, phi "
         f"{math.degrees(phi):.1f} to {math.degrees(phi_end):.1f} deg; {'; '.join(possible)}"
     )
 
 
 def _name_share(share: float) -> str:
     """Where along a border slow motions are possible."""
-    where = "all along" if share == 1 else "on parts" if share > 0 else "nowhere"
-    return f"slow motions {where}"
+    return "all along" if share == 1 else "on parts" if share > 0 else "nowhere"
 
 
 def _name_time(time: float) -> str:
     """How long the fastest motion from one end to the other takes."""
-    return (
-        f"from rest to rest about {time:.3f} s" if math.isfinite(time) else "none from end to end"
-    )
+    return f"least time about {time:.3f} s" if math.isfinite(time) else "no motion from end to end"
 
 
 def _describe_crossing(crossing: Crossing) -> str:
-    x, phi = crossing.point
-    return f"{_list(crossing.contacts)} at x = {1e3 * x:.2f} mm, phi = {math.degrees(phi):.2f} deg"
+    return f"a crossing at {_name_place(crossing.point)}"

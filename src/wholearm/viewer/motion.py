@@ -79,6 +79,21 @@ def describe_motion(
         }
         for index, name in enumerate(trajectory.contacts)
     ]
+    return describe_hand(scene) | {
+        "epsilon": problem.epsilon,
+        "t": _round(trajectory.t),
+        "z": _round(trajectory.z),
+        "tau": _round(trajectory.tau),
+        "phase": trajectory.phase.tolist(),
+        "starts": _round(trajectory.phase_starts),
+        "steps": find_steps(trajectory).tolist(),
+        "contacts": contacts,
+        "ghost": None if ghost is None else {"t": _round(ghost.t), "z": _round(ghost.z)},
+    }
+
+
+def describe_hand(scene: Scene) -> dict[str, Any]:
+    """The object and the fingers, as plain values."""
     return {
         "vertices": scene.polygon.vertices.tolist(),
         "fingers": [
@@ -91,15 +106,6 @@ def describe_motion(
             }
             for finger, colours in zip(scene.fingers, FINGERS, strict=True)
         ],
-        "epsilon": problem.epsilon,
-        "t": _round(trajectory.t),
-        "z": _round(trajectory.z),
-        "tau": _round(trajectory.tau),
-        "phase": trajectory.phase.tolist(),
-        "starts": _round(trajectory.phase_starts),
-        "steps": find_steps(trajectory).tolist(),
-        "contacts": contacts,
-        "ghost": None if ghost is None else {"t": _round(ghost.t), "z": _round(ghost.z)},
     }
 
 

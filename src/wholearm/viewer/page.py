@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -62,12 +61,12 @@ def write_player(motion: dict[str, Any]) -> str:
     return f'<div class="{PLAYER}">{_embed(motion)}</div>'
 
 
-def write_chart(picture: bytes, places: dict[str, Any]) -> str:
-    """A picture (PNG) with places to click; see `chart.describe_map`."""
-    source = "data:image/png;base64," + base64.b64encode(picture).decode()
-    image = f'<div class="map"><img alt="map of contact formations" src="{source}"></div>'
-    hint = '<p class="choice">Click a border or a crossing to see what touches there.</p>'
-    return f'<div class="{CHART}">{image}{hint}{_embed(places)}</div>'
+def write_chart(drawing: str, legend: str, places: dict[str, Any]) -> str:
+    """A map whose places can be clicked; see `chart.describe_map`."""
+    hint = "Click a cell, a border or a crossing to see what touches there."
+    told = f'<div class="choice"><p>{hint}</p><div class="pose"></div></div>'
+    wide = f'<div class="scroll"><div class="map">{drawing}</div></div>'
+    return f'<div class="{CHART}">{wide}{legend}{told}{_embed(places)}</div>'
 
 
 def _embed(value: dict[str, Any]) -> str:

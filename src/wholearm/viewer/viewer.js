@@ -139,15 +139,14 @@ function makeScene(parent, motion) {
     motion.contacts.forEach((own, i) => {
       const force = blend(motion.t, own.force, t), there = force[0] !== null;
       const point = blend(motion.t, own.point, t), normal = blend(motion.t, own.normal, t);
-      for (const part of [cones[i], arrows[i], dots[i]])
-        change(part, { visibility: there ? "visible" : "hidden" });
+      for (const part of [cones[i], arrows[i]]) change(part, { visibility: there ? "visible" : "hidden" });
+      change(dots[i], { visibility: there || motion.still ? "visible" : "hidden", cx: point[0], cy: point[1] });
       if (!there) return;
       const reach = 1.15 * Math.max(extend(force), 6 * thin), mu = own.friction;
       const side = (k) => [point[0] + reach * (normal[0] + k * mu * normal[1]),
                            point[1] + reach * (normal[1] - k * mu * normal[0])];
       change(cones[i], { points: join([point, side(1), side(-1)]) });
       change(arrows[i], { points: arrow(point, force) });
-      change(dots[i], { cx: point[0], cy: point[1] });
     });
     motion.fingers.forEach((finger, i) => change(arcs[i], { points: turn(finger, tau[i]) }));
   };
@@ -316,26 +315,46 @@ function makePlayer(parent, motion) {
   show(asked ? Math.min(Number(asked[1]), end) : 0);
 }
 
+// Where a contact is, by its name: a vertex, or the foot of a fingertip's centre on an edge.
+function touch(hand, z, name) {
+  const [, kind, number, other] = /^([ve])(\d+)-(.*)$/.exec(name), corners = place(hand, z);
+  const a = corners[number];
+  if (kind === "v") return a;
+  const i = Number(other.slice(-1)) - 1, b = corners[(Number(number) + 1) % corners.length];
+  const centre = tip(hand.fingers[i], z[3 + i]), way = [b[0] - a[0], b[1] - a[1]];
+  const share = ((centre[0] - a[0]) * way[0] + (centre[1] - a[1]) * way[1]) / (way[0] ** 2 + way[1] ** 2);
+  return [a[0] + share * way[0], a[1] + share * way[1]];
+}
+
+// The hand and the object at rest, with what touches.
+function showPose(parent, hand, own, z) {
+  const contacts = own.contacts.map((name) => ({
+    colour: "#d55e00", friction: 0, point: [touch(hand, z, name)], normal: [[0, 1]], force: [[null, null]] }));
+  const still = { ...hand, t: [0], z: [z], tau: [[0, 0]], ghost: null, contacts, still: true };
+  parent.replaceChildren();
+  makeScene(parent, still)(0);
+}
+
 function makeMap(parent, chart) {
-  const svg = add(parent.querySelector(".map"), "svg", { viewBox: [0, 0, 1, 1], preserveAspectRatio: "none" });
-  const text = parent.querySelector(".choice");
-  const tell = (element, words) => {
-    element.addEventListener("click", () => {
-      svg.querySelectorAll(".chosen").forEach((old) => old.classList.remove("chosen"));
+  const [text, pose] = parent.querySelector(".choice").children;
+  parent.querySelectorAll(".hit").forEach((element, k) => {
+    const own = chart.places[k];
+    element.addEventListener("click", (event) => {
+      parent.querySelectorAll(".chosen").forEach((old) => old.classList.remove("chosen"));
       element.classList.add("chosen");
-      text.textContent = words;
+      let nearest = 0;
+      if (element.points) {
+        const to = element.getScreenCTM(), far = Array.from(element.points, (p) => {
+          const on = p.matrixTransform(to);
+          return Math.hypot(on.x - event.clientX, on.y - event.clientY);
+        });
+        nearest = far.indexOf(Math.min(...far));
+      }
+      const z = own.z[nearest], at = `${(1e3 * z[0]).toFixed(1)} mm, ${(z[2] * 180 / Math.PI).toFixed(1)} deg`;
+      text.textContent = `${own.contacts.join(" ")}: ${own.text}${own.z.length > 1 ? `; drawn at ${at}` : ""}`;
+      showPose(pose, chart.hand, own, z);
     });
-  };
-  for (const border of chart.borders) {
-    const line = add(svg, "polyline", { points: join(border.points), class: "hit",
-                                        "vector-effect": "non-scaling-stroke" });
-    tell(line, border.text);
-  }
-  for (const spot of chart.crossings) {
-    const mark = add(svg, "ellipse", { cx: spot.point[0], cy: spot.point[1], rx: 0.006, ry: 0.0085,
-                                       class: "hit", "vector-effect": "non-scaling-stroke" });
-    tell(mark, spot.text);
-  }
+  });
 }
 
 for (const element of document.querySelectorAll(".motion"))
