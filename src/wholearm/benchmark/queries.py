@@ -6,7 +6,7 @@ where it was stopped. So many `jobs` are asked at once; times by the wall clock 
 job, on a machine that does nothing else. A query has a start and a goal, each an edge on the palm
 and an x at which both fingers close on the object, drawn at random for the shipped scenes and for
 random polygons in the hexagon's hand. Each query is asked twice: first of a scene that nothing is
-known of, then again from the other end of the same border, with what is known.
+known of, then for a goal a little further on, with what is known.
 """
 
 from __future__ import annotations
