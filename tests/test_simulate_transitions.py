@@ -8,15 +8,19 @@ import numpy as np
 import pytest
 
 from integrated import integrate_phase
+from once import once
 from planned import LandingMotion, change, plan_landing
 from pushed import forward
+from shipped import HEXAGON, problem_of
 from stepping import march
 from wholearm.common.arrays import Array
 from wholearm.common.errors import SimulationError
 from wholearm.contacts.elemental import parse_contact
 from wholearm.contacts.formation import Formation
 from wholearm.mechanics.dynamics import Directions
+from wholearm.planning.plan import solve
 from wholearm.problem.definition import End, Phase, Problem, Until
+from wholearm.problem.read import build_problem
 from wholearm.results.torque import TorqueProfile
 from wholearm.simulation.events import EventKind, OutcomeKind
 from wholearm.simulation.simulate import simulate
@@ -43,6 +47,20 @@ def brake_less(starts: Array, c: Array) -> Array:
     """Near the end of the landing."""
     c[starts > 0.66] *= 0.97
     return c
+
+
+@once
+def plan_passing() -> tuple[Problem, TorqueProfile, float]:
+    """The hexagon slides until vertex 4 goes on round the tip of finger 2, and when that is."""
+    table = {**problem_of(HEXAGON).table, "start": {"flush": 0, "x": 0.066}}
+    held = ["v0-palm", "v1-palm", "v1-finger1"]
+    table["phases"] = [
+        {"contacts": [*held, "v4-finger2"], "until": "v4-tip2", "end": "smooth"},
+        {"contacts": [*held, "v4-tip2"], "until": "e4-tip2"},
+    ]
+    problem = build_problem(table)
+    trajectory = solve(problem, replay=False).trajectory
+    return problem, trajectory.torque, float(trajectory.t[trajectory.phase == 1][0])
 
 
 def replace_phases(problem: Problem, *phases: Phase) -> Problem:
@@ -340,3 +358,15 @@ def test_directions_that_stand_still_follow_the_acceleration() -> None:
     row = int(np.flatnonzero(simulation.phase == 2)[1])
     slides = simulation.c_t[row][~np.isnan(simulation.c_t[row])]
     assert (np.sign(slides) == -directions.Xi).all()
+
+
+@pytest.mark.parametrize("early", (1e-7, 1e-9, 1e-11, 0.0, -1e-11, -1e-9))
+def test_a_vertex_goes_on_from_link_to_tip_at_speed(early: float) -> None:
+    """By rounding the torques step just before it does, or just after."""
+    problem, torque, passed = plan_passing()
+    breaks = torque.breaks.copy()
+    breaks[np.abs(breaks - passed).argmin()] -= early
+    simulation = simulate(problem, TorqueProfile(breaks, torque.coefficients))
+    assert simulation.outcome.reached
+    # Torques that are off for so short a time have turned nothing by more than that at 10 rad/s.
+    assert np.allclose(simulation.z[-1], simulate(problem, torque).z[-1], atol=1e-6, rtol=0)

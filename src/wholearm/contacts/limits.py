@@ -107,6 +107,15 @@ def build_limits(contact: Contact, scene: Scene) -> list[GapLimit]:
     ]
 
 
+def takes_over(contact: Contact, scene: Scene, held: Sequence[Contact]) -> bool:
+    """Whether a contact goes on for one of those `held`, which leaves its range there.
+
+    The object then rolls or slides on from one feature to the next, at any speed, while a gap can
+    only be closed softly.
+    """
+    return any(limit.gained == contact for own in held for limit in build_limits(own, scene))
+
+
 def build_clearance(contact: Contact, scene: Scene, touching: bool) -> GapLimit:
     """Return the limit at which `contact`, not in the formation, is gained.
 

@@ -96,16 +96,17 @@ def _is_at_end(run: Replay, t: float) -> bool:
     """Whether the step just tried ends at the end of the phase, and at a torque break.
 
     By rounding a planned motion ends a little beyond the end of its phase, or has just turned back.
-    It has to be at rest there, or to reach a contact softly; a coordinate is passed at any speed,
-    and an impact comes at any, with the step of the torques that goes with it, or as they end. A
-    motion that is about to stop instead may step its torques before it is there.
+    It has to be at rest there, or to reach a contact softly; a coordinate, or the end of a
+    contact's range, is passed at any speed, and an impact comes at any, with the step of the
+    torques that goes with it, or as they end. A motion that is about to stop instead may step its
+    torques before it is there.
     """
     s = run.stepper
     if t != run.breaks[run.piece + 1] or not is_there(run) or _comes_later(run):
         return False
     speed = abs(_measure_rate(run))
     if run.phase.end is End.SMOOTH:
-        speed = speed if run.phase.until.contact else 0.0
+        speed = 0.0 if run.passes else speed
     elif run.phase.end is End.IMPACT and _strikes(run):
         coming = run.piece + 1
         speed = 0.0 if coming >= len(run.steps_at) or run.steps_at[coming] else speed

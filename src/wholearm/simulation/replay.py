@@ -50,6 +50,8 @@ class Replay:
         Those of the scene.
     until_unit : float, [m or rad]
         Unit of the distance to the end of the phase.
+    passes : bool
+        Whether a motion may pass the end of the phase at any speed, without an impact.
     moving : bool
         Whether the motion goes on into the phase that is entered.
     left : Formation or None
@@ -93,7 +95,7 @@ class Replay:
         self.h = self.tolerances.first_step
         self.held_until = self.settled_by = -math.inf
         self.impact = 0.0
-        self.moving = False
+        self.passes = self.moving = False
         self.left: Formation | None = None
         self.side = 1.0
         self.stuck: set[int] = set()

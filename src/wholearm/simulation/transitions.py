@@ -10,6 +10,7 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import JammingError, SimulationError
 from ..contacts.formation import Formation
+from ..contacts.limits import takes_over
 from ..mechanics.impact import ViolationKind, compute_impact, solve_impulses
 from ..problem.definition import End, Phase
 from .choosing import measure_rates
@@ -46,11 +47,22 @@ def enter(run: Replay, phase: Phase, following: Phase | None) -> None:
         run.side = math.copysign(1.0, run.y[0 if until.coordinate == "x" else 2] - until.value)
     run.stuck = set()
     run.until_unit = measure_until(run.problem.scene, until)
+    run.passes = _is_passed(phase)
     run.take()
     run.limits = [limit.text for limit in open_limits(phase.formation, until)]
     run.releasable = find_releasable(phase, following)
     run.resting, run.slipping = find_switching(phase, following)
     run.has_slid = False
+
+
+def _is_passed(phase: Phase) -> bool:
+    """Whether a motion may pass the end of a phase at any speed, without an impact.
+
+    A contact can be gained so where it goes on for another one, and softly elsewhere.
+    """
+    gained, own = phase.until.contact, phase.formation
+    smooth = phase.end is End.SMOOTH
+    return smooth and (gained is None or takes_over(gained, own.scene, own.contacts))
 
 
 def _close(run: Replay, formation: Formation) -> Array:
