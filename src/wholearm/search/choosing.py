@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 from ..planning.options import PlanOptions
@@ -9,7 +10,7 @@ from ..planning.result import Plan
 from ..problem.definition import Problem
 from .candidates import Failure, make_candidate, plan_candidate
 from .find import CAREFUL, EAGER, Route, Rule, Search
-from .joining import can_join, join_route
+from .joining import Lost, can_join, join_route
 from .links import Link, describe_steps
 from .measure import Measured
 from .polishing import Polisher
@@ -55,6 +56,7 @@ class Chooser:
         self.failures: list[Failure] = []
         self._polisher = Polisher(problem, search.chart, options)
         self._measurements = 0
+        self._lost: list[tuple[Link, ...]] = []
 
     def run(self, wanted: int, report: Callable[[str], None]) -> None:
         """Look for routes and plan them, for as long as there are fewer than `wanted` plans."""
@@ -67,6 +69,8 @@ class Chooser:
             self.plan(wanted, report)
             if len(self.made) >= wanted or len(self.failures) == failed:
                 return
+            # What had no plan bounds nothing.
+            self.search.limit = math.inf
 
     def plan(self, wanted: int, report: Callable[[str], None]) -> None:
         """Plan the routes that are found, the best first, until there are as many as wanted."""
@@ -74,11 +78,15 @@ class Chooser:
             if len(self.made) >= wanted or len(self.failures) >= TRIED:
                 return
             self.found.remove(route)
+            if self._is_lost(route):
+                continue
             self._polisher.polish(route, report)
             report(f"planning a route of {sum(len(own.steps) for own in route.links)} phases")
             plan = self._plan(route, report)
             if isinstance(plan, str):
                 self.failures.append(Failure(route, plan))
+                if isinstance(plan, Lost):
+                    self._lost.append(plan.links)
             else:
                 self.made.append((plan, route))
 
@@ -122,6 +130,8 @@ class Chooser:
     def _measure(self, route: Route, report: Callable[[str], None]) -> bool:
         """Plan the links of a route that lead through cells; whether all have a plan."""
         known = self.chart.measured
+        if self._is_lost(route):
+            return False
         for link in route.links:
             if not link.in_cell:
                 continue
@@ -132,6 +142,14 @@ class Chooser:
             if isinstance(known[link], str):
                 return False
         return True
+
+    def _is_lost(self, route: Route) -> bool:
+        """Whether a route has links for which another one had no plan."""
+        return any(
+            route.links[k : k + len(lost)] == lost
+            for lost in self._lost
+            for k in range(len(route.links))
+        )
 
     def _estimate(self, route: Route) -> float:
         """About the least time that a plan along all routes may take [s]."""
