@@ -21,6 +21,8 @@ from typing import TextIO
 
 PATIENCE = 0.45
 """Longest time that a command may take to clean up [s]."""
+WATCHER = "wholearm signals"
+"""Name of that thread."""
 _WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 ENDED = tuple(128 + number for number in _WORDS)
 """Exit statuses of commands that a signal ended."""
@@ -165,7 +167,7 @@ def _watcher() -> Iterator[None]:
                     if not over.is_set():
                         _end(number, errors)
 
-    thread = threading.Thread(target=watch, name="wholearm signals", daemon=True)
+    thread = threading.Thread(target=watch, name=WATCHER, daemon=True)
     thread.start()
     try:
         yield

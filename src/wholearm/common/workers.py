@@ -1,0 +1,195 @@
+"""Tasks that do not depend on each other, done at the same time by forked processes.
+
+Children are forked where tasks are shared out, so that they have all that is known by then. Each
+process takes the next task for as long as there is one, and children send what has come of theirs.
+What a task leaves behind besides its result is lost in a child: it has to be a pure function. What
+a child does not send, as it was ended or met an error, its parent does itself.
+"""
+
+from __future__ import annotations
+
+import gc
+import io
+import multiprocessing as mp
+import os
+import pickle
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from typing import Any, NamedTuple, TypeVar
+
+from .interrupts import WATCHER
+
+_T = TypeVar("_T")
+Task = Callable[[], _T]
+
+DEEP = 20_000
+"""Depth of recursion that pickling may take."""
+_NUMBER = 2
+"""Bytes of a task's number."""
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_sharing = False
+
+
+def count_cores() -> int:
+    """How many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def share(tasks: Sequence[Task[_T]], jobs: int, known: Sequence[object] = ()) -> list[_T]:
+    """Results of tasks, in their order.
+
+    Processes are forked on POSIX alone, where this one may have children and no other thread could
+    be in the middle of something. Otherwise, and for tasks inside of tasks, one is done after the
+    other.
+
+    Parameters
+    ----------
+    tasks : sequence of callable
+        Without arguments. What they return has to be picklable.
+    jobs : int
+        Most processes, this one included.
+    known : sequence of object
+        What results may refer to: they then have these very objects.
+    """
+    global _sharing
+    count = min(jobs, len(tasks)) - 1
+    if count < 1 or _sharing or not can_fork():
+        return [task() for task in tasks]
+    _sharing = True
+    try:
+        return _share(tasks, count, {id(own): k for k, own in enumerate(known)}, known)
+    finally:
+        _sharing = False
+
+
+def can_fork() -> bool:
+    """Whether this process may have children that go on from where it is."""
+    mine = (threading.current_thread().name, WATCHER)
+    return (
+        os.name == "posix"
+        and not mp.current_process().daemon
+        and all(thread.name in mine for thread in threading.enumerate())
+    )
+
+
+class _Child(NamedTuple):
+    process: BaseProcess
+    answers: Connection
+
+
+def _share(
+    tasks: Sequence[Task[_T]], count: int, numbers: dict[int, int], known: Sequence[object]
+) -> list[_T]:
+    """Results of tasks, done by this process and `count` others."""
+    source, sink = os.pipe()
+    os.write(sink, b"".join(k.to_bytes(_NUMBER, "big") for k in range(len(tasks))))
+    os.close(sink)
+    children = list[_Child]()
+    try:
+        for _ in range(count):
+            children.append(_start(tasks, source, numbers))
+        results = _take(tasks, source)
+        for child in children:
+            # A child that was ended, or met an error, sends nothing.
+            with suppress(EOFError, OSError):
+                results |= _unpickle(child.answers.recv_bytes(), known)
+        return [results[k] if k in results else task() for k, task in enumerate(tasks)]
+    finally:
+        os.close(source)
+        for child in children:
+            child.process.kill()
+            child.process.join()
+            child.process.close()
+            child.answers.close()
+
+
+def _start(tasks: Sequence[Task[Any]], source: int, numbers: dict[int, int]) -> _Child:
+    """Fork a child that takes tasks."""
+    context = mp.get_context("fork")
+    answers, far = context.Pipe(duplex=False)
+    given = tasks, source, far, numbers, os.getpid()
+    process = context.Process(target=_serve, args=given, daemon=True)
+    # No signal may meet the child before it has said what it does about it.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
+    try:
+        with warnings.catch_warnings():
+            # Of other threads there is the one that waits for signals, and holds nothing.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        far.close()
+    return _Child(process, answers)
+
+
+def _serve(
+    tasks: Sequence[Task[Any]], source: int, far: Connection, numbers: dict[int, int], parent: int
+) -> None:
+    """Take tasks for as long as there are any, and send what has come of them."""
+    # The parent alone answers an interrupt, and ends its children.
+    signal.set_wakeup_fd(-1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
+    # What there is by now is not looked at for garbage, which would copy its pages.
+    gc.freeze()
+    results = _take(tasks, source, parent)
+    with suppress(Exception):
+        far.send_bytes(_pickle(results, numbers))
+
+
+def _take(tasks: Sequence[Task[_T]], source: int, parent: int | None = None) -> dict[int, _T]:
+    """Results of tasks by their numbers, which whoever reads them has taken from a pipe.
+
+    A child ends with its `parent`. Tasks that raise an error have none: they are done again in
+    the end, so that the first of them raises it, whoever has met it.
+    """
+    results = dict[int, _T]()
+    while parent in (None, os.getppid()) and (number := os.read(source, _NUMBER)):
+        index = int.from_bytes(number, "big")
+        with suppress(Exception):
+            results[index] = tasks[index]()
+    return results
+
+
+class _Pickler(pickle.Pickler):
+    """Pickles with numbers in place of objects that both sides know."""
+
+    def __init__(self, stream: io.BytesIO, numbers: dict[int, int]) -> None:
+        super().__init__(stream, pickle.HIGHEST_PROTOCOL)
+        self._numbers = numbers
+
+    def persistent_id(self, obj: object) -> int | None:
+        return self._numbers.get(id(obj))
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, stream: io.BytesIO, known: Sequence[object]) -> None:
+        super().__init__(stream)
+        self._known = known
+
+    def persistent_load(self, pid: int) -> object:
+        return self._known[pid]
+
+
+def _pickle(value: object, numbers: dict[int, int]) -> bytes:
+    stream = io.BytesIO()
+    deepest = sys.getrecursionlimit()
+    sys.setrecursionlimit(max(deepest, DEEP))
+    try:
+        _Pickler(stream, numbers).dump(value)
+    finally:
+        sys.setrecursionlimit(deepest)
+    return stream.getvalue()
+
+
+def _unpickle(data: bytes, known: Sequence[object]) -> Any:
+    return _Unpickler(io.BytesIO(data), known).load()
