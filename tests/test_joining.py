@@ -1,61 +1,41 @@
-"""Routes put together from their links: what is tried where a link has no plan."""
-
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any
+import numpy as np
 
 from shipped import HEPTAGON, problem_of
 from wholearm.planning.options import PlanOptions
-from wholearm.problem.definition import Until
-from wholearm.search.joining import Lost, PlannedLink, join_route, key_steps
-from wholearm.search.links import Link, Step
+from wholearm.planning.result import Plan
+from wholearm.problem.goal import Goal
+from wholearm.search.chart import Chart
+from wholearm.search.find import Search
+from wholearm.search.joining import Kept, join_route
+from wholearm.search.links import Link
 from wholearm.search.measure import Measured
 from wholearm.search.places import make_place
 
-PROBLEM = problem_of(HEPTAGON)
-PLACE = make_place(PROBLEM.scene, PROBLEM.start)
+# Where plans come from does not depend on how accurate they are.
+OPTIONS = PlanOptions(accuracy=0.1, replay=False)
 
 
-def make_steps(x: float) -> tuple[Step, ...]:
-    return (Step(PLACE.contacts, Until(coordinate="x", value=x)),)
+def join(links: tuple[Link, ...], kept: Kept, jobs: int) -> Plan:
+    own = [(link, list[Measured]()) for link in links]
+    plan = join_route(problem_of(HEPTAGON), own, OPTIONS, kept, lambda _: None, jobs)
+    assert isinstance(plan, Plan), plan
+    return plan
 
 
-class Plans(dict[Any, Any]):
-    """Plans of every link, but of those with some steps, and what has been asked for."""
-
-    def __init__(self, without: tuple[Step, ...]) -> None:
-        super().__init__()
-        self.without, self.asked = key_steps(without), list[Any]()
-
-    def __contains__(self, key: object) -> bool:
-        return True
-
-    def __getitem__(self, key: Any) -> Any:
-        self.asked.append(key[1])
-        if key[1] == self.without:
-            return "too short of force"
-        return PlannedLink((), (SimpleNamespace(end=PROBLEM.start),))  # type: ignore[arg-type]
-
-
-def test_where_nothing_leads_on_another_landing_is_tried() -> None:
-    first = Link(PLACE, PLACE, make_steps(0.01), 1.0, 1.0)
-    landing = Link(PLACE, PLACE, make_steps(0.02), 1.0, 0.0, in_cell=True)
-    onward = Link(PLACE, PLACE, make_steps(0.03), 1.0, 1.0)
-    ways = [Measured(1.0, make_steps(x), []) for x in (0.021, 0.022)]
-    plans = Plans(onward.steps)
-    links = [(first, []), (landing, ways), (onward, [])]
-    lost = join_route(PROBLEM, links, PlanOptions(), plans, lambda _: None)
-    assert isinstance(lost, Lost) and "too short of force" in lost
-    # The landing decides whether the border after it can be set out on, the border before does not.
-    assert lost.links == (landing, onward)
-    tried = [key for key in plans.asked if key not in (key_steps(first.steps), plans.without)]
-    assert tried == [key_steps(own) for own in (*(way.steps for way in ways), landing.steps)]
-
-
-def test_a_link_from_a_crossing_is_alone_to_blame() -> None:
-    first, second = (Link(PLACE, PLACE, make_steps(x), 1.0, 1.0) for x in (0.01, 0.02))
-    plans = Plans(second.steps)
-    lost = join_route(PROBLEM, [(first, []), (second, [])], PlanOptions(), plans, lambda _: None)
-    assert isinstance(lost, Lost) and lost.links == (second,)
-    assert plans.asked == [key_steps(first.steps), key_steps(second.steps)]
+def test_links_planned_at_the_same_time_make_the_same_plan() -> None:
+    problem = problem_of(HEPTAGON)
+    search = Search(Chart(problem, 0.1), make_place(problem.scene, problem.start), Goal(flush=6))
+    route = next(search.run())
+    assert len(route.links) > 1
+    kept: Kept = {}
+    one, other = join(route.links, {}, 1), join(route.links, kept, 2)
+    assert one.duration == other.duration
+    assert np.array_equal(one.trajectory.z, other.trajectory.z)
+    # What solving has cost is said of each phase, wherever it was done, and of plans kept as well.
+    again = join(route.links, kept, 1)
+    for mine, theirs, kept_one in zip(one.phases, other.phases, again.phases, strict=True):
+        assert mine.statistics.solves > 0 and mine.statistics.iterations > 0
+        assert mine.statistics.iterations == theirs.statistics.iterations
+        assert mine.statistics.iterations == kept_one.statistics.iterations

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 from functools import lru_cache
 
@@ -58,6 +59,20 @@ def test_halved_intervals_start_from_the_multipliers_before(objective: str) -> N
         costs.append(answer.cost)
     # The problem is not convex, and both answers need not be one.
     assert costs[0] == pytest.approx(costs[1], rel=0.03)
+
+
+def test_a_solution_is_gone_on_with_in_another_process() -> None:
+    solution = coarse("time")
+    known = pickle.loads(pickle.dumps(solution))
+    every = [np.ones(stage.intervals, dtype=int) for stage in solution.stages]
+    finer = bisect_intervals(solution.stages, SCHEME, every)
+    nlp = search_for("time").build(finer)
+    one, other = (
+        carry_multipliers(own.multipliers, own.nlp, nlp, SCHEME, own.stages, finer)
+        for own in (solution, known)
+    )
+    for key, values in one.items():
+        assert np.array_equal(values, other[key]) and values.any()
 
 
 def test_first_multipliers_push_away_from_the_bounds_there_are() -> None:

@@ -64,7 +64,14 @@ def add_solve(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--certify", action="store_true", help=text)
     _add_least_minor(parser)
     add_cache(parser)
+    add_jobs(parser)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+
+
+def add_jobs(parser: argparse.ArgumentParser) -> None:
+    """Add `--jobs` of a search for a goal."""
+    text = "processes that a search for a [goal] uses (2, or 1 where there is one core)"
+    parser.add_argument("--jobs", metavar="N", type=int, help=text)
 
 
 def add_cache(parser: argparse.ArgumentParser) -> None:

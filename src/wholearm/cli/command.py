@@ -167,9 +167,11 @@ def _solve(options: argparse.Namespace) -> int:
     problem = load(options.problem)
     if options.cache is not None and not problem.goals:
         raise InputError("", "--cache", "is for problems with [goal]")
+    if options.jobs is not None and not problem.goals:
+        raise InputError("", "--jobs", "is for problems with [goal]")
     try:
         if problem.goals:
-            answer = find(problem, plan_options, cache=options.cache)
+            answer = find(problem, plan_options, cache=options.cache, jobs=options.jobs)
             plan, found = answer.plan, answer.to_text()
         else:
             plan, found = solve_with(problem, plan_options, show_progress()), ""

@@ -8,13 +8,16 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .arguments import add_cache
+from .arguments import add_cache, add_jobs
 from .progress import clear_progress, show_progress
 
 if TYPE_CHECKING:
     from ..planning.options import PlanOptions
     from ..problem.definition import Problem
     from ..search.result import Answer
+
+MOST_JOBS = 2
+"""Most processes of a search if nothing else is asked for: there is seldom more to share out."""
 
 
 def add_route(parser: argparse.ArgumentParser) -> None:
@@ -27,6 +30,7 @@ def add_route(parser: argparse.ArgumentParser) -> None:
     text = "of the plans: time, effort or margin (time); routes are looked for by time"
     parser.add_argument("--objective", default="time", help=text)
     add_cache(parser)
+    add_jobs(parser)
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
 
 
@@ -47,7 +51,7 @@ def route(options: argparse.Namespace) -> int:
         require_writable(options.output)
     problem = read_problem(options.problem)
     own = PlanOptions(objective=options.objective)
-    answer = find(problem, own, options.alternatives, options.cache)
+    answer = find(problem, own, options.alternatives, options.cache, options.jobs)
     clear_progress()
     print(json.dumps(answer.to_dict(), indent=2) if options.json else answer.to_text(), end="")
     if options.json:
@@ -59,15 +63,24 @@ def route(options: argparse.Namespace) -> int:
 
 
 def find(
-    problem: Problem, options: PlanOptions, alternatives: int = 0, cache: str | None = None
+    problem: Problem,
+    options: PlanOptions,
+    alternatives: int = 0,
+    cache: str | None = None,
+    jobs: int | None = None,
 ) -> Answer:
     """Find a route, with a progress line."""
-    from ..common.errors import WholearmError
+    from ..common.errors import InputError, WholearmError
+    from ..common.workers import count_cores
     from ..search.route import find_route_with
 
+    if jobs is not None and jobs < 1:
+        raise InputError("", "--jobs", f"{jobs} given; allowed is 1 or more")
+    count = min(MOST_JOBS, count_cores()) if jobs is None else jobs
     try:
         folder = None if cache is None else Path(cache)
-        return find_route_with(problem, options, alternatives, show_progress(), folder)
+        given = options, alternatives, show_progress(), folder
+        return find_route_with(problem, *given, jobs=count)
     except WholearmError:
         clear_progress()
         raise

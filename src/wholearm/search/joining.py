@@ -7,14 +7,17 @@ by one. Where a link lands on a border is left open: it is chosen with regard to
 from __future__ import annotations
 
 import time
+from collections import ChainMap
 from collections.abc import Callable, MutableMapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError, WholearmError, name_source
 from ..common.sharing import exclusive
+from ..common.workers import share
 from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phase
 from ..planning.advice import unadvised
@@ -27,7 +30,7 @@ from ..planning.self_check import Checked
 from ..planning.splitting import split_blocks
 from ..problem.definition import End, Phase, Problem
 from ..scene.model import Scene
-from ..solvers.statistics import open_ledger
+from ..solvers.statistics import SolverStatistics, open_ledger
 from .links import Link, Step, describe_steps, point_out
 from .measure import SINGULAR, Measured, make_phases
 
@@ -36,30 +39,10 @@ OFF = 1e-4
 radians."""
 SAME = 9
 """Decimals of configurations that are one, in the same unit."""
+MET = 1e-8
+"""Largest distance, in the same unit, of a border's end as planned from the same end as found."""
 
 Key = tuple[object, ...]
-Links = Sequence[tuple[Link, Sequence[Measured]]]
-"""Links of a route, with the ways in which those through cells can be gone."""
-
-
-class Lost(str):
-    """Why a route has no plan, with the links for which that is so on every route.
-
-    Attributes
-    ----------
-    links : tuple of Link
-        The one that has no plan, or whose plan does not hold, behind the one that lands where it
-        starts, if any.
-    """
-
-    links: tuple[Link, ...] = ()
-
-    @classmethod
-    def at(cls, links: tuple[Link, ...], reason: str) -> Lost:
-        """A reason that some links are to blame for."""
-        lost = cls(reason)
-        lost.links = links
-        return lost
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +54,13 @@ class PlannedLink:
     phases : tuple of Phase
         Counted from the first of the link.
     blocks : tuple of BlockPlan
+    costs : tuple of SolverStatistics
+        What solving has cost, for each phase.
     """
 
     phases: tuple[Phase, ...]
     blocks: tuple[BlockPlan, ...]
+    costs: tuple[SolverStatistics, ...]
 
     @property
     def end(self) -> Array:
@@ -87,6 +73,8 @@ class PlannedLink:
         return sum(plan.motion.duration for own in self.blocks for plan in own.plans)
 
 
+Chosen = tuple[Link, Measured | None]
+"""A link, and what is begun of it."""
 Kept = MutableMapping[Key, PlannedLink | str]
 
 
@@ -98,10 +86,11 @@ def can_join(problem: Problem, options: PlanOptions) -> bool:
 @exclusive
 def join_route(
     problem: Problem,
-    links: Links,
+    links: Sequence[tuple[Link, Sequence[Measured]]],
     options: PlanOptions,
     kept: Kept,
     report: Callable[[str], None],
+    jobs: int = 1,
 ) -> Plan | str:
     """The plan of a route, from plans of its links, or why there is none.
 
@@ -110,75 +99,125 @@ def join_route(
     problem : Problem
     links : sequence of (Link, sequence of Measured)
         One after the other from the problem's start, with the ways in which those through cells
-        can be gone, the best first. Where a plan does not hold, or nothing leads on from where it
-        lands, the next one is taken, and at last one that is planned from guesses of its own.
+        can be gone, the best first. Where a plan does not hold, the next one is taken, and at last
+        one that is planned from guesses of its own.
     options : PlanOptions
     kept : mapping
         Plans of links that were made before, to which others are added.
     report : callable
+    jobs : int
+        Most processes that plan links at the same time.
     """
     options = options.scale_ranges(problem.uncertainty or {})
     begun = time.perf_counter()
-    ways, culprit = [[*measured, None] for _, measured in links], None
+    ways = [[*measured, None] for _, measured in links]
     try:
         with open_ledger() as ledger, unadvised():
             while True:
                 own = [(link, way[0]) for (link, _), way in zip(links, ways, strict=True)]
-                planned, reason = _plan_links(problem, own, options, kept, report)
-                if reason:
-                    culprit = len(planned)
-                    if _try_other(links, ways, culprit):
-                        continue
-                    return Lost.at(_blame(links, culprit), reason)
+                _plan_ahead(problem, own, options, kept, report, jobs)
+                planned = _plan_links(problem, own, options, kept, report)
+                if isinstance(planned, str):
+                    return planned
                 made, checked = _put_together(problem, planned, options), None
                 if not options.replay:
                     break
                 report("replaying the plan")
                 checked = Checked.of(made.problem, assemble_plan(made))
                 owners = [k for k, own in enumerate(planned) for _ in own.phases]
-                culprit = None if checked.culprit is None else owners[checked.culprit - 1]
-                if culprit is None or not _try_other(links, ways, culprit):
+                if checked.culprit is None or len(ways[owners[checked.culprit - 1]]) == 1:
                     break
+                ways[owners[checked.culprit - 1]].pop(0)
+            costs = [cost for own in planned for cost in own.costs]
+            for number, cost in enumerate(costs, 1):
+                ledger.add(number, cost)
             return finish_plan(made, report, ledger, (begun, begun), checked)
     except WholearmError as error:
-        return str(error) if culprit is None else Lost.at(_blame(links, culprit), str(error))
+        return str(error)
     except np.linalg.LinAlgError:
         return SINGULAR
 
 
-def _blame(links: Links, culprit: int) -> tuple[Link, ...]:
-    """A link that has no plan, behind the one that lands where it starts, if any."""
-    first = culprit - 1 if culprit and links[culprit - 1][0].in_cell else culprit
-    return tuple(link for link, _ in links[first : culprit + 1])
+def _plan_ahead(
+    problem: Problem,
+    links: Sequence[Chosen],
+    options: PlanOptions,
+    kept: Kept,
+    report: Callable[[str], None],
+    jobs: int,
+) -> None:
+    """Keep plans of all links whose starts are known, and of those after them, at the same time."""
+    if jobs == 1:
+        return
+    starts = [0, *(k + 1 for k, (link, _) in enumerate(links[:-1]) if not link.in_cell)]
+    parts = [range(*ends) for ends in zip(starts, [*starts[1:], len(links)], strict=True)]
+    # What takes longest comes first.
+    parts.sort(key=lambda own: not any(links[k][0].in_cell for k in own))
+    report(f"planning {len(links)} parts of the route")
+    tasks = [partial(_plan_part, problem, links, own, options, kept) for own in parts]
+    for found in share(tasks, jobs, (problem, problem.scene)):
+        kept.update(found)
 
 
-def _try_other(links: Links, ways: list[list[Measured | None]], culprit: int) -> bool:
-    """Go on to another way of a link that has no plan, or of the one that lands where it starts."""
-    for k in range(culprit, culprit - len(_blame(links, culprit)), -1):
-        if len(ways[k]) > 1:
-            ways[k].pop(0)
-            return True
-    return False
+def _plan_part(
+    problem: Problem,
+    links: Sequence[Chosen],
+    part: Sequence[int],
+    options: PlanOptions,
+    kept: Kept,
+) -> dict[Key, PlannedLink | str]:
+    """What there is to keep of links, by their numbers, planned one after the other."""
+    own = ChainMap[Key, PlannedLink | str]({}, kept)
+    z = links[part[0]][0].start.z if part[0] else problem.start
+    for k in part:
+        planned = _plan_one(problem, links, k, z, options, own, lambda _: None)
+        if isinstance(planned, str):
+            break
+        z = planned.end
+    return dict(own.maps[0])
 
 
 def _plan_links(
     problem: Problem,
-    links: Sequence[tuple[Link, Measured | None]],
+    links: Sequence[Chosen],
     options: PlanOptions,
     kept: Kept,
     report: Callable[[str], None],
-) -> tuple[list[PlannedLink], str]:
-    """Plans of links one after the other, from what is begun of them, and why the next has none."""
+) -> list[PlannedLink] | str:
+    """Plans of links one after the other, from what is begun of them; or why there is none."""
     z, found = problem.start, list[PlannedLink]()
-    for k, (link, measured) in enumerate(links):
-        ahead = links[k + 1][0] if k + 1 < len(links) else None
-        own = (link if measured is None else replace(link, steps=measured.steps), ahead)
-        planned = _keep_link(problem, *own, measured, z, options, kept, report)
+    for k, (link, _) in enumerate(links):
+        if k and not links[k - 1][0].in_cell and _measure_gap(z, link) < MET:
+            # Wherever it began, a border ends at the same place.
+            z = link.start.z
+        planned = _plan_one(problem, links, k, z, options, kept, report)
         if isinstance(planned, str):
-            return found, f"{describe_steps(link.steps)}: {planned}"
+            return f"{describe_steps(link.steps)}: {planned}"
         found.append(planned)
         z = planned.end
-    return found, ""
+    return found
+
+
+def _measure_gap(z: Array, link: Link) -> float:
+    """Distance from `z` of where a link starts, in radii of gyration or radians."""
+    length = link.start.scene.scales.length
+    return float(np.abs((z - link.start.z) / [length, length, 1, 1, 1]).max())
+
+
+def _plan_one(
+    problem: Problem,
+    links: Sequence[Chosen],
+    k: int,
+    z: Array,
+    options: PlanOptions,
+    kept: Kept,
+    report: Callable[[str], None],
+) -> PlannedLink | str:
+    """The plan of one of some links, from `z`."""
+    link, measured = links[k]
+    ahead = links[k + 1][0] if k + 1 < len(links) else None
+    own = link if measured is None else replace(link, steps=measured.steps)
+    return _keep_link(problem, own, ahead, measured, z, options, kept, report)
 
 
 def _put_together(problem: Problem, links: Sequence[PlannedLink], options: PlanOptions) -> Planning:
@@ -251,20 +290,21 @@ def _plan_link(
     count = len(phases) - len(follows)
     none = list[float | None]([None] * len(phases))
     made = Planning(own, tuple(curves), options, (), none, none, sketches=True)
-    for part in split_blocks(own):
-        if part[0].index >= count:
-            break
-        begun = None
-        if (
-            measured
-            and measured.begun
-            and (part[0].end is not End.REST or part[0].index == count - 1)
-        ):
-            start = made.blocks[-1].end if made.blocks else z
-            begun = BlockPlan(part, start, BEGUN, None, [], list(measured.begun), None)
-        with name_source(problem.source):
+    with open_ledger(apart=True) as ledger, name_source(problem.source):
+        for part in split_blocks(own):
+            if part[0].index >= count:
+                break
+            begun = None
+            if (
+                measured
+                and measured.begun
+                and (part[0].end is not End.REST or part[0].index == count - 1)
+            ):
+                start = made.blocks[-1].end if made.blocks else z
+                begun = BlockPlan(part, start, BEGUN, None, [], list(measured.begun), None)
             made = plan_next(made, 0, begun, report)
-    return PlannedLink(tuple(phases[:count]), made.blocks)
+    costs = tuple(ledger.of(phase.number) for phase in phases[:count])
+    return PlannedLink(tuple(phases[:count]), made.blocks, costs)
 
 
 def _aim(phase: Phase, z: Array, link: Link) -> tuple[Phase, Curve]:

@@ -39,15 +39,11 @@ class Measured(NamedTuple):
         Its phases, in the way that was planned.
     begun : list of PhasePlan
         Plans of those in the cell, and of the border that is left in motion, on few intervals.
-        Copies and files are without them, as they hold the solver.
     """
 
     duration: float
     steps: tuple[Step, ...]
     begun: list[PhasePlan[TimeMotion]]
-
-    def __reduce__(self) -> tuple[type[Measured], tuple[float, tuple[Step, ...], list[object]]]:
-        return Measured, (self.duration, self.steps, [])
 
 
 def make_phases(problem: Problem, steps: Sequence[Step], index: int = 0) -> list[Phase]:
@@ -63,8 +59,9 @@ def measure_link(
     link: Link,
     steps: tuple[Step, ...],
     options: PlanOptions,
-    straight: bool = True,
     further: int = 0,
+    straight: bool = True,
+    hurried: bool = False,
 ) -> Measured | str:
     """Plan a link through a cell for itself, on few intervals.
 
@@ -75,10 +72,12 @@ def measure_link(
     steps : tuple of Step
         Its own, or others that lead the same way.
     options : PlanOptions
+    further : int
+        Guesses beyond the first ones, if these lead nowhere.
     straight : bool
         Whether a cell is first guessed to be crossed straight, or to the nearest end of the phase.
-    further : int
-        Guesses beyond the first one, if that leads nowhere.
+    hurried : bool
+        Whether there is one guess alone.
 
     Returns
     -------
@@ -102,7 +101,7 @@ def measure_link(
             return f"{phases[0].until} holds already where it starts"
         alone = len(phases) == 1
         towards = goal.z if straight and alone else None
-        plans = try_phases(own, phases, z, rough, towards, further if alone else 0)
+        plans = try_phases(own, phases, z, rough, towards, further if alone else 0, hurried)
     except NoMotionError:
         return "no motion keeps its limits along the border"
     except WholearmError as error:

@@ -40,6 +40,7 @@ def find_route(
     alternatives: int = 0,
     progress: Callable[[str], None] | None = None,
     cache: str | Path | None = None,
+    jobs: int = 1,
     **options: Any,
 ) -> Answer:
     """Find the contact formations that lead from a problem's start to its goals, and a plan.
@@ -57,6 +58,9 @@ def find_route(
     cache : path-like, optional
         Folder where what is known of the scene is kept, for other processes. Its files are pickles:
         it has to be one that nobody else writes to.
+    jobs : int
+        Most processes at the same time; others than this one are forked. What is found does not
+        depend on it.
     **options
         As `wholearm.solve` takes them.
 
@@ -67,9 +71,11 @@ def find_route(
     InfeasibleError
         If nothing leads to a goal; names what blocks the way.
     """
+    if jobs < 1:
+        raise InputError("", "jobs", f"{jobs} given; allowed is 1 or more")
     own = PlanOptions(objective=objective, **options)
     folder = None if cache is None else Path(cache)
-    return find_route_with(problem, own, alternatives, progress, folder)
+    return find_route_with(problem, own, alternatives, progress, folder, jobs=jobs)
 
 
 @exclusive
@@ -80,6 +86,7 @@ def find_route_with(
     progress: Callable[[str], None] | None = None,
     cache: Path | None = None,
     trial: bool = False,
+    jobs: int = 1,
 ) -> Answer:
     """Find a route with `options` given as one object; see `find_route`.
 
@@ -99,7 +106,7 @@ def find_route_with(
             raise InputError(problem.source, key, f"{goal} holds already where the motion starts")
         search = Search(chart, place, goal)
         wanted = alternatives if index + 1 == len(problem.goals) else 0
-        answer = _choose(problem, before, search, options, wanted, report, trial)
+        answer = _choose(problem, before, search, options, wanted, report, trial, jobs)
         before = [*before, answer.route]
     if cache is not None:
         store_chart(cache, key_chart(problem, options), chart)
@@ -157,9 +164,10 @@ def _choose(
     alternatives: int,
     report: Callable[[str], None],
     trial: bool,
+    jobs: int,
 ) -> Answer:
     """Plan routes to one goal, and say how good the best one is."""
-    chooser, complete = Chooser(problem, before, search, options), True
+    chooser, complete = Chooser(problem, before, search, options, jobs), True
     try:
         with yielding():
             report("looking for routes")

@@ -33,6 +33,8 @@ WAYS = 3
 ATTEMPT = 50
 """Most iterations of the first run of the solver from a guess: where it leads to a plan it takes 25
 or less in one phase."""
+FEW = 35
+"""The same where a plan is known, and others may be better: of up to two phases."""
 SPLIT = 80
 """The same in modes that friction has shown which sets in gradually, with many stages."""
 MUCH_DEARER = 3.0
@@ -56,6 +58,8 @@ class Attempt(NamedTuple):
         Whether friction first sets in gradually, which shows its modes.
     before : Solution or None
         What has led to the stages.
+    most : int
+        Most iterations of the first run of the solver.
     """
 
     name: str
@@ -63,6 +67,7 @@ class Attempt(NamedTuple):
     stages: list[Stage]
     gradual: bool = False
     before: Solution | None = None
+    most: int = ATTEMPT
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +193,7 @@ def solve_attempt(search: Search, attempt: Attempt) -> Solution:
         if not found.success:
             return found
         stages, least = found.stages, found.cost
-    patience = SPLIT if attempt.gradual else ATTEMPT
+    patience = SPLIT if attempt.gradual else attempt.most
     solution = search.solve(stages, attempt.before, search.wait(patience))
     if solution.success and solution.margin < -ROUNDING:
         # A way that presses too little may be far from one that presses enough.

@@ -26,8 +26,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -69,7 +70,9 @@ class TimeNLP:
 
     Attributes
     ----------
-    assembled : Assembled
+    assembled : Assembled or None
+        None in copies and from files: CasADi's objects belong to one process. What is left says
+        which unknowns and rows there are.
     max_iter : int
         Most iterations of the solver.
     layouts : list of StageLayout
@@ -79,12 +82,16 @@ class TimeNLP:
         Row of the whole duration, if something gives way; otherwise -1.
     """
 
-    assembled: Assembled
+    assembled: Assembled | None
     max_iter: int
     layouts: list[StageLayout]
     rows: Rows
     rows_of: list[StageRows]
     duration_row: int
+
+    def __getstate__(self) -> dict[str, Any]:
+        known = {own.name: getattr(self, own.name) for own in fields(self)}
+        return known | {"assembled": None}
 
     @cached_property
     def solver(self) -> Expression:
@@ -98,6 +105,7 @@ class TimeNLP:
 
     def _build(self, push: float) -> Expression:
         built = self.assembled
+        assert built is not None
         return build_solver(
             "time_nlp",
             built.nlp,

@@ -12,7 +12,7 @@ it is a better guess, or says why there is no plan.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import chain, islice
 from typing import TYPE_CHECKING, NamedTuple
@@ -26,7 +26,7 @@ from ...problem.definition import Phase, Problem
 from ...results.trajectory import Motion
 from ..options import Objective, PlanOptions
 from ..phase_plan import PhasePlan
-from .attempts import NEAREST, Attempt, Attempts, solve_attempt
+from .attempts import FEW, NEAREST, Attempt, Attempts, solve_attempt
 from .mesh import resample
 from .modes import LEAST_INTERVALS
 from .motion import TimeMotion
@@ -114,6 +114,7 @@ def try_phases(
     options: PlanOptions,
     goal: Array | None = None,
     further: int = 0,
+    hurried: bool = False,
 ) -> list[PhasePlan[TimeMotion]] | None:
     """Begin to plan phases from the first guesses, and from a few further ones if these fail.
 
@@ -126,17 +127,23 @@ def try_phases(
         A single phase is first guessed to go straight there; otherwise to its nearest end.
     further : int
         How many guesses are looked at beyond.
+    hurried : bool
+        Whether there is one guess alone, straight to the goal if there is one, for few iterations.
     """
     own = replace(options, mode_search=False)
     search = Search.of(problem, own, None, None, math.inf, True)
     attempts = Attempts(problem, phases, z, search, None, further > 0)
     straight = None if goal is None else attempts.towards(goal)
+    begin = [straight] if straight else []
     first = (attempts.first for _ in range(straight is None or further > 0))
-    for attempt in chain([straight] if straight else [], first, islice(attempts, further)):
+    guesses: Iterable[Attempt] = chain(begin, first, islice(attempts, further))
+    if hurried:
+        guesses = [own._replace(most=FEW) for own in (begin if goal is not None else first)]
+    for attempt in guesses:
         solution = solve_attempt(search, attempt)
         if solution.success:
             return _list_begun(problem, search, phases, solution, attempt.name, options)
-    moved = approach(search, problem, phases, z)
+    moved = None if hurried else approach(search, problem, phases, z)
     return moved and _list_begun(problem, search, phases, moved, MOVED, options)
 
 

@@ -21,6 +21,10 @@ class Rows:
         self._linear: list[Indices] = []
         self._entries: list[tuple[Array, Array, Array]] = []
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Which rows there are, and their bounds: kernels belong to CasADi.
+        return self.__dict__ | {"blocks": [], "_entries": []}
+
     def nonlinear(self, *shape: int, low: Any = 0.0, high: Any = 0.0) -> Indices:
         """Rows of a kernel, equal to zero unless bounds are given."""
         own = self._count + np.arange(int(np.prod(shape))).reshape(shape)
