@@ -25,7 +25,7 @@ from .jumps import (
 from .locate import find_first
 from .replay import Replay
 from .runge_kutta import ORDER
-from .tolerances import CREEPING, REACHED, SHORTEST_STEP, SLOW, measure_units
+from .tolerances import CREEPING, REACHED, SETTLING, SHORTEST_STEP, SLOW, measure_units
 
 _GROWTH = 40.0
 """Largest growth of a step: at order 8 an error of 1e-13 of the tolerance allows it."""
@@ -97,24 +97,30 @@ def _is_at_end(run: Replay, t: float) -> bool:
 
     By rounding a planned motion ends a little beyond the end of its phase, or has just turned back.
     It has to be at rest there, or to reach a contact softly; a coordinate, or the end of a
-    contact's range, is passed at any speed, and an impact comes at any, with the step of the
-    torques that goes with it, or as they end. A motion that is about to stop instead may step its
-    torques before it is there.
+    contact's range, is passed at any speed, just then, and an impact comes at any, with the step of
+    the torques that goes with it, or as they end. A motion that is about to stop instead may step
+    its torques before it is there.
     """
     s = run.stepper
     if t != run.breaks[run.piece + 1] or not is_there(run) or _comes_later(run):
         return False
     speed = abs(_measure_rate(run))
-    if run.phase.end is End.SMOOTH:
-        speed = 0.0 if run.passes else speed
+    if run.passes:
+        speed = 0.0 if _is_passing(run) else math.inf
     elif run.phase.end is End.IMPACT and _strikes(run):
         coming = run.piece + 1
         speed = 0.0 if coming >= len(run.steps_at) or run.steps_at[coming] else speed
-    elif s.formation.n_constraints < 4:
+    elif run.phase.end is not End.SMOOTH and s.formation.n_constraints < 4:
         units = measure_units(run.problem.scene)[5:]
         speed = float(np.abs(s.outputs[s.to.y][5:10] / units).max())
     pressing = s.outputs[s.to.events][s.rows.force]
     return speed < SLOW and bool(pressing.min() >= -run.tolerances.force) and not find_slipping(s)
+
+
+def _is_passing(run: Replay) -> bool:
+    """Whether a motion that passes the end of a phase is there but for rounding of the time."""
+    distance = abs(run.value(run.stepper.rows.until)) / run.until_unit
+    return distance <= SETTLING * abs(_measure_rate(run))
 
 
 def _comes_later(run: Replay) -> bool:
