@@ -80,6 +80,7 @@ def draw_map(
             *_write_labels(chart, paper, paths, parts),
             *(f'<polyline class="hit" points="{write_line(paper.place(own))}"/>' for own in lines),
             *_draw_crossings(paper, points),
+            *_number_paths(paper, paths),
             f'</g>{clip} fill="none" stroke="{INK}" stroke-width="0.8"/>',
             *_draw_axes(chart, paper),
             "</svg>",
@@ -188,13 +189,15 @@ def _draw_borders(chart: FormationMap, paper: Paper) -> Iterable[str]:
 
 
 def _draw_paths(paper: Paper, paths: Sequence[Array]) -> Iterable[str]:
-    places = [paper.place(own) for own in paths]
     look = f'stroke="{INK}" stroke-width="6" stroke-linecap="round" opacity="0.4"'
-    for own in places:
-        yield f'<path fill="none" {look} d="{write_path([own])}"/>'
-    for number, own in enumerate(places, start=1):
+    for own in paths:
+        yield f'<path fill="none" {look} d="{write_path([paper.place(own)])}"/>'
+
+
+def _number_paths(paper: Paper, paths: Sequence[Array]) -> Iterable[str]:
+    for number, own in enumerate(map(paper.place, paths), start=1):
         x, y = find_middle(own)
-        yield f'<circle cx="{x:.1f}" cy="{SHEET[1] - y:.1f}" r="8" fill="{INK}" stroke="white"/>'
+        yield f'<circle cx="{x:.1f}" cy="{SHEET[1] - y:.1f}" r="8" class="disc"/>'
         yield write_text(str(number), (x, y - 4), ' class="number"')
 
 

@@ -22,7 +22,8 @@ def build_page(title: str, parts: Iterable[str]) -> str:
         As the other functions of this module make them.
     """
     style, script = (_read(name) for name in ("viewer.css", "viewer.js"))
-    head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{style}</style>'
+    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+    head += f"<title>{escape(title)}</title><style>{style}</style>"
     body = "\n".join([f"<h1>{escape(title)}</h1>", *parts, f"<script>{script}</script>"])
     return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head><body>\n{body}\n</body></html>\n'
 

@@ -86,7 +86,7 @@ function makeScene(parent, motion) {
   const ghost = motion.ghost ? body("#ffffff", "#bbbbbb", `${2 * thin}`) : null;
   const main = body(null, "#222222", "none");
   const numbers = motion.vertices.map((_, i) => add(svg, "text", {
-    style: `font-size: ${0.032 * size}px`, "text-anchor": "middle", "dominant-baseline": "central" },
+    style: `font-size: ${0.027 * size}px`, "text-anchor": "middle", "dominant-baseline": "central" },
     String(i)));
   const cones = motion.contacts.map((own) => add(world, "polygon", { fill: own.colour, opacity: 0.18 }));
   const arrows = motion.contacts.map((own) => add(world, "polyline", {
@@ -152,7 +152,8 @@ function makeScene(parent, motion) {
   };
 }
 
-const WIDTH = 1000, LEFT = 58, RIGHT = 10;
+// Narrow where the screen is, as a phone's, so that texts stay readable.
+const WIDTH = innerWidth < 700 ? 520 : 1000, LEFT = 58, RIGHT = 10;
 
 function ticks(low, high, most) {
   const rough = (high - low) / most, power = 10 ** Math.floor(Math.log10(rough));
@@ -184,7 +185,7 @@ function makePlot(parent, motion, height, title, lines, options) {
                        stroke: value === 0 ? "#222" : "#c4c9d0", "stroke-width": value === 0 ? 1.2 : 0.5 });
     add(svg, "text", { x: LEFT - 5, y: y(value) + 4, "text-anchor": "end" }, String(value));
   }
-  for (const t of ticks(0, end, 8))
+  for (const t of ticks(0, end, WIDTH / 125))
     add(svg, "text", { x: x(t), y: bottom + 14, "text-anchor": "middle" }, `${t} s`);
   add(svg, "text", { x: 12, y: (top + bottom) / 2, "text-anchor": "middle",
                      transform: `rotate(-90 12 ${(top + bottom) / 2})` }, title);
