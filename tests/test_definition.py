@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -132,7 +133,7 @@ def test_a_problem_for_a_map_needs_no_phases() -> None:
     problem = read_edited(drop("phases"))
     assert problem.phases == () and repr(problem).endswith("0 phases)")
     assert problem.with_(mass=0.3).phases == ()
-    with pytest.raises(InputError, match="phases: is missing; `wholearm map"):
+    with pytest.raises(InputError, match="phases: is missing, and so is .goal., .* `wholearm map"):
         wholearm.solve(problem)
     torques = wholearm.TorqueProfile(np.array([0.0, 1.0]), np.zeros((1, 2, 1)))
     with pytest.raises(InputError, match="phases: is missing"):
@@ -363,6 +364,16 @@ def test_a_hand_that_is_crossed_at_the_start_is_refused() -> None:
     with pytest.raises(InputError, match=r"into each other: their gap is -0\.0") as caught:
         read_edited(cross)
     assert caught.value.key == "start.x" and "allowed is 0 or more" in caught.value.problem
+    # It is said where the hand would close, and there it does.
+    text = caught.value.problem.split("; the hand closes for x ")[1]
+    for own in re.findall(r"-?[\d.]+", text):
+
+        def move(table: dict[str, Any], x: float = float(own)) -> None:
+            cross(table)
+            table["start"]["x"] = x
+            del table["phases"]
+
+        assert read_edited(move).start[0] == float(own)
 
     def pass_by(table: dict[str, Any]) -> None:
         cross(table)

@@ -15,6 +15,7 @@ from ..common.require import require_number, require_vector
 from ..common.sharing import exclusive
 from ..contacts.formation import Formation, describe, find_touching
 from ..contacts.links import evaluate_finger_gap
+from ..contacts.reach import name_reach
 from ..scene.model import Scene
 from ..scene.ranges import (
     TURN,
@@ -81,7 +82,8 @@ def require_phases(problem: Problem) -> None:
         If the problem has no phases.
     """
     if not problem.phases:
-        text = "is missing; `wholearm map FILE --list X,PHI ...` lists [[phases]] along a route"
+        text = "is missing, and so is [goal], from which wholearm finds them; "
+        text += "`wholearm map FILE --list X,PHI ...` lists [[phases]] along a route"
         if problem.goals:
             text = "is missing; `wholearm route FILE` finds the [[phases]] that lead to the goal"
         raise InputError(problem.source, "phases", text)
@@ -196,7 +198,8 @@ def _check_fingers(problem: Problem) -> None:
             "",
             "start.x",
             f"{problem.start[0]:g} closes the fingers into each other: their gap is {gap:.4g} m; "
-            "allowed is 0 or more, unless fingers_collide = false",
+            "allowed is 0 or more, unless fingers_collide = false; "
+            + name_reach(scene, float(problem.start[2])),
         )
 
 

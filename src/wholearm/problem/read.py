@@ -20,6 +20,7 @@ from ..common.sharing import exclusive
 from ..contacts.closing import close_finger, place_flush
 from ..contacts.elemental import Contact, parse_contact
 from ..contacts.formation import Formation
+from ..contacts.reach import name_reach
 from ..scene.model import HOLDS, Finger, Friction, Scene
 from ..scene.polygon import Polygon
 from ..scene.ranges import TURN, check_place, check_ranges
@@ -222,7 +223,11 @@ def place_start(scene: Scene, flush: int, x: float) -> Array:
     """
     check_place(scene, "start.x", x)
     q = place_flush(scene, flush, x)
-    z = np.array([*q, close_finger(scene, q, 0), close_finger(scene, q, 1)])
+    try:
+        z = np.array([*q, close_finger(scene, q, 0), close_finger(scene, q, 1)])
+    except InputError as error:
+        text = f"{error.problem}; {name_reach(scene, float(q[2]))}"
+        raise InputError(error.source, error.key, text) from error
     z.setflags(write=False)
     return z
 
