@@ -24,7 +24,7 @@ from wholearm.policy.make import hold_end, make_policy
 from wholearm.policy.motion_law import MotionLaw
 from wholearm.policy.pace import Pace
 from wholearm.policy.policy import Policy
-from wholearm.policy.regulator import RATE, Linear, regulate
+from wholearm.policy.regulator import RATE, Linear, follow, regulate
 from wholearm.policy.retime import eliminate, retime
 from wholearm.policy.sensing import Sensing
 from wholearm.policy.squeeze import choose_squeeze
@@ -341,3 +341,13 @@ def test_a_landing_without_a_reserve_is_planned_anew() -> None:
     assert np.abs(law.tau).max() < 1.85
     report = verify_policy(problem, plan, policy)
     assert report.ok, report.failures
+
+
+def test_what_is_followed_ends_with_its_own_contacts() -> None:
+    problem, plan = problem_of(HEPTAGON), plan_of(HEPTAGON)
+    # The second phase lets go of a contact that the first one presses to its end.
+    first, second = (set(phase.formation.names) for phase in problem.phases[:2])
+    assert first - second
+    t = np.linspace(0.0, plan.phase_starts[1], 20)
+    found = follow(problem, problem.phases[:1], plan, t)
+    assert np.isfinite(found.gains).all() and np.isfinite(found.tau).all()

@@ -22,7 +22,7 @@ from .pace import Pace
 from .policy import Policy
 from .push import find_arrival, find_push, find_still
 from .reference import TOUCH, Piece, Reserve, trace_pieces
-from .regulator import RATE, follow
+from .regulator import RATE, end_within, follow
 from .replan import Planner, replan
 
 STILL = 1e-3
@@ -172,7 +172,7 @@ def _follow_motion(
     starts[-1] = plan.t[(plan.phase == phases[-1].index) & ~plan.held][-1]
     count = max(int(np.ceil((starts[-1] - starts[0]) / period)), 2)
     t = np.linspace(starts[0], starts[-1], count + 1)
-    samples, last = plan.at(t), phases[-1]
+    samples, last = plan.at(end_within(phases, plan, t)), phases[-1]
     hold = hold_end(problem, last, samples.z[-1])
     found = follow(problem, phases, plan, t)
     speed = np.sqrt(found.b)

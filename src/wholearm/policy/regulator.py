@@ -86,12 +86,18 @@ class Followed(NamedTuple):
     gains: Array
 
 
+def end_within(phases: tuple[Phase, ...], plan: Trajectory, t: Array) -> Array:
+    """Times in phases, before their very end: there the next phase answers, with its contacts."""
+    end = plan.phase_starts[phases[-1].index + 1]
+    return np.asarray(np.minimum(t, np.nextafter(end, 0.0)))
+
+
 def follow(problem: Problem, phases: tuple[Phase, ...], plan: Trajectory, t: Array) -> Followed:
     """Torques and gains for phases of a plan at even times in them, shape (n,).
 
     The motion is as much slower as leaves most of normal forces and torques to feedback.
     """
-    starts = plan.phase_starts
+    starts, t = plan.phase_starts, end_within(phases, plan, t)
     owner = np.searchsorted(starts, t, side="right") - 1
     owner = owner.clip(phases[0].index, phases[-1].index)
     parts = [
