@@ -1,15 +1,22 @@
+"""Routes put together from their links, and what is tried where a link has no plan."""
+
 from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
 from shipped import HEPTAGON, problem_of
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.result import Plan
+from wholearm.problem.definition import Until
 from wholearm.problem.goal import Goal
+from wholearm.search.candidates import Lost
 from wholearm.search.chart import Chart
 from wholearm.search.find import Search
-from wholearm.search.joining import Kept, join_route
-from wholearm.search.links import Link
+from wholearm.search.joining import Kept, PlannedLink, join_route, key_steps
+from wholearm.search.links import Link, Step
 from wholearm.search.measure import Measured
 from wholearm.search.places import make_place
 
@@ -39,3 +46,51 @@ def test_links_planned_at_the_same_time_make_the_same_plan() -> None:
         assert mine.statistics.solves > 0 and mine.statistics.iterations > 0
         assert mine.statistics.iterations == theirs.statistics.iterations
         assert mine.statistics.iterations == kept_one.statistics.iterations
+
+
+PROBLEM = problem_of(HEPTAGON)
+PLACE = make_place(PROBLEM.scene, PROBLEM.start)
+
+
+def make_steps(x: float) -> tuple[Step, ...]:
+    return (Step(PLACE.contacts, Until(coordinate="x", value=x)),)
+
+
+class Plans(dict[Any, Any]):
+    """Plans of every link, but of those with some steps, and what has been asked for."""
+
+    def __init__(self, without: tuple[Step, ...]) -> None:
+        super().__init__()
+        self.without, self.asked = key_steps(without), list[Any]()
+
+    def __contains__(self, key: object) -> bool:
+        return True
+
+    def __getitem__(self, key: Any) -> Any:
+        self.asked.append(key[1])
+        if key[1] == self.without:
+            return "too short of force"
+        return PlannedLink((), (SimpleNamespace(end=PROBLEM.start),), ())  # type: ignore[arg-type]
+
+
+def test_where_nothing_leads_on_another_landing_is_tried() -> None:
+    first = Link(PLACE, PLACE, make_steps(0.01), 1.0, 1.0)
+    landing = Link(PLACE, PLACE, make_steps(0.02), 1.0, 0.0, in_cell=True)
+    onward = Link(PLACE, PLACE, make_steps(0.03), 1.0, 1.0)
+    ways = [Measured(1.0, make_steps(x), []) for x in (0.021, 0.022)]
+    plans = Plans(onward.steps)
+    links = [(first, []), (landing, ways), (onward, [])]
+    lost = join_route(PROBLEM, links, PlanOptions(), plans, lambda _: None)
+    assert isinstance(lost, Lost) and "too short of force" in lost
+    # The landing decides whether the border after it can be set out on, the border before does not.
+    assert lost.links == (landing, onward)
+    tried = [key for key in plans.asked if key not in (key_steps(first.steps), plans.without)]
+    assert tried == [key_steps(own) for own in (*(way.steps for way in ways), landing.steps)]
+
+
+def test_a_link_from_a_crossing_is_alone_to_blame() -> None:
+    first, second = (Link(PLACE, PLACE, make_steps(x), 1.0, 1.0) for x in (0.01, 0.02))
+    plans = Plans(second.steps)
+    lost = join_route(PROBLEM, [(first, []), (second, [])], PlanOptions(), plans, lambda _: None)
+    assert isinstance(lost, Lost) and lost.links == (second,)
+    assert plans.asked == [key_steps(first.steps), key_steps(second.steps)]

@@ -52,6 +52,26 @@ class Failure:
     reason: str
 
 
+class Lost(str):
+    """Why a route has no plan, with the links for which that is so on every route.
+
+    Attributes
+    ----------
+    links : tuple of Link
+        The one that has no plan, or whose plan does not hold, behind the one that lands where it
+        starts, if any.
+    """
+
+    links: tuple[Link, ...] = ()
+
+    @classmethod
+    def at(cls, links: tuple[Link, ...], reason: str) -> Lost:
+        """A reason that some links are to blame for."""
+        lost = cls(reason)
+        lost.links = links
+        return lost
+
+
 def make_candidate(
     problem: Problem, routes: list[Route], known: Mapping[Link, Measured | str]
 ) -> Candidate | Failure:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 from ..planning.options import PlanOptions
 from ..planning.result import Plan
 from ..problem.definition import Problem
-from .candidates import Failure, make_candidate, plan_candidate
+from .candidates import Failure, Lost, make_candidate, plan_candidate
 from .find import CAREFUL, EAGER, Route, Rule, Search
 from .joining import can_join, join_route
 from .links import Link, describe_steps
@@ -62,6 +63,7 @@ class Chooser:
         self.failures: list[Failure] = []
         self._polisher = Polisher(problem, search.chart, options, jobs)
         self._measurements = 0
+        self._lost: list[tuple[Link, ...]] = []
 
     def run(self, wanted: int, report: Callable[[str], None]) -> None:
         """Look for routes and plan them, for as long as there are fewer than `wanted` plans."""
@@ -74,6 +76,8 @@ class Chooser:
             self.plan(wanted, report)
             if len(self.made) >= wanted or len(self.failures) == failed:
                 return
+            # What had no plan bounds nothing.
+            self.search.limit = math.inf
 
     def plan(self, wanted: int, report: Callable[[str], None]) -> None:
         """Plan the routes that are found, the best first, until there are as many as wanted."""
@@ -81,11 +85,15 @@ class Chooser:
             if len(self.made) >= wanted or len(self.failures) >= TRIED:
                 return
             self.found.remove(route)
+            if self._is_lost(route):
+                continue
             self._polisher.polish(route, report)
             report(f"planning a route of {sum(len(own.steps) for own in route.links)} phases")
             plan = self._plan(route, report)
             if isinstance(plan, str):
                 self.failures.append(Failure(route, plan))
+                if isinstance(plan, Lost):
+                    self._lost.append(plan.links)
             else:
                 self.made.append((plan, route))
 
@@ -130,6 +138,8 @@ class Chooser:
     def _measure(self, route: Route, report: Callable[[str], None]) -> bool:
         """Plan the links of a route that lead through cells; whether all have a plan."""
         known = self.chart.measured
+        if self._is_lost(route):
+            return False
         self._polisher.begin([own for own in route.links if own.in_cell and own not in known])
         for link in route.links:
             if not link.in_cell:
@@ -141,6 +151,14 @@ class Chooser:
             if isinstance(known[link], str):
                 return False
         return True
+
+    def _is_lost(self, route: Route) -> bool:
+        """Whether a route has links for which another one had no plan."""
+        return any(
+            route.links[k : k + len(lost)] == lost
+            for lost in self._lost
+            for k in range(len(route.links))
+        )
 
     def _estimate(self, route: Route) -> float:
         """About the least time that a plan along all routes may take [s]."""

@@ -31,6 +31,7 @@ from ..planning.splitting import split_blocks
 from ..problem.definition import End, Phase, Problem
 from ..scene.model import Scene
 from ..solvers.statistics import SolverStatistics, open_ledger
+from .candidates import Lost
 from .links import Link, Step, describe_steps, point_out
 from .measure import SINGULAR, Measured, make_phases
 
@@ -73,6 +74,8 @@ class PlannedLink:
         return sum(plan.motion.duration for own in self.blocks for plan in own.plans)
 
 
+Links = Sequence[tuple[Link, Sequence[Measured]]]
+"""Links of a route, with the ways in which those through cells can be gone."""
 Chosen = tuple[Link, Measured | None]
 """A link, and what is begun of it."""
 Kept = MutableMapping[Key, PlannedLink | str]
@@ -86,7 +89,7 @@ def can_join(problem: Problem, options: PlanOptions) -> bool:
 @exclusive
 def join_route(
     problem: Problem,
-    links: Sequence[tuple[Link, Sequence[Measured]]],
+    links: Links,
     options: PlanOptions,
     kept: Kept,
     report: Callable[[str], None],
@@ -99,8 +102,8 @@ def join_route(
     problem : Problem
     links : sequence of (Link, sequence of Measured)
         One after the other from the problem's start, with the ways in which those through cells
-        can be gone, the best first. Where a plan does not hold, the next one is taken, and at last
-        one that is planned from guesses of its own.
+        can be gone, the best first. Where a plan does not hold, or nothing leads on from where it
+        lands, the next one is taken, and at last one that is planned from guesses of its own.
     options : PlanOptions
     kept : mapping
         Plans of links that were made before, to which others are added.
@@ -110,32 +113,51 @@ def join_route(
     """
     options = options.scale_ranges(problem.uncertainty or {})
     begun = time.perf_counter()
-    ways = [[*measured, None] for _, measured in links]
+    ways, culprit = [[*measured, None] for _, measured in links], None
     try:
         with open_ledger() as ledger, unadvised():
             while True:
                 own = [(link, way[0]) for (link, _), way in zip(links, ways, strict=True)]
                 _plan_ahead(problem, own, options, kept, report, jobs)
-                planned = _plan_links(problem, own, options, kept, report)
-                if isinstance(planned, str):
-                    return planned
+                planned, reason = _plan_links(problem, own, options, kept, report)
+                if reason:
+                    culprit = len(planned)
+                    if _try_other(links, ways, culprit):
+                        continue
+                    return Lost.at(_blame(links, culprit), reason)
                 made, checked = _put_together(problem, planned, options), None
                 if not options.replay:
                     break
                 report("replaying the plan")
                 checked = Checked.of(made.problem, assemble_plan(made))
                 owners = [k for k, own in enumerate(planned) for _ in own.phases]
-                if checked.culprit is None or len(ways[owners[checked.culprit - 1]]) == 1:
+                culprit = None if checked.culprit is None else owners[checked.culprit - 1]
+                if culprit is None or len(ways[culprit]) == 1:
                     break
-                ways[owners[checked.culprit - 1]].pop(0)
+                ways[culprit].pop(0)
             costs = [cost for own in planned for cost in own.costs]
             for number, cost in enumerate(costs, 1):
                 ledger.add(number, cost)
             return finish_plan(made, report, ledger, (begun, begun), checked)
     except WholearmError as error:
-        return str(error)
+        return str(error) if culprit is None else Lost.at(_blame(links, culprit), str(error))
     except np.linalg.LinAlgError:
         return SINGULAR
+
+
+def _blame(links: Links, culprit: int) -> tuple[Link, ...]:
+    """A link that has no plan, behind the one that lands where it starts, if any."""
+    first = culprit - 1 if culprit and links[culprit - 1][0].in_cell else culprit
+    return tuple(link for link, _ in links[first : culprit + 1])
+
+
+def _try_other(links: Links, ways: list[list[Measured | None]], culprit: int) -> bool:
+    """Go on to another way of a link that has no plan, or of the one that lands where it starts."""
+    for k in range(culprit, culprit - len(_blame(links, culprit)), -1):
+        if len(ways[k]) > 1:
+            ways[k].pop(0)
+            return True
+    return False
 
 
 def _plan_ahead(
@@ -183,8 +205,8 @@ def _plan_links(
     options: PlanOptions,
     kept: Kept,
     report: Callable[[str], None],
-) -> list[PlannedLink] | str:
-    """Plans of links one after the other, from what is begun of them; or why there is none."""
+) -> tuple[list[PlannedLink], str]:
+    """Plans of links one after the other, from what is begun of them, and why the next has none."""
     z, found = problem.start, list[PlannedLink]()
     for k, (link, _) in enumerate(links):
         if k and not links[k - 1][0].in_cell and _measure_gap(z, link) < MET:
@@ -192,10 +214,10 @@ def _plan_links(
             z = link.start.z
         planned = _plan_one(problem, links, k, z, options, kept, report)
         if isinstance(planned, str):
-            return f"{describe_steps(link.steps)}: {planned}"
+            return found, f"{describe_steps(link.steps)}: {planned}"
         found.append(planned)
         z = planned.end
-    return found
+    return found, ""
 
 
 def _measure_gap(z: Array, link: Link) -> float:

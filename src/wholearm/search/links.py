@@ -217,7 +217,8 @@ def look_at(
 def time_parts(curve: Curve, shares: Array, epsilon: float, least_minor: float) -> Array:
     """About the least times along first parts of a curve, from rest to rest, shape (n,) [s].
 
-    Infinite where no motion keeps the limits, or contact forces are not the only ones.
+    Infinite where no motion keeps the limits, none begins at rest, or contact forces are not the
+    only ones.
 
     Parameters
     ----------
@@ -227,10 +228,11 @@ def time_parts(curve: Curve, shares: Array, epsilon: float, least_minor: float) 
     epsilon : float, [N]
     least_minor : float
     """
-    lengths = shares * curve.length
+    times, lengths = np.full(len(shares), np.inf), shares * curve.length
+    if _find_held(curve, epsilon, 0.0):
+        return times
     while len(lengths) and _find_ambiguity(cut_curve(curve, lengths[-1]), least_minor):
         lengths = lengths[:-1]
-    times = np.full(len(shares), np.inf)
     if not len(lengths):
         return times
     nodes = (1 - np.cos(np.linspace(0, np.pi, PARTED + 1))) / 2
