@@ -173,7 +173,9 @@ def add_compare(parser: argparse.ArgumentParser) -> None:
 def add_map(parser: argparse.ArgumentParser) -> None:
     """Add what `map` takes."""
     parser.add_argument("problem", help="problem file (TOML)")
-    parser.add_argument("-o", "--output", help="figure to write (default: map_NAME.png)")
+    parser.add_argument(
+        "-o", "--output", help="figure to write (.png, .pdf, .svg; default: map_NAME.png)"
+    )
     parser.add_argument("--plan", metavar="FILE", help="trajectory file (.npz) to draw over it")
     parser.add_argument(
         "--phi", metavar="LOW,HIGH", help="range of phi [deg] (default: the plan's)"

@@ -25,7 +25,6 @@ from ..mapping.route import trace_problem
 from ..results.trajectory import Trajectory
 from .map_lines import (
     find_middle,
-    find_runs,
     name_palm_lines,
     place_heads,
     shift,
@@ -44,7 +43,7 @@ from .map_style import (
     TINTS,
     UNREACHED,
 )
-from .regions import choose_tints, find_room, split
+from .regions import choose_tints, find_room, find_runs, split
 from .style import STYLE
 
 SIZE = (11.0, 7.9)  # in

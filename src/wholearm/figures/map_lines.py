@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from ..common.arrays import Array
-from ..contacts.closing import Flags
 from ..contacts.elemental import Contact
 from ..mapping.formation_map import Border
 from ..results.trajectory import Trajectory
@@ -32,13 +31,6 @@ def name_palm_lines(borders: tuple[Border, ...]) -> dict[float, int]:
         for border in borders
         if border.along == "x"
     }
-
-
-def find_runs(flags: Flags) -> list[slice]:
-    """Stretches of True, of two places or more."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
-    runs = [slice(a, b) for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)]
-    return [run for run in runs if run.stop - run.start > 1]
 
 
 def shift(points: Array, distance: float) -> Array:

@@ -1,4 +1,4 @@
-"""Regions of a grid: what hangs together, where a text fits best, tints that differ."""
+"""Runs and regions: what hangs together, where a text fits best, tints that differ."""
 
 from __future__ import annotations
 
@@ -8,6 +8,13 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..contacts.closing import Flags, Numbers
+
+
+def find_runs(flags: Flags) -> list[slice]:
+    """Stretches of True, of two places or more."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
+    runs = [slice(a, b) for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)]
+    return [run for run in runs if run.stop - run.start > 1]
 
 
 def split(cell: Numbers) -> Iterator[tuple[int, Flags]]:

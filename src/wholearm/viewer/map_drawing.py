@@ -10,7 +10,6 @@ from ..common.arrays import Array
 from ..contacts.closing import Flags
 from ..figures.map_lines import (
     find_middle,
-    find_runs,
     name_palm_lines,
     place_heads,
     shift,
@@ -28,7 +27,7 @@ from ..figures.map_style import (
     TINTS,
     UNREACHED,
 )
-from ..figures.regions import choose_tints, find_room
+from ..figures.regions import choose_tints, find_room, find_runs
 from ..mapping.formation_map import CROSSED, FormationMap
 from .paper import BOX, SHEET, Paper, choose_ticks, write_line, write_path, write_region, write_text
 

@@ -10,15 +10,20 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.sharing import exclusive
+from ..contacts.closing import Numbers
 from ..contacts.elemental import build_features, build_geometry, parse_contact
 from ..figures.data import find_steps
+from ..figures.regions import find_runs
 from ..figures.style import FINGERS, choose_styles
 from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 
-_DIGITS = 6
-"""Significant digits of numbers in a page: more than a screen shows."""
+_DIGITS, _DECIMALS = 6, 5
+"""Significant digits of numbers in a page, and decimals of places and angles [m, rad]: more than
+a screen shows."""
+MOST = 4000
+"""Samples of a motion in a page."""
 
 
 class Pushes(NamedTuple):
@@ -52,7 +57,10 @@ def place_pushes(scene: Scene, trajectory: Trajectory) -> Pushes:
 
 
 def describe_motion(
-    trajectory: Trajectory, problem: Problem, ghost: Trajectory | None = None
+    trajectory: Trajectory,
+    problem: Problem,
+    ghost: Trajectory | None = None,
+    most: int = MOST,
 ) -> dict[str, Any]:
     """Everything that a page needs to play a motion, as plain values.
 
@@ -63,33 +71,61 @@ def describe_motion(
         Its scene and epsilon.
     ghost : Trajectory, optional
         Another motion of the same hand, drawn behind: a replay.
+    most : int
+        About as many samples are taken at most.
     """
     scene, pushes = problem.scene, place_pushes(problem.scene, trajectory)
-    styles = choose_styles(trajectory.contacts)
+    styles, every = choose_styles(trajectory.contacts), find_steps(trajectory)
+    rows = _choose_rows(trajectory, every, most)
     contacts = [
         {
             "name": name,
             "colour": styles[name].colour,
             "dashes": _list_dashes(styles[name].line),
             "friction": scene.friction.of(parse_contact(name, scene).finger),
-            "point": _round(pushes.points[:, index]),
-            "normal": _round(pushes.normals[:, index]),
-            "force": _round(pushes.forces[:, index]),
-            "c_n": _round(trajectory.c_n[:, index]),
+            "spans": _list_spans(trajectory, pushes, index, rows),
         }
         for index, name in enumerate(trajectory.contacts)
     ]
+    behind = None
+    if ghost is not None:
+        few = _choose_rows(ghost, every[:0], most)
+        behind = {"t": _round(ghost.t[few]), "z": _fix(ghost.z[few])}
     return describe_hand(scene) | {
         "epsilon": problem.epsilon,
-        "t": _round(trajectory.t),
-        "z": _round(trajectory.z),
-        "tau": _round(trajectory.tau),
-        "phase": trajectory.phase.tolist(),
+        "t": _round(trajectory.t[rows]),
+        "z": _fix(trajectory.z[rows]),
+        "tau": _round(trajectory.tau[rows]),
+        "phase": trajectory.phase[rows].tolist(),
         "starts": _round(trajectory.phase_starts),
-        "steps": find_steps(trajectory).tolist(),
+        "steps": np.searchsorted(rows, every).tolist(),
         "contacts": contacts,
-        "ghost": None if ghost is None else {"t": _round(ghost.t), "z": _round(ghost.z)},
+        "ghost": behind,
     }
+
+
+def _choose_rows(trajectory: Trajectory, steps: Numbers, most: int) -> Numbers:
+    """Rows to show: all, or each so-manieth, ends of phases and both sides of steps."""
+    count = len(trajectory.t)
+    joints = np.flatnonzero(np.diff(trajectory.phase)) + 1
+    ends = np.concatenate([[0, count - 1], joints - 1, joints, steps - 1, steps])
+    return np.union1d(np.arange(0, count, -(-count // most)), ends).astype(np.int64)
+
+
+def _list_spans(
+    trajectory: Trajectory, pushes: Pushes, index: int, rows: Numbers
+) -> list[dict[str, Any]]:
+    """When a contact presses: the first row, and from there on places, normals and forces."""
+    c = np.column_stack([trajectory.c_n[rows, index], trajectory.c_t[rows, index]])
+    return [
+        {
+            "first": own.start,
+            "point": _fix(pushes.points[rows[own], index]),
+            "normal": _fix(pushes.normals[rows[own], index]),
+            "c": _round(c[own]),
+        }
+        for own in find_runs(np.isfinite(c).all(axis=1))
+    ]
 
 
 def describe_hand(scene: Scene) -> dict[str, Any]:
@@ -112,6 +148,11 @@ def describe_hand(scene: Scene) -> dict[str, Any]:
 def _list_dashes(line: Any) -> Sequence[float]:
     """Lengths of dashes and gaps of one of Matplotlib's line styles; none where it is solid."""
     return [] if isinstance(line, str) else list(line[1])
+
+
+def _fix(values: Array) -> Any:
+    """Nested lists of places, directions or angles."""
+    return np.round(values, _DECIMALS).tolist()
 
 
 def _round(values: Array) -> Any:

@@ -14,6 +14,8 @@ from .chart import describe_map
 from .motion import describe_motion
 from .tables import JOINT_HEADS, PHASE_HEADS, list_joints, list_phases
 
+_SAMPLES = 8000
+"""Of all motions in a page, which they leave at some 3 MB."""
 _RESOLUTION = 90
 """Grid of the map: its borders are exact, only cells are drawn by it."""
 
@@ -48,7 +50,7 @@ def build_report(
     parts = [_summarise(comparison)]
     for contender in comparison.contenders:
         progress(f"writing {contender.name}")
-        parts += _describe(contender)
+        parts += _describe(contender, _SAMPLES // len(comparison.contenders))
     first = next((own.planned for own in comparison.contenders if own.planned is not None), None)
     progress("map")
     chart = chart or build_map(problem, _RESOLUTION, choose_window(problem, None))
@@ -80,8 +82,11 @@ def _summarise(comparison: Comparison) -> str:
     return page.write_table(heads, rows, words=2)
 
 
-def _describe(contender: Contender) -> list[str]:
-    """The section of one plan or table of torques: player, verdict, phases and joints."""
+def _describe(contender: Contender, most: int) -> list[str]:
+    """The section of one plan or table of torques: player, verdict, phases and joints.
+
+    Of its motion `most` samples are taken, about.
+    """
     problem, planned = contender.problem, contender.planned
     parts = [page.write_heading(contender.name)]
     kind = "ok" if contender.ok else "bad"
@@ -91,7 +96,7 @@ def _describe(contender: Contender) -> list[str]:
     if shown is None or problem is None:
         return parts
     ghost = replayed if planned is not None else None
-    parts.append(page.write_player(describe_motion(shown, problem, ghost)))
+    parts.append(page.write_player(describe_motion(shown, problem, ghost, most)))
     parts.append(page.write_table(PHASE_HEADS, list_phases(problem, shown), words=4))
     joints = list_joints(shown)
     if joints:

@@ -35,6 +35,19 @@ function blend(times, rows, t) {
   return Array.isArray(a) ? a.map((value, i) => mix(value, b[i])) : mix(a, b);
 }
 
+// What a contact does at t: where it is, its normal, its forces; null where it does not press.
+function during(motion, own, t) {
+  const k = find(motion.t, t);
+  const span = own.spans.find((one) => one.first <= k && k < one.first + one.c.length);
+  if (!span) return null;
+  const i = k - span.first, next = Math.min(i + 1, span.c.length - 1);
+  const share = next > i ? Math.min(1, (t - motion.t[k]) / (motion.t[k + 1] - motion.t[k])) : 0;
+  const mix = (rows) => rows[i].map((value, j) => value + share * (rows[next][j] - value));
+  const [point, normal, [c_n, c_t]] = [mix(span.point), mix(span.normal), mix(span.c)];
+  const force = [c_n * normal[0] + c_t * normal[1], c_n * normal[1] - c_t * normal[0]];
+  return { point, normal, force, c_n };
+}
+
 function place(motion, z) {
   const [c, s] = [Math.cos(z[2]), Math.sin(z[2])];
   return motion.vertices.map(([u, v]) => [z[0] + c * u - s * v, z[1] + s * u + c * v]);
@@ -100,7 +113,7 @@ function makeScene(parent, motion) {
                            stroke: "#444", "stroke-width": 0.6 * thin });
   let strongest = 0;
   for (const own of motion.contacts)
-    for (const f of own.force) if (f[0] !== null) strongest = Math.max(strongest, Math.hypot(...f));
+    for (const span of own.spans) for (const c of span.c) strongest = Math.max(strongest, Math.hypot(...c));
   // Square roots: small forces are to be seen beside large ones.
   const extend = (force) => 0.3 * size * Math.sqrt(Math.hypot(...force) / (strongest || 1));
 
@@ -137,11 +150,13 @@ function makeScene(parent, motion) {
     place(motion, z).forEach((v, i) => change(numbers[i], {
       x: v[0] + 0.16 * (z[0] - v[0]), y: -(v[1] + 0.16 * (z[1] - v[1])) }));
     motion.contacts.forEach((own, i) => {
-      const force = blend(motion.t, own.force, t), there = force[0] !== null;
-      const point = blend(motion.t, own.point, t), normal = blend(motion.t, own.normal, t);
-      for (const part of [cones[i], arrows[i]]) change(part, { visibility: there ? "visible" : "hidden" });
-      change(dots[i], { visibility: there || motion.still ? "visible" : "hidden", cx: point[0], cy: point[1] });
-      if (!there) return;
+      const now = own.spot ? { point: own.spot } : during(motion, own, t);
+      for (const part of [cones[i], arrows[i]])
+        change(part, { visibility: now && now.force ? "visible" : "hidden" });
+      change(dots[i], { visibility: now ? "visible" : "hidden" });
+      if (now) change(dots[i], { cx: now.point[0], cy: now.point[1] });
+      if (!now || !now.force) return;
+      const { point, normal, force } = now;
       const reach = 1.15 * Math.max(extend(force), 6 * thin), mu = own.friction;
       const side = (k) => [point[0] + reach * (normal[0] + k * mu * normal[1]),
                            point[1] + reach * (normal[1] - k * mu * normal[0])];
@@ -222,9 +237,11 @@ function makePlot(parent, motion, height, title, lines, options) {
 }
 
 function makeMargins(parent, motion, seek) {
-  const lines = motion.contacts.map((own) => ({
-    colour: own.colour, dashes: own.dashes,
-    values: own.c_n.map((v) => (v === null ? null : v - motion.epsilon)) }));
+  const lines = motion.contacts.map((own) => {
+    const values = motion.t.map(() => null);
+    for (const span of own.spans) span.c.forEach((c, k) => { values[span.first + k] = c[0] - motion.epsilon; });
+    return { colour: own.colour, dashes: own.dashes, values };
+  });
   let low = -motion.epsilon, high = 2 * motion.epsilon;
   for (const line of lines)
     for (const v of line.values)
@@ -330,8 +347,8 @@ function touch(hand, z, name) {
 // The hand and the object at rest, with what touches.
 function showPose(parent, hand, own, z) {
   const contacts = own.contacts.map((name) => ({
-    colour: "#d55e00", friction: 0, point: [touch(hand, z, name)], normal: [[0, 1]], force: [[null, null]] }));
-  const still = { ...hand, t: [0], z: [z], tau: [[0, 0]], ghost: null, contacts, still: true };
+    colour: "#d55e00", spans: [], spot: touch(hand, z, name) }));
+  const still = { ...hand, t: [0], z: [z], tau: [[0, 0]], ghost: null, contacts };
   parent.replaceChildren();
   makeScene(parent, still)(0);
 }
