@@ -12,7 +12,8 @@ from wholearm.problem.definition import End
 from wholearm.problem.goal import Goal
 from wholearm.search.chart import Chart
 from wholearm.search.goals import is_at
-from wholearm.search.links import Link, cut_curve, look_at, time_parts
+from wholearm.search.ground import sketch, survey
+from wholearm.search.links import Link, cut_curve, time_parts
 from wholearm.search.places import make_place
 
 
@@ -71,12 +72,13 @@ def test_parts_of_a_border_take_as_long_together_as_one_by_one() -> None:
     problem = problem_of(IMPACTS)
     chart, shares = Chart(problem, 0.1), np.array([0.2, 0.5, 0.8])
     for border in chart.trace(make_place(problem.scene, problem.start)):
-        times = time_parts(border.curve, shares, chart.epsilon, 0.1)
+        times = time_parts(border, shares)
         for share, took in zip(shares, times, strict=True):
             part = cut_curve(border.curve, share * border.curve.length)
-            alone = look_at((part,), chart.epsilon, 0.1)
+            ground = survey(part, *chart.terms)
+            alone = ground.closed or ground.begins or ground.ends or sketch([ground])
             assert np.isfinite(took) == (not isinstance(alone, str))
-            assert isinstance(alone, str) or took == pytest.approx(alone.duration, rel=0.02)
+            assert isinstance(alone, str) or took == pytest.approx(alone, rel=0.02)
 
 
 def test_a_landing_is_led_to_where_the_goal_is() -> None:

@@ -31,7 +31,7 @@ def draw(seed: int) -> Graph:
                 continue
             there = place if stop is None else places[stop]
             steps = (Step((), Until()),) * int(rng.integers(1, 4))
-            link = Link(place, there, steps, float(rng.uniform(0.1, 1.0)), 0.0)
+            link = Link(place, there, steps, float(rng.uniform(0.1, 1.0)))
             links[place.key].append((link, END if stop is None else there.key))
     return Graph(Chart(problem, 0.1), places[0], links)
 

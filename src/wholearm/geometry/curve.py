@@ -139,9 +139,18 @@ class Curve:
 
     def with_speed_ratio(self, ratio: float) -> Curve:
         """Return the same curve with a parameter that runs through it at another ratio."""
+        if ratio == self.speed_ratio:
+            return self
         share = self.speed_ratio / ratio
         panels = tuple(Panel(share * panel.s, panel.z, panel.z_s) for panel in self.panels)
-        return replace(self, panels=panels, length=share * self.length, speed_ratio=ratio)
+        found = replace(self, panels=panels, length=share * self.length, speed_ratio=ratio)
+        if "segments" in self.__dict__:
+            # Reversals are where they were.
+            found.__dict__["segments"] = tuple(
+                replace(part, start=share * part.start, stop=share * part.stop)
+                for part in self.segments
+            )
+        return found
 
     @property
     def start(self) -> Array:

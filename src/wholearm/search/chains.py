@@ -12,10 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..contacts.formation import Formation
-from ..geometry.curve import Curve
 from ..planning.path_domain.impact_sequence import compute_curve_impact
 from ..problem.definition import End, Phase, Until
-from .links import Blocked, Border, Link, Step, look_at
+from .links import Blocked, Border, Link, Step, link_along
 from .places import Place, make_place
 
 LONGEST = 6
@@ -32,18 +31,18 @@ class Chain:
         Phases along those that are followed whole.
     borders : tuple of Border
         These, and the last one.
-    curves : tuple of Curve
-        Of all borders, with such speed ratios that the speed is the same on both sides of a join.
+    ratios : tuple of float
+        Speed ratios of all borders, with which the speed is the same on both sides of a join.
     """
 
     steps: tuple[Step, ...]
     borders: tuple[Border, ...]
-    curves: tuple[Curve, ...]
+    ratios: tuple[float, ...]
 
     @classmethod
     def of(cls, border: Border) -> Chain:
         """A border that others may follow."""
-        return cls((), (border,), (border.curve,))
+        return cls((), (border,), (1.0,))
 
     def can_enter(self, formation: Formation) -> bool:
         """Whether a formation keeps what is gained at the end, and nothing touches that did not."""
@@ -60,33 +59,21 @@ class Chain:
             phase = Phase(0, last.formation, Until(contact=gained), end)
             join = compute_curve_impact(phase, last.curve, following.curve)
             if join.possible and np.isfinite(join.ratio):
-                ratio = self.curves[-1].speed_ratio * join.ratio
                 return Chain(
                     (*self.steps, Step(last.formation.contacts, phase.until, end)),
                     (*self.borders, following),
-                    (*self.curves, following.curve.with_speed_ratio(ratio)),
+                    (*self.ratios, self.ratios[-1] * join.ratio),
                 )
         return None
 
-    def link(
-        self, last: Step, curve: Curve, stop: Place, epsilon: float, least_minor: float
-    ) -> Link | Blocked:
-        """The link along the chain, at rest at the end of a last phase along its `curve`.
+    def link(self, step: Step, last: Border, stop: Place) -> Link | Blocked:
+        """The link along the chain, at rest at the end of the last border or of a part of it."""
+        return link_along((*self.borders[:-1], last), self.ratios, (*self.steps, step), stop)
 
-        What bars motions from the borders before has been looked for when these were the chain.
-        """
-        start, steps = self.borders[0].start, (*self.steps, last)
-        curves = (*self.curves[:-1], curve)
-        ahead = look_at(curves, epsilon, least_minor, known=len(self.steps))
-        if isinstance(ahead, str):
-            return Blocked(start, steps, ahead, stop)
-        return Link(start, stop, steps, ahead.duration, ahead.bound)
-
-    def link_whole(self, epsilon: float, least_minor: float) -> Link | Blocked | None:
+    def link_whole(self) -> Link | Blocked | None:
         """The link along all of it; None where the last border ends at an obstacle."""
         last = self.borders[-1]
         if last.gained is None:
             return None
         step = Step(last.formation.contacts, Until(contact=last.gained))
-        stop = make_place(last.formation.scene, last.curve.end)
-        return self.link(step, self.curves[-1], stop, epsilon, least_minor)
+        return self.link(step, last, make_place(last.formation.scene, last.curve.end))

@@ -21,12 +21,13 @@ from ..problem.goal import Goal
 from .cells import Crossing, cross, go_to
 from .chains import LONGEST, Chain
 from .goals import is_flush, list_pins, list_poses, measure_along
+from .ground import Unstopped
 from .links import (
     Blocked,
     Border,
     Link,
     Step,
-    Unstopped,
+    Terms,
     cut_curve,
     follow_borders,
     link_border,
@@ -90,7 +91,8 @@ class Chart:
     """
 
     def __init__(self, problem: Problem, least_minor: float) -> None:
-        self.scene, self.epsilon, self.least_minor = problem.scene, problem.epsilon, least_minor
+        self.scene, self.epsilon = problem.scene, problem.epsilon
+        self.terms = Terms(problem.epsilon, least_minor)
         self.polished: set[Link] = set()
         self._borders: dict[tuple[Key, tuple[Contact, ...]], list[Border]] = {}
         self._links: dict[Key, list[tuple[Border, Link | Blocked | None]]] = {}
@@ -109,7 +111,7 @@ class Chart:
             if settled and (chain is None or chain.can_enter(formation)):
                 key = place.key, formation.contacts
                 if key not in self._borders:
-                    self._borders[key] = follow_borders(settled, formation)
+                    self._borders[key] = follow_borders(settled, formation, self.terms)
                 found += self._borders[key]
         return found
 
@@ -117,10 +119,7 @@ class Chart:
         """Borders that lead on from a place, with the link along the whole of each."""
         key = place.key
         if key not in self._links:
-            self._links[key] = [
-                (border, link_border(border, self.epsilon, self.least_minor))
-                for border in self.trace(place)
-            ]
+            self._links[key] = [(border, link_border(border)) for border in self.trace(place)]
         return self._links[key]
 
     def extend(self, chain: Chain) -> list[tuple[Chain, Link | Blocked | None]]:
@@ -131,9 +130,7 @@ class Chart:
         if key not in self._longer:
             place = make_place(self.scene, last.curve.end)
             longer = [chain.extend(border) for border in self.trace(place, chain)]
-            self._longer[key] = [
-                (own, own.link_whole(self.epsilon, self.least_minor)) for own in longer if own
-            ]
+            self._longer[key] = [(own, own.link_whole()) for own in longer if own]
         return self._longer[key]
 
     def pass_on(self, place: Place) -> Iterator[tuple[Chain, Link | Blocked | None]]:
@@ -196,7 +193,7 @@ class Chart:
         if key in self._releases:
             return self._releases[key]
         shares = np.array(RELEASES)
-        times = time_parts(border.curve, shares, self.epsilon, self.least_minor)
+        times = time_parts(border, shares)
         shares, times = shares[np.isfinite(times)], times[np.isfinite(times)]
         best: dict[tuple[Formation, str], Link] = {}
         if len(shares):
@@ -227,18 +224,18 @@ class Chart:
         steps = (*before, Step(formation.contacts, Until(contact=way.gained)))
         assert way.gained is not None
         stop = Place(self.scene, way.z, (*formation.contacts, way.gained), landed=True)
-        return Link(start, stop, steps, spent + way.duration, 0.0, True)
+        return Link(start, stop, steps, spent + way.duration, True)
 
     def _end_chain(self, chain: Chain, goal: Goal) -> Link | Blocked | None:
         """The link along a chain to where its last border meets a goal; None if it does not."""
-        found = measure_along(chain.borders[-1].curve, goal)
+        last = chain.borders[-1]
+        found = measure_along(last.curve, goal)
         if found is None:
             return None
         s, until = found
-        curve = cut_curve(chain.curves[-1], s / chain.curves[-1].speed_ratio)
-        stop = make_place(self.scene, curve.end)
-        last = Step(curve.formation.contacts, until)
-        return chain.link(last, curve, stop, self.epsilon, self.least_minor)
+        cut = replace(last, curve=cut_curve(last.curve, s))
+        step = Step(last.formation.contacts, until)
+        return chain.link(step, cut, make_place(self.scene, cut.curve.end))
 
     def land_at(self, links: Found, goal: Goal) -> list[Link]:
         """Links that land on the edge of a goal which gives x, as they land right there.
@@ -275,7 +272,7 @@ class Chart:
                 until = Until(None, "phi", goal.phi, list_pins(goal))
                 steps = (Step(formation.contacts, until),)
                 stop = Place(self.scene, way.z, formation.contacts, landed=True)
-                yield Link(place, stop, steps, way.duration, 0.0, True)
+                yield Link(place, stop, steps, way.duration, True)
 
 
 def _is_barred(link: Link | Blocked | None) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -11,28 +12,28 @@ import numpy as np
 from ..common.arrays import Array
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
-from ..geometry.curve import Curve, describe_pose
+from ..geometry.curve import Curve
 from ..geometry.tracing import HELD, trace_curve
-from ..mechanics.dynamics import Directions, reduced_inertia
 from ..mechanics.metric import metric_weights
-from ..mechanics.uniqueness import find_minors
-from ..planning.lower_bound.lower_bound import Outlook, look_along
+from ..planning.lower_bound.lower_bound import look_along
 from ..planning.lower_bound.rows import Rows, evaluate_rows
 from ..planning.lower_bound.sweep import NoMotionError
 from ..problem.definition import End, Until
+from .ground import INTERVALS, Ground, Unstopped, sketch, survey
 from .places import Place, make_place
 from .sweep import find_durations
 
-INTERVALS = 24
-"""Intervals of the grid on which the fastest motion along curves is looked for."""
+BARRED = 0.01
+"""By how much limits are missed a little way on, over that way, where no border leads on."""
 PARTED = 16
-"""The same of parts of a curve, many at once."""
-CHECKED = 12
-"""Places of a segment at which jamming and ambiguous forces are looked for."""
+"""Intervals on which the fastest motion along a part of a border is looked for."""
 
 
-class Unstopped(str):
-    """Why no motion along curves ends at rest, though one that goes on beyond them may be."""
+class Terms(NamedTuple):
+    """What motions have to keep: the least normal force [N], and the least ratio of minors."""
+
+    epsilon: float
+    least_minor: float
 
 
 class Step(NamedTuple):
@@ -51,8 +52,8 @@ class Link:
     ----------
     start, stop : Place
     steps : tuple of Step
-    duration, bound : float, [s]
-        About how long it takes, and at least.
+    duration : float, [s]
+        About how long it takes.
     in_cell : bool
         Whether it leads through a cell. Then the planner chooses where it ends, the duration is
         that of straight ways, and nothing bounds it from below.
@@ -60,16 +61,33 @@ class Link:
         The border that it leaves for the cell.
     share : float
         Which part of that it follows.
+    borders : tuple of Border
+        Those that it follows, if it leads through no cell.
+    ratios : tuple of float
+        Their speed ratios, with which the speed is the same on both sides of where two meet.
     """
 
     start: Place
     stop: Place
     steps: tuple[Step, ...]
     duration: float
-    bound: float
     in_cell: bool = False
     left: Curve | None = None
     share: float = 0.0
+    borders: tuple[Border, ...] = ()
+    ratios: tuple[float, ...] = ()
+
+    @cached_property
+    def bound(self) -> float:
+        """How long it takes at least [s]."""
+        if self.in_cell:
+            return 0.0
+        own = zip(self.borders, self.ratios, strict=True)
+        curves = [border.curve.with_speed_ratio(ratio) for border, ratio in own]
+        try:
+            return look_along(curves, self.borders[0].terms.epsilon, INTERVALS).bound
+        except NoMotionError:
+            return 0.0
 
     @property
     def signature(self) -> tuple[tuple[str, ...], ...]:
@@ -104,11 +122,18 @@ class Border:
     curve : Curve
     gained : Contact or None
         What is gained at its end; None where it ends at an obstacle.
+    terms : Terms
     """
 
     start: Place
     curve: Curve
     gained: Contact | None
+    terms: Terms
+
+    @cached_property
+    def ground(self) -> Ground:
+        """What motions along it may do."""
+        return survey(self.curve, *self.terms)
 
     @property
     def formation(self) -> Formation:
@@ -116,13 +141,20 @@ class Border:
         return self.curve.formation
 
 
-def follow_borders(place: Place, formation: Formation) -> list[Border]:
+def follow_borders(place: Place, formation: Formation, terms: Terms) -> list[Border]:
     """The border of a formation from a place, one way and the other, as far as it leads on."""
     found, least = [], HELD * place.scene.scales.length
-    for heading in find_headings(formation, place.z):
+    headings = find_headings(formation, place.z)
+    if not headings:
+        return []
+    # Most end where they begin, which limits a little way on tell.
+    ahead = formation.evaluate_limits(place.z + least * np.array(headings))
+    for heading, limits in zip(headings, ahead, strict=True):
+        if limits.min() < -BARRED * least:
+            continue
         curve = trace_curve(formation, place.z, heading, Until())
         if curve.length > least and _is_regular(curve):
-            found.append(Border(place, curve, _find_gained(curve)))
+            found.append(Border(place, curve, _find_gained(curve), terms))
     return found
 
 
@@ -185,61 +217,28 @@ def cut_curve(curve: Curve, length: float) -> Curve:
     return replace(curve, length=length, ending="", reached=True)
 
 
-def look_at(
-    curves: Sequence[Curve], epsilon: float, least_minor: float, known: int = 0
-) -> Outlook | str:
-    """About how long motions along curves take, or why there are none, in words.
-
-    Of the first `known` curves it is known that motions begin there and forces are the only ones.
-    """
-    for curve in curves[known:]:
-        reason = _find_ambiguity(curve, least_minor)
-        if reason:
-            return reason
-    if not known and (reason := _find_held(curves[0], epsilon, 0.0)):
-        return reason
-    if reason := _find_held(curves[-1], epsilon, curves[-1].length):
-        return Unstopped(reason)
-    try:
-        return look_along(curves, epsilon, INTERVALS)
-    except NoMotionError as error:
-        part = (error.interval + 0.5) / INTERVALS
-        length = sum(curve.length for curve in curves)
-        s = length * (1 - np.cos(np.pi * min(part, 1.0))) / 2
-        for curve in curves:
-            if s <= curve.length:
-                break
-            s -= curve.length
-        place = curve.evaluate(np.array([min(s, curve.length)])).z[0]
-        return Unstopped(f"no motion keeps its limits at {describe_pose(place)}")
-
-
-def time_parts(curve: Curve, shares: Array, epsilon: float, least_minor: float) -> Array:
-    """About the least times along first parts of a curve, from rest to rest, shape (n,) [s].
+def time_parts(border: Border, shares: Array) -> Array:
+    """About the least times along first parts of a border, from rest to rest, shape (n,) [s].
 
     Infinite where no motion keeps the limits, none begins at rest, or contact forces are not the
     only ones.
 
     Parameters
     ----------
-    curve : Curve
+    border : Border
     shares : ndarray, shape (n,)
-        Lengths of the parts, increasing, over that of the curve.
-    epsilon : float, [N]
-    least_minor : float
+        Lengths of the parts, increasing, over that of the border.
     """
-    times, lengths = np.full(len(shares), np.inf), shares * curve.length
-    if _find_held(curve, epsilon, 0.0):
-        return times
-    while len(lengths) and _find_ambiguity(cut_curve(curve, lengths[-1]), least_minor):
-        lengths = lengths[:-1]
-    if not len(lengths):
+    curve, times = border.curve, np.full(len(shares), np.inf)
+    lengths = shares * curve.length
+    lengths = lengths[lengths <= border.ground.clear]
+    if not len(lengths) or border.ground.begins:
         return times
     nodes = (1 - np.cos(np.linspace(0, np.pi, PARTED + 1))) / 2
     places, steps = (nodes[1:] + nodes[:-1]) / 2, np.diff(nodes)
     s, size = lengths[:, None] * places, lengths[:, None]
     stops = np.array([part.stop for part in curve.segments[:-1]])
-    rows = evaluate_rows(curve, epsilon, s.ravel(), np.searchsorted(stops, s.ravel()))
+    rows = evaluate_rows(curve, border.terms.epsilon, s.ravel(), np.searchsorted(stops, s.ravel()))
     # By the share of each part that is behind, not by its length.
     a, b, v, one, cap = (part.reshape(*s.shape, *part.shape[1:]) for part in rows)
     scale = size[..., None]
@@ -248,46 +247,38 @@ def time_parts(curve: Curve, shares: Array, epsilon: float, least_minor: float) 
     return times
 
 
-def _find_held(curve: Curve, epsilon: float, s: float) -> str:
-    """Why a motion along a curve cannot begin or end at rest at a place; empty if it can."""
-    segment = 0 if s == 0 else len(curve.segments) - 1
-    rows = evaluate_rows(curve, epsilon, np.array([s]), np.array([segment]))
-    a, one = rows.a[0], rows.one[0]
-    if s > 0:
-        a = -a
-    with np.errstate(divide="ignore", invalid="ignore"):
-        least = np.where(a > 0, -one / a, 0.0).max()
-        most = np.where(a < 0, -one / a, np.inf).min()
-    if max(least, 0.0) <= most and not ((a == 0) & (one < 0)).any():
-        return ""
-    what = "begins" if s == 0 else "ends"
-    return f"no motion {what} at rest at {describe_pose(curve.evaluate(np.array([s])).z[0])}"
+def link_along(
+    borders: tuple[Border, ...],
+    ratios: tuple[float, ...],
+    steps: tuple[Step, ...],
+    stop: Place,
+) -> Link | Blocked:
+    """The link along borders that are passed without a stop, at rest at the end of the last one.
+
+    Parameters
+    ----------
+    borders : tuple of Border
+        Those before the last one are known to let motions pass.
+    ratios : tuple of float
+        Their speed ratios, with which the speed is the same on both sides of where two meet.
+    steps : tuple of Step
+    stop : Place
+    """
+    start, last = borders[0].start, borders[-1].ground
+    reason = last.closed or ("" if len(borders) > 1 else last.begins)
+    if reason:
+        return Blocked(start, steps, reason, stop)
+    grounds = zip(borders, ratios, strict=True)
+    found = last.ends or sketch([own.ground.with_speed_ratio(ratio) for own, ratio in grounds])
+    if isinstance(found, str):
+        return Blocked(start, steps, Unstopped(found), stop)
+    return Link(start, stop, steps, found, borders=borders, ratios=ratios)
 
 
-def _find_ambiguity(curve: Curve, least: float) -> str:
-    """Why contact forces along a curve are not the only ones; empty where they are."""
-    formation = curve.formation
-    for part in curve.segments:
-        s = np.linspace(part.start, min(part.stop, curve.length), CHECKED)
-        at = curve.evaluate(s)
-        inertia = reduced_inertia(formation, at.kinematics, Directions(part.Xi, part.sigma))
-        if not np.isfinite(inertia).all():
-            return "its contacts depend on each other"
-        if inertia.min() <= 0:
-            return "friction jams it"
-        ratio, names, row = find_minors(formation, at.kinematics, part.Xi).find_least()
-        if ratio < least:
-            return f"{names} ambiguous: minor {ratio:.2f} at {describe_pose(at.z[row])}"
-    return ""
-
-
-def link_border(border: Border, epsilon: float, least_minor: float) -> Link | Blocked | None:
+def link_border(border: Border) -> Link | Blocked | None:
     """The link along the whole of a border; None where it ends at an obstacle."""
     if border.gained is None:
         return None
     steps = (Step(border.formation.contacts, Until(contact=border.gained)),)
-    found = look_at((border.curve,), epsilon, least_minor)
     stop = make_place(border.formation.scene, border.curve.end)
-    if isinstance(found, str):
-        return Blocked(border.start, steps, found, stop)
-    return Link(border.start, stop, steps, found.duration, found.bound)
+    return link_along((border,), (1.0,), steps, stop)

@@ -20,7 +20,8 @@ from ..planning.options import Objective, PlanOptions
 from ..planning.phase_plan import PhasePlan
 from ..planning.time_domain.motion import TimeMotion
 from ..problem.definition import End, Phase, Problem, Until
-from .links import INTERVALS, Link, Step
+from .ground import INTERVALS
+from .links import Link, Step
 from .places import settle
 
 ROUGH = 1e-2

@@ -38,8 +38,11 @@ def list_cut(search: Search) -> list[Blocked]:
         if own.stop.key not in search.reached
     }
 
-    def rank(own: Blocked) -> tuple[float, float]:
-        return search.measure(own.stop), search.measure(own.start)
+    def rank(own: Blocked) -> tuple[float, ...]:
+        # Along a flush edge nothing turns but by rounding, and x says which end is nearer.
+        turns = (round(search.measure(place), 9) for place in (own.stop, own.start))
+        x = search.goal.x
+        return *turns, 0.0 if x is None else abs(float(own.stop.z[0]) - x)
 
     return sorted(cut.values(), key=rank)
 

@@ -8,6 +8,8 @@ order only, and never to whether the bound is one. What has an error is the quad
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +19,7 @@ from ...geometry.curve import Curve
 from .costate import find_costate
 from .dual import evaluate, find_least
 from .rows import Rows
-from .sweep import NoMotionError, Sweep, find_fastest
+from .sweep import NoMotionError, Sweep, add_up, find_fastest, find_steady
 from .way import Grid, Way
 
 _TOLERANCE = 3e-8
@@ -29,8 +31,6 @@ _MOST = 1500
 """Most intervals."""
 _SAFETY = 2.0
 """Factor on the difference of two rules of quadrature; where limits take turns both err alike."""
-_SPEEDS = 4
-"""Sweeps until viscous friction is linearised about the right speed."""
 
 _RULES = tuple(np.polynomial.legendre.leggauss(count) for count in (2, 3))
 _PLACES = np.concatenate([[0.0, 0.5, 1.0], *((1 + nodes) / 2 for nodes, _ in _RULES)])
@@ -52,18 +52,30 @@ class LowerBound(NamedTuple):
     error: float
 
 
-class Outlook(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Outlook:
     """About how long the fastest motion along curves takes, and a lower bound of it.
 
     Attributes
     ----------
+    way : Way
+    grid : Grid
+        A coarse one.
     duration : float, [s]
-        Of a motion that keeps the limits at one place of each interval of a coarse grid.
-    bound : float, [s]
+        Of a motion that keeps the limits at one place of each interval of it.
     """
 
+    way: Way
+    grid: Grid
     duration: float
-    bound: float
+
+    @cached_property
+    def bound(self) -> float:
+        """The lower bound on that grid [s], zero where no motion is found on it."""
+        try:
+            return _bound(self.way, self.grid, None).bound.value
+        except NoMotionError:
+            return 0.0
 
 
 class _Round(NamedTuple):
@@ -103,10 +115,20 @@ def look_along(curves: Sequence[Curve], epsilon: float, intervals: int) -> Outlo
     """
     way = Way(curves, epsilon)
     grid = way.make_grid(intervals)
-    found = _bound(way, grid, None)
-    speeds = np.sqrt(np.maximum(found.motion.b, 0.0))
-    steps = np.diff(way.place(grid.angles))
-    return Outlook(float((2 * steps / (speeds[1:] + speeds[:-1])).sum()), found.bound.value)
+    ends, angles = way.place(grid.angles), (grid.angles[1:] + grid.angles[:-1]) / 2
+    rows = way.evaluate(angles[:, None], grid.owners).pick((slice(None), 0))
+    cap = np.full(len(ends), np.inf)
+    if np.isfinite(rows.cap).any():
+        sides = np.column_stack([grid.angles[:-1], grid.angles[1:]])
+        cap = _join_caps(*way.evaluate(sides, grid.owners).cap.T)
+    steps = np.diff(ends)
+    motion = find_steady(rows, steps, (way.place(angles) - ends[:-1]) / steps, cap)
+    return Outlook(way, grid, add_up(motion.b, steps))
+
+
+def _join_caps(left: Array, right: Array) -> Array:
+    """Limits of b at nodes from those on both sides of each."""
+    return np.asarray(np.minimum(np.append(left, np.inf), np.append(np.inf, right)))
 
 
 def _refine(way: Way, grid: Grid) -> LowerBound:
@@ -133,12 +155,12 @@ def _bound(way: Way, grid: Grid, near: Array | None) -> _Round:
     left, middle, right = (rows.pick((slice(None), k)) for k in range(3))
     s = way.place(grid.angles)
     part = (way.place(angles) - s[:-1, None]) / np.diff(s)[:, None]
-    cap = np.append(left.cap, np.inf)
-    cap[1:] = np.minimum(cap[1:], right.cap)
-    for _ in range(_SPEEDS if near is None else 1):
-        motion = find_fastest(middle, np.diff(s), part[:, 1], cap, near)
-        b = motion.b[:-1, None] + part * np.diff(motion.b)[:, None]
-        near = b[:, 1]
+    cap, places = _join_caps(left.cap, right.cap), part[:, 1]
+    if near is None:
+        motion = find_steady(middle, np.diff(s), places, cap)
+    else:
+        motion = find_fastest(middle, np.diff(s), places, cap, near)
+    b = motion.b[:-1, None] + part * np.diff(motion.b)[:, None]
     costate = find_costate(way, grid, left, right, motion)
     shape = len(h), len(_PLACES) - 3
     p, slope = (part.ravel() for part in costate.interpolate(way, grid, _PLACES[3:]))

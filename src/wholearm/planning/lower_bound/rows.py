@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
-from ...geometry.curve import Curve
+from ...geometry.curve import Curve, CurvePoint
 from ...mechanics.dynamics import Directions, PathForces, inverse
 from ...mechanics.limits import SPEED, LimitSet, make_limits
 from ...mechanics.sides import SideTerms
@@ -92,7 +92,13 @@ def evaluate_rows(curve: Curve, epsilon: float, s: Array, segment: NDArray[np.in
     s : ndarray, shape (n,)
     segment : ndarray of int, shape (n,)
     """
-    point = curve.evaluate(s)
+    return limit_along(curve, epsilon, curve.evaluate(s), segment)
+
+
+def limit_along(
+    curve: Curve, epsilon: float, point: CurvePoint, segment: NDArray[np.int64]
+) -> Rows:
+    """Limits at n places of a curve that have been evaluated; see `evaluate_rows`."""
     signs = ([getattr(part, name) for part in curve.segments] for name in ("Xi", "sigma"))
     directions = Directions(*(np.array(sign)[segment] for sign in signs))
     forces = inverse(curve.formation, *point[:3], directions, point.kinematics)

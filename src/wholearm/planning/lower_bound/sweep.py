@@ -41,6 +41,12 @@ _ROUNDING = 1e-12
 """Largest b below zero at the end that is rounding, over the largest b."""
 
 
+_SPEEDS = 4
+"""Most sweeps until viscous friction is linearised about the right speed."""
+_SETTLED = 1e-6
+"""Change of b, over the largest, from which on it is."""
+
+
 class NoMotionError(ValueError):
     """No motion keeps the limits on this grid.
 
@@ -106,6 +112,29 @@ def find_fastest(rows: Rows, steps: Array, part: Array, cap: Array, near: Array 
     b[-1] = max(b[-1], 0.0)
     found = [~reaches[1:], ~reaches[:-1], braked]
     return Sweep(b, np.select(found, [Mode.PUSH, Mode.SWITCH, Mode.BRAKE], Mode.HELD))
+
+
+def find_steady(rows: Rows, steps: Array, part: Array, cap: Array) -> Sweep:
+    """Sweep until viscous friction is linearised about the speeds that are found.
+
+    Parameters are those of `find_fastest`.
+    """
+    motion = find_fastest(rows, steps, part, cap, None)
+    if not rows.v.any():
+        return motion
+    for _ in range(_SPEEDS - 1):
+        before = motion.b
+        near = before[:-1] + part * np.diff(before)
+        motion = find_fastest(rows, steps, part, cap, near)
+        if np.abs(motion.b - before).max() < _SETTLED * motion.b.max():
+            break
+    return motion
+
+
+def add_up(b: Array, steps: Array) -> float:
+    """Duration of a motion with b at the nodes of a grid, a being constant in intervals [s]."""
+    speeds = np.sqrt(np.maximum(b, 0.0))
+    return float((2 * steps / (speeds[1:] + speeds[:-1])).sum())
 
 
 def _find_corner(before: Array, after: Array, one: Array, following: float) -> float:
