@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from wholearm.common.batch import FEW, SIZE, Batch
+from wholearm.common.batch import FEW, SIZE, SOME, Batch
 
 
 def build_function() -> ca.Function:
@@ -15,7 +15,9 @@ def build_function() -> ca.Function:
     return ca.Function("f", [x, y], [ca.mtimes(x, y.T) + 1, ca.sin(ca.sum1(x)) * y[0]])
 
 
-@pytest.mark.parametrize("count", [0, 1, FEW, FEW + 1, SIZE - 1, SIZE, SIZE + 1, 3 * SIZE + 5])
+@pytest.mark.parametrize(
+    "count", [0, 1, FEW, FEW + 1, SOME, SOME + 1, SIZE - 1, SIZE, SIZE + 1, 3 * SIZE + 5]
+)
 def test_batches_agree_with_single_calls(count: int) -> None:
     rng = np.random.default_rng(count)
     function = build_function()

@@ -8,9 +8,11 @@ from .arrays import Array, Expression
 from .sharing import exclusive
 
 SIZE = 64
-"""Points per call. Larger needs more memory at no gain; smaller, more calls."""
-FEW = 10
-"""Points up to which each is a call of its own: one for all of `SIZE` costs as much as a dozen."""
+"""Most points per call. More need more memory at no gain; fewer, more calls."""
+SOME = 20
+"""Points of a smaller call."""
+FEW = 5
+"""Points up to which each is a call of its own: one for `SOME` costs as much as half a dozen."""
 
 
 class Batch:
@@ -26,19 +28,20 @@ class Batch:
     """
 
     def __init__(self, function: Expression) -> None:
-        mapped = function.map(SIZE)
         self._arguments = [np.zeros((SIZE, function.size1_in(i))) for i in range(function.n_in())]
         shapes = [function.size_out(i) for i in range(function.n_out())]
         self._results = [np.zeros((SIZE, columns, rows)) for rows, columns in shapes]
-        # Both buffers keep raw pointers into the same arrays, so they have to live as long.
-        self._many, self._run_many = mapped.buffer()
-        self._one, self._run_one = function.buffer()
+        # Buffers keep raw pointers into the same arrays, so they have to live as long.
+        self._calls = [self._prepare(function, size) for size in (1, SOME, SIZE)]
+
+    def _prepare(self, function: Expression, size: int) -> tuple[int, Expression, Expression]:
+        """A number of points, the buffer of a call for as many, and what runs it."""
+        buffer, run = (function if size == 1 else function.map(size)).buffer()
         for i, argument in enumerate(self._arguments):
-            self._many.set_arg(i, argument.data)
-            self._one.set_arg(i, argument[0].data)
+            buffer.set_arg(i, argument[:size].data)
         for i, result in enumerate(self._results):
-            self._many.set_res(i, result.data)
-            self._one.set_res(i, result[0].data)
+            buffer.set_res(i, result[:size].data)
+        return size, buffer, run
 
     @exclusive
     def __call__(self, *arguments: Array) -> list[Array]:
@@ -56,7 +59,7 @@ class Batch:
         """
         count = len(arguments[0])
         outputs = [np.empty((count, *result.shape[1:])) for result in self._results]
-        size, run = (1, self._run_one) if count <= FEW else (SIZE, self._run_many)
+        size, _, run = self._calls[0 if count <= FEW else 1 if count <= SOME else 2]
         for start in range(0, count, size):
             stop = min(start + size, count)
             for store, argument in zip(self._arguments, arguments, strict=True):
@@ -82,5 +85,5 @@ class Batch:
         """
         for store, argument in zip(self._arguments, point, strict=True):
             store[0] = argument
-        self._run_one()
+        self._calls[0][2]()
         return [result[0].copy() for result in self._results]

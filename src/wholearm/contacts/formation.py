@@ -248,11 +248,35 @@ def describe(contacts: Sequence[Contact]) -> str:
     return " ".join(sorted(contact.name for contact in contacts)) or "nothing"
 
 
+class _Parts:
+    """Expressions of single contacts, which formations of scenes of one shape are put together of.
+
+    Making them takes most of the time that it takes to make a function of a formation.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.z, self.v = build_features(scene).z, ca.SX.sym("v", 5)
+        self._known: dict[Contact, tuple[Expression, ...]] = {}
+
+    def find(self, contact: Contact, scene: Scene) -> tuple[Expression, ...]:
+        """Gap, rows A and A_t, and A' v of a contact."""
+        if contact not in self._known:
+            gap, A, A_t = build_rows((contact,), scene)
+            self._known[contact] = gap, A, A_t, ca.jtimes(A @ self.v, self.z, self.v)
+        return self._known[contact]
+
+
+_PARTS = Store(_Parts, lambda scene: scene.shape)
+
+
 def _build_function(formation: Formation) -> Expression:
-    z, v = build_features(formation.scene).z, ca.SX.sym("v", 5)
-    gaps, A, A_t = build_rows(formation.contacts, formation.scene)
-    outputs = [gaps, A, A_t, ca.jtimes(A @ v, z, v)]
-    return ca.Function("formation", [z, v], [ca.densify(part) for part in outputs])
+    scene, own = formation.scene, _PARTS(formation.scene)
+    parts = [own.find(contact, scene) for contact in formation.contacts]
+    outputs = [
+        ca.densify(ca.vertcat(ca.SX(0, width), *(part[k] for part in parts)))
+        for k, width in enumerate((1, 5, 5, 1))
+    ]
+    return ca.Function("formation", [own.z, own.v], outputs)
 
 
 def _build_roll_function(formation: Formation) -> Expression:
