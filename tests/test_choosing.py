@@ -25,7 +25,7 @@ PLACE = make_place(PROBLEM.scene, PROBLEM.start)
 
 def make_link(duration: float) -> Link:
     steps = (Step(PLACE.contacts, Until(coordinate="x", value=duration)),)
-    return Link(PLACE, PLACE, steps, duration, duration)
+    return Link(PLACE, PLACE, steps, duration)
 
 
 class Found:

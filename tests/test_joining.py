@@ -74,9 +74,9 @@ class Plans(dict[Any, Any]):
 
 
 def test_where_nothing_leads_on_another_landing_is_tried() -> None:
-    first = Link(PLACE, PLACE, make_steps(0.01), 1.0, 1.0)
-    landing = Link(PLACE, PLACE, make_steps(0.02), 1.0, 0.0, in_cell=True)
-    onward = Link(PLACE, PLACE, make_steps(0.03), 1.0, 1.0)
+    first = Link(PLACE, PLACE, make_steps(0.01), 1.0)
+    landing = Link(PLACE, PLACE, make_steps(0.02), 1.0, in_cell=True)
+    onward = Link(PLACE, PLACE, make_steps(0.03), 1.0)
     ways = [Measured(1.0, make_steps(x), []) for x in (0.021, 0.022)]
     plans = Plans(onward.steps)
     links = [(first, []), (landing, ways), (onward, [])]
@@ -89,7 +89,7 @@ def test_where_nothing_leads_on_another_landing_is_tried() -> None:
 
 
 def test_a_link_from_a_crossing_is_alone_to_blame() -> None:
-    first, second = (Link(PLACE, PLACE, make_steps(x), 1.0, 1.0) for x in (0.01, 0.02))
+    first, second = (Link(PLACE, PLACE, make_steps(x), 1.0) for x in (0.01, 0.02))
     plans = Plans(second.steps)
     lost = join_route(PROBLEM, [(first, []), (second, [])], PlanOptions(), plans, lambda _: None)
     assert isinstance(lost, Lost) and lost.links == (second,)
