@@ -16,6 +16,7 @@ from wholearm.common.interrupts import guard, yielding
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phase
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
+from wholearm.planning.options import PlanOptions
 from wholearm.planning.saved import load_plan
 from wholearm.problem.definition import Phase, Problem
 from wholearm.problem.goal import Goal
@@ -23,6 +24,7 @@ from wholearm.problem.read import build_problem
 from wholearm.search.bounds import bound_borders
 from wholearm.search.cells import cross, time_ways
 from wholearm.search.chart import Chart
+from wholearm.search.choosing import Chooser
 from wholearm.search.find import Route, Search
 from wholearm.search.places import make_place
 from wholearm.search.result import describe_block
@@ -173,6 +175,23 @@ def test_ctrl_c_ends_a_search_that_has_an_answer() -> None:
         return 0
 
     assert guard(run) == 0 and reached == ["stopped"]
+
+
+def test_a_route_whose_planning_is_interrupted_is_still_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    own, route = to_edge_6()
+    chooser = Chooser(problem_of(HEPTAGON), [], own, PlanOptions())
+    chooser.found.append(route)
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("wholearm.search.choosing.join_route", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            chooser.plan(1, print)
+    assert chooser.found == [route] and not chooser.made
 
 
 def test_route_prints_phases_that_load(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -100,13 +100,13 @@ def yielding() -> Iterator[None]:
     Where somebody swallows it, it is raised at the end.
     """
     global _yielding
-    _yielding = True
+    errors, _yielding = sys.stderr, True
     try:
         yield
         if not _yielding:
             raise KeyboardInterrupt
     finally:
-        _yielding = False
+        sys.stderr, _yielding = errors, False
 
 
 def on_end(cleanup: Callable[[], object]) -> None:
@@ -127,13 +127,15 @@ def _handlers() -> Iterator[None]:
 
 
 def _interrupt(number: int, _: FrameType | None) -> None:
-    """Handle a signal: the first one raises KeyboardInterrupt."""
+    """Handle a signal: the first one raises KeyboardInterrupt.
+
+    Whoever swallows it writes about it, which nobody is to read: what has to be said is said later.
+    """
     global _received, _yielding, _pardoned
     if _yielding and number == signal.SIGINT:
-        _yielding, _pardoned = False, True
+        _yielding, _pardoned, sys.stderr = False, True, io.StringIO()
         raise KeyboardInterrupt
     first, _received = _received is None, _received or number
-    # Whoever swallows the exception writes about it; one line is to be there, ours.
     sys.stderr = io.StringIO()
     if first and not _holding:
         raise KeyboardInterrupt

@@ -84,12 +84,14 @@ class Chooser:
         for route in sorted(self.found, key=self._estimate):
             if len(self.made) >= wanted or len(self.failures) >= TRIED:
                 return
-            self.found.remove(route)
             if self._is_lost(route):
+                self.found.remove(route)
                 continue
             self._polisher.polish(route, report)
             report(f"planning a route of {sum(len(own.steps) for own in route.links)} phases")
             plan = self._plan(route, report)
+            # An interrupted one is still there, to be planned then.
+            self.found.remove(route)
             if isinstance(plan, str):
                 self.failures.append(Failure(route, plan))
                 if isinstance(plan, Lost):

@@ -187,7 +187,13 @@ def _choose(
         raise _refuse(problem, search, options, chooser.failures, trial)
     made.sort(key=lambda own: -own[0].value if margin else own[0].value)
     plan, route = made[0]
-    bound = bound_borders(search, plan.duration) if complete and not before else None
+    bound = None
+    if complete and not before:
+        try:
+            with yielding():
+                bound = bound_borders(search, plan.duration)
+        except KeyboardInterrupt:
+            complete = False
     return Answer(
         plan,
         plan.problem,
