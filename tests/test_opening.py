@@ -2,68 +2,73 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import pytest
 
 from shipped import HEPTAGON, problem_of
-from wholearm.common.errors import InfeasibleError
 from wholearm.common.shortfalls import Change, Parameter
 from wholearm.planning.options import PlanOptions
-from wholearm.problem.definition import Problem
 from wholearm.problem.goal import Goal
-from wholearm.search import opening
 from wholearm.search.chart import Chart
 from wholearm.search.find import Search
-from wholearm.search.opening import explain_cut, find_opening, list_cut
+from wholearm.search.gates import Opening, list_cut, list_gates, list_openings, look_through
+from wholearm.search.links import Link
+from wholearm.search.opening import choose_opening, explain, find_opening
 from wholearm.search.places import make_place
 from wholearm.search.result import describe_block
 
 TORQUE = Parameter("torque limit of finger 1", 2.0, "N m", 1, "fingers.1.torque_limit")
 EPSILON = Parameter("epsilon", 0.05, "N", -1, "epsilon")
+NEVER = math.nan
 
 
-@pytest.mark.parametrize("needed, opens", [(2.5, True), (2.9, True), (9.0, False)])
-def test_a_number_is_changed_as_far_as_the_next_border_asks_for(needed: float, opens: bool) -> None:
-    tried = list[float]()
+@pytest.mark.parametrize("needed, least", [(2.5, 2.5), (2.9, 3.0), (9.0, None)])
+def test_a_number_is_changed_no_further_than_its_way_needs(
+    needed: float, least: float | None
+) -> None:
+    """All that a number opens is looked through first, then the way that was found, alone."""
+    openings = [Opening(EPSILON, (0.04, NEVER, 0.03)), Opening(TORQUE, (NEVER, 2.5, 3.0))]
+    tried = list[tuple[Change, list[int]]]()
 
-    def find(problem: Problem) -> float:
-        limit = problem.scene.fingers[0].torque_limit
-        tried.append(limit)
-        if limit < needed:
-            raise InfeasibleError("short", changes=[Change(TORQUE, round(limit + 0.2, 3))])
-        return 0.5
+    def find(change: Change, beyond: Sequence[int]) -> tuple[float, list[int]] | None:
+        tried.append((change, list(beyond)))
+        enough = change.parameter is TORQUE and change.value >= needed
+        return (0.5, [1]) if enough else None
 
-    problem = problem_of(HEPTAGON)
-    text = find_opening(problem, [Change(EPSILON, 0.04), Change(TORQUE, 2.5)], find)
-    assert tried[0] == 2.0 and tried[1] == 2.5
-    if opens:
-        assert (
-            text
-            == f"with torque limit of finger 1 = {tried[-1]:g} N m instead of 2 the goal is "
-            "reached, in 0.5 s"
-            and tried[-1] >= needed
+    text, changes = choose_opening(openings, find)
+    assert tried[:2] == [(Change(EPSILON, 0.03), [0, 2]), (Change(TORQUE, 3.0), [1, 2])]
+    if least is None:
+        assert changes == () and text == (
+            "the goal is not reached with epsilon = 0.03 N instead of 0.05, "
+            "nor with torque limit of finger 1 = 3 N m instead of 2"
         )
-    else:
-        assert text.startswith(
-            "the goal is not reached with epsilon = 0.04 N instead of 0.05, nor "
-        )
+        return
+    assert tried[2:] == [(Change(TORQUE, 2.5), [1])] and changes == (Change(TORQUE, least),)
+    assert text == f"with {changes[0]} the goal is reached, in about 0.5 s"
 
 
-def test_what_is_advised_opens_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_advised_opens_the_way() -> None:
     """On a rough palm the slide cannot begin; with the friction that is named it can."""
-    goal = Goal(flush=0, x=0.03)
-    monkeypatch.setattr(opening, "EXPLAINED", 1)
-
-    def search(problem: Problem) -> Search:
-        return Search(Chart(problem, 0.1), make_place(problem.scene, problem.start), goal)
-
-    rough = problem_of(HEPTAGON).with_(friction_palm=1.5)
-    own = search(rough)
+    goal, rough = Goal(flush=0, x=0.03), problem_of(HEPTAGON).with_(friction_palm=1.5)
+    own = Search(Chart(rough, 0.1), make_place(rough.scene, rough.start), goal)
     assert not list(own.run())
     # All that leads on from what is reached is in the cut, and nothing that ends where it was.
     assert all(blocked.stop.key not in own.reached for blocked in list_cut(own))
-    text, (change, *_) = explain_cut(own, rough, PlanOptions())
+    gates = list_gates(own)
+    assert [gate.blocked for gate in gates] == list_cut(own)
+    for opening in list_openings(gates):
+        for gate, value in zip(gates, opening.values, strict=True):
+            if not math.isnan(value):
+                change = Change(opening.parameter, value)
+                assert isinstance(look_through(gate, change), Link)
+    text, (change,) = find_opening(own, rough, PlanOptions())
     assert change.parameter.key == "friction.palm" and change.value < 1.5
-    assert f"feasible with {change}" in text
-    assert next(search(rough.with_({change.parameter.key: change.value})).run()).duration > 0
-    said = describe_block(own, [], text, "with less it is reached")
-    assert "all blocked; with less it is reached; v0-palm" in said
+    assert text.startswith(f"with {change} the goal is reached, in about ")
+    eased = rough.with_({"friction.palm": change.value})
+    assert next(
+        Search(Chart(eased, 0.1), make_place(eased.scene, eased.start), goal).run()
+    ).duration == pytest.approx(float(text.split()[-2]), rel=0.05)
+    said = describe_block(own, [], text, lambda blocked: explain(rough, PlanOptions(), blocked))
+    assert "all blocked; v0-palm" in said and said.endswith(text) and " N short; " in said

@@ -23,6 +23,8 @@ OTHERS = 2
 """Most slower ways through a cell that are tried where the plan of the fastest does not hold."""
 BEYOND = 1.1
 """Times of routes, by the search, over that of the best one, from which on they are left out."""
+NEARBY = 30
+"""Most places that are looked at in a hurry."""
 MEASURED, MORE = 24, 8
 """Most links through cells that are planned for themselves, until there is a route and after it."""
 
@@ -39,6 +41,8 @@ class Chooser:
     options : PlanOptions
     jobs : int
         Most processes at the same time.
+    hurried : bool
+        Whether any plan will do, of a route over few places, planned as it is found.
 
     Attributes
     ----------
@@ -55,7 +59,9 @@ class Chooser:
         search: Search,
         options: PlanOptions,
         jobs: int = 1,
+        hurried: bool = False,
     ) -> None:
+        self.hurried = hurried
         self.problem, self.before, self.search = problem, before, search
         self.options, self.chart, self.jobs = options, search.chart, jobs
         self.found: list[Route] = []
@@ -67,6 +73,10 @@ class Chooser:
 
     def run(self, wanted: int, report: Callable[[str], None]) -> None:
         """Look for routes and plan them, for as long as there are fewer than `wanted` plans."""
+        if self.hurried:
+            self._look_by(EAGER._replace(most=NEARBY), wanted, report)
+            self.plan(wanted, report)
+            return
         for _ in range(TRIED):
             failed = len(self.failures)
             self._look_by(EAGER, wanted, report)
@@ -87,7 +97,8 @@ class Chooser:
             if self._is_lost(route):
                 self.found.remove(route)
                 continue
-            self._polisher.polish(route, report)
+            if not self.hurried:
+                self._polisher.polish(route, report)
             report(f"planning a route of {sum(len(own.steps) for own in route.links)} phases")
             plan = self._plan(route, report)
             # An interrupted one is still there, to be planned then.

@@ -11,7 +11,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 from typing import NamedTuple
@@ -103,21 +103,24 @@ class Search:
     goal : Goal
     blocked : list of Blocked
         Links that no motion can take, as they are met.
-    reached : set
-        Keys of places that have been settled.
+    reached : dict
+        Routes to places that have been settled, the first to each, by their keys.
     found : set
         Keys of routes that have been found.
     limit : float
         Cost from which on nothing is of interest [s].
+    sources : sequence of Route
+        Ways to set out by, if not from the start itself.
     """
 
     chart: Chart
     start: Place
     goal: Goal
     blocked: list[Blocked] = field(default_factory=list)
-    reached: set[Key] = field(default_factory=set)
+    reached: dict[Key, Route] = field(default_factory=dict)
     found: set[object] = field(default_factory=set)
     limit: float = math.inf
+    sources: Sequence[Route] = ()
 
     @property
     def settled(self) -> int:
@@ -143,7 +146,8 @@ class Search:
             assert isinstance(own.link, Link)
             put(Route((*before, own.link)), own.link.stop, own.chain if own.whole else None)
 
-        put(Route(()), self.start, None)
+        for way in self.sources or (Route(()),):
+            put(way, way.links[-1].stop if way.links else self.start, None)
         for _ in range(MOST):
             if not queue:
                 return
@@ -163,7 +167,7 @@ class Search:
                 if times[key] >= (1 if place.landed else OFTEN):
                     continue
                 times[key] += 1
-                self.reached.add(key)
+                self.reached.setdefault(key, route)
                 for own in self._set_out(route, place):
                     if isinstance(own.link, Link):
                         put_along(route.links, own)

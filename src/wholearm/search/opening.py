@@ -1,4 +1,4 @@
-"""What keeps a search from its goal: the ways out of what it has reached, and what opens them."""
+"""What keeps a search from its goal, in words, and the change of one number that opens the way."""
 
 from __future__ import annotations
 
@@ -10,91 +10,105 @@ import numpy as np
 from ..common.errors import InfeasibleError, InputError, WholearmError
 from ..common.shortfalls import Change
 from ..contacts.formation import Formation
-from ..planning.options import PlanOptions
+from ..planning.advice import unadvised
+from ..planning.options import Objective, PlanOptions
 from ..planning.plan import solve_with
 from ..problem.definition import Phase, Problem
+from .chart import Chart
+from .choosing import Chooser
 from .find import Search
+from .gates import Gate, Opening, list_gates, list_openings, pass_gate
 from .links import Blocked, point_out
+from .measure import ROUGH, SINGULAR
 
-EXPLAINED = 2
-"""Borders of the cut that are planned to see what they are short of, those nearest to the goal."""
-ROUNDS = 3
-"""How often a number is changed further, as the next border asks for."""
-SINGULAR = "its contacts depend on each other"
+TRIED = 3
+"""Most numbers with which the goal is looked for."""
 
-Advice = tuple[str, tuple[Change, ...]]
-Try = Callable[[Problem], float]
-"""Finds a route and returns its duration [s]; raises an `InfeasibleError` that knows changes."""
+Try = Callable[[Change, Sequence[int]], tuple[float, Sequence[int]] | None]
+"""Looks for the goal with a change and beyond some borders: how long the route takes [s], and over
+which of them it leads."""
 
 
-def list_cut(search: Search) -> list[Blocked]:
-    """Borders that lead out of all that is reached, those that end nearest to the goal first.
+def find_opening(
+    search: Search, problem: Problem, options: PlanOptions
+) -> tuple[str, tuple[Change, ...]]:
+    """The change of a single number with which the goal is reached, in words and as such.
 
-    Every route along borders takes one of them.
+    It is looked for on the borders that are shut, and tried by a search beyond those that it opens.
     """
-    cut = {
-        (own.start.key, own.steps): own
-        for own in search.blocked
-        if own.stop.key not in search.reached
-    }
+    gates = list_gates(search)
+    openings = list_openings(gates)
 
-    def rank(own: Blocked) -> tuple[float, ...]:
-        # Along a flush edge nothing turns but by rounding, and x says which end is nearer.
-        turns = (round(search.measure(place), 9) for place in (own.stop, own.start))
-        x = search.goal.x
-        return *turns, 0.0 if x is None else abs(float(own.stop.z[0]) - x)
+    def find(change: Change, beyond: Sequence[int]) -> tuple[float, Sequence[int]] | None:
+        return _look_beyond(search, problem, options, change, {k: gates[k] for k in beyond})
 
-    return sorted(cut.values(), key=rank)
+    return choose_opening(openings, find)
 
 
-def explain_cut(search: Search, problem: Problem, options: PlanOptions) -> Advice:
-    """What borders of the cut are short of, in words, and the single changes that open one."""
-    texts, changes = list[str](), dict[str, Change]()
-    for own in [own for own in list_cut(search) if len(own.steps) == 1][:EXPLAINED]:
-        text, found = _explain(problem, own, options)
-        texts += [text] if text else []
-        for change in found:
-            changes.setdefault(change.parameter.key, change)
-    return "; ".join(texts), tuple(changes.values())
+def choose_opening(openings: Sequence[Opening], find: Try) -> tuple[str, tuple[Change, ...]]:
+    """The first number with which the goal is reached, and the least change of it that does."""
+    tried = list[str]()
+    for opening in openings[:TRIED]:
+        change = opening.open_all()
+        found = find(change, opening.list_open(change))
+        if found is None:
+            tried.append(str(change))
+            continue
+        duration, over = found
+        less = opening.open_all(over)
+        if less != change and (again := find(less, over)) is not None:
+            change, (duration, _) = less, again
+        return f"with {change} the goal is reached, in about {duration:.3g} s", (change,)
+    return f"the goal is not reached with {', nor with '.join(tried)}" if tried else "", ()
 
 
-def _explain(problem: Problem, blocked: Blocked, options: PlanOptions) -> Advice:
-    """What keeps a border from being followed, and what single change would let it be."""
+def _look_beyond(
+    search: Search, problem: Problem, options: PlanOptions, change: Change, gates: dict[int, Gate]
+) -> tuple[float, list[int]] | None:
+    """Look for the goal in a changed scene, beyond borders that are open there."""
+    try:
+        changed = problem.with_({change.parameter.key: change.value})
+    except InputError:
+        return None
+    changed = replace(changed, start=search.start.z)
+    ways = {k: pass_gate(search, gate, change) for k, gate in gates.items()}
+    sources = [way for way in ways.values() if way is not None]
+    if not sources:
+        return None
+    start = replace(search.start, scene=changed.scene)
+    beyond = Search(Chart(changed, options.least_minor), start, search.goal, sources=sources)
+    rough = replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH, replay=False)
+    chooser = Chooser(changed, [], beyond, replace(rough, certify=False, robust=0.0), hurried=True)
+    try:
+        chooser.run(1, lambda _: None)
+    except np.linalg.LinAlgError:
+        return None
+    if not chooser.made:
+        return None
+    plan, route = chooser.made[0]
+    over = [k for k, way in ways.items() if way and way.links[-1] in route.links]
+    return plan.duration, over
+
+
+def explain(problem: Problem, options: PlanOptions, blocked: Blocked) -> str:
+    """What a motion along a border of the cut is short of, in words."""
     (step,) = blocked.steps
     # A contact may touch at the start already, or be gained both ways; a place says which is meant.
     for until in (step.until, point_out(step.contacts, blocked.stop.z)):
         phase = Phase(0, Formation(problem.scene, step.contacts), until)
         own = replace(problem, start=blocked.start.z, phases=(phase,), goals=())
         try:
-            solve_with(own, replace(options, replay=False))
+            with unadvised():
+                solve_with(own, replace(options, replay=False))
         except InputError:
             continue
-        except WholearmError as error:
-            return f"from {blocked.start} {error}", getattr(error, "changes", ())
+        except InfeasibleError as error:
+            if error.shortfalls:
+                short = error.shortfalls[0]
+                return f"{short.limit} is {short.amount:.3g} {short.unit} short"
+        except WholearmError:
+            break
         except np.linalg.LinAlgError:
-            return f"from {blocked.start} {SINGULAR}", ()
+            return SINGULAR
         break
-    return "", ()
-
-
-def find_opening(problem: Problem, changes: Sequence[Change], find: Try) -> str:
-    """The single change with which the goal is reached, in words: each is tried by a search."""
-    tried = list[str]()
-    for change in changes:
-        for _ in range(ROUNDS):
-            try:
-                duration = find(problem.with_({change.parameter.key: change.value}))
-            except InfeasibleError as error:
-                same = [own for own in error.changes if own.parameter.key == change.parameter.key]
-                if not same or same[0].value == change.value:
-                    tried.append(str(change))
-                    break
-                # The next border asks for more of the same.
-                change = Change(change.parameter, same[0].value)
-            except InputError:
-                break
-            else:
-                return f"with {change} the goal is reached, in {duration:.4g} s"
-        else:
-            tried.append(str(change))
-    return f"the goal is not reached with {', nor with '.join(tried)}" if tried else ""
+    return blocked.reason

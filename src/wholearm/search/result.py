@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,11 +15,11 @@ from .bounds import BorderBound
 from .candidates import Failure
 from .chains import LONGEST
 from .find import EAGER, Route, Search
+from .gates import list_cut
 from .links import Blocked, describe_steps
-from .opening import list_cut
 
-LISTED = 3
-"""Most reasons that a message names."""
+LISTED, FAILED = 2, 1
+"""Most reasons that a message names, and most of them of routes without a plan."""
 NOT_CONSIDERED = (
     "not considered: rolling contacts, formations without the palm or without one of the fingers, "
     f"more than {LONGEST} borders passed without a stop, impacts out of or into cells, motions "
@@ -158,14 +159,13 @@ def format_phases(problem: Problem) -> str:
 
 
 def describe_block(
-    search: Search, failures: list[Failure], advice: str = "", opening: str = ""
+    search: Search,
+    failures: Sequence[Failure],
+    opening: str = "",
+    explain: Callable[[Blocked], str] = lambda own: own.reason,
 ) -> str:
-    """Why nothing leads to a goal: the cut, `advice` on it, and what would open it."""
-    cut = list_cut(search)
-    reasons = [failure.reason for failure in failures[:2]]
-    named = cut[: LISTED - len(reasons)]
-    reasons += [_describe_blocked(own) for own in named]
-    count = search.settled
+    """Why nothing leads to a goal: the cut, what is short there, and what would open the way."""
+    cut, count = list_cut(search), search.settled
     text = f"nothing leads from {search.start} to {search.goal}: {count} place{'s'[: count != 1]}"
     text += f" reached, touching {describe(search.start.contacts)} at the start; "
     if not cut:
@@ -173,10 +173,15 @@ def describe_block(
     else:
         many = len(cut) != 1
         text += f"{len(cut)} border{'s'[:many]} lead{'s'[many:]} on from there, all blocked"
-    parts = [text, *([opening] if opening else []), *reasons]
-    parts += [f"and {len(cut) - len(named)} more"] if len(cut) > len(named) else []
-    return "; ".join([*parts, *([advice] if advice else [])])
+    # What would help beside the plan itself is in the first part of a reason.
+    reasons = list(dict.fromkeys(own.reason.split("; ")[0] for own in failures))[:FAILED]
+    reasons += [f"{_describe_way(own)}: {explain(own)}" for own in cut[: LISTED - len(reasons)]]
+    return "; ".join([text, *reasons, *([opening] if opening else [])])
+
+
+def _describe_way(own: Blocked) -> str:
+    return f"{describe_steps(own.steps)} from {own.start}"
 
 
 def _describe_blocked(own: Blocked) -> str:
-    return f"{describe_steps(own.steps)} from {own.start}: {own.reason}"
+    return f"{_describe_way(own)}: {own.reason}"

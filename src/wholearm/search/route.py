@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import OrderedDict
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from .chart import Chart
 from .choosing import Chooser
 from .find import Route, Search
 from .goals import is_at
-from .opening import explain_cut, find_opening
+from .opening import explain, find_opening
 from .places import make_place
 from .result import Alternative, Answer, describe_block
 from .store import load_chart, require_folder, store_chart
@@ -85,13 +86,9 @@ def find_route_with(
     alternatives: int = 0,
     progress: Callable[[str], None] | None = None,
     cache: Path | None = None,
-    trial: bool = False,
     jobs: int = 1,
 ) -> Answer:
-    """Find a route with `options` given as one object; see `find_route`.
-
-    As a `trial` of another scene it does not look in turn for changes that open the way.
-    """
+    """Find a route with `options` given as one object; see `find_route`."""
     if not problem.goals:
         raise InputError(problem.source, "goal", "is missing; allowed is flush or phi_deg, and x")
     report = progress or (lambda _: None)
@@ -106,7 +103,7 @@ def find_route_with(
             raise InputError(problem.source, key, f"{goal} holds already where the motion starts")
         search = Search(chart, place, goal)
         wanted = alternatives if index + 1 == len(problem.goals) else 0
-        answer = _choose(problem, before, search, options, wanted, report, trial, jobs)
+        answer = _choose(problem, before, search, options, wanted, report, jobs)
         before = [*before, answer.route]
     if cache is not None:
         store_chart(cache, key_chart(problem, options), chart)
@@ -138,22 +135,12 @@ def forget_charts() -> None:
 
 
 def _refuse(
-    problem: Problem,
-    search: Search,
-    options: PlanOptions,
-    failures: list[Failure],
-    trial: bool,
+    problem: Problem, search: Search, options: PlanOptions, failures: list[Failure]
 ) -> InfeasibleError:
     """Why nothing leads to a goal, and what would open the way."""
-    advice, changes = explain_cut(search, problem, options)
-    opening = ""
-    if not trial:
-
-        def find(changed: Problem) -> float:
-            return find_route_with(changed, options, trial=True).plan.duration
-
-        opening = find_opening(problem, changes, find)
-    return InfeasibleError(describe_block(search, failures, advice, opening), changes=changes)
+    opening, changes = find_opening(search, problem, options)
+    text = describe_block(search, failures, opening, partial(explain, problem, options))
+    return InfeasibleError(text, changes=changes)
 
 
 def _choose(
@@ -163,7 +150,6 @@ def _choose(
     options: PlanOptions,
     alternatives: int,
     report: Callable[[str], None],
-    trial: bool,
     jobs: int,
 ) -> Answer:
     """Plan routes to one goal, and say how good the best one is."""
@@ -184,7 +170,7 @@ def _choose(
             chooser.plan(1, report)
     made, margin = chooser.made, options.goal is Objective.MARGIN
     if not made:
-        raise _refuse(problem, search, options, chooser.failures, trial)
+        raise _refuse(problem, search, options, chooser.failures)
     made.sort(key=lambda own: -own[0].value if margin else own[0].value)
     plan, route = made[0]
     bound = None

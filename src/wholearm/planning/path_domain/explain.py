@@ -100,7 +100,7 @@ def explain(
     may_change = [*data.speeds.parameters, *data.limits.parameters]
     if len(parts) == 1:
         # Where impacts join phases, their velocities depend on friction too.
-        may_change += _list_frictions(data.curve.formation)
+        may_change += list_frictions(data.curve.formation)
     curves = [part.curve for part in parts]
 
     def find_value(parameter: Parameter) -> float | None:
@@ -139,7 +139,7 @@ def explain_jam(curve: Curve, epsilon: float, jam: JammingError, replan: Replan)
     def change(parameter: Parameter, value: float) -> object:
         return _replan_with([curve], epsilon, replan, parameter, value)
 
-    advice = advise(str(jam), _list_frictions(curve.formation), find_value, change)
+    advice = advise(str(jam), list_frictions(curve.formation), find_value, change)
     error = type(jam)(advice.text)
     error.changes = advice.changes
     return error
@@ -161,7 +161,7 @@ def change_curve(curve: Curve, key: str, value: float) -> Curve:
     )
 
 
-def _list_frictions(formation: Formation) -> list[Parameter]:
+def list_frictions(formation: Formation) -> list[Parameter]:
     """Friction of what is touched: to be lowered, and where a contact rolls to be raised."""
     parts = dict.fromkeys(contact.finger for contact in formation.contacts)
     rolls = {contact.finger for contact in formation.rolling}
