@@ -180,10 +180,8 @@ class Chart:
     def cross_cells(self, place: Place) -> Found:
         """Links from rest at a place through the cells around it."""
         if place.key not in self._cells:
-            found: Found = []
-            for formation in list_formations_at(place, 3):
-                for way in cross(formation, place.z[None], self.epsilon, place.contacts):
-                    found.append(self._link_cell(place, (), formation, way, 0.0))
+            ways = cross((place,), self.epsilon)
+            found: Found = [self._link_cell(place, (), way, 0.0) for way in ways]
             self._cells[place.key] = found
         return self._cells[place.key]
 
@@ -195,35 +193,27 @@ class Chart:
         shares = np.array(RELEASES)
         times = time_parts(border, shares)
         shares, times = shares[np.isfinite(times)], times[np.isfinite(times)]
-        best: dict[tuple[Formation, str], Link] = {}
+        best: dict[tuple[Contact | None, ...], Link] = {}
         if len(shares):
             z = border.curve.evaluate(shares * border.curve.length).z
             held = border.formation.contacts
             middle = make_place(self.scene, z[0])
-            for formation in list_formations_at(middle, 3):
-                for way in cross(formation, z, self.epsilon, held):
-                    first = Step(held, point_out(held, z[way.source]))
-                    link = self._link_cell(
-                        border.start, (first,), formation, way, times[way.source]
-                    )
-                    own = formation, str(link.steps[-1].until)
-                    if own not in best or link.duration < best[own].duration:
-                        share = float(shares[way.source])
-                        best[own] = replace(link, left=border.curve, share=share)
+            for way in cross([replace(middle, z=row) for row in z], self.epsilon):
+                first = Step(held, point_out(held, z[way.source]))
+                link = self._link_cell(border.start, (first,), way, times[way.source])
+                own = *way.contacts, way.gained
+                if own not in best or link.duration < best[own].duration:
+                    share = float(shares[way.source])
+                    best[own] = replace(link, left=border.curve, share=share)
         self._releases[key] = list(best.values())
         return self._releases[key]
 
     def _link_cell(
-        self,
-        start: Place,
-        before: tuple[Step, ...],
-        formation: Formation,
-        way: Crossing,
-        spent: float,
+        self, start: Place, before: tuple[Step, ...], way: Crossing, spent: float
     ) -> Link:
-        steps = (*before, Step(formation.contacts, Until(contact=way.gained)))
+        steps = (*before, Step(way.contacts, Until(contact=way.gained)))
         assert way.gained is not None
-        stop = Place(self.scene, way.z, (*formation.contacts, way.gained), landed=True)
+        stop = Place(self.scene, way.z, (*way.contacts, way.gained), landed=True)
         return Link(start, stop, steps, spent + way.duration, True)
 
     def _end_chain(self, chain: Chain, goal: Goal) -> Link | Blocked | None:
@@ -266,7 +256,7 @@ class Chart:
         if not len(poses):
             return
         for formation in list_formations_at(place, 3):
-            way = go_to(formation, place.z, poses, self.epsilon)
+            way = go_to(place, formation, poses, self.epsilon)
             if way is not None:
                 assert goal.phi is not None
                 until = Until(None, "phi", goal.phi, list_pins(goal))
