@@ -31,7 +31,7 @@ or right above it, so that the link overlaps the object before it closes; the ot
 in its way."""
 
 
-AROUND = 5
+AROUND = 3
 """Neighbouring vertices that are looked at where a finger closes."""
 LEVEL = 1e-12
 """How far below a joint the object is still level with it, over the link's length."""

@@ -25,6 +25,9 @@ from .ways import list_middles, time_ways
 NEAREST = 0.02
 """Length of the shortest way to a pose, in radii of gyration or radians."""
 
+TIED = 1 - 1e-9
+"""Part of another time below which a time is less: of mirrored ways the first is the fastest."""
+
 
 class Crossing(NamedTuple):
     """A straight way through a cell.
@@ -64,7 +67,7 @@ def cross(places: Sequence[Place], epsilon: float) -> list[Crossing]:
     best: dict[tuple[int, ...], int] = {}
     for k in np.flatnonzero(np.isfinite(times)).tolist():
         key = int(rays.sources[k]), *rays.labels[k].tolist(), int(rays.gained[k])
-        if key not in best or times[k] < times[best[key]]:
+        if key not in best or times[k] < TIED * times[best[key]]:
             best[key] = k
     chosen = [best[key] for key in sorted(best)]
     z, table = place_at(scene, rays.labels[chosen], rays.ends[chosen]), contact_table(scene)

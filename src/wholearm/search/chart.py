@@ -18,7 +18,7 @@ from ..geometry.explore import close_contacts, is_inside
 from ..planning.result import Plan
 from ..problem.definition import End, Problem, Until
 from ..problem.goal import Goal
-from .cells import Crossing, cross, go_to
+from .cells import TIED, Crossing, cross, go_to
 from .chains import LONGEST, Chain
 from .goals import is_flush, list_pins, list_poses, measure_along
 from .ground import Unstopped
@@ -202,7 +202,7 @@ class Chart:
                 first = Step(held, point_out(held, z[way.source]))
                 link = self._link_cell(border.start, (first,), way, times[way.source])
                 own = *way.contacts, way.gained
-                if own not in best or link.duration < best[own].duration:
+                if own not in best or link.duration < TIED * best[own].duration:
                     share = float(shares[way.source])
                     best[own] = replace(link, left=border.curve, share=share)
         self._releases[key] = list(best.values())
