@@ -26,19 +26,21 @@ def _print(options: argparse.Namespace) -> int:
     from .command import build_parser
 
     parser = build_parser()
-    _complete_files(parser, shtab.FILE)
+    _complete_files(parser, shtab.FILE, shtab.DIRECTORY)
     print(shtab.complete(parser, options.shell))
     return 0
 
 
-def _complete_files(parser: argparse.ArgumentParser, files: object) -> None:
-    """Let all arguments that name files be completed so."""
+def _complete_files(parser: argparse.ArgumentParser, files: object, folders: object) -> None:
+    """Let all arguments that name files or folders be completed so."""
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for own in action.choices.values():
-                _complete_files(own, files)
+                _complete_files(own, files, folders)
         elif action.metavar in ("FILE", "PLAN") or action.dest in _FILES:
             action.complete = files  # type: ignore[attr-defined]
+        elif action.metavar == "DIR":
+            action.complete = folders  # type: ignore[attr-defined]
 
 
 _FILES = {"problem", "plan", "trajectory", "torques", "files", "output"}

@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 from ..common.files import make_folder, write_text
 from ..figures import plots
 from ..geometry.path_guess import load
-from ..planning.plan import solve
 from ..planning.result import Plan
+from ..search.solve import solve
 from ..verification.verify import verify
 from .movie import Movie, write_movie
 
