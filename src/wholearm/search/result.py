@@ -93,9 +93,10 @@ class Answer:
     def to_text(self) -> str:
         """The route as ``[[phases]]``, and how good it is, as comments."""
         lines = [f"# {line}" for line in self._describe()]
-        lines += ["", format_phases(self.problem)]
+        lines += ["", format_phases(self.problem).rstrip()]
         for number, other in enumerate(self.alternatives, start=2):
             lines += [
+                "",
                 f"# alternative {number}: {other.plan.value:.6f} {other.plan.unit}, "
                 f"{other.plan.duration:.6f} s",
                 *(f"# {line}".rstrip() for line in format_phases(other.problem).splitlines()),
@@ -103,9 +104,9 @@ class Answer:
         return "\n".join(lines).rstrip() + "\n"
 
     def _describe(self) -> list[str]:
-        plan = self.plan
+        plan, count = self.plan, len(self.problem.phases)
         lines = [
-            f"{len(self.problem.phases)} phases, {plan.options.goal.value} = {plan.value:.6f} "
+            f"{count} phase{'s'[: count != 1]}, {plan.options.goal.value} = {plan.value:.6f} "
             f"{plan.unit}, {plan.duration:.6f} s in all"
         ]
         if not self.complete:
