@@ -1,12 +1,13 @@
 """Seeded queries from pose to pose: which are solved, how fast, and how near to the bound.
 
-``python -m wholearm.benchmark.queries [--queries 250] [--seed 0] [--jobs 1] [--records FILE.jsonl]
-[-o FILE.md]`` prints a line for each query and a table. With a file of records the study goes on
-where it was stopped. So many `jobs` are asked at once; times by the wall clock are of use with one
-job, on a machine that does nothing else. A query has a start and a goal, each an edge on the palm
-and an x at which both fingers close on the object, drawn at random for the shipped scenes and for
-random polygons in the hexagon's hand. Each query is asked twice: first of a scene that nothing is
-known of, then for a goal a little further on, with what is known.
+``python -m wholearm.benchmark.queries [--queries 250] [--seed 0] [--cores 2] [--jobs 1]
+[--records FILE.jsonl] [-o FILE.md]`` prints a line for each query and a table. With a file of
+records the study goes on where it was stopped. A query is asked on so many `cores`, or several at
+once on one core each, as `jobs`. Times by the wall clock are of use with one job, on a machine that
+does nothing else; the processor's are those of the process that asks. A query has a start and a
+goal, each an edge on the palm and an x at which both fingers close on the object, drawn at random
+for the shipped scenes and for random polygons in the hexagon's hand. Each query is asked twice:
+first of a scene that nothing is known of, then for a goal a little further on, with what is known.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import json
 import sys
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,11 +47,12 @@ SECOND = 0.1
 
 
 class Query(NamedTuple):
-    """A query by its number and the folder of the shipped problems."""
+    """A query by its number and the folder of the shipped problems, and its cores."""
 
     seed: int
     number: int
     folder: Path
+    cores: int = 1
 
 
 class Spent(NamedTuple):
@@ -151,7 +153,7 @@ def run_query(query: Query) -> Outcome:
     name = f"{problem.name}: {problem.table['start']} to {problem.goals[0]}"
     spent = Stopwatch()
     try:
-        answer = find_route(problem)
+        answer = find_route(problem, jobs=query.cores)
     except WholearmError as error:
         kind = "blocked" if isinstance(error, InfeasibleError) else "no answer"
         return Outcome(name, kind, spent.read(), text=str(error))
@@ -163,21 +165,21 @@ def run_query(query: Query) -> Outcome:
         name,
         "solved",
         first,
-        _ask_again(problem),
+        _ask_again(problem, query.cores),
         np.nan if answer.gap is None else answer.gap,
         answer.plan.duration,
         len(answer.problem.phases),
     )
 
 
-def _ask_again(problem: Problem) -> Spent:
+def _ask_again(problem: Problem, cores: int) -> Spent:
     """Time of a query to nearly the same goal, with what is known of the scene."""
     goal, step = problem.goals[0], SECOND * problem.scene.scales.length
     assert goal.x is not None
     table = {**problem.table, "goal": Goal(flush=goal.flush, x=goal.x + step).to_table()}
     spent = Stopwatch()
     try:
-        find_route(build_problem(table))
+        find_route(build_problem(table), jobs=cores)
     except WholearmError:
         return NOT_ASKED
     return spent.read()
@@ -238,6 +240,18 @@ def _keep(path: Path | None, query: Query, outcome: Outcome) -> None:
             stream.write(f"{json.dumps(record)}\n")
 
 
+def _ask(queries: Sequence[Query], jobs: int) -> Iterator[tuple[Query, Outcome]]:
+    """Ask queries, one after the other or, bounded in time, in processes of their own."""
+    if jobs == 1:
+        yield from ((query, run_query(query)) for query in queries)
+        return
+    for answer in run_tasks(run_query, queries, jobs, 2 * BOUND):
+        if answer.ended == "done":
+            yield answer.task, answer.result
+        else:
+            yield answer.task, Outcome("", "no answer", NOT_ASKED, text=str(answer.result)[-300:])
+
+
 def main() -> int:
     """Print a line for each query and tables; the exit status is 1 if a plan fails."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -245,6 +259,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--first", type=int, default=0, help="number of the first query")
     parser.add_argument("--problems", type=Path, default=Path("problems"), help="folder of scenes")
+    parser.add_argument("--cores", type=int, default=1, help="of each query, one after the other")
     parser.add_argument("--jobs", type=int, default=1, help="queries at once")
     parser.add_argument("--records", type=Path, help="JSON lines that the study goes on with")
     parser.add_argument("-o", "--output", type=Path, help="file for the tables")
@@ -252,13 +267,13 @@ def main() -> int:
     numbers = range(options.first, options.first + options.queries)
     known = read_records(options.records, options.seed)
     outcomes = {number: known[number] for number in numbers if number in known}
-    tasks = [Query(options.seed, own, options.problems) for own in numbers if own not in known]
-    for answer in run_tasks(run_query, tasks, options.jobs, 2 * BOUND):
-        own = answer.result
-        if answer.ended != "done":
-            own = Outcome("", "no answer", NOT_ASKED, text=str(own)[-300:])
-        outcomes[answer.task.number] = own
-        _keep(options.records, answer.task, own)
+    cores = options.cores if options.jobs == 1 else 1
+    tasks = [
+        Query(options.seed, own, options.problems, cores) for own in numbers if own not in known
+    ]
+    for query, own in _ask(tasks, options.jobs):
+        outcomes[query.number] = own
+        _keep(options.records, query, own)
     tables = summarise(list(outcomes.values()))
     print(tables)
     if options.output is not None:
