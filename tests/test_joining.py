@@ -15,7 +15,8 @@ from wholearm.problem.goal import Goal
 from wholearm.search.candidates import Lost
 from wholearm.search.chart import Chart
 from wholearm.search.find import Search
-from wholearm.search.joining import Kept, PlannedLink, join_route, key_steps
+from wholearm.search.joining import Aside, join_route
+from wholearm.search.linking import Kept, PlannedLink, key_steps
 from wholearm.search.links import Link, Step
 from wholearm.search.measure import Measured
 from wholearm.search.places import make_place
@@ -24,9 +25,9 @@ from wholearm.search.places import make_place
 OPTIONS = PlanOptions(accuracy=0.1, replay=False)
 
 
-def join(links: tuple[Link, ...], kept: Kept, jobs: int) -> Plan:
+def join(links: tuple[Link, ...], kept: Kept, jobs: int, aside: Aside[int] | None = None) -> Plan:
     own = [(link, list[Measured]()) for link in links]
-    plan = join_route(problem_of(HEPTAGON), own, OPTIONS, kept, lambda _: None, jobs)
+    plan = join_route(problem_of(HEPTAGON), own, OPTIONS, kept, lambda _: None, jobs, aside)
     assert isinstance(plan, Plan), plan
     return plan
 
@@ -37,7 +38,9 @@ def test_links_planned_at_the_same_time_make_the_same_plan() -> None:
     route = next(search.run())
     assert len(route.links) > 1
     kept: Kept = {}
-    one, other = join(route.links, {}, 1), join(route.links, kept, 2)
+    asides = [Aside(lambda: 7) for _ in range(2)]
+    one, other = join(route.links, {}, 1, asides[0]), join(route.links, kept, 2, asides[1])
+    assert [own.result for own in asides] == [None, 7]
     assert one.duration == other.duration
     assert np.array_equal(one.trajectory.z, other.trajectory.z)
     # What solving has cost is said of each phase, wherever it was done, and of plans kept as well.

@@ -78,6 +78,8 @@ def test_no_route_along_borders_is_faster() -> None:
     bound = bound_borders(own, 1.0)
     assert bound.complete and 0.99 * route.duration < bound.value <= route.bound * (1 + 1e-12)
     assert bound_borders(own, 0.05).value == 0.05
+    # A bound up to more says what one up to less does.
+    assert bound.up_to(0.05) == bound_borders(own, 0.05) and bound.up_to(1.0) == bound
 
 
 def test_a_place_along_a_border_is_a_goal() -> None:

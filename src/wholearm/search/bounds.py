@@ -32,6 +32,10 @@ class BorderBound(NamedTuple):
     value: float
     complete: bool
 
+    def up_to(self, enough: float) -> BorderBound:
+        """What it is if no more than that is asked for [s]."""
+        return self if self.value < enough else BorderBound(enough, True)
+
 
 def bound_borders(search: Search, enough: float) -> BorderBound:
     """Bound every route along borders from below, up to `enough` [s]."""

@@ -38,7 +38,7 @@ from .measure import Measured
 from .places import Key, Place, list_formations_at, make_place, settle
 
 if TYPE_CHECKING:
-    from .joining import PlannedLink
+    from .linking import PlannedLink
 
 RELEASES = (0.15, 0.4, 0.6, 0.75, 0.88)
 """Shares of a border at which contacts may be let go."""
@@ -83,7 +83,7 @@ class Chart:
     others : dict
         Slower plans of these.
     joined : dict
-        Plans of links from rest to rest; see `joining`.
+        Plans of links from rest to rest; see `linking`.
     polished : set of Link
         Those that were planned with borders left in motion, too.
     measured : dict

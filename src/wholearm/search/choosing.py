@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 from ..planning.options import PlanOptions
 from ..planning.result import Plan
 from ..problem.definition import Problem
+from .bounds import BorderBound, bound_borders
 from .candidates import Failure, Lost, make_candidate, plan_candidate
 from .find import CAREFUL, EAGER, Route, Rule, Search
-from .joining import can_join, join_route
+from .joining import Aside, can_join, join_route
 from .links import Link, describe_steps
 from .measure import Measured
 from .polishing import Polisher
@@ -69,6 +71,7 @@ class Chooser:
         self.failures: list[Failure] = []
         self._polisher = Polisher(problem, search.chart, options, jobs)
         self._measurements = 0
+        self._bound: tuple[float, Aside[BorderBound]] | None = None
         self._lost: list[tuple[Link, ...]] = []
 
     def run(self, wanted: int, report: Callable[[str], None]) -> None:
@@ -114,12 +117,28 @@ class Chooser:
         routes, known = [*self.before, route], self.chart.measured
         if can_join(self.problem, self.options):
             links = [(link, self._list_ways(link)) for own in routes for link in own.links]
-            given = self.options, self.chart.joined, report, self.jobs
+            given = self.options, self.chart.joined, report, self.jobs, self._bound_aside(route)
             return join_route(self.problem, links, *given)
         candidate = make_candidate(self.problem, routes, known)
         if isinstance(candidate, Failure):
             return candidate.reason
         return plan_candidate(candidate, self.options, self.chart.plans)
+
+    def _bound_aside(self, route: Route) -> Aside[BorderBound] | None:
+        """A bound of routes along borders, up to more than a plan of a route will take."""
+        if self.jobs == 1 or self.before or self._bound is not None:
+            return None
+        enough = BEYOND * self._estimate(route)
+        self._bound = enough, Aside(partial(bound_borders, self.search, enough))
+        return self._bound[1]
+
+    def bound(self, duration: float) -> BorderBound:
+        """Bound every route along borders from below, up to a duration [s]."""
+        enough, aside = self._bound or (0.0, None)
+        known = aside.result if aside else None
+        if known is None or enough < duration:
+            return bound_borders(self.search, duration)
+        return known.up_to(duration)
 
     def _list_ways(self, link: Link) -> list[Measured]:
         """Ways in which a link through a cell can be gone, the fastest first."""

@@ -8,77 +8,55 @@ from __future__ import annotations
 
 import time
 from collections import ChainMap
-from collections.abc import Callable, MutableMapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import InputError, WholearmError, name_source
+from ..common.errors import WholearmError
 from ..common.sharing import exclusive
-from ..common.workers import share
-from ..geometry.curve import Curve
-from ..geometry.tracing import trace_phase
+from ..common.workers import Task, share
 from ..planning.advice import unadvised
-from ..planning.block_plan import BEGUN, BlockPlan, Planning
-from ..planning.blocks import plan_next
+from ..planning.block_plan import BlockPlan, Planning
 from ..planning.options import PlanOptions
 from ..planning.plan import assemble_plan, finish_plan
 from ..planning.result import Plan
 from ..planning.self_check import Checked
-from ..planning.splitting import split_blocks
-from ..problem.definition import End, Phase, Problem
-from ..scene.model import Scene
-from ..solvers.statistics import SolverStatistics, open_ledger
+from ..problem.definition import Phase, Problem
+from ..solvers.statistics import open_ledger
 from .candidates import Lost
-from .links import Link, Step, describe_steps, point_out
-from .measure import SINGULAR, Measured, make_phases
+from .linking import Kept, Key, PlannedLink, keep_link
+from .links import Link, describe_steps
+from .measure import SINGULAR, Measured
 
-OFF = 1e-4
-"""Distance from the end of a border's link from which on it is another end, in radii of gyration or
-radians."""
-SAME = 9
-"""Decimals of configurations that are one, in the same unit."""
 MET = 1e-8
-"""Largest distance, in the same unit, of a border's end as planned from the same end as found."""
+"""Largest distance of a border's end as planned from the same end as found, in radii of gyration or
+radians."""
 
-Key = tuple[object, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class PlannedLink:
-    """A link as it is planned.
-
-    Attributes
-    ----------
-    phases : tuple of Phase
-        Counted from the first of the link.
-    blocks : tuple of BlockPlan
-    costs : tuple of SolverStatistics
-        What solving has cost, for each phase.
-    """
-
-    phases: tuple[Phase, ...]
-    blocks: tuple[BlockPlan, ...]
-    costs: tuple[SolverStatistics, ...]
-
-    @property
-    def end(self) -> Array:
-        """Where it ends, shape (5,)."""
-        return self.blocks[-1].end
-
-    @property
-    def duration(self) -> float:
-        """How long it takes [s]."""
-        return sum(plan.motion.duration for own in self.blocks for plan in own.plans)
-
-
+T = TypeVar("T")
 Links = Sequence[tuple[Link, Sequence[Measured]]]
 """Links of a route, with the ways in which those through cells can be gone."""
 Chosen = tuple[Link, Measured | None]
 """A link, and what is begun of it."""
-Kept = MutableMapping[Key, PlannedLink | str]
+
+
+@dataclass
+class Aside(Generic[T]):
+    """What is done beside planning, where there is a process for it, and else is not.
+
+    Attributes
+    ----------
+    task : callable
+        Without arguments.
+    result : object or None
+        What it has returned.
+    """
+
+    task: Task[T]
+    result: T | None = None
 
 
 def can_join(problem: Problem, options: PlanOptions) -> bool:
@@ -94,6 +72,7 @@ def join_route(
     kept: Kept,
     report: Callable[[str], None],
     jobs: int = 1,
+    aside: Aside[Any] | None = None,
 ) -> Plan | str:
     """The plan of a route, from plans of its links, or why there is none.
 
@@ -110,15 +89,18 @@ def join_route(
     report : callable
     jobs : int
         Most processes that plan links at the same time.
+    aside : Aside, optional
+        What else is to be done then.
     """
     options = options.scale_ranges(problem.uncertainty or {})
     begun = time.perf_counter()
     ways, culprit = [[*measured, None] for _, measured in links], None
     try:
         with open_ledger() as ledger, unadvised():
+            first = [(link, way[0]) for (link, _), way in zip(links, ways, strict=True)]
+            _plan_ahead(problem, first, options, kept, report, jobs, aside)
             while True:
                 own = [(link, way[0]) for (link, _), way in zip(links, ways, strict=True)]
-                _plan_ahead(problem, own, options, kept, report, jobs)
                 planned, reason = _plan_links(problem, own, options, kept, report)
                 if reason:
                     culprit = len(planned)
@@ -167,6 +149,7 @@ def _plan_ahead(
     kept: Kept,
     report: Callable[[str], None],
     jobs: int,
+    aside: Aside[Any] | None,
 ) -> None:
     """Keep plans of all links whose starts are known, and of those after them, at the same time."""
     if jobs == 1:
@@ -174,11 +157,18 @@ def _plan_ahead(
     starts = [0, *(k + 1 for k, (link, _) in enumerate(links[:-1]) if not link.in_cell)]
     parts = [range(*ends) for ends in zip(starts, [*starts[1:], len(links)], strict=True)]
     # What takes longest comes first.
-    parts.sort(key=lambda own: not any(links[k][0].in_cell for k in own))
+    cells = [own for own in parts if any(links[k][0].in_cell for k in own)]
+    parts = [*cells, *(own for own in parts if own not in cells)]
     report(f"planning {len(links)} parts of the route")
+    tasks: list[Task[Any]]
     tasks = [partial(_plan_part, problem, links, own, options, kept) for own in parts]
-    for found in share(tasks, jobs, (problem, problem.scene)):
-        kept.update(found)
+    if aside:
+        tasks.insert(len(cells), aside.task)
+    found = share(tasks, jobs, (problem, problem.scene))
+    if aside:
+        aside.result = found.pop(len(cells))
+    for own in found:
+        kept.update(own)
 
 
 def _plan_part(
@@ -239,7 +229,7 @@ def _plan_one(
     link, measured = links[k]
     ahead = links[k + 1][0] if k + 1 < len(links) else None
     own = link if measured is None else replace(link, steps=measured.steps)
-    return _keep_link(problem, own, ahead, measured, z, options, kept, report)
+    return keep_link(problem, own, ahead, measured, z, options, kept, report)
 
 
 def _put_together(problem: Problem, links: Sequence[PlannedLink], options: PlanOptions) -> Planning:
@@ -254,94 +244,3 @@ def _put_together(problem: Problem, links: Sequence[PlannedLink], options: PlanO
     whole = replace(problem, phases=tuple(phases), goals=())
     none = list[float | None]([None] * len(phases))
     return Planning(whole, (), options, tuple(blocks), none, none, ahead=False)
-
-
-def key_configuration(scene: Scene, z: Array) -> tuple[float, ...]:
-    """The same for configurations that are one."""
-    length = scene.scales.length
-    return tuple(np.round(z / [length, length, 1, 1, 1], SAME).tolist())
-
-
-def key_steps(steps: Sequence[Step]) -> Key:
-    """The same for phases that are the same."""
-    return tuple((tuple(c.name for c in own.contacts), own.until, own.end.value) for own in steps)
-
-
-def _keep_link(
-    problem: Problem,
-    link: Link,
-    ahead: Link | None,
-    begun: Measured | None,
-    z: Array,
-    options: PlanOptions,
-    kept: Kept,
-    report: Callable[[str], None],
-) -> PlannedLink | str:
-    """The plan of a link from `z`, made now, from what is begun, if it is not kept."""
-    # Where a link lands, the next one goes on along a border, looked at as if it stopped there.
-    lands = link.in_cell and ahead is not None and not ahead.in_cell
-    follows = (ahead.steps[0]._replace(end=End.REST),) if ahead is not None and lands else ()
-    place, own = key_configuration(problem.scene, z), repr(replace(options, samples=2))
-    key = (place, key_steps(link.steps), key_steps(follows), begun is None, own)
-    if key not in kept:
-        report(f"planning {describe_steps(link.steps)}")
-        try:
-            kept[key] = _plan_link(problem, link, follows, begun, z, options, report)
-        except WholearmError as error:
-            kept[key] = str(error)
-        except np.linalg.LinAlgError:
-            kept[key] = SINGULAR
-    return kept[key]
-
-
-def _plan_link(
-    problem: Problem,
-    link: Link,
-    follows: Sequence[Step],
-    measured: Measured | None,
-    z: Array,
-    options: PlanOptions,
-    report: Callable[[str], None],
-) -> PlannedLink:
-    steps = (*link.steps, *follows)
-    phases, curves = make_phases(problem, steps), list[Curve]()
-    if not link.in_cell and len(phases) == 1:
-        phases[0], curve = _aim(phases[0], z, link)
-        curves.append(curve)
-    own = replace(problem, start=z, phases=tuple(phases), goals=())
-    count = len(phases) - len(follows)
-    none = list[float | None]([None] * len(phases))
-    made = Planning(own, tuple(curves), options, (), none, none, sketches=True)
-    with open_ledger(apart=True) as ledger, name_source(problem.source):
-        for part in split_blocks(own):
-            if part[0].index >= count:
-                break
-            begun = None
-            if (
-                measured
-                and measured.begun
-                and (part[0].end is not End.REST or part[0].index == count - 1)
-            ):
-                start = made.blocks[-1].end if made.blocks else z
-                begun = BlockPlan(part, start, BEGUN, None, [], list(measured.begun), None)
-            made = plan_next(made, 0, begun, report)
-    costs = tuple(ledger.of(phase.number) for phase in phases[:count])
-    return PlannedLink(tuple(phases[:count]), made.blocks, costs)
-
-
-def _aim(phase: Phase, z: Array, link: Link) -> tuple[Phase, Curve]:
-    """The phase of a border's link from `z`, so that it ends where the link does, and its curve.
-
-    A contact may be gained both ways along a border; x or phi tells which is meant.
-    """
-    try:
-        curve = trace_phase(phase, z)
-        length = link.stop.scene.scales.length
-        off = np.abs((curve.end - link.stop.z) / [length, length, 1, 1, 1]).max()
-        if off <= OFF:
-            return phase, curve
-    except InputError:
-        pass
-    until = point_out(phase.formation.contacts, link.stop.z)
-    other = replace(phase, until=until)
-    return other, trace_phase(other, z)

@@ -18,7 +18,6 @@ from ..planning.options import Objective, PlanOptions
 from ..problem.definition import Problem
 from ..problem.goal import name_goal
 from ..problem.table import describe_scene
-from .bounds import bound_borders
 from .candidates import Failure
 from .chart import Chart
 from .choosing import Chooser
@@ -177,7 +176,7 @@ def _choose(
     if complete and not before:
         try:
             with yielding():
-                bound = bound_borders(search, plan.duration)
+                bound = chooser.bound(plan.duration)
         except KeyboardInterrupt:
             complete = False
     return Answer(

@@ -1,0 +1,153 @@
+"""Links planned from rest to rest, and kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, MutableMapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.errors import InputError, WholearmError, name_source
+from ..geometry.curve import Curve
+from ..geometry.tracing import trace_phase
+from ..planning.block_plan import BEGUN, BlockPlan, Planning
+from ..planning.blocks import plan_next
+from ..planning.options import PlanOptions
+from ..planning.splitting import split_blocks
+from ..problem.definition import End, Phase, Problem
+from ..scene.model import Scene
+from ..solvers.statistics import SolverStatistics, open_ledger
+from .links import Link, Step, describe_steps, point_out
+from .measure import SINGULAR, Measured, make_phases
+
+OFF = 1e-4
+"""Distance from the end of a border's link from which on it is another end, in radii of gyration or
+radians."""
+SAME = 9
+"""Decimals of configurations that are one, in the same unit."""
+
+Key = tuple[object, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedLink:
+    """A link as it is planned.
+
+    Attributes
+    ----------
+    phases : tuple of Phase
+        Counted from the first of the link.
+    blocks : tuple of BlockPlan
+    costs : tuple of SolverStatistics
+        What solving has cost, for each phase.
+    """
+
+    phases: tuple[Phase, ...]
+    blocks: tuple[BlockPlan, ...]
+    costs: tuple[SolverStatistics, ...]
+
+    @property
+    def end(self) -> Array:
+        """Where it ends, shape (5,)."""
+        return self.blocks[-1].end
+
+    @property
+    def duration(self) -> float:
+        """How long it takes [s]."""
+        return sum(plan.motion.duration for own in self.blocks for plan in own.plans)
+
+
+Kept = MutableMapping[Key, PlannedLink | str]
+"""Plans of links, or why there are none."""
+
+
+def key_configuration(scene: Scene, z: Array) -> tuple[float, ...]:
+    """The same for configurations that are one."""
+    length = scene.scales.length
+    return tuple(np.round(z / [length, length, 1, 1, 1], SAME).tolist())
+
+
+def key_steps(steps: Sequence[Step]) -> Key:
+    """The same for phases that are the same."""
+    return tuple((tuple(c.name for c in own.contacts), own.until, own.end.value) for own in steps)
+
+
+def keep_link(
+    problem: Problem,
+    link: Link,
+    ahead: Link | None,
+    begun: Measured | None,
+    z: Array,
+    options: PlanOptions,
+    kept: Kept,
+    report: Callable[[str], None],
+) -> PlannedLink | str:
+    """The plan of a link from `z`, made now, from what is begun, if it is not kept."""
+    # Where a link lands, the next one goes on along a border, looked at as if it stopped there.
+    lands = link.in_cell and ahead is not None and not ahead.in_cell
+    follows = (ahead.steps[0]._replace(end=End.REST),) if ahead is not None and lands else ()
+    place, own = key_configuration(problem.scene, z), repr(replace(options, samples=2))
+    key = (place, key_steps(link.steps), key_steps(follows), begun is None, own)
+    if key not in kept:
+        report(f"planning {describe_steps(link.steps)}")
+        try:
+            kept[key] = _plan_link(problem, link, follows, begun, z, options, report)
+        except WholearmError as error:
+            kept[key] = str(error)
+        except np.linalg.LinAlgError:
+            kept[key] = SINGULAR
+    return kept[key]
+
+
+def _plan_link(
+    problem: Problem,
+    link: Link,
+    follows: Sequence[Step],
+    measured: Measured | None,
+    z: Array,
+    options: PlanOptions,
+    report: Callable[[str], None],
+) -> PlannedLink:
+    steps = (*link.steps, *follows)
+    phases, curves = make_phases(problem, steps), list[Curve]()
+    if not link.in_cell and len(phases) == 1:
+        phases[0], curve = _aim(phases[0], z, link)
+        curves.append(curve)
+    own = replace(problem, start=z, phases=tuple(phases), goals=())
+    count = len(phases) - len(follows)
+    none = list[float | None]([None] * len(phases))
+    made = Planning(own, tuple(curves), options, (), none, none, sketches=True)
+    with open_ledger(apart=True) as ledger, name_source(problem.source):
+        for part in split_blocks(own):
+            if part[0].index >= count:
+                break
+            begun = None
+            if (
+                measured
+                and measured.begun
+                and (part[0].end is not End.REST or part[0].index == count - 1)
+            ):
+                start = made.blocks[-1].end if made.blocks else z
+                begun = BlockPlan(part, start, BEGUN, None, [], list(measured.begun), None)
+            made = plan_next(made, 0, begun, report)
+    costs = tuple(ledger.of(phase.number) for phase in phases[:count])
+    return PlannedLink(tuple(phases[:count]), made.blocks, costs)
+
+
+def _aim(phase: Phase, z: Array, link: Link) -> tuple[Phase, Curve]:
+    """The phase of a border's link from `z`, so that it ends where the link does, and its curve.
+
+    A contact may be gained both ways along a border; x or phi tells which is meant.
+    """
+    try:
+        curve = trace_phase(phase, z)
+        length = link.stop.scene.scales.length
+        off = np.abs((curve.end - link.stop.z) / [length, length, 1, 1, 1]).max()
+        if off <= OFF:
+            return phase, curve
+    except InputError:
+        pass
+    until = point_out(phase.formation.contacts, link.stop.z)
+    other = replace(phase, until=until)
+    return other, trace_phase(other, z)
