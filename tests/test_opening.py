@@ -30,22 +30,27 @@ def test_a_number_is_changed_no_further_than_its_way_needs(
 ) -> None:
     """All that a number opens is looked through first, then the way that was found, alone."""
     openings = [Opening(EPSILON, (0.04, NEVER, 0.03)), Opening(TORQUE, (NEVER, 2.5, 3.0))]
-    tried = list[tuple[Change, list[int]]]()
+    tried = list[tuple[Change, list[int], bool]]()
 
-    def find(change: Change, beyond: Sequence[int]) -> tuple[float, list[int]] | None:
-        tried.append((change, list(beyond)))
-        enough = change.parameter is TORQUE and change.value >= needed
-        return (0.5, [1]) if enough else None
+    def find(change: Change, beyond: Sequence[int], plan: bool) -> tuple[float, list[int]] | None:
+        tried.append((change, list(beyond), plan))
+        seen = change.parameter is TORQUE and (not plan or change.value >= needed)
+        return (0.5, [1]) if seen else None
 
     text, changes = choose_opening(openings, find)
-    assert tried[:2] == [(Change(EPSILON, 0.03), [0, 2]), (Change(TORQUE, 3.0), [1, 2])]
+    assert tried[:3] == [
+        (Change(EPSILON, 0.03), [0, 2], False),
+        (Change(TORQUE, 3.0), [1, 2], False),
+        (Change(TORQUE, 2.5), [1], True),
+    ]
+    assert tried[3:] == ([] if needed <= 2.5 else [(Change(TORQUE, 3.0), [1, 2], True)])
     if least is None:
         assert changes == () and text == (
             "the goal is not reached with epsilon = 0.03 N instead of 0.05, "
             "nor with torque limit of finger 1 = 3 N m instead of 2"
         )
         return
-    assert tried[2:] == [(Change(TORQUE, 2.5), [1])] and changes == (Change(TORQUE, least),)
+    assert changes == (Change(TORQUE, least),)
     assert text == f"with {changes[0]} the goal is reached, in about 0.5 s"
 
 

@@ -25,8 +25,10 @@ OTHERS = 2
 """Most slower ways through a cell that are tried where the plan of the fastest does not hold."""
 BEYOND = 1.1
 """Times of routes, by the search, over that of the best one, from which on they are left out."""
+FURTHER = 4
+"""How many times as many places are looked at by the second rule where there is no route yet."""
 NEARBY = 30
-"""Most places that are looked at in a hurry."""
+"""Most places that are looked at in a glance."""
 MEASURED, MORE = 24, 8
 """Most links through cells that are planned for themselves, until there is a route and after it."""
 
@@ -44,7 +46,7 @@ class Chooser:
     jobs : int
         Most processes at the same time.
     hurried : bool
-        Whether any plan will do, of a route over few places, planned as it is found.
+        Whether any plan will do: routes are planned as they are found.
 
     Attributes
     ----------
@@ -76,21 +78,22 @@ class Chooser:
 
     def run(self, wanted: int, report: Callable[[str], None]) -> None:
         """Look for routes and plan them, for as long as there are fewer than `wanted` plans."""
-        if self.hurried:
-            self._look_by(EAGER._replace(most=NEARBY), wanted, report)
-            self.plan(wanted, report)
-            return
         for _ in range(TRIED):
             failed = len(self.failures)
             self._look_by(EAGER, wanted, report)
-            # Without a route by then, the other rule leads elsewhere, and as far.
-            most = CAREFUL.most if self.found else EAGER.most
+            # Without a route by then, the other rule leads elsewhere, and further.
+            most = CAREFUL.most if self.found else FURTHER * CAREFUL.most
             self._look_by(CAREFUL._replace(most=most), wanted, report)
             self.plan(wanted, report)
             if len(self.made) >= wanted or len(self.failures) == failed:
                 return
             # What had no plan bounds nothing.
             self.search.limit = math.inf
+
+    def glance(self, report: Callable[[str], None]) -> Route | None:
+        """Look for any route over few places whose ways through cells have plans."""
+        self._look_by(EAGER._replace(most=NEARBY), 1, report)
+        return self.found[0] if self.found else None
 
     def plan(self, wanted: int, report: Callable[[str], None]) -> None:
         """Plan the routes that are found, the best first, until there are as many as wanted."""

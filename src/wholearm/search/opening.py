@@ -24,9 +24,9 @@ from .measure import ROUGH, SINGULAR
 TRIED = 3
 """Most numbers with which the goal is looked for."""
 
-Try = Callable[[Change, Sequence[int]], tuple[float, Sequence[int]] | None]
-"""Looks for the goal with a change and beyond some borders: how long the route takes [s], and over
-which of them it leads."""
+Try = Callable[[Change, Sequence[int], bool], tuple[float, Sequence[int]] | None]
+"""Looks for the goal with a change, beyond some borders: about how long the route takes [s], which
+is planned if that is asked for, and over which of the borders it leads."""
 
 
 def find_opening(
@@ -37,33 +37,41 @@ def find_opening(
     It is looked for on the borders that are shut, and tried by a search beyond those that it opens.
     """
     gates = list_gates(search)
-    openings = list_openings(gates)
 
-    def find(change: Change, beyond: Sequence[int]) -> tuple[float, Sequence[int]] | None:
-        return _look_beyond(search, problem, options, change, {k: gates[k] for k in beyond})
+    def find(
+        change: Change, beyond: Sequence[int], planned: bool
+    ) -> tuple[float, Sequence[int]] | None:
+        own = {k: gates[k] for k in beyond}
+        return _look_beyond(search, problem, options, change, own, planned)
 
-    return choose_opening(openings, find)
+    return choose_opening(list_openings(gates), find)
 
 
 def choose_opening(openings: Sequence[Opening], find: Try) -> tuple[str, tuple[Change, ...]]:
     """The first number with which the goal is reached, and the least change of it that does."""
     tried = list[str]()
     for opening in openings[:TRIED]:
-        change = opening.open_all()
-        found = find(change, opening.list_open(change))
-        if found is None:
-            tried.append(str(change))
-            continue
-        duration, over = found
-        less = opening.open_all(over)
-        if less != change and (again := find(less, over)) is not None:
-            change, (duration, _) = less, again
-        return f"with {change} the goal is reached, in about {duration:.3g} s", (change,)
+        most = opening.open_all()
+        beyond = opening.list_open(most)
+        seen = find(most, beyond, False)
+        # What else it opens may be needed beyond those borders over which the way leads.
+        least = most if seen is None else opening.open_all(seen[1])
+        for change in dict.fromkeys((least, most)) if seen else ():
+            found = find(change, opening.list_open(change), True)
+            if found is not None:
+                text = f"with {change} the goal is reached, in about {found[0]:.3g} s"
+                return text, (change,)
+        tried.append(str(most))
     return f"the goal is not reached with {', nor with '.join(tried)}" if tried else "", ()
 
 
 def _look_beyond(
-    search: Search, problem: Problem, options: PlanOptions, change: Change, gates: dict[int, Gate]
+    search: Search,
+    problem: Problem,
+    options: PlanOptions,
+    change: Change,
+    gates: dict[int, Gate],
+    planned: bool,
 ) -> tuple[float, list[int]] | None:
     """Look for the goal in a changed scene, beyond borders that are open there."""
     try:
@@ -77,17 +85,19 @@ def _look_beyond(
         return None
     start = replace(search.start, scene=changed.scene)
     beyond = Search(Chart(changed, options.least_minor), start, search.goal, sources=sources)
-    rough = replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH, replay=False)
-    chooser = Chooser(changed, [], beyond, replace(rough, certify=False, robust=0.0), hurried=True)
+    rough = replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH, robust=0.0)
+    rough = replace(rough, mode_search=False, certify=False, replay=False)
+    chooser = Chooser(changed, [], beyond, rough, hurried=True)
     try:
-        chooser.run(1, lambda _: None)
+        route = chooser.glance(lambda _: None)
+        if planned:
+            chooser.plan(1, lambda _: None)
     except np.linalg.LinAlgError:
         return None
-    if not chooser.made:
+    if route is None or (planned and not chooser.made):
         return None
-    plan, route = chooser.made[0]
-    over = [k for k, way in ways.items() if way and way.links[-1] in route.links]
-    return plan.duration, over
+    duration = chooser.made[0][0].duration if planned else route.duration
+    return duration, [k for k, way in ways.items() if way and way.links[-1] in route.links]
 
 
 def explain(problem: Problem, options: PlanOptions, blocked: Blocked) -> str:
