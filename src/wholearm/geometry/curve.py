@@ -120,14 +120,15 @@ class Curve:
 
     def evaluate(self, s: Array) -> CurvePoint:
         """Return z, its tangent z_s and its curvature z_ss at the places `s`, shape (n,)."""
-        z, tangent = self._interpolate(np.asarray(s, dtype=float))
+        z, tangent = self.interpolate(np.asarray(s, dtype=float))
         formation = self.formation
         kinematics = formation.evaluate(z, tangent)
         metric = metric_weights(formation.scene)
         z_s, z_ss = solve_tangent(kinematics.P, kinematics.P_dot_v, tangent, metric)
         return CurvePoint(z, z_s * self.speed_ratio, z_ss * self.speed_ratio**2, kinematics)
 
-    def _interpolate(self, s: Array) -> tuple[Array, Array]:
+    def interpolate(self, s: Array) -> tuple[Array, Array]:
+        """Return z and its unit tangent at the places `s`, shape (n, 5) each, from the panels."""
         starts = np.array([panel.s[0] for panel in self.panels])
         owner = np.clip(np.searchsorted(starts, s, side="right") - 1, 0, None)
         z, tangent = np.empty((len(s), 5)), np.empty((len(s), 5))
@@ -160,22 +161,33 @@ class Curve:
     @cached_property
     def end(self) -> Array:
         """Configuration at s = length, shape (5,)."""
-        return np.asarray(self._interpolate(np.array([self.length]))[0][0])
+        return np.asarray(self.interpolate(np.array([self.length]))[0][0])
 
     def sliding(self, s: Array) -> Array:
         """Sliding rates A_t z_s of the contacts and rates of the joints, shape (n, n_c + 2)."""
-        point = self.evaluate(s)
-        rho = self.formation.scene.polygon.gyration_radius
-        slip = np.einsum("nij,nj->ni", point.kinematics.A_t, point.z_s)
+        z, tangent = self.interpolate(s)
+        return self._find_rates(self.formation.evaluate(z, tangent), tangent)
+
+    def _find_rates(self, kinematics: Kinematics, tangent: Array) -> Array:
+        z_s, rho = tangent * self.speed_ratio, self.formation.scene.polygon.gyration_radius
+        slip = np.einsum("nij,nj->ni", kinematics.A_t, z_s)
         slip[:, list(self.formation.rolling_rows)] = 0.0
-        return np.hstack([slip, rho * point.z_s[:, 3:]])
+        return np.hstack([slip, rho * z_s[:, 3:]])
 
     @cached_property
     def segments(self) -> tuple[Segment, ...]:
-        """The curve split wherever a contact's sliding or a joint reverses."""
+        """The curve split wherever a contact's sliding or a joint reverses.
+
+        Raises `LinAlgError` where the contacts depend on each other.
+        """
         grids = [refine(panel.s, self.length) for panel in self.panels]
         grid = np.concatenate([grid[index > 0 :] for index, grid in enumerate(grids)])
-        rates = self.sliding(grid)
+        z, tangent = self.interpolate(grid)
+        kinematics = self.formation.evaluate(z, tangent)
+        solve_tangent(
+            kinematics.P, kinematics.P_dot_v, tangent, metric_weights(self.formation.scene)
+        )
+        rates = self._find_rates(kinematics, tangent)
         rates[np.abs(rates) < 1e-9] = 0.0
         breaks = []
         for column in range(rates.shape[1]):

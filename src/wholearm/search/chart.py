@@ -14,6 +14,7 @@ import numpy as np
 
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
+from ..geometry.curve import Curve
 from ..geometry.explore import close_contacts, is_inside
 from ..planning.result import Plan
 from ..problem.definition import End, Problem, Until
@@ -95,6 +96,7 @@ class Chart:
         self.terms = Terms(problem.epsilon, least_minor)
         self.polished: set[Link] = set()
         self._borders: dict[tuple[Key, tuple[Contact, ...]], list[Border]] = {}
+        self._curves: dict[frozenset[Contact], list[Curve]] = {}
         self._links: dict[Key, list[tuple[Border, Link | Blocked | None]]] = {}
         self._cells: dict[Key, Found] = {}
         self.plans: dict[object, Plan | str] = {}
@@ -111,7 +113,8 @@ class Chart:
             if settled and (chain is None or chain.can_enter(formation)):
                 key = place.key, formation.contacts
                 if key not in self._borders:
-                    self._borders[key] = follow_borders(settled, formation, self.terms)
+                    known = self._curves.setdefault(frozenset(formation.contacts), [])
+                    self._borders[key] = follow_borders(settled, formation, self.terms, known)
                 found += self._borders[key]
         return found
 

@@ -16,6 +16,7 @@ from ..common.arrays import Array
 from ..contacts.formation import Kinematics
 from ..geometry.curve import Curve, CurvePoint, describe_pose
 from ..mechanics.dynamics import Directions, reduced_inertia
+from ..mechanics.metric import metric_weights
 from ..mechanics.uniqueness import find_minors
 from ..planning.lower_bound.rows import Rows, limit_along
 from ..planning.lower_bound.sweep import NoMotionError, add_up, find_steady
@@ -25,6 +26,8 @@ INTERVALS = 24
 """Intervals of the grid on which the fastest motion along a border is looked for."""
 CHECKED = 12
 """Places of a segment at which jamming and ambiguous forces are looked for, besides those."""
+INDEPENDENT = 1e-12
+"""Least Gram determinant of the rows of contacts, each of length one."""
 DEPENDENT = "its contacts depend on each other"
 
 
@@ -170,14 +173,18 @@ def _find_ambiguity(
     Xi, sigma = (
         np.array([getattr(own, key) for own in curve.segments])[owners] for key in ("Xi", "sigma")
     )
+    rows = at.kinematics.P / np.sqrt(metric_weights(formation.scene))
+    rows = rows / np.linalg.norm(rows, axis=2, keepdims=True)
+    volumes = np.linalg.det(rows @ rows.transpose(0, 2, 1))
     inertia = reduced_inertia(formation, at.kinematics, Directions(Xi, sigma))
     minors = find_minors(formation, at.kinematics, Xi)
-    bad = ~(np.isfinite(inertia) & (inertia > 0) & (minors.ratios >= least))
+    lost = ~(np.isfinite(inertia) & (volumes > INDEPENDENT))
+    bad = lost | (inertia <= 0) | (minors.ratios < least)
     if not bad.any():
         return "", curve.length
     first = s[bad].min()
     clear = float(s[s < first].max(initial=0.0))
-    if not np.isfinite(inertia).all():
+    if lost.any():
         return DEPENDENT, clear
     if inertia.min() <= 0:
         return "friction jams it", clear

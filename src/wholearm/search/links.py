@@ -12,6 +12,7 @@ import numpy as np
 from ..common.arrays import Array
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
+from ..geometry.arcs import find_on, join, take
 from ..geometry.curve import Curve
 from ..geometry.tracing import HELD, trace_curve
 from ..mechanics.metric import metric_weights
@@ -141,21 +142,47 @@ class Border:
         return self.curve.formation
 
 
-def follow_borders(place: Place, formation: Formation, terms: Terms) -> list[Border]:
-    """The border of a formation from a place, one way and the other, as far as it leads on."""
-    found, least = [], HELD * place.scene.scales.length
-    headings = find_headings(formation, place.z)
+def follow_borders(
+    place: Place, formation: Formation, terms: Terms, known: list[Curve]
+) -> list[Border]:
+    """The border of a formation from a place, one way and the other, as far as it leads on.
+
+    Parameters
+    ----------
+    place : Place
+    formation : Formation
+    terms : Terms
+    known : list of Curve
+        Whole borders of these contacts, to which those that are traced are added.
+    """
+    headings, least = find_headings(formation, place.z), HELD * place.scene.scales.length
     if not headings:
         return []
+    for whole in known:
+        s = find_on(whole, place.z)
+        if s is not None:
+            curves = [take(whole, s, end) for end in (whole.length, 0.0) if abs(end - s) > least]
+            break
+    else:
+        curves = _trace(formation, place.z, headings, known)
+    return [Border(place, curve, _find_gained(curve), terms) for curve in curves]
+
+
+def _trace(
+    formation: Formation, z: Array, headings: tuple[Array, ...], known: list[Curve]
+) -> list[Curve]:
+    """The curves of a formation from a place; the whole of them is added to those known."""
+    least, ways = HELD * formation.scene.scales.length, list[Curve | None]()
     # Most end where they begin, which limits a little way on tell.
-    ahead = formation.evaluate_limits(place.z + least * np.array(headings))
-    for heading, limits in zip(headings, ahead, strict=True):
-        if limits.min() < -BARRED * least:
-            continue
-        curve = trace_curve(formation, place.z, heading, Until())
-        if curve.length > least and _is_regular(curve):
-            found.append(Border(place, curve, _find_gained(curve), terms))
-    return found
+    ahead = formation.evaluate_limits(z + least * np.array(headings)).min(axis=1)
+    for heading, limit in zip(headings, ahead.tolist(), strict=True):
+        barred = limit < -BARRED * least
+        curve = None if barred else trace_curve(formation, z, heading, Until())
+        ways.append(curve if curve is not None and curve.length > least else None)
+    curves = [curve for curve in ways if curve is not None and _is_regular(curve)]
+    if curves and len(curves) == 2 - ways.count(None):
+        known.append(join(*ways[::-1]))
+    return curves
 
 
 def find_headings(formation: Formation, z: Array) -> tuple[Array, ...]:
