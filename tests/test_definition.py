@@ -365,7 +365,7 @@ def test_a_hand_that_is_crossed_at_the_start_is_refused() -> None:
         read_edited(cross)
     assert caught.value.key == "start.x" and "allowed is 0 or more" in caught.value.problem
     # It is said where the hand would close, and there it does.
-    text = caught.value.problem.split("; the hand closes for x ")[1]
+    text = caught.value.problem.split("; at that angle the hand closes for x ")[1]
     for own in re.findall(r"-?[\d.]+", text):
 
         def move(table: dict[str, Any], x: float = float(own)) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from shipped import HEPTAGON, problem_of
 from wholearm.cli.command import main
-from wholearm.common.errors import InputError
+from wholearm.common.errors import InfeasibleError, InputError
 from wholearm.common.interrupts import guard, yielding
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phase
@@ -27,6 +27,7 @@ from wholearm.search.chart import Chart
 from wholearm.search.choosing import Chooser
 from wholearm.search.find import Route, Search
 from wholearm.search.places import list_formations_at, make_place
+from wholearm.search.reach import require_reach
 from wholearm.search.result import describe_block
 from wholearm.search.route import find_route
 from wholearm.search.store import load_chart, require_folder, store_chart
@@ -156,6 +157,14 @@ def test_what_blocks_is_said() -> None:
 def test_a_goal_that_holds_is_no_goal() -> None:
     with pytest.raises(InputError, match="goal: edge 0 on the palm holds already"):
         find_route(read({"flush": 0}))
+
+
+def test_a_goal_out_of_the_hand_s_reach_is_refused_without_a_search() -> None:
+    scene, near = problem_of(HEPTAGON).scene, float(problem_of(HEPTAGON).start[2])
+    for goal in (Goal(flush=1, x=0.02), Goal(phi=-0.9, x=0.0), Goal(flush=3)):
+        require_reach(scene, goal, near)
+    with pytest.raises(InfeasibleError, match=r"finger 2 is too short there; .* closes for x from"):
+        find_route(read({"flush": 1, "x": 0.9}))
 
 
 def test_ctrl_c_ends_a_search_that_has_an_answer() -> None:

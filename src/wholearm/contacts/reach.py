@@ -29,9 +29,9 @@ def name_reach(scene: Scene, phi: float) -> str:
         if end - first > 1
     ]
     if not spans:
-        return "the hand closes at no x there"
+        return "at that angle the hand closes at no x"
     every = " and ".join(f"from {first:g} to {last:g}" for first, last in spans)
-    return f"the hand closes for x {every}"
+    return f"at that angle the hand closes for x {every}"
 
 
 def _round(low: float, high: float) -> tuple[float, float]:

@@ -25,6 +25,7 @@ from .find import Route, Search
 from .goals import is_at
 from .opening import explain, find_opening
 from .places import make_place
+from .reach import require_reach
 from .result import Alternative, Answer, describe_block
 from .store import load_chart, require_folder, store_chart
 
@@ -100,6 +101,7 @@ def find_route_with(
         if is_at(place, goal):
             key = name_goal(problem.goals, index, problem.table)
             raise InputError(problem.source, key, f"{goal} holds already where the motion starts")
+        require_reach(problem.scene, goal, float(start[2]))
         search = Search(chart, place, goal)
         wanted = alternatives if index + 1 == len(problem.goals) else 0
         answer = _choose(problem, before, search, options, wanted, report, jobs)
