@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from wholearm.search.measure import Measured
-from wholearm.search.polishing import FINEST, Found, Leaving, Way
+from wholearm.search.polishing import FINEST, STEPS, Found, Leaving, Way
 
 
 def plan_of(duration: float) -> Measured:
@@ -40,11 +40,14 @@ def test_a_border_is_left_where_that_is_best(best: int, end: int) -> None:
     assert Way(0) not in cell.tried
 
 
-def test_a_border_that_is_better_left_in_motion_is_not_left_elsewhere() -> None:
-    cell = Cell(-7, -20, moving=0.9)
-    found, other = cell.leave()
-    assert cell.tried == [Way(None)]
-    assert (found.duration, other.duration) == (0.9, 1 + 7 * FINEST)
+def test_a_border_that_no_other_place_is_better_for_may_be_left_in_motion() -> None:
+    cell = Cell(-1, -20, moving=0.9)
+    found, *others = cell.leave()
+    assert cell.tried == [Way(-STEPS[0]), Way(STEPS[0]), Way(None)]
+    assert found.duration == 0.9 and len(others) == 3
+    # Where another place is better, that is gone on with.
+    other = Cell(-7, -20, moving=0.9)
+    assert other.leave()[0].duration == pytest.approx(1) and Way(None) not in other.tried
 
 
 def test_another_guess_goes_on_from_the_best_place() -> None:

@@ -149,8 +149,11 @@ class Leaving:
 
     def run(self) -> list[Measured]:
         """The best way, and others."""
-        if not self._take(Way(None)):
-            here = self._move(Way(0), STEPS)
+        here = self._move(Way(0), STEPS[:1])
+        # The planner chooses the place of a border that is left in motion: there it may be better
+        # where no other place is.
+        if here.move or not self._take(Way(None)):
+            here = self._move(here, STEPS[1:])
             if self._take(here._replace(straight=False)):
                 self._move(here._replace(straight=False), STEPS[1:])
         return [self.best, *self._others]
