@@ -18,7 +18,7 @@ from wholearm.search.times import time_borders
 
 def look(curve: Curve, epsilon: float) -> float:
     try:
-        return look_along((curve,), epsilon, 100).duration
+        return look_along((curve,), epsilon, 100)
     except NoMotionError:
         return math.inf
 

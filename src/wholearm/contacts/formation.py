@@ -228,16 +228,17 @@ class Formation(Keeper):
 def find_touching(scene: Scene, z: Array) -> tuple[Contact, ...]:
     """Return the contacts that touch at `z`, in the order palm, finger 1, finger 2."""
     candidates, function = _CLEARANCES(scene)
-    values = function(z).full()[:, 0]
+    values = function(z[None])[0][0, :, 0]
     near = np.abs(values) < scene.touching
     return tuple(c for c, touches in zip(candidates, near, strict=True) if touches)
 
 
-def _build_clearances(scene: Scene) -> tuple[tuple[Contact, ...], Expression]:
+def _build_clearances(scene: Scene) -> tuple[tuple[Contact, ...], Batch]:
     """Every contact that a scene's object can have, and a function z -> their clearances [m]."""
     candidates = tuple(c for part in (None, 0, 1) for c in candidate_contacts(scene, part))
     values = ca.vertcat(*(build_clearance(c, scene, touching=False).value for c in candidates))
-    return candidates, ca.Function("clearances", [build_features(scene).z], [ca.densify(values)])
+    function = ca.Function("clearances", [build_features(scene).z], [ca.densify(values)])
+    return candidates, Batch(function)
 
 
 _CLEARANCES = Store(_build_clearances, lambda scene: scene.shape)

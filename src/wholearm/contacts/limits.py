@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import casadi as ca
 
+from ..common.sharing import Store
 from ..scene.model import Scene
 from .elemental import Contact, GapLimit, build_features, build_gap, candidate_contacts
 from .links import build_finger_limit
@@ -18,7 +19,8 @@ from .obstacles import build_obstacles, face
 
 def list_limits(scene: Scene, contacts: Sequence[Contact]) -> list[GapLimit]:
     """Return every limit of a formation: of its contacts, of other features, and of the links."""
-    limits = [limit for contact in contacts for limit in build_limits(contact, scene)]
+    known = _KNOWN(scene)
+    limits = [limit for contact in contacts for limit in known.find_limits(contact, scene)]
     for finger in (None, 0, 1):
         held = [contact for contact in contacts if contact.finger == finger]
         clearances = _list_clearances(scene, finger, held)
@@ -48,8 +50,32 @@ def _list_clearances(scene: Scene, finger: int | None, held: Sequence[Contact]) 
             continue
         if tips and not on_side and (on_tip or contact.index not in behind):
             continue
-        limits.append(build_clearance(contact, scene, bool(on_side)))
+        limits.append(_KNOWN(scene).find_clearance(contact, scene, bool(on_side)))
     return limits
+
+
+class _Known:
+    """Limits of single contacts, which formations of scenes of one shape have in common."""
+
+    def __init__(self, _: Scene) -> None:
+        self._limits: dict[Contact, list[GapLimit]] = {}
+        self._clearances: dict[tuple[Contact, bool], GapLimit] = {}
+
+    def find_limits(self, contact: Contact, scene: Scene) -> list[GapLimit]:
+        """See `build_limits`."""
+        if contact not in self._limits:
+            self._limits[contact] = build_limits(contact, scene)
+        return self._limits[contact]
+
+    def find_clearance(self, contact: Contact, scene: Scene, touching: bool) -> GapLimit:
+        """See `build_clearance`."""
+        key = contact, touching
+        if key not in self._clearances:
+            self._clearances[key] = build_clearance(contact, scene, touching)
+        return self._clearances[key]
+
+
+_KNOWN = Store(_Known, lambda scene: scene.shape)
 
 
 def build_limits(contact: Contact, scene: Scene) -> list[GapLimit]:

@@ -57,6 +57,6 @@ def look_ahead(
 def _sketch(phase: Phase, z: Array, epsilon: float) -> float:
     """About the least time of a phase along its curve from `z` [s]."""
     try:
-        return look_along((trace_phase(phase, z),), epsilon, SKETCH).duration
+        return look_along((trace_phase(phase, z),), epsilon, SKETCH)
     except NoMotionError:
         raise SolverError(f"phase {phase.number}: no motion keeps the limits") from None

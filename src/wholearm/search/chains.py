@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..contacts.formation import Formation
-from ..planning.path_domain.impact_sequence import compute_curve_impact
+from ..mechanics.metric import metric_weights
+from ..planning.path_domain.impact_sequence import BEND, compute_curve_impact
 from ..problem.definition import End, Phase, Until
 from .links import Blocked, Border, Link, Step, link_along
 from .places import Place, make_place
@@ -55,7 +56,8 @@ class Chain:
         last, gained = self.borders[-1], self.borders[-1].gained
         if not self.can_enter(following.formation):
             return None
-        for end in (End.SMOOTH, End.IMPACT):
+        ends = (End.SMOOTH, End.IMPACT) if _goes_on(last, following) else (End.IMPACT,)
+        for end in ends:
             phase = Phase(0, last.formation, Until(contact=gained), end)
             join = compute_curve_impact(phase, last.curve, following.curve)
             if join.possible and np.isfinite(join.ratio):
@@ -77,3 +79,12 @@ class Chain:
             return None
         step = Step(last.formation.contacts, Until(contact=last.gained))
         return self.link(step, last, make_place(last.formation.scene, last.curve.end))
+
+
+def _goes_on(before: Border, after: Border) -> bool:
+    """Whether a border goes on about along the tangent of the one before."""
+    metric, ends = metric_weights(after.formation.scene), np.array([before.curve.length, 0.0])
+    (v,), (heading,) = (
+        own.curve.interpolate(s[None])[1] for own, s in zip((before, after), ends, strict=True)
+    )
+    return bool(v * metric @ heading > 1 - 2 * BEND)

@@ -16,9 +16,8 @@ from ..geometry.arcs import find_on, join, take
 from ..geometry.curve import Curve
 from ..geometry.tracing import HELD, trace_curve
 from ..mechanics.metric import metric_weights
-from ..planning.lower_bound.lower_bound import look_along
+from ..planning.lower_bound.lower_bound import bound_roughly
 from ..planning.lower_bound.rows import Rows, evaluate_rows
-from ..planning.lower_bound.sweep import NoMotionError
 from ..problem.definition import End, Until
 from .ground import INTERVALS, Ground, Unstopped, sketch, survey
 from .places import Place, make_place
@@ -85,10 +84,7 @@ class Link:
             return 0.0
         own = zip(self.borders, self.ratios, strict=True)
         curves = [border.curve.with_speed_ratio(ratio) for border, ratio in own]
-        try:
-            return look_along(curves, self.borders[0].terms.epsilon, INTERVALS).bound
-        except NoMotionError:
-            return 0.0
+        return bound_roughly(curves, self.borders[0].terms.epsilon, INTERVALS)
 
     @property
     def signature(self) -> tuple[tuple[str, ...], ...]:

@@ -92,7 +92,7 @@ def measure_link(
         own = replace(problem, goals=(), phases=tuple(phases))
         if len(phases) > 1 and phases[0].end is End.REST:
             curve = trace_phase(phases[0], z)
-            spent = look_along((curve,), problem.epsilon, INTERVALS).duration
+            spent = look_along((curve,), problem.epsilon, INTERVALS)
             z, phases = curve.end, phases[1:]
         goal = settle(link.stop) if len(phases) == 1 else None
         if goal is None:

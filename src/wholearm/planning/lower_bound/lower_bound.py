@@ -8,8 +8,6 @@ order only, and never to whether the bound is one. What has an error is the quad
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -52,32 +50,6 @@ class LowerBound(NamedTuple):
     error: float
 
 
-@dataclass(frozen=True, eq=False)
-class Outlook:
-    """About how long the fastest motion along curves takes, and a lower bound of it.
-
-    Attributes
-    ----------
-    way : Way
-    grid : Grid
-        A coarse one.
-    duration : float, [s]
-        Of a motion that keeps the limits at one place of each interval of it.
-    """
-
-    way: Way
-    grid: Grid
-    duration: float
-
-    @cached_property
-    def bound(self) -> float:
-        """The lower bound on that grid [s], zero where no motion is found on it."""
-        try:
-            return _bound(self.way, self.grid, None).bound.value
-        except NoMotionError:
-            return 0.0
-
-
 class _Round(NamedTuple):
     """The bound on a grid, what each interval may lose, (N,) [s], and the motion it is from."""
 
@@ -105,8 +77,22 @@ def bound_least_time(curves: Sequence[Curve], epsilon: float) -> LowerBound | No
     return None
 
 
-def look_along(curves: Sequence[Curve], epsilon: float, intervals: int) -> Outlook:
-    """Look at the fastest motion along curves on one coarse grid; see `bound_least_time`.
+def bound_roughly(curves: Sequence[Curve], epsilon: float, intervals: int) -> float:
+    """Bound the time of motions along curves from below on one coarse grid; see `bound_least_time`.
+
+    Zero where no motion is found on that grid.
+    """
+    way = Way(curves, epsilon)
+    try:
+        return _bound(way, way.make_grid(intervals), None).bound.value
+    except NoMotionError:
+        return 0.0
+
+
+def look_along(curves: Sequence[Curve], epsilon: float, intervals: int) -> float:
+    """About how long the fastest motion along curves takes, from rest to rest [s].
+
+    It keeps the limits at one place of each interval of a coarse grid; see `bound_least_time`.
 
     Raises
     ------
@@ -123,7 +109,7 @@ def look_along(curves: Sequence[Curve], epsilon: float, intervals: int) -> Outlo
         cap = _join_caps(*way.evaluate(sides, grid.owners).cap.T)
     steps = np.diff(ends)
     motion = find_steady(rows, steps, (way.place(angles) - ends[:-1]) / steps, cap)
-    return Outlook(way, grid, add_up(motion.b, steps))
+    return add_up(motion.b, steps)
 
 
 def _join_caps(left: Array, right: Array) -> Array:

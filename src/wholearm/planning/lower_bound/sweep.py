@@ -43,8 +43,8 @@ _ROUNDING = 1e-12
 
 _SPEEDS = 4
 """Most sweeps until viscous friction is linearised about the right speed."""
-_SETTLED = 1e-6
-"""Change of b, over the largest, from which on it is."""
+_SETTLED = 2e-3
+"""Change of b, over the largest, from which on it is: the next one would be about its square."""
 
 
 class NoMotionError(ValueError):
