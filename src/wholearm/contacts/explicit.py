@@ -11,6 +11,7 @@ A label is three indices into `closing.contact_table`: with the palm, with finge
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -50,8 +51,8 @@ class _Touch(NamedTuple):
         Which of the poses.
     kind : int
     arm, corner, outward : ndarray, shape (n, 2)
-        The vertex from the centroid and from the joint, and the outward normal of the edge that
-        begins there.
+        The vertex from the centroid and from the joint; for an edge, the one where it begins, and
+        its outward normal.
     """
 
     rows: Numbers
@@ -188,20 +189,28 @@ def _bend(
 def _list_touches(scene: Scene, finger: int, contacts: Numbers, z: Array) -> Iterator[_Touch]:
     kinds, indices = np.divmod(contacts - first_contact(scene, finger), scene.polygon.n_vertices)
     body, base = scene.polygon.vertices, np.asarray(scene.fingers[finger].base)
-    run = np.roll(body, -1, axis=0) - body
-    outward = -_quarter(run / np.hypot(*run.T)[:, None])
     for kind in (SIDE, EDGE, ARC):
         rows = np.flatnonzero(kinds == kind)
         if len(rows):
-            index, phi = indices[rows], z[rows, 2]
-            arm = _turn(body[index], phi)
-            yield _Touch(rows, kind, arm, arm + z[rows, :2] - base, _turn(outward[index], phi))
+            index, at = indices[rows], z[rows]
+            arm = _turn(body[index], at[:, 2])
+            outward = _turn(_list_normals(scene)[index], at[:, 2]) if kind == EDGE else arm
+            yield _Touch(rows, kind, arm, arm + at[:, :2] - base, outward)
+
+
+@lru_cache(maxsize=8)
+def _list_normals(scene: Scene) -> Array:
+    """Outward normals of the edges of the object, in its own frame, shape (n_v, 2)."""
+    run = np.roll(scene.polygon.vertices, -1, axis=0) - scene.polygon.vertices
+    return -_quarter(run / np.hypot(*run.T)[:, None])
 
 
 def _turn(vectors: Array, phi: Array) -> Array:
     c, s = np.cos(phi), np.sin(phi)
-    x, y = vectors.T
-    return np.column_stack([c * x - s * y, s * x + c * y])
+    turned = np.empty_like(vectors)
+    turned[:, 0] = c * vectors[:, 0] - s * vectors[:, 1]
+    turned[:, 1] = s * vectors[:, 0] + c * vectors[:, 1]
+    return turned
 
 
 def _heading(vectors: Array) -> Array:
@@ -210,7 +219,9 @@ def _heading(vectors: Array) -> Array:
 
 def _quarter(vectors: Array) -> Array:
     """Vectors turned by +90 degrees."""
-    return np.column_stack([-vectors[:, 1], vectors[:, 0]])
+    turned = np.empty_like(vectors)
+    turned[:, 0], turned[:, 1] = -vectors[:, 1], vectors[:, 0]
+    return turned
 
 
 def _cross(one: Array, two: Array) -> Array:

@@ -81,11 +81,13 @@ def shoot(places: Sequence[Place], epsilon: float) -> Rays:
     labels = label_cells(scene, *(starts + FIRST * ways).T)[:, [0, 2, 4]]
     kept = (labels[:, None] == cells[sources]).all(axis=2).any(axis=1)
     rays = Rays(sources, labels, labels[:, 0], starts, starts + ways).pick(kept)
-    rays, about = _look_ahead(scene, rays, held)
-    if len(about):
-        kept = can_set_out(scene, epsilon, rays.labels, rays.starts, rays.ways)
-        rays, about = rays.pick(kept), about[kept]
-    return _end(scene, rays, about) if len(about) else rays
+    ray, gained, about = _look_ahead(scene, rays, held)
+    used, ray = np.unique(ray, return_inverse=True)
+    rays = rays.pick(used)
+    if not len(used):
+        return rays
+    kept = can_set_out(scene, epsilon, rays.labels, rays.starts, rays.ways)[ray]
+    return _end(scene, rays.pick(ray[kept])._replace(gained=gained[kept]), about[kept])
 
 
 def _list_cells(places: Sequence[Place]) -> tuple[Numbers, Numbers]:
@@ -101,8 +103,8 @@ def _list_cells(places: Sequence[Place]) -> tuple[Numbers, Numbers]:
     return labels, held
 
 
-def _look_ahead(scene: Scene, rays: Rays, held: Numbers) -> tuple[Rays, Array]:
-    """Rays once for each contact that they may gain, and about where [-].
+def _look_ahead(scene: Scene, rays: Rays, held: Numbers) -> tuple[Numbers, Numbers, Array]:
+    """Contacts that rays may gain: which rays, the contacts, and about where [-], shape (k,).
 
     As the nearest place of the grid may be in another cell, contacts that come into view at the
     first few places outside of the ray's cell all count.
@@ -123,7 +125,7 @@ def _look_ahead(scene: Scene, rays: Rays, held: Numbers) -> tuple[Rays, Array]:
     ray, step = ray[entry], step[entry]
     gained = grid.labels[seen[ray, step], part]
     _, once = np.unique(ray * len(contact_table(scene)) + gained, return_index=True)
-    return rays.pick(ray[once])._replace(gained=gained[once]), np.asarray(away[step[once]])
+    return ray[once], gained[once], np.asarray(away[step[once]])
 
 
 def _end(scene: Scene, rays: Rays, about: Array) -> Rays:

@@ -7,14 +7,16 @@ with palm and fingers, so that ways through different ones are looked at togethe
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from ..common.arrays import Array
-from ..contacts.closing import Flags, Numbers, contact_table
+from ..contacts.closing import Flags, Numbers, contact_table, first_contact
 from ..contacts.explicit import move
 from ..contacts.formation import Formation
 from ..mechanics.dynamics import Directions, force_rows, inverse
-from ..mechanics.limits import make_limits
+from ..mechanics.limits import LimitSet, make_limits
 from ..planning.lower_bound.rows import Rows, limit
 from ..scene.model import Scene
 from .sweep import find_durations
@@ -66,9 +68,7 @@ def time_ways(scene: Scene, epsilon: float, labels: Numbers, starts: Array, ends
 
 def _evaluate(scene: Scene, epsilon: float, labels: Numbers, poses: Array, ways: Array) -> Rows:
     """Limits at n places of straight ways, as what they are of acceleration and speed."""
-    at = move(scene, labels, poses, ways)
-    # Three contacts have the same limits wherever they are on palm and fingers.
-    formation = Formation(scene, tuple(contact_table(scene)[k] for k in labels[0]))
+    at, (formation, limits) = move(scene, labels, poses, ways), _make_limits(scene, epsilon)
     directions, kinematics = Directions.of(at.kinematics, at.z_u), at.kinematics
     try:
         forces = inverse(formation, at.z, at.z_u, at.z_uu, directions, kinematics)
@@ -77,8 +77,16 @@ def _evaluate(scene: Scene, epsilon: float, labels: Numbers, poses: Array, ways:
         unheld = np.equal(np.linalg.det(wrenches), 0.0).reshape(-1, 1, 1)
         kinematics = kinematics._replace(A=np.where(unheld, np.nan, kinematics.A))
         forces = inverse(formation, at.z, at.z_u, at.z_uu, directions, kinematics)
-    rows = limit(make_limits(formation, epsilon), forces, at.z_u[:, 3:])
+    rows = limit(limits, forces, at.z_u[:, 3:])
     # Three contacts that do not hold the object let nothing through.
     held = np.asarray(np.isfinite(rows.a + rows.b + rows.v + rows.one).all(axis=1))[:, None]
     a, b, v = (np.where(held, part, 0.0) for part in (rows.a, rows.b, rows.v))
     return Rows(a, b, v, np.where(held, rows.one, -1.0), np.where(held[:, 0], rows.cap, 0.0))
+
+
+@lru_cache(maxsize=8)
+def _make_limits(scene: Scene, epsilon: float) -> tuple[Formation, LimitSet]:
+    """Three contacts that slide, and their limits: the same wherever on palm and fingers."""
+    some = (0, first_contact(scene, 0), first_contact(scene, 1))
+    formation = Formation(scene, tuple(contact_table(scene)[k] for k in some))
+    return formation, make_limits(formation, epsilon)
