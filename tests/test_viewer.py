@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -226,6 +227,13 @@ def test_a_gallery_shows_every_problem(tmp_path: Path, capsys: pytest.CaptureFix
     for name in re.findall(r"\]\((.*?)\)", text):
         assert (tmp_path / name).stat().st_size < 1_000_000
     assert len(list((tmp_path / "gallery").iterdir())) == 2
+
+
+def test_a_report_needs_no_matplotlib() -> None:
+    # That alone would take as long as the map.
+    told = "import sys, wholearm.viewer.report; print({'matplotlib', 'scipy'} & {*sys.modules})"
+    done = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == "set()", done.stdout + done.stderr
 
 
 def test_a_report_holds_what_was_given(tmp_path: Path) -> None:

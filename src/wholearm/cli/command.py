@@ -35,7 +35,7 @@ from .new import add_new, add_schema
 from .overlay import overlay
 from .policy import add_policy
 from .predict import predict
-from .progress import clear_progress, show_progress
+from .progress import announce, clear_progress, show_progress
 from .robustness import add_robustness
 from .route import add_route, find, route
 from .tune import tune
@@ -256,6 +256,7 @@ def _verify(options: argparse.Namespace) -> int:
         rate = {} if options.restitution is None else {"restitution": options.restitution}
         report: Report | FreeReport = _simulate_free(options, problem, torques, {**given, **rate})
     else:
+        announce(f"replaying {len(problem.phases)} phases")
         report = verify(problem, torques, reduced=options.reduced, **given)
     clear_progress()
     if options.output is not None:

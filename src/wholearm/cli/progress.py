@@ -17,6 +17,13 @@ def show_progress() -> Callable[[str], None] | None:
     return show
 
 
+def announce(text: str) -> None:
+    """Show one progress line, if anybody sees it."""
+    show = show_progress()
+    if show is not None:
+        show(text)
+
+
 def clear_progress() -> None:
     """Remove the progress line."""
     if sys.stderr.isatty():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from ..common.files import make_folder, write_text
 from ..figures import plots
@@ -38,7 +39,8 @@ def write_gallery(
     for path in paths:
         name = os.path.splitext(os.path.basename(path))[0]
         progress(name)
-        plan = solve(load(path))
+        plan = solve(load(path), progress=partial(_say, progress, name))
+        progress(f"{name}: figure and movie")
         _draw(plan, os.path.join(folder, name))
         rows.append(_list_figures(name, plan))
         place = f"{os.path.basename(folder)}/{name}"
@@ -49,6 +51,10 @@ def write_gallery(
         "cones, and torques as arcs at the joints."
     )
     write_text(page, "\n\n".join(["# Gallery", text, "\n".join(rows), *pictures]) + "\n")
+
+
+def _say(progress: Callable[[str], None], name: str, text: str) -> None:
+    progress(f"{name}: {text}")
 
 
 def _draw(plan: Plan, stem: str) -> None:
