@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -11,10 +12,12 @@ from plane import make_formation, measure_gaps
 from planned import plan_landing
 from shipped import HEPTAGON, problem_of
 from timed import landing
-from wholearm.common.errors import InputError
+from wholearm.common.errors import InfeasibleError, InputError
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
+from wholearm.planning.time_domain.pinning import Approach, refuse_pinned
 from wholearm.planning.time_domain.plan import try_phases
+from wholearm.planning.time_domain.search import Search, Solution
 from wholearm.problem.definition import Problem
 from wholearm.simulation.simulate import simulate
 from wholearm.verification.verdict import Allowance, describe_ends
@@ -31,7 +34,7 @@ def pin(problem: Problem, index: int, *pins: tuple[str, float]) -> Problem:
 
 
 def test_a_landing_comes_to_rest_where_it_is_pinned() -> None:
-    """Also beside the end that is the fastest, and far from the nearest."""
+    """Also beside the end that is the fastest, and far from the nearest; or it is said why not."""
     problem = pin(landing(), 5, ("x", 0.0195))
     start = trace_phases(problem)[-1].end
     options = PlanOptions(time_intervals=5, mode_search=False)
@@ -46,6 +49,14 @@ def test_a_landing_comes_to_rest_where_it_is_pinned() -> None:
         problem.scene, " ".join([*problem.phases[5].formation.names, "v2-palm"])
     )
     assert np.abs(measure_gaps(formation, end.z)).max() < 1e-6 * size
+    # Much nearer to where the flip starts torques would have to be larger.
+    short, solution = pin(landing(), 5, ("x", 0.0145)), plans[0].solution
+    assert isinstance(solution, Solution)
+    search = Search.of(short, options, None, None, math.inf, True)
+    ends = {stage.phase: stage.guess.nodes[-1, 0] for stage in solution.stages}
+    with pytest.raises(InfeasibleError, match=r"ends at x = 19.5 mm, .* at the nearest") as own:
+        refuse_pinned(search, short, short.phases[4:], Approach(None, solution, ends, 0.0))
+    assert {lack.part for lack in own.value.shortfalls} & {"finger 1", "finger 2"}
 
 
 def test_with_one_freedom_pins_have_to_agree_with_the_curve() -> None:

@@ -6,15 +6,20 @@ anywhere is soon found. In steps that are as long as the solver can follow its e
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, islice
+from types import MappingProxyType
+from typing import NamedTuple
 
 from ...common.arrays import Array
-from ...common.errors import InputError
+from ...common.errors import InfeasibleError, InputError
+from ...geometry.curve import describe_pose
 from ...problem.definition import ROWS, Phase, Problem
+from ..advice import describe_shortfalls, name_phases, rank_shortfalls
 from .attempts import Attempt, Attempts, solve_attempt
 from .mode_search import improve
+from .own_units import to_si
 from .search import Search, Solution
 from .stage import Stage
 
@@ -24,11 +29,32 @@ FURTHER = 4
 """Guesses, beyond the first one, from which such a plan is looked for."""
 SHORTEST = 1 / 16
 """Shortest step of the end, over its whole way."""
+NEARER = (0.3, 0.1)
+"""Shares of the way that is left, after which it is asked what motions are short of."""
 
 
-def approach(
-    search: Search, problem: Problem, phases: Sequence[Phase], z: Array
-) -> Solution | None:
+class Approach(NamedTuple):
+    """What moving ends to where they are pinned has led to.
+
+    Attributes
+    ----------
+    solution : Solution or None
+        A plan that ends there; None where nothing is pinned, or the place is not reached so.
+    nearest : Solution or None
+        Otherwise the plan that comes nearest to it, if there is any.
+    ends : dict
+        Where each phase ended at first, by its index.
+    share : float
+        How far the nearest plan has moved from there.
+    """
+
+    solution: Solution | None = None
+    nearest: Solution | None = None
+    ends: Mapping[int, Array] = MappingProxyType({})
+    share: float = 0.0
+
+
+def approach(search: Search, problem: Problem, phases: Sequence[Phase], z: Array) -> Approach:
     """Plan phases with ends that are left open, then move these to where they are pinned.
 
     Parameters
@@ -38,18 +64,14 @@ def approach(
     problem : Problem
     phases, z : sequence of Phase, ndarray of shape (5,)
         Planned as one, from `z`.
-
-    Returns
-    -------
-    Solution, or None where nothing is pinned, or the place is not reached so.
     """
     free = [_set_free(phase) for phase in phases]
     if all(own is phase for own, phase in zip(free, phases, strict=True)):
-        return None
+        return Approach()
     every = [_set_free(phase) for phase in problem.phases]
     begun = _begin(search, replace(problem, phases=tuple(every)), free, z)
     if begun is None:
-        return None
+        return Approach()
     ends = {stage.phase: stage.guess.nodes[-1, 0] for stage in begun.stages}
     solution, reached, step = begun, 0.0, 1.0
     while reached < 1.0:
@@ -60,12 +82,44 @@ def approach(
             plain = share == 1.0 or not search.options.mode_search
             solution, reached = moved if plain else improve(search, moved), share
         elif (step := step / 4) < SHORTEST:
-            return None
+            return Approach(None, solution, ends, reached)
     if search.only_begins:
-        return solution
+        return Approach(solution)
     halvings = Attempts(problem, phases, z, search, None, False).first.halvings
     last = solve_attempt(search, Attempt(MOVED, halvings, solution.stages, before=solution))
-    return last if last.success else None
+    return Approach(last) if last.success else Approach(None, solution, ends, reached)
+
+
+def refuse_pinned(
+    search: Search, problem: Problem, phases: Sequence[Phase], found: Approach
+) -> None:
+    """Raise an error on what motions are short of whose ends are moved on to where they are pinned.
+
+    Where none is found that ends there, one that ends nearer to it than any plan says why.
+
+    Raises
+    ------
+    InfeasibleError
+        With the limits that are missed, and where the motion ends.
+    """
+    from .explain import list_shortfalls, solve_elastic
+
+    if found.nearest is None:
+        return
+    for part in (1.0, *NEARER):
+        share = found.share + part * (1.0 - found.share)
+        stages = [_pin(search, own, found.ends[own.phase], share) for own in found.nearest.stages]
+        elastic = solve_elastic(search, stages)
+        ranked = rank_shortfalls(list_shortfalls(problem, elastic or [], search.scheme))
+        if ranked and elastic:
+            lasts = (to_si(own[-1], problem) for own in (found.nearest.stages, elastic))
+            ends = [describe_pose(own.guess.nodes[-1, 0]) for own in lasts]
+            text = name_phases([phase.number for phase in phases], "infeasible")
+            raise InfeasibleError(
+                f"{text}: a plan ends at {ends[0]} at the nearest, and at {ends[1]} "
+                f"{describe_shortfalls(ranked)}",
+                ranked,
+            )
 
 
 def _begin(search: Search, free: Problem, phases: Sequence[Phase], z: Array) -> Solution | None:

@@ -31,7 +31,7 @@ from .mesh import resample
 from .modes import LEAST_INTERVALS
 from .motion import TimeMotion
 from .phase_plans import list_plans
-from .pinning import MOVED, approach
+from .pinning import MOVED, Approach, approach, refuse_pinned
 from .refinement import halve
 from .search import Search, Solution
 from .stage import Stage
@@ -100,11 +100,12 @@ def plan_phases(
     if known is not None:
         return list_plans(problem, search, phases, known, begun[0].attempt)
     first, name = _begin(search, attempts.first, fastest, pinned)
-    if not first.success and (moved := approach(search, problem, phases, z)) is not None:
-        first, name = moved, MOVED
     if first.success:
         return list_plans(problem, search, phases, first, name)
-    return _look_further(search, attempts, problem, phases, first, explained)
+    moved = approach(search, problem, phases, z)
+    if moved.solution is not None:
+        return list_plans(problem, search, phases, moved.solution, MOVED)
+    return _look_further(search, attempts, problem, phases, first, moved, explained)
 
 
 def try_phases(
@@ -143,7 +144,7 @@ def try_phases(
         solution = solve_attempt(search, attempt)
         if solution.success:
             return _list_begun(problem, search, phases, solution, attempt.name, options)
-    moved = None if hurried else approach(search, problem, phases, z)
+    moved = None if hurried else approach(search, problem, phases, z).solution
     return moved and _list_begun(problem, search, phases, moved, MOVED, options)
 
 
@@ -166,6 +167,7 @@ def _look_further(
     problem: Problem,
     phases: Sequence[Phase],
     first: Solution,
+    moved: Approach,
     explained: bool,
 ) -> list[PhasePlan[TimeMotion]]:
     """Make further attempts where the first one has led nowhere, or say why there is no plan."""
@@ -180,6 +182,8 @@ def _look_further(
     *_, last = outcomes = _try_all(search, problem, attempts, first)
     if last.solution.success:
         return list_plans(problem, search, phases, last.solution, last.name)
+    if not any(own.short for own in outcomes):
+        refuse_pinned(search, problem, phases, moved)
     raise _explain(search, problem, attempts, outcomes, replan if explained else None)
 
 
