@@ -3,6 +3,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable
 
@@ -11,7 +12,7 @@ import pytest
 from wholearm.common.workers import can_fork, count_cores, share
 
 PARENT = os.getpid()
-needs_fork = pytest.mark.skipif(os.name != "posix", reason="processes are forked on POSIX")
+needs_fork = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux")
 
 
 class Meeting:

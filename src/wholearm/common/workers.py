@@ -46,9 +46,9 @@ def count_cores() -> int:
 def share(tasks: Sequence[Task[_T]], jobs: int, known: Sequence[object] = ()) -> list[_T]:
     """Results of tasks, in their order.
 
-    Processes are forked on POSIX alone, where this one may have children and no other thread could
-    be in the middle of something. Otherwise, and for tasks inside of tasks, one is done after the
-    other.
+    Processes are forked on Linux alone, where libraries bear it, if this one may have children and
+    no other thread could be in the middle of something. Otherwise, and for tasks inside of tasks,
+    one is done after the other.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def can_fork() -> bool:
     """Whether this process may have children that go on from where it is."""
     mine = (threading.current_thread().name, WATCHER)
     return (
-        os.name == "posix"
+        sys.platform == "linux"
         and not mp.current_process().daemon
         and all(thread.name in mine for thread in threading.enumerate())
     )
@@ -115,7 +115,7 @@ def _start(tasks: Sequence[Task[Any]], source: int, numbers: dict[int, int]) -> 
     """Fork a child that takes tasks."""
     context = mp.get_context("fork")
     answers, far = context.Pipe(duplex=False)
-    given = tasks, source, far, numbers, os.getpid()
+    given = tasks, source, (answers, far), numbers, os.getpid()
     process = context.Process(target=_serve, args=given, daemon=True)
     # No signal may meet the child before it has said what it does about it.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
@@ -131,7 +131,11 @@ def _start(tasks: Sequence[Task[Any]], source: int, numbers: dict[int, int]) -> 
 
 
 def _serve(
-    tasks: Sequence[Task[Any]], source: int, far: Connection, numbers: dict[int, int], parent: int
+    tasks: Sequence[Task[Any]],
+    source: int,
+    ends: tuple[Connection, Connection],
+    numbers: dict[int, int],
+    parent: int,
 ) -> None:
     """Take tasks for as long as there are any, and send what has come of them."""
     # The parent alone answers an interrupt, and ends its children.
@@ -139,6 +143,9 @@ def _serve(
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
+    near, far = ends
+    # Nobody would read what is sent if the parent were gone.
+    near.close()
     # What there is by now is not looked at for garbage, which would copy its pages.
     gc.freeze()
     results = _take(tasks, source, parent)
