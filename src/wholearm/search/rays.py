@@ -20,7 +20,7 @@ from ..mapping.borders import NOWHERE, label_cells
 from ..scene.model import Scene
 from .label_map import AROUND, map_labels
 from .places import Place, list_formations_at, unit_steps
-from .ways import can_set_out, list_middles
+from .ways import MIDDLES, can_set_out, list_middles
 
 HEADINGS = 36
 """Ways in which motions may set out from a place."""
@@ -136,7 +136,7 @@ def _end(scene: Scene, rays: Rays, about: Array) -> Rays:
     rays, end = rays.pick(kept), end[kept, None]
     before, after = (rays.starts + (end + aside) * rays.ways for aside in (-BESIDE / 2, BESIDE / 2))
     rays = rays._replace(ends=before)
-    return rays.pick(_is_inside(scene, rays, after))
+    return rays.pick(_is_inside(scene, rays, end, after))
 
 
 def _find_root(scene: Scene, rays: Rays, places: Array) -> Array:
@@ -175,18 +175,21 @@ def _interpolate(s: Array, f: Array, left: Array, right: Array) -> Array:
         return np.asarray(np.where((root >= left) & (root <= right), root, (left + right) / 2))
 
 
-def _is_inside(scene: Scene, rays: Rays, after: Array) -> Flags:
-    """Whether rays are in their cells up to their ends, and gain what they should right after."""
-    every = np.arange(len(after))
-    middles = list_middles(rays.starts, rays.ends).reshape(-1, 2)
-    rows = np.repeat(every, len(middles) // max(len(after), 1))
-    grid = map_labels(scene)
-    unsure = grid.look_up(middles) != grid.find(rays.labels)[rows]
-    rows = np.concatenate([rows[unsure], every, every])
+def _is_inside(scene: Scene, rays: Rays, end: Array, after: Array) -> Flags:
+    """Whether rays are in their cells up to their ends, and gain what they should right after.
+
+    Next to their ends, which are looked at closely, nothing else is looked for.
+    """
+    every, grid = np.arange(len(after)), map_labels(scene)
+    poses = list_middles(rays.starts, rays.ends)
+    away = end * np.minimum(MIDDLES, 1 - MIDDLES)
+    unsure = grid.look_up(poses) != grid.find(rays.labels)[:, None]
+    row, step = np.nonzero(unsure & (away > SPACING / 2))
+    rows = np.concatenate([row, every, every])
     expected = rays.labels[rows]
     part = _list_parts(scene)[rays.gained]
     expected[len(rows) - len(after) + every, part] = rays.gained
-    poses = np.concatenate([middles[unsure], rays.ends, after])
+    poses = np.concatenate([poses[row, step], rays.ends, after])
     wrong = (label_cells(scene, *poses.T)[:, [0, 2, 4]] != expected).any(axis=1)
     return np.asarray(np.bincount(rows, wrong, len(after)) == 0)
 
