@@ -41,6 +41,8 @@ RESOLUTION = 90
 """Dots per inch of a movie that is 8 inches wide."""
 _REACH = 0.3
 """Length of the largest force's arrow, over the picture's."""
+_BEYOND = 1.15
+"""Length of friction cones over that of the arrows in them."""
 _TURN = 1.5 * math.pi
 """Angle of the arc of a torque at its limit."""
 
@@ -57,6 +59,9 @@ class _Scene:
         self._strongest = float(np.nanmax(strengths, initial=0.0)) or 1.0
         low, high = _measure(self._scene, trajectory.z)
         self._size = float((high - low).max())
+        fingers = [parse_contact(name, self._scene).finger for name in trajectory.contacts]
+        self._friction = np.array([self._scene.friction.of(finger) for finger in fingers])
+        low, high = self._cover_cones(low, high)
         pad = 0.05 * self._size
         axes.set(xlim=(low[0] - pad, high[0] + pad), ylim=(low[1] - pad, high[1] + pad))
         axes.set_aspect("equal")
@@ -69,8 +74,6 @@ class _Scene:
         self._bodies = self._add_bodies(axes, INK, None)
         styles = choose_styles(trajectory.contacts)
         colours = [styles[name].colour for name in trajectory.contacts]
-        fingers = [parse_contact(name, self._scene).finger for name in trajectory.contacts]
-        self._friction = np.array([self._scene.friction.of(finger) for finger in fingers])
         self._cones = [
             Polygon(np.zeros((3, 2)), fc=colour, alpha=0.2, lw=0, zorder=5) for colour in colours
         ]
@@ -93,6 +96,18 @@ class _Scene:
         """What moves, in the order of drawing."""
         forces = [*self._cones, *self._arrows, *self._dots, *self._arcs]
         return [*self._behind, *self._bodies, *forces]
+
+    def _cover_cones(self, low: Array, high: Array) -> tuple[Array, Array]:
+        """Corners of a box, moved so far that arrows and their cones are inside, too."""
+        points, normals, forces = self._pushes
+        tangents = np.stack([normals[..., 1], -normals[..., 0]], axis=-1) * self._friction[:, None]
+        strength = np.sqrt(np.hypot(forces[..., 0], forces[..., 1]) / self._strongest)
+        reach = _BEYOND * _REACH * self._size * strength[..., None]
+        ends = np.concatenate([points + reach * (normals + sign * tangents) for sign in (1, -1)])
+        every = ends[np.isfinite(ends).all(axis=-1)]
+        if not len(every):
+            return low, high
+        return np.minimum(low, every.min(axis=0)), np.maximum(high, every.max(axis=0))
 
     def _add_bodies(self, axes: Axes, ink: str, face: str | None) -> list[Polygon]:
         """Both links and the object."""
@@ -135,7 +150,7 @@ class _Scene:
             if not presses[k]:
                 continue
             cone, arrow, dot = own
-            reach = 1.15 * max(float(np.hypot(*arrows[k])), 0.03 * self._size)
+            reach = _BEYOND * max(float(np.hypot(*arrows[k])), 0.03 * self._size)
             sides = [points[k] + reach * (normals[k] + sign * tangents[k]) for sign in (1, -1)]
             cone.set_xy(np.array([points[k], *sides]))
             arrow.set_data(*_trace_arrow(points[k], arrows[k], 0.018 * self._size).T)

@@ -81,6 +81,23 @@ function measure(motion) {
 function makeScene(parent, motion) {
   const [low, high] = measure(motion);
   const size = Math.max(high[0] - low[0], high[1] - low[1]), pad = 0.06 * size;
+  let strongest = 0;
+  for (const own of motion.contacts)
+    for (const span of own.spans) for (const c of span.c) strongest = Math.max(strongest, Math.hypot(...c));
+  // Square roots: small forces are to be seen beside large ones.
+  const extend = (force) => 0.3 * size * Math.sqrt(Math.hypot(...force) / (strongest || 1));
+  // Arrows, with their cones, are in the picture too.
+  for (const own of motion.contacts)
+    for (const span of own.spans)
+      span.c.forEach((c, k) => {
+        const [nx, ny] = span.normal[k], reach = 1.15 * extend(c);
+        for (const side of [own.friction, -own.friction])
+          [nx + side * ny, ny - side * nx].forEach((way, i) => {
+            const end = span.point[k][i] + reach * way;
+            low[i] = Math.min(low[i], end);
+            high[i] = Math.max(high[i], end);
+          });
+      });
   const svg = add(parent, "svg", {
     viewBox: [low[0] - pad, -high[1] - pad, high[0] - low[0] + 2 * pad, high[1] - low[1] + 2 * pad],
     style: "max-height: 46vh", role: "img", "aria-label": "hand and object" });
@@ -111,12 +128,6 @@ function makeScene(parent, motion) {
   for (const finger of motion.fingers)
     add(world, "circle", { cx: finger.base[0], cy: finger.base[1], r: 1.3 * thin, fill: "white",
                            stroke: "#444", "stroke-width": 0.6 * thin });
-  let strongest = 0;
-  for (const own of motion.contacts)
-    for (const span of own.spans) for (const c of span.c) strongest = Math.max(strongest, Math.hypot(...c));
-  // Square roots: small forces are to be seen beside large ones.
-  const extend = (force) => 0.3 * size * Math.sqrt(Math.hypot(...force) / (strongest || 1));
-
   const pose = (parts, z) => {
     change(parts.object, { points: join(place(motion, z)) });
     motion.fingers.forEach((finger, i) => {
