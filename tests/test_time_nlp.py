@@ -305,6 +305,25 @@ def test_unknowns_are_bounded(scheme_name: str) -> None:
     np.testing.assert_array_equal(low[nlp.layouts[0].impulses], 0.0)
 
 
+@pytest.mark.parametrize("contacts", [3, 4])
+def test_where_both_joints_turn_everything_stops_and_that_is_said_once(contacts: int) -> None:
+    scheme = make_scheme("radau", 3)
+    first, second = cut(driven("radau", 3, 8, contacts), 3)
+    stopping = [replace(first, turns=(contacts, contacts + 1)), second]
+    plain, nlp = build([first, second], scheme), build(stopping, scheme)
+    added = len(nlp.rows.bounds[0]) - len(plain.rows.bounds[0])
+    assert added == 5 - contacts
+    # The motion goes on there, as it does at its end: that misses the added equations, and no more.
+    moving, before = (misses(own, packed(own, stopping))[0] for own in (nlp, plain))
+    much = 1e-2 * np.linalg.norm(first.guess.nodes[-1, 1])
+    assert 0 < (moving > much).sum() - (before > much).sum() <= added
+    # Equations keep all rates at zero: an inequality that does too would leave no interior.
+    low, high = bound_unknowns(nlp, stopping, scheme)
+    end = nlp.layouts[0].v[-1, -1, 3:]
+    assert np.isinf(low[end]).all() and np.isinf(high[end]).all()
+    assert np.isinf(nlp.rows.bounds[0][nlp.rows_of[0].senses[-1, -1]]).all()
+
+
 def test_what_two_freedoms_leave_must_not_stand_still() -> None:
     scheme = make_scheme("radau", 3)
     one, two = driven("radau", 3, 8, 4), driven("radau", 3, 8, 3)

@@ -107,7 +107,12 @@ def add_stage(
         until, N = None, tangent_basis(formation, stage.stop)
         there = rows.linear(N.shape[1], low=N.T @ stage.stop, high=N.T @ stage.stop)
         rows.add_entries(there[:, None], layout.nodes[-1, Z], N.T)
-    goal = goal_kernel(formation, until, _list_free_turns(stage), stage.gained)
+    turns, gained_softly = _list_free_turns(stage), stage.gained
+    if _stops(stage):
+        turns, gained_softly = (), None
+        N = tangent_basis(formation, stage.guess.nodes[-1, 0])
+        rows.add_entries(rows.linear(N.shape[1])[:, None], layout.nodes[-1, V], N.T)
+    goal = goal_kernel(formation, until, turns, gained_softly)
     if goal is not None:
         end = layout.nodes[-1]
         rows.add_copies(goal, goal.x.join(z=end[Z], v=end[V]), rows.nonlinear(goal.outputs))
@@ -118,18 +123,23 @@ def add_stage(
 
 
 def _list_free_turns(stage: Stage) -> tuple[int, ...]:
-    """One of each that turn together: equations said twice spoil the solver's steps.
-
-    With two freedoms two of them stop all.
-    """
+    """One of each that turn together: equations said twice spoil the solver's steps."""
     formation, end = stage.formation, stage.guess.nodes[-1, 0]
     told, found = set[int](), list[int]()
     for row in stage.turns:
         if row not in told:
             found.append(row)
             told.update(find_tied(formation, end, row))
-    freedoms = 5 - formation.n_constraints
-    return tuple(found[:freedoms] if freedoms > 1 else found)
+    return tuple(found)
+
+
+def _stops(stage: Stage) -> bool:
+    """Whether everything stops at the end of a stage: rates turn there that are not tied.
+
+    With one freedom or two these are two; one alone may have a zero of its own.
+    """
+    freedoms = 5 - stage.formation.n_constraints
+    return len(_list_free_turns(stage)) >= max(2, freedoms)
 
 
 def _collocate(
@@ -235,7 +245,7 @@ def least_senses(stage: Stage, places: Array) -> Array:
 
 def find_still(stage: Stage, last: bool) -> set[int]:
     """Rows of (contacts, joints) that stand still at the end of a stage."""
-    if last:
+    if last or _stops(stage):
         return set(range(stage.formation.n_contacts + 2))
     coming = stage.gained.rolling if stage.gained else ()
     rolls = [k for k, c in enumerate(stage.formation.contacts) if c in coming]
