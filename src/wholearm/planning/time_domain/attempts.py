@@ -12,7 +12,7 @@ from ...common.arrays import Array
 from ...geometry.cost_to_go import CostToGo
 from ...problem.definition import Phase, Problem
 from .ending import choose_end, keep_apart
-from .enforcing import DEARER, enforce_between, is_hopeless
+from .enforcing import DEARER, PATIENCE, enforce_between, is_hopeless
 from .mode_search import improve
 from .refinement import halve
 from .search import Search, Solution
@@ -211,7 +211,8 @@ def solve_attempt(search: Search, attempt: Attempt) -> Solution:
     for _ in range(attempt.halvings):
         # Modes that were found may have asked for more intervals than the guess has.
         if solution.success and sum(stage.intervals for stage in solution.stages) < wanted:
-            solution = search.solve(halve(solution.stages, search.scheme), solution)
+            finer = halve(solution.stages, search.scheme)
+            solution = search.solve(finer, solution, most=search.wait(PATIENCE))
     solution = enforce_between(search, solution) if solution.success else solution
     if solution.success and search.problem.scene.control_period:
         from .held import hold_torques

@@ -25,9 +25,9 @@ from .search import Search, Solution
 
 ROUNDS = 24
 """Most times that limits are tightened."""
-STALLED = 9
+STALLED = 5
 """Times of tightening in which it has to lead somewhere."""
-_CREEPS = 0.1
+_CREEPS = 0.3
 """Share of the miss that is left then if it does; otherwise finer intervals are tried instead."""
 REFINEMENTS = 8
 """Most times that intervals are halved because of misses."""
@@ -38,8 +38,11 @@ _USUAL = 1e-4
 """The accuracy of the default."""
 _SPARE = 0.5
 """Share of the accuracy that halving intervals is to leave."""
-_PATIENCE = 80
+PATIENCE = 80
 """Most iterations of one solve on finer intervals, that starts from a solution."""
+_VAGUE = 20.0
+"""Error of a plan from which finer intervals lead nowhere, over the accuracy, from which on it is
+no plan: that something moves the wrong way for an instant only finer intervals show."""
 _DEARER = 0.2
 """Largest relative cost increase accepted from tightening."""
 DEARER = "a plan that keeps limits between points is much dearer"
@@ -65,7 +68,7 @@ def enforce_between(search: Search, solution: Solution) -> Solution:
         checks = [check_between(*pair) for pair in zip(solution.stages, motions, strict=True)]
         monitoring = monitor_missed(solution.stages, checks)
         if monitoring is not None:
-            solution = search.solve(monitoring, solution)
+            solution = search.solve(monitoring, solution, most=search.wait(PATIENCE))
             if not solution.success:
                 return solution
             raised = [Raised.none(stage) for stage in solution.stages]
@@ -82,7 +85,7 @@ def enforce_between(search: Search, solution: Solution) -> Solution:
         if any(mine.any() for mine in times):
             refined += 1
             stages = bisect_intervals(solution.stages, search.scheme, times)
-            finer = search.solve(stages, solution, most=search.wait(_PATIENCE))
+            finer = search.solve(stages, solution, most=search.wait(PATIENCE))
             if finer.success:
                 if finer.cost - first > _COARSE * abs(first):
                     status = "a plan on finer intervals is much dearer"
@@ -90,6 +93,8 @@ def enforce_between(search: Search, solution: Solution) -> Solution:
                 solution, coarse = finer, solution.cost
                 raised = [Raised.none(stage) for stage in solution.stages]
                 continue
+            if measure_error(solution, misses, gains) > _VAGUE * search.options.accuracy:
+                return finer
             # What finer intervals do not lead to now they will not lead to later.
             refined = REFINEMENTS
         if worst <= 1:
@@ -185,6 +190,11 @@ def price_misses(solution: Solution, misses: Sequence[Limits]) -> list[Array]:
     return prices
 
 
+def measure_error(solution: Solution, misses: Sequence[Limits], gains: Sequence[Array]) -> float:
+    """What better torques would gain and misses cost in all intervals, over the cost."""
+    return float(sum(own.sum() for own in (*gains, *price_misses(solution, misses))))
+
+
 def _choose_halvings(
     search: Search,
     solution: Solution,
@@ -219,4 +229,5 @@ def _choose_halvings(
 def _halve_missed(search: Search, solution: Solution, misses: Sequence[Limits]) -> Solution:
     """Go on from a plan with twice the intervals where it misses limits, which then is less."""
     times = [miss.list_missed().astype(np.int64) for miss in misses]
-    return search.solve(bisect_intervals(solution.stages, search.scheme, times), solution)
+    stages = bisect_intervals(solution.stages, search.scheme, times)
+    return search.solve(stages, solution, most=search.wait(PATIENCE))

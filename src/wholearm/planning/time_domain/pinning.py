@@ -27,6 +27,8 @@ MOVED = "a plan that chooses where it ends"
 """Name of the guess."""
 FURTHER = 4
 """Guesses, beyond the first one, from which such a plan is looked for."""
+PATIENCE = 50
+"""Most iterations of the solver for one step."""
 SHORTEST = 1 / 16
 """Shortest step of the end, over its whole way."""
 NEARER = (0.3, 0.1)
@@ -77,7 +79,7 @@ def approach(search: Search, problem: Problem, phases: Sequence[Phase], z: Array
     while reached < 1.0:
         share = min(1.0, reached + step)
         stages = [_pin(search, stage, ends[stage.phase], share) for stage in solution.stages]
-        moved = search.solve(stages, solution)
+        moved = search.solve(stages, solution, most=search.wait(PATIENCE))
         if moved.success:
             plain = share == 1.0 or not search.options.mode_search
             solution, reached = moved if plain else improve(search, moved), share
