@@ -220,40 +220,49 @@ def find_nearby(scene: Scene, finger: int, x: Array, y: Array, phi: Array) -> tu
     clear : ndarray of bool, shape (n,)
         Whether this holds: the joint is outside of the object and not above any of it.
     """
-    link, polygon = scene.fingers[finger], scene.polygon
-    body, count, radius = polygon.vertices, polygon.n_vertices, link.radius
-    run = np.roll(body, -1, axis=0) - body
-    size = np.hypot(run[:, 0], run[:, 1])
-    along = run / size[:, None]
-    outward = np.column_stack([along[:, 1], -along[:, 0]])
+    link, body = scene.fingers[finger], scene.polygon.vertices
+    count, radius = len(body), link.radius
+    size, along, outward, starts, offsets = _list_edges(scene)
+    before, after = (np.arange(count) - 1) % count, (np.arange(count) + 1) % count
     c, s = np.cos(phi), np.sin(phi)
     across, up = np.asarray(link.base)
     dx, dy = across - x, up - y
     joint = np.column_stack([c * dx + s * dy, c * dy - s * dx])
-    height = joint @ outward.T - (outward * body).sum(axis=1)
+    height = joint @ outward.T - offsets
     seen = height > radius
     lowest = (np.column_stack([s, c]) @ body.T).min(axis=1) - dy
     clear = seen.any(axis=1) & (lowest > -LEVEL * link.length) & (link.length > radius)
     # Finger 1 comes to the end of the chain, finger 2 to its start.
-    onwards = -1 if finger == 0 else 1
-    last = (seen & ~np.roll(seen, onwards, axis=1)).argmax(axis=1)
+    onwards = after if finger == 0 else before
+    last = (seen & ~seen[:, onwards]).argmax(axis=1)
     vertex = (last + (finger == 0)) % count
     away = np.hypot(*(joint - body[vertex]).T)
     far = np.flatnonzero(clear & (away**2 - radius**2 > link.length**2))
     if len(far):
         away = np.hypot(*(joint[far, None] - body).transpose(2, 0, 1))
-        place = joint[far] @ along.T - (along * body).sum(axis=1)
+        place = joint[far] @ along.T - starts
         height, least = height[far], away - radius
         # From the ends of an edge, moved out by the radius, and from the edge between them.
         start = away**2 + radius**2 - 2 * radius * height
-        stop = np.roll(away, -1, axis=1) ** 2 + radius**2 - 2 * radius * height
+        stop = away[:, after] ** 2 + radius**2 - 2 * radius * height
         within = np.minimum(start, stop) <= link.length**2
         within |= (place > 0) & (place < size) & (height - radius <= link.length)
-        corner = (place <= 0) & np.roll(place >= size, 1, axis=1)
+        corner = (place <= 0) & (place >= size)[:, before]
         corner &= least <= link.length
-        within = seen[far] & (within | corner | np.roll(corner, -1, axis=1))
-        vertex[far] = (within & ~np.roll(within, onwards, axis=1)).argmax(axis=1) + (finger == 0)
+        within = seen[far] & (within | corner | corner[:, after])
+        vertex[far] = (within & ~within[:, onwards]).argmax(axis=1) + (finger == 0)
     return (vertex - AROUND // 2) % count, clear
+
+
+@lru_cache(maxsize=8)
+def _list_edges(scene: Scene) -> tuple[Array, Array, Array, Array, Array]:
+    """Lengths of edges, directions, outward normals, and products of both with where they begin."""
+    body = scene.polygon.vertices
+    run = np.roll(body, -1, axis=0) - body
+    size = np.hypot(run[:, 0], run[:, 1])
+    along = run / size[:, None]
+    outward = np.column_stack([along[:, 1], -along[:, 0]])
+    return size, along, outward, (along * body).sum(axis=1), (outward * body).sum(axis=1)
 
 
 def _touch(link: Finger, finger: int, corners: Array) -> tuple[Array, Numbers]:
