@@ -16,7 +16,6 @@ from ..mechanics.metric import metric_weights
 from ..planning.path_domain.impact_sequence import BEND, compute_curve_impact
 from ..problem.definition import End, Phase, Until
 from .links import Blocked, Border, Link, Step, link_along
-from .places import Place, make_place
 
 LONGEST = 6
 """Most borders that are passed in one go."""
@@ -68,9 +67,10 @@ class Chain:
                 )
         return None
 
-    def link(self, step: Step, last: Border, stop: Place) -> Link | Blocked:
+    def link(self, step: Step, last: Border) -> Link | Blocked:
         """The link along the chain, at rest at the end of the last border or of a part of it."""
-        return link_along((*self.borders[:-1], last), self.ratios, (*self.steps, step), stop)
+        borders, steps = (*self.borders[:-1], last), (*self.steps, step)
+        return link_along(borders, self.ratios, steps, last.stop)
 
     def link_whole(self) -> Link | Blocked | None:
         """The link along all of it; None where the last border ends at an obstacle."""
@@ -78,7 +78,7 @@ class Chain:
         if last.gained is None:
             return None
         step = Step(last.formation.contacts, Until(contact=last.gained))
-        return self.link(step, last, make_place(last.formation.scene, last.curve.end))
+        return self.link(step, last)
 
 
 def _goes_on(before: Border, after: Border) -> bool:

@@ -131,8 +131,7 @@ class Chart:
         if last.gained is None or len(key) == LONGEST:
             return []
         if key not in self._longer:
-            place = make_place(self.scene, last.curve.end)
-            longer = [chain.extend(border) for border in self.trace(place, chain)]
+            longer = [chain.extend(border) for border in self.trace(last.stop, chain)]
             self._longer[key] = [(own, own.link_whole()) for own in longer if own]
         return self._longer[key]
 
@@ -228,7 +227,7 @@ class Chart:
         s, until = found
         cut = replace(last, curve=cut_curve(last.curve, s))
         step = Step(last.formation.contacts, until)
-        return chain.link(step, cut, make_place(self.scene, cut.curve.end))
+        return chain.link(step, cut)
 
     def land_at(self, links: Found, goal: Goal) -> list[Link]:
         """Links that land on the edge of a goal which gives x, as they land right there.

@@ -53,7 +53,7 @@ def measure_along(curve: Curve, goal: Goal) -> tuple[float, Until] | None:
     s = _find_first(curve, 2, goal.phi)
     if s is None:
         return None
-    x = float(curve.evaluate(np.array([s])).z[0, 0])
+    x = float(curve.interpolate(np.array([s]))[0][0, 0])
     if goal.x is not None and abs(x - goal.x) > HELD * scene.scales.length:
         return None
     return s, Until(coordinate="phi", value=goal.phi)
@@ -63,7 +63,7 @@ def _find_first(curve: Curve, row: int, value: float) -> float | None:
     """First place along a curve at which a coordinate takes a value, beyond its start."""
     grid = np.concatenate([refine(panel.s, curve.length) for panel in curve.panels])
     grid = np.unique(grid[grid <= curve.length])
-    off = curve.evaluate(grid).z[:, row] - value
+    off = curve.interpolate(grid)[0][:, row] - value
     least = HELD * (curve.formation.scene.scales.length if row == 0 else 1.0)
     if abs(off[0]) < least:
         return None
@@ -75,7 +75,7 @@ def _find_first(curve: Curve, row: int, value: float) -> float | None:
         return float(grid[k + 1])
 
     def miss(s: float) -> float:
-        return float(curve.evaluate(np.array([s])).z[0, row]) - value
+        return float(curve.interpolate(np.array([s]))[0][0, row]) - value
 
     return find_root(miss, float(grid[k]), float(grid[k + 1]))
 

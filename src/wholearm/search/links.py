@@ -128,6 +128,11 @@ class Border:
     terms: Terms
 
     @cached_property
+    def stop(self) -> Place:
+        """Where it ends."""
+        return make_place(self.formation.scene, self.curve.end)
+
+    @cached_property
     def ground(self) -> Ground:
         """What motions along it may do."""
         return survey(self.curve, *self.terms)
@@ -151,23 +156,23 @@ def follow_borders(
     known : list of Curve
         Whole borders of these contacts, to which those that are traced are added.
     """
-    headings, least = find_headings(formation, place.z), HELD * place.scene.scales.length
-    if not headings:
-        return []
+    least = HELD * place.scene.scales.length
     for whole in known:
         s = find_on(whole, place.z)
         if s is not None:
-            curves = [take(whole, s, end) for end in (whole.length, 0.0) if abs(end - s) > least]
+            ends = (whole.length, 0.0) if find_headings(whole.formation, place.z) else ()
+            curves = [take(whole, s, end) for end in ends if abs(end - s) > least]
             break
     else:
-        curves = _trace(formation, place.z, headings, known)
+        curves = _trace(formation, place.z, known)
     return [Border(place, curve, _find_gained(curve), terms) for curve in curves]
 
 
-def _trace(
-    formation: Formation, z: Array, headings: tuple[Array, ...], known: list[Curve]
-) -> list[Curve]:
+def _trace(formation: Formation, z: Array, known: list[Curve]) -> list[Curve]:
     """The curves of a formation from a place; the whole of them is added to those known."""
+    headings = find_headings(formation, z)
+    if not headings:
+        return []
     least, ways = HELD * formation.scene.scales.length, list[Curve | None]()
     # Most end where they begin, which limits a little way on tell.
     ahead = formation.evaluate_limits(z + least * np.array(headings)).min(axis=1)
@@ -303,5 +308,4 @@ def link_border(border: Border) -> Link | Blocked | None:
     if border.gained is None:
         return None
     steps = (Step(border.formation.contacts, Until(contact=border.gained)),)
-    stop = make_place(border.formation.scene, border.curve.end)
-    return link_along((border,), (1.0,), steps, stop)
+    return link_along((border,), (1.0,), steps, border.stop)

@@ -60,7 +60,9 @@ def make_place(scene: Scene, z: Array, landed: bool = False) -> Place:
 
 def settle(place: Place) -> Place | None:
     """A place with all of its contacts closed exactly; None where they do not close."""
-    formation = Formation(place.scene, place.contacts)
+    # In the order in which formations at the place have them, whose functions it shares.
+    own = sorted(place.contacts, key=lambda c: -1 if c.finger is None else c.finger)
+    formation = Formation(place.scene, tuple(own))
     z = close_contacts(formation, place.z, np.zeros(0))
     return None if z is None else replace(place, z=z)
 
