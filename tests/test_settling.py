@@ -186,7 +186,9 @@ def test_held_ends_are_written_and_read(tmp_path: Path) -> None:
         np.testing.assert_allclose(one.tau, two.tau, atol=1e-3)
         np.testing.assert_array_equal(np.isnan(one.c_n), np.isnan(two.c_n))
     rest = read.trajectory.at(ends - held / 3)
-    assert not rest.z_dot.any() and np.isnan(rest.c_n).all()
+    # Interpolated from samples that are the same but for rounding.
+    np.testing.assert_allclose(rest.z_dot, 0.0, atol=1e-9)
+    assert np.isnan(rest.c_n).all()
 
 
 def test_margins_are_those_of_the_linear_programme() -> None:
