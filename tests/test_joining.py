@@ -6,12 +6,17 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from shipped import HEPTAGON, problem_of
+from wholearm.common.arrays import Array
+from wholearm.common.errors import ReplayError
+from wholearm.planning.block_plan import BlockPlan, Planning
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.result import Plan
 from wholearm.problem.definition import Until
 from wholearm.problem.goal import Goal
+from wholearm.search import joining
 from wholearm.search.candidates import Lost
 from wholearm.search.chart import Chart
 from wholearm.search.find import Search
@@ -52,17 +57,25 @@ def test_links_planned_at_the_same_time_make_the_same_plan() -> None:
 
 
 PROBLEM = problem_of(HEPTAGON)
-PLACE = make_place(PROBLEM.scene, PROBLEM.start)
+PLACE, PHASE = make_place(PROBLEM.scene, PROBLEM.start), PROBLEM.phases[0]
 
 
 def make_steps(x: float) -> tuple[Step, ...]:
     return (Step(PLACE.contacts, Until(coordinate="x", value=x)),)
 
 
+class Still(BlockPlan):
+    """A plan that ends where it starts."""
+
+    @property
+    def end(self) -> Array:
+        return self.start
+
+
 class Plans(dict[Any, Any]):
     """Plans of every link, but of those with some steps, and what has been asked for."""
 
-    def __init__(self, without: tuple[Step, ...]) -> None:
+    def __init__(self, without: tuple[Step, ...] = ()) -> None:
         super().__init__()
         self.without, self.asked = key_steps(without), list[Any]()
 
@@ -73,7 +86,7 @@ class Plans(dict[Any, Any]):
         self.asked.append(key[1])
         if key[1] == self.without:
             return "too short of force"
-        return PlannedLink((), (SimpleNamespace(end=PROBLEM.start),), ())  # type: ignore[arg-type]
+        return PlannedLink((PHASE,), (Still((PHASE,), PROBLEM.start, 0, None, [], [], None),), ())
 
 
 def test_where_nothing_leads_on_another_landing_is_tried() -> None:
@@ -97,3 +110,28 @@ def test_a_link_from_a_crossing_is_alone_to_blame() -> None:
     lost = join_route(PROBLEM, [(first, []), (second, [])], PlanOptions(), plans, lambda _: None)
     assert isinstance(lost, Lost) and lost.links == (second,)
     assert plans.asked == [key_steps(first.steps), key_steps(second.steps)]
+
+
+def test_where_a_plan_never_holds_it_is_landed_with_regard_to_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    landing = Link(PLACE, PLACE, make_steps(0.02), 1.0, in_cell=True)
+    onward = Link(PLACE, PLACE, make_steps(0.03), 1.0)
+    ways = [Measured(1.0, make_steps(x), []) for x in (0.021, 0.022)]
+    plans, finished = Plans(), list[int]()
+
+    def finish(made: Planning, *rest: object) -> str:
+        finished.append(len(made.problem.phases))
+        if len(finished) == 1:
+            raise ReplayError("does not hold, however fine it is")
+        return "holds"
+
+    monkeypatch.setattr(joining, "finish_plan", finish)
+    monkeypatch.setattr(joining, "assemble_plan", lambda made: None)
+    checked = SimpleNamespace(of=lambda *given: SimpleNamespace(culprit=2))
+    monkeypatch.setattr(joining, "Checked", checked)
+    links = [(landing, ways), (onward, list[Measured]())]
+    assert join_route(PROBLEM, links, PlanOptions(), plans, lambda _: None) == "holds"
+    # The border has no other ways: its plan is first refined, then the landing chosen anew.
+    tried = [key for key in plans.asked if key != key_steps(onward.steps)]
+    assert tried == [key_steps(ways[0].steps), key_steps(landing.steps)] and finished == [2, 2]

@@ -16,7 +16,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.errors import WholearmError
+from ..common.errors import ReplayError, WholearmError
 from ..common.sharing import exclusive
 from ..common.workers import Task, share
 from ..planning.advice import unadvised
@@ -82,7 +82,8 @@ def join_route(
     links : sequence of (Link, sequence of Measured)
         One after the other from the problem's start, with the ways in which those through cells
         can be gone, the best first. Where a plan does not hold, or nothing leads on from where it
-        lands, the next one is taken, and at last one that is planned from guesses of its own.
+        lands, the next one is taken, and at last one that is planned from guesses of its own, with
+        regard to the link after it.
     options : PlanOptions
     kept : mapping
         Plans of links that were made before, to which others are added.
@@ -96,7 +97,7 @@ def join_route(
     begun = time.perf_counter()
     ways, culprit = [[*measured, None] for _, measured in links], None
     try:
-        with open_ledger() as ledger, unadvised():
+        with unadvised():
             first = [(link, way[0]) for (link, _), way in zip(links, ways, strict=True)]
             _plan_ahead(problem, first, options, kept, report, jobs, aside)
             while True:
@@ -108,19 +109,22 @@ def join_route(
                         continue
                     return Lost.at(_blame(links, culprit), reason)
                 made, checked = _put_together(problem, planned, options), None
-                if not options.replay:
-                    break
-                report("replaying the plan")
-                checked = Checked.of(made.problem, assemble_plan(made))
-                owners = [k for k, own in enumerate(planned) for _ in own.phases]
-                culprit = None if checked.culprit is None else owners[checked.culprit - 1]
-                if culprit is None or len(ways[culprit]) == 1:
-                    break
-                ways[culprit].pop(0)
-            costs = [cost for own in planned for cost in own.costs]
-            for number, cost in enumerate(costs, 1):
-                ledger.add(number, cost)
-            return finish_plan(made, report, ledger, (begun, begun), checked)
+                if options.replay:
+                    report("replaying the plan")
+                    checked = Checked.of(made.problem, assemble_plan(made))
+                    owners = [k for k, own in enumerate(planned) for _ in own.phases]
+                    culprit = None if checked.culprit is None else owners[checked.culprit - 1]
+                    if culprit is not None and len(ways[culprit]) > 1:
+                        ways[culprit].pop(0)
+                        continue
+                try:
+                    with open_ledger() as ledger:
+                        for number, cost in enumerate((c for own in planned for c in own.costs), 1):
+                            ledger.add(number, cost)
+                        return finish_plan(made, report, ledger, (begun, begun), checked)
+                except ReplayError:
+                    if culprit is None or not _land_anew(links, ways, culprit):
+                        raise
     except WholearmError as error:
         return str(error) if culprit is None else Lost.at(_blame(links, culprit), str(error))
     except np.linalg.LinAlgError:
@@ -140,6 +144,15 @@ def _try_other(links: Links, ways: list[list[Measured | None]], culprit: int) ->
             ways[k].pop(0)
             return True
     return False
+
+
+def _land_anew(links: Links, ways: list[list[Measured | None]], culprit: int) -> bool:
+    """Choose a landing with regard to the border after it, whose plan does not hold, if one is."""
+    landing = culprit - 1
+    if len(_blame(links, culprit)) == 1 or len(ways[landing]) == 1:
+        return False
+    del ways[landing][:-1]
+    return True
 
 
 def _plan_ahead(
