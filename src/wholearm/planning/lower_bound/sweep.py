@@ -30,6 +30,9 @@ class Mode(IntEnum):
     """A limit of b."""
 
 
+_PUSH, _SWITCH, _BRAKE, _HELD = (int(mode) for mode in Mode)
+
+
 class Sweep(NamedTuple):
     """The fastest motion on a grid: b at its nodes, (N + 1,), and modes of its intervals, (N,)."""
 
@@ -84,34 +87,41 @@ def find_fastest(rows: Rows, steps: Array, part: Array, cap: Array, near: Array 
     of_a = rows.a / (2 * steps)[:, None]
     before = (1 - part)[:, None] * of_b - of_a
     after = part[:, None] * of_b + of_a
-    # From one node's b, bounds of the other's: slopes and values at zero.
+    # From one node's b, bounds of the other's: slopes and values at zero, interval by interval.
     with np.errstate(divide="ignore", invalid="ignore"):
         brakes, pushes = (after >= 0) & (before < 0), after < 0
-        brake = np.where(brakes, after / -before, 0), np.where(brakes, one / -before, np.inf)
-        push = np.where(pushes, before / -after, 0), np.where(pushes, one / -after, np.inf)
-    count, least = len(steps), np.minimum.reduce
-    largest, braked = np.zeros(count + 1), np.zeros(count, dtype=bool)
+        brake_slopes = list(np.where(brakes, after / -before, 0))
+        brake_values = list(np.where(brakes, one / -before, np.inf))
+        push_slopes = list(np.where(pushes, before / -after, 0))
+        push_values = list(np.where(pushes, one / -after, np.inf))
+    count, least, caps = len(steps), np.minimum.reduce, cap.tolist()
+    largest, braked = [0.0] * (count + 1), [False] * count
+    following = 0.0
     for k in range(count - 1, -1, -1):
-        following = largest[k + 1]
-        b = least(brake[0][k] * following + brake[1][k])
-        braked[k] = b < cap[k] and least(push[0][k] * b + push[1][k]) >= following
+        found = float(least(brake_slopes[k] * following + brake_values[k]))
+        pushed = float(least(push_slopes[k] * found + push_values[k])) if found < caps[k] else 0.0
+        braked[k] = found < caps[k] and pushed >= following
         if not braked[k]:
-            b = min(_find_corner(before[k], after[k], one[k], following), cap[k])
-        if not b > 0 and (k or b < 0):
+            found = min(_find_corner(before[k], after[k], one[k], following), caps[k])
+        if not found > 0 and (k or found < 0):
             raise NoMotionError(k)
-        largest[k] = b
-    b, reaches = np.zeros(count + 1), np.zeros(count + 1, dtype=bool)
+        largest[k] = following = found
+    b, reaches = [0.0] * (count + 1), [False] * (count + 1)
+    reached = 0.0
     for k in range(count):
-        pushed = least(push[0][k] * b[k] + push[1][k])
+        pushed = float(least(push_slopes[k] * reached + push_values[k]))
         reaches[k + 1] = pushed >= largest[k + 1]
-        b[k + 1] = min(pushed, largest[k + 1])
-        if not b[k + 1] > 0 and k + 1 < count:
+        b[k + 1] = reached = min(pushed, largest[k + 1])
+        if not reached > 0 and k + 1 < count:
             raise NoMotionError(k)
-    if b[-1] < -_ROUNDING * b.max():
+    if b[-1] < -_ROUNDING * max(b):
         raise NoMotionError(count - 1)
     b[-1] = max(b[-1], 0.0)
-    found = [~reaches[1:], ~reaches[:-1], braked]
-    return Sweep(b, np.select(found, [Mode.PUSH, Mode.SWITCH, Mode.BRAKE], Mode.HELD))
+    modes = [
+        _PUSH if not after else _SWITCH if not before else _BRAKE if brake else _HELD
+        for before, after, brake in zip(reaches[:-1], reaches[1:], braked, strict=True)
+    ]
+    return Sweep(np.array(b), np.array(modes))
 
 
 def find_steady(rows: Rows, steps: Array, part: Array, cap: Array) -> Sweep:
