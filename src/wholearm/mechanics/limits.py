@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,12 +161,9 @@ Maker = Callable[[Formation, float], Sequence[MotionLimit]]
 
 
 def make_limits(formation: Formation, epsilon: float) -> LimitSet:
-    """Make the limits of a formation and a least normal force [N]; kept with the formation."""
-    kept, key = _MADE.setdefault(formation, {}), (epsilon, *MAKERS)
-    if key not in kept:
-        made = [limit for maker in MAKERS for limit in maker(formation, epsilon)]
-        kept[key] = LimitSet(tuple(limit for limit in made if len(limit.low)))
-    return kept[key]
+    """Make the limits of a formation and a least normal force [N]."""
+    made = [limit for maker in MAKERS for limit in maker(formation, epsilon)]
+    return LimitSet(tuple(limit for limit in made if len(limit.low)))
 
 
 def _make_force_limits(formation: Formation, epsilon: float) -> list[MotionLimit]:
@@ -216,6 +212,5 @@ def _make_joint_limits(formation: Formation, _: float) -> list[MotionLimit]:
     return found
 
 
-_MADE: WeakKeyDictionary[Formation, dict[object, LimitSet]] = WeakKeyDictionary()
 MAKERS: list[Maker] = [_make_force_limits, _make_joint_limits]
 """Functions that make the limits of a formation."""
