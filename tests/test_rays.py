@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -59,3 +60,10 @@ def test_more_to_press_leaves_fewer_rays() -> None:
     own, rays = around_the_start()
     fewer = shoot([own], 4 * problem_of(SQUARE).epsilon)
     assert len(fewer.gained) < len(rays.gained)
+
+
+def test_places_without_a_cell_have_no_rays() -> None:
+    own, _ = around_the_start()
+    epsilon = problem_of(SQUARE).epsilon
+    assert not len(shoot([replace(own, contacts=own.contacts[:1])], epsilon).gained)
+    assert not len(shoot([replace(own, contacts=())], epsilon).gained)
