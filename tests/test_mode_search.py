@@ -125,6 +125,21 @@ def test_a_stage_of_no_length_that_gains_by_its_intervals_alone_is_dropped(
     assert found.cost == pytest.approx(split_up.cost, rel=WORTH)
 
 
+def test_stages_dropped_one_way_or_another_are_solved_for_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    search, stages = outlined(raised(), 4)
+    (stage,) = stages
+    solution = search.solve(link(split(stage, search.scheme, 0, 2, mode_of(stage))))
+    assert len(solution.stages) == 2
+    # The same single stage twice, the wrong way round: no better than the two.
+    moves = [turn_joint(stages, 1), turn_joint(stages, 1)]
+    monkeypatch.setattr(mode_search, "list_neighbours", lambda *given, **named: list(moves))
+    known = search.tried.sequences
+    assert improve(search, solution) is solution
+    assert search.tried.sequences == known + 1
+
+
 def test_rounding_of_masses_decides_nothing() -> None:
     problem = landing()
     noisy = problem.with_(mass=problem.scene.polygon.mass * (1 + 2.04e-10))

@@ -19,13 +19,15 @@ def improve(search: Search, solution: Solution) -> Solution:
     """Change the modes of a solution for as long as that makes it better."""
     known = {sign_sequence(solution.stages)}
     waiting, tried, lost = list_neighbours(search, solution), 1, 0
+    beside = set[tuple[object, ...]]()
     while waiting and tried < MOST and lost < LOST:
         moved = waiting.pop(0)
         signs = sign_sequence(moved)
         # A stage that has shrunk to nothing may have gained by the intervals beside it alone.
-        if signs in known and len(moved) >= len(solution.stages):
+        if signs in known and (signs in beside or len(moved) >= len(solution.stages)):
             continue
         known.add(signs)
+        beside.add(signs)
         tried += 1
         other = search.solve(moved, most=PATIENCE)
         search.tried.sequences += 1
@@ -36,6 +38,7 @@ def improve(search: Search, solution: Solution) -> Solution:
         least = WORTH if len(moved) >= len(solution.stages) else -WORTH
         if gain > least * abs(solution.cost):
             solution, waiting, lost = other, list_neighbours(search, other), 0
+            beside = set()
         elif _rolls(moved) > _rolls(solution.stages):
             # No better by itself, but it tells which way its contacts would slide.
             waiting = [*list_neighbours(search, other, leaning=True), *waiting]
