@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -126,6 +126,10 @@ class Border:
     curve: Curve
     gained: Contact | None
     terms: Terms
+
+    def __getstate__(self) -> dict[str, Any]:
+        # What is seen of a border is large, and soon seen again.
+        return {name: value for name, value in self.__dict__.items() if name != "ground"}
 
     @cached_property
     def stop(self) -> Place:
