@@ -60,6 +60,8 @@ def test_phases_in_motion_are_tried_ahead() -> None:
     names = [attempt.name for attempt in attempts]
     assert names[:2] == [f"{NEAREST}{GRADUAL}", NEAREST]
     assert all(name.startswith("an end ahead at ") for name in names[2:])
+    # Where the first one has led nowhere, it is not among those that are made after it.
+    assert [attempt.name for attempt in attempts.list_further(3)] == [names[0], names[2]]
 
 
 def test_where_patience_is_not_asked_for_there_is_one_attempt() -> None:

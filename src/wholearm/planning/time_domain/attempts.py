@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import islice
 from typing import NamedTuple
 
 from ...common.arrays import Array
@@ -154,6 +155,10 @@ class Attempts:
                     end = "an end ahead" if onwards else NEAREST
                     name = f"{end} at {falls:g} times the duration of a fall"
                     yield Attempt(name, halvings, self._guess(halvings, falls, onwards))
+
+    def list_further(self, most: int) -> Iterator[Attempt]:
+        """So many of the attempts to be made after the first, which is not made again."""
+        return (own for own in islice(self, most) if own is not self.first)
 
     @property
     def _intervals(self) -> int:

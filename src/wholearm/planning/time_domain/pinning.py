@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import chain, islice
+from itertools import chain
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -135,7 +135,7 @@ def _begin(search: Search, free: Problem, phases: Sequence[Phase], z: Array) -> 
     )
     attempts = Attempts(free, phases, z, own, None, True)
     try:
-        for attempt in chain([attempts.first], islice(attempts, FURTHER)):
+        for attempt in chain([attempts.first], attempts.list_further(FURTHER)):
             solution = solve_attempt(own, attempt)
             if solution.success:
                 return solution

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from itertools import chain, islice
+from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -137,7 +137,7 @@ def try_phases(
     straight = None if goal is None else attempts.towards(goal)
     begin = [straight] if straight else []
     first = (attempts.first for _ in range(straight is None or further > 0))
-    guesses: Iterable[Attempt] = chain(begin, first, islice(attempts, further))
+    guesses: Iterable[Attempt] = chain(begin, first, attempts.list_further(further))
     if hurried:
         guesses = [own._replace(most=FEW) for own in (begin if goal is not None else first)]
     for attempt in guesses:
