@@ -25,8 +25,6 @@ OTHERS = 2
 """Most slower ways through a cell that are tried where the plan of the fastest does not hold."""
 BEYOND = 1.1
 """Times of routes, by the search, over that of the best one, from which on they are left out."""
-FURTHER = 4
-"""How many times as many places are looked at by the second rule where there is no route yet."""
 NEARBY = 30
 """Most places that are looked at in a glance."""
 MEASURED, MORE = 24, 8
@@ -81,8 +79,8 @@ class Chooser:
         for _ in range(TRIED):
             failed = len(self.failures)
             self._look_by(EAGER, wanted, report)
-            # Without a route by then, the other rule leads elsewhere, and further.
-            most = CAREFUL.most if self.found else FURTHER * CAREFUL.most
+            # Without a route by then, the other rule leads elsewhere, and as far.
+            most = CAREFUL.most if self.found else EAGER.most
             self._look_by(CAREFUL._replace(most=most), wanted, report)
             self.plan(wanted, report)
             if len(self.made) >= wanted or len(self.failures) == failed:
