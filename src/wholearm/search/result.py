@@ -112,10 +112,13 @@ class Answer:
         if not self.complete:
             lines.append("the search ended early: the best route so far")
         if self.bound is not None:
-            text = "no route along borders, with stops or impacts, takes less than {} s{}"
+            text = "no route along borders, with stops or impacts, "
+            # In place of a larger bound stands the duration of the plan.
+            none = self.route.in_cells and self.bound.value >= plan.duration
+            text += "is faster" if none else f"takes less than {self.bound.value:.6f} s"
+            text += "" if self.gap is None else f": gap {100 * self.gap:.2g} %"
             ended = "" if self.bound.complete else " (the search for such routes ended early)"
-            gap = "" if self.gap is None else f": gap {100 * self.gap:.2g} %"
-            lines.append(text.format(f"{self.bound.value:.6f}", gap + ended))
+            lines.append(text + ended)
         if self.route.in_cells:
             lines.append("this one leads through cells, where nothing bounds times from below")
         tried = f"{self.settled} places looked at, {len(self.blocked)} ways blocked"
