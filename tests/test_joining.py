@@ -128,7 +128,9 @@ def test_where_a_plan_never_holds_it_is_landed_with_regard_to_it(
 
     monkeypatch.setattr(joining, "finish_plan", finish)
     monkeypatch.setattr(joining, "assemble_plan", lambda made: None)
-    checked = SimpleNamespace(of=lambda *given: SimpleNamespace(culprit=2))
+    fails = SimpleNamespace(failure=(2, "a contact is lost"))
+    found = SimpleNamespace(culprit=2, usually=fails)
+    checked = SimpleNamespace(of=lambda *given: found)
     monkeypatch.setattr(joining, "Checked", checked)
     links = [(landing, ways), (onward, list[Measured]())]
     assert join_route(PROBLEM, links, PlanOptions(), plans, lambda _: None) == "holds"

@@ -114,7 +114,8 @@ def join_route(
                     checked = Checked.of(made.problem, assemble_plan(made))
                     owners = [k for k, own in enumerate(planned) for _ in own.phases]
                     culprit = None if checked.culprit is None else owners[checked.culprit - 1]
-                    if culprit is not None and len(ways[culprit]) > 1:
+                    holds = checked.usually.failure is None
+                    if culprit is not None and not holds and len(ways[culprit]) > 1:
                         ways[culprit].pop(0)
                         continue
                 try:

@@ -57,12 +57,12 @@ def _sweep(rows: Rows, steps: Array, part: Array, near: Array | None) -> Array:
     # Rows that a small b' breaks let b be the larger, the larger b' may be.
     starts, slopes = _solve(before, after, one, (before < 0) & (after > 0))
     for k in range(count - 1, -1, -1):
-        bounds = (starts[k] + slopes[k] * largest[k + 1, :, None]).min(axis=1)
+        bounds = _bound(starts[k], slopes[k], largest[k + 1])
         largest[k] = np.maximum(np.minimum(bounds, most[k]), 0.0)
     b = np.zeros((count + 1, ways))
     starts, slopes = _solve(after, before, one, after < 0)
     for k in range(count):
-        bounds = (starts[k] + slopes[k] * b[k, :, None]).min(axis=1)
+        bounds = _bound(starts[k], slopes[k], b[k])
         b[k + 1] = np.maximum(np.minimum(bounds, largest[k + 1]), 0.0)
     return b.T
 
@@ -72,6 +72,13 @@ def _solve(own: Array, other: Array, one: Array, used: Flags) -> tuple[Array, Ar
     with np.errstate(divide="ignore", invalid="ignore"):
         starts, slopes = np.where(used, one / -own, np.inf), np.where(used, other / -own, 0.0)
     return np.ascontiguousarray(starts.swapaxes(0, 1)), np.ascontiguousarray(slopes.swapaxes(0, 1))
+
+
+def _bound(starts: Array, slopes: Array, other: Array) -> Array:
+    """Largest p that all rows of a place let it be where q is `other`, maybe infinite, (w,)."""
+    with np.errstate(invalid="ignore"):
+        more = np.where(slopes == 0, 0.0, slopes * other[:, None])
+    return np.asarray((starts + more).min(axis=1))
 
 
 def _find_corners(before: Array, after: Array, one: Array) -> Array:

@@ -25,7 +25,7 @@ from .jumps import (
 from .locate import find_first
 from .replay import Replay
 from .runge_kutta import ORDER
-from .tolerances import CREEPING, REACHED, SETTLING, SHORTEST_STEP, SLOW, measure_units
+from .tolerances import CREEPING, PASSED, REACHED, SETTLING, SHORTEST_STEP, SLOW, measure_units
 
 _GROWTH = 40.0
 """Largest growth of a step: at order 8 an error of 1e-13 of the tolerance allows it."""
@@ -226,7 +226,11 @@ def _pass_on(run: Replay) -> Arrival:
     rate, settling = -float(s.outputs[s.to.until_rate]), run.tolerances.settling
     window = settling
     strikes = run.phase.end is End.IMPACT
-    if run.phase.until.contact is not None and not strikes:
+    if run.passes and rate > 0:
+        # A motion that is off by rounding comes the earlier the slower it is.
+        early = PASSED * run.until_unit / rate
+        window = min(max(early, settling), run.tolerances.longest_window)
+    elif run.phase.until.contact is not None and not strikes:
         run.step_to(settling)
         slowing = (float(s.outputs[s.to.until_rate]) + rate) / settling
         if slowing > 0:

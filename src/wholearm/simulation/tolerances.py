@@ -26,6 +26,9 @@ SHORT = 3e-5
 the next one's formation begins."""
 REACHED = 3e-5
 """Distance to the end of a phase that counts as there, when at rest."""
+PASSED = 1e-5
+"""Distance beyond the end of a phase that is passed at speed, for which a formation may still be
+taken for the one before, until the torques step: an error of a long motion before it."""
 SLOW = 2e-4
 """Speed that counts as rest at the end of a phase."""
 CREEPING = 1e-7

@@ -34,6 +34,8 @@ REFINEMENTS = 8
 MOST = 64
 """Intervals of each phase from which on none is halved, with the accuracy of the default; they go
 with the root of its inverse."""
+_BEYOND = 2
+"""Largest number of intervals with which limits are looked for that are missed, over that."""
 _USUAL = 1e-4
 """The accuracy of the default."""
 _SPARE = 0.5
@@ -206,9 +208,7 @@ def _choose_halvings(
 
     With a number of intervals that was asked for, gains do not count.
     """
-    options = search.options
-    share = MOST * max(1.0, math.sqrt(_USUAL / options.accuracy))
-    most = math.ceil(share) * len({stage.phase for stage in solution.stages})
+    options, most = search.options, _count_most(search, solution)
     if sum(stage.intervals for stage in solution.stages) >= most:
         return []
     prices = price_misses(solution, misses)
@@ -226,8 +226,22 @@ def _choose_halvings(
     return cap_halvings(times, most)
 
 
+def _count_most(search: Search, solution: Solution) -> int:
+    """Intervals of all phases from which on none is halved for its gain or its price."""
+    share = MOST * max(1.0, math.sqrt(_USUAL / search.options.accuracy))
+    return math.ceil(share) * len({stage.phase for stage in solution.stages})
+
+
 def _halve_missed(search: Search, solution: Solution, misses: Sequence[Limits]) -> Solution:
-    """Go on from a plan with twice the intervals where it misses limits, which then is less."""
+    """Go on from a plan with twice the intervals where it misses limits, which then is less.
+
+    There is no plan with many more than are halved for other reasons: such solves take long, and
+    limits that so many still miss they go on to miss.
+    """
     times = [miss.list_missed().astype(np.int64) for miss in misses]
+    count = sum(stage.intervals for stage in solution.stages) + sum(int(own.sum()) for own in times)
+    if count > _BEYOND * _count_most(search, solution):
+        status = f"limits between points are missed with {count} intervals, too"
+        return solution._replace(status=status, success=False)
     stages = bisect_intervals(solution.stages, search.scheme, times)
     return search.solve(stages, solution, most=search.wait(PATIENCE))
