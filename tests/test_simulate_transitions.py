@@ -51,7 +51,7 @@ def brake_less(starts: Array, c: Array) -> Array:
 
 @once
 def plan_passing(x: float) -> tuple[Problem, TorqueProfile, float]:
-    """The hexagon slides from `x` until vertex 4 goes on round the tip of finger 2, and when that is."""
+    """The hexagon slides from `x` until vertex 4 goes round the tip of finger 2, and when."""
     table = {**problem_of(HEXAGON).table, "start": {"flush": 0, "x": x}}
     held = ["v0-palm", "v1-palm", "v1-finger1"]
     table["phases"] = [
