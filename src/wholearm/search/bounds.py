@@ -11,7 +11,7 @@ from .goals import is_at
 from .links import Link
 from .places import Key, Place
 
-MOST = 60
+MOST = 240
 """Most places that are settled to bound routes from below."""
 
 
