@@ -18,6 +18,7 @@ from ..problem.definition import Phase, Problem
 from .find import Route
 from .links import Link, describe_steps, point_out
 from .measure import SINGULAR, Measured, make_phases
+from .places import measure_apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +111,7 @@ def _make_phases(problem: Problem, index: int, link: Link, z: Array) -> tuple[li
 
 
 def _misses(end: Array, link: Link, last: bool) -> bool:
-    length = link.stop.scene.scales.length
-    return last and bool(np.abs((end - link.stop.z) / [length, length, 1, 1, 1]).max() > 1e-4)
+    return last and measure_apart(link.stop.scene, end, link.stop.z) > 1e-4
 
 
 def plan_candidate(

@@ -31,6 +31,7 @@ from .candidates import Lost
 from .linking import Kept, Key, PlannedLink, keep_link
 from .links import Link, describe_steps
 from .measure import SINGULAR, Measured
+from .places import measure_apart
 
 MET = 1e-8
 """Largest distance of a border's end as planned from the same end as found, in radii of gyration or
@@ -213,7 +214,8 @@ def _plan_links(
     """Plans of links one after the other, from what is begun of them, and why the next has none."""
     z, found = problem.start, list[PlannedLink]()
     for k, (link, _) in enumerate(links):
-        if k and not links[k - 1][0].in_cell and _measure_gap(z, link) < MET:
+        apart = measure_apart(problem.scene, z, link.start.z)
+        if k and not links[k - 1][0].in_cell and apart < MET:
             # Wherever it began, a border ends at the same place.
             z = link.start.z
         planned = _plan_one(problem, links, k, z, options, kept, report)
@@ -222,12 +224,6 @@ def _plan_links(
         found.append(planned)
         z = planned.end
     return found, ""
-
-
-def _measure_gap(z: Array, link: Link) -> float:
-    """Distance from `z` of where a link starts, in radii of gyration or radians."""
-    length = link.start.scene.scales.length
-    return float(np.abs((z - link.start.z) / [length, length, 1, 1, 1]).max())
 
 
 def _plan_one(

@@ -20,6 +20,7 @@ from ..scene.model import Scene
 from ..solvers.statistics import SolverStatistics, open_ledger
 from .links import Link, Step, describe_steps, point_out
 from .measure import SINGULAR, Measured, make_phases
+from .places import measure_apart
 
 OFF = 1e-4
 """Distance from the end of a border's link from which on it is another end, in radii of gyration or
@@ -142,9 +143,7 @@ def _aim(phase: Phase, z: Array, link: Link) -> tuple[Phase, Curve]:
     """
     try:
         curve = trace_phase(phase, z)
-        length = link.stop.scene.scales.length
-        off = np.abs((curve.end - link.stop.z) / [length, length, 1, 1, 1]).max()
-        if off <= OFF:
+        if measure_apart(link.stop.scene, curve.end, link.stop.z) <= OFF:
             return phase, curve
     except InputError:
         pass

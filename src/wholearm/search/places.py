@@ -95,6 +95,12 @@ def _is_flush(pair: tuple[Contact, ...], vertices: int) -> bool:
     return False
 
 
+def measure_apart(scene: Scene, z: Array, other: Array) -> float:
+    """Largest distance of configurations in a coordinate, in radii of gyration or radians."""
+    length = scene.scales.length
+    return float(np.abs((z - other) / [length, length, 1, 1, 1]).max())
+
+
 def unit_steps(scene: Scene) -> Array:
     """One unit of (x, phi): a radius of gyration and a radian, shape (2,)."""
     return np.array([scene.scales.length, 1.0])
