@@ -20,6 +20,7 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from ...common.arrays import Array
+from ...common.quadrature import jacobi_nodes
 
 DEGREE = 4
 """Degree of the polynomials."""
@@ -59,8 +60,7 @@ class Basis(NamedTuple):
 @lru_cache(maxsize=8)
 def find_basis(degree: int = DEGREE) -> Basis:
     """The basis of elements of a degree."""
-    inner = legendre.legroots(legendre.legder([0.0] * degree + [1.0]))
-    x = (np.concatenate([[-1.0], inner, [1.0]]) + 1) / 2
+    x = (np.concatenate([[-1.0], jacobi_nodes(degree - 1, 1, 1), [1.0]]) + 1) / 2
     y = np.stack([x, x, 1 - x, x, 1 - x])
     powers = np.arange(degree + 1)
     to_powers = np.linalg.inv(y[..., None] ** powers)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...common.arrays import Array
+from ...common.quadrature import jacobi_nodes
 
 
 class Scheme(NamedTuple):
@@ -92,13 +93,10 @@ def make_scheme(name: str, degree: int, controls: int = 2) -> Scheme:
     -----
     Source: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II, section IV.5.
     """
-    series = np.zeros(degree + 1)
-    series[degree] = 1.0
     if name == "radau":
-        series[degree - 1] = -1.0
-    points = (np.sort(np.polynomial.legendre.legroots(series).real) + 1) / 2
-    if name == "radau":
-        points[-1] = 1.0
+        points = (np.append(jacobi_nodes(degree - 1, 1, 0), 1.0) + 1) / 2
+    else:
+        points = (jacobi_nodes(degree) + 1) / 2
     powers = np.arange(1, degree + 1)
     invert = np.linalg.inv(points[:, None] ** (powers - 1))
     integrals = (points[:, None] ** powers / powers) @ invert

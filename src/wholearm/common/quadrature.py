@@ -1,0 +1,30 @@
+"""Nodes of Gauss, Radau and Lobatto quadrature."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .arrays import Array
+
+
+def jacobi_nodes(count: int, alpha: int = 0, beta: int = 0) -> Array:
+    """Zeros of the Jacobi polynomial P_n^(alpha, beta), increasing, shape (n,), in (-1, 1).
+
+    Eigenvalues of the symmetric tridiagonal matrix of the three-term recurrence (Golub and Welsch
+    1969), which are real in any arithmetic. Gauss-Legendre nodes are those of (0, 0); with the ends
+    added, Radau nodes with 1 are those of (1, 0), Lobatto nodes those of (1, 1).
+
+    Parameters
+    ----------
+    count : int
+        Degree n of the polynomial; zero gives no nodes.
+    alpha, beta : int
+        Exponents of the weight (1 - x)^alpha (1 + x)^beta, not negative.
+    """
+    k, total = np.arange(count), alpha + beta
+    diagonal = (beta**2 - alpha**2) / np.maximum((2 * k + total) * (2 * k + total + 2), 1)
+    diagonal[:1] = (beta - alpha) / (total + 2)
+    k = k[1:]
+    squares = 4 * k * (k + alpha) * (k + beta) * (k + total)
+    squares = squares / ((2 * k + total) ** 2 * (2 * k + total + 1) * (2 * k + total - 1))
+    return np.linalg.eigvalsh(np.diag(diagonal) + np.diag(np.sqrt(squares), -1))
