@@ -10,6 +10,7 @@ import alone  # noqa: F401 -- before NumPy
 import shipped
 from once import STORE
 from shipped import HEPTAGON, plan_of, problem_of
+from wholearm.benchmark.rounding import perturb_scenes
 from wholearm.geometry.curve import Curve
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mapping.formation_map import FormationMap
@@ -18,6 +19,17 @@ from wholearm.results.trajectory import Trajectory
 
 # A shell lets what it starts in the background ignore SIGINT, and so would all that tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    text = "multiply every number of every scene by 1 + k 2^-52, k from -4 to 4, drawn by SEED"
+    parser.addoption("--rounding", type=int, metavar="SEED", help=text)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    seed = config.getoption("--rounding")
+    if seed is not None:
+        perturb_scenes(seed)
 
 
 def pytest_collection_finish() -> None:

@@ -375,7 +375,7 @@ def test_object_may_hang_over_the_back_of_a_tip(finger: int) -> None:
     z = np.array([*centre, -0.3 * side, *angles])
     hanging = place_corners(scene, z)[1 if finger == 0 else 0]
     assert hanging[1] < place_tips(scene, finger, angles[finger])[1]
-    assert finger_gap(scene, z[:3], finger, angles[finger])[0] == pytest.approx(0.0, abs=1e-15)
+    assert finger_gap(scene, z[:3], finger, angles[finger])[0] == pytest.approx(0.0, abs=1e-13)
     formation = make_formation(scene, f"e0-tip{finger + 1}")
     assert (formation.evaluate_limits(z[None])[0] > 0.01).all()
 
@@ -420,4 +420,4 @@ def test_limits_are_expressions_of_the_scene_that_they_belong_to() -> None:
         function = ca.Function("limits", [z], [ca.vertcat(*values)])
         given = np.array([0.01, 0.05, 0.1, 1.2, 2.0])
         found = formation.evaluate_limits(given[None])[0]
-        np.testing.assert_allclose(function(given).full()[:, 0], found, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(function(given).full()[:, 0], found, rtol=0, atol=1e-13)

@@ -163,7 +163,7 @@ def test_configurations_of_cells_touch_without_overlap(every: FormationMap) -> N
     rows, columns = rows[chosen], columns[chosen]
     z = close_fingers(scene, every.x[columns], every.phi[rows]).z
     lowest = place_corners(scene, z)[..., 1].min(axis=1)
-    np.testing.assert_allclose(lowest, 0.0, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(lowest, 0.0, rtol=0, atol=1e-13)
     for finger in (0, 1):
         # Distances of polygon and segment in plain geometry; rounding only.
         assert np.abs(finger_gap(scene, z[:, :3], finger, z[:, 3 + finger])).max() < 1e-10

@@ -56,7 +56,7 @@ CLOSED = [
 def test_closed_forms_are_bounded_closely(case: int) -> None:
     toy, exact = CLOSED[case]
     found = bound(toy)
-    assert exact * (1 - 1e-6) < found.value <= exact
+    assert exact * (1 - 1e-6) < found.value <= exact * (1 + 1e-9)
     assert 0 <= found.error < 1e-7 * exact
 
 
@@ -134,8 +134,8 @@ def test_plans_come_near_the_bound(curves: tuple[Curve, ...], phase: int) -> Non
     found = bound_least_time([curves[phase]], EPSILON)
     assert found is not None and found.error < 3e-8 * found.value
     plan = plan_path(curves[phase], EPSILON, PlanOptions(intervals=80), 1)
-    # What is asked of the defaults: 5e-4.
-    assert 0 <= plan.value / found.value - 1 < 2e-4
+    # What is asked of the defaults: 5e-4. The bound is good to its error.
+    assert -1e-7 < plan.value / found.value - 1 < 2e-4
 
 
 def test_plans_of_a_chain_come_near_the_bound() -> None:
@@ -144,7 +144,7 @@ def test_plans_of_a_chain_come_near_the_bound() -> None:
     found = bound_least_time(chain.continuous_curves, EPSILON)
     assert found is not None
     plans = plan_sequence(chain, EPSILON, PlanOptions(intervals=80))
-    assert 0 <= sum(plan.value for plan in plans) / found.value - 1 < 5e-4
+    assert -1e-7 < sum(plan.value for plan in plans) / found.value - 1 < 5e-4
 
 
 def test_limits_give_way_by_what_a_plan_may_miss() -> None:

@@ -88,7 +88,7 @@ def test_halved_intervals_hold_the_same_motion(name: str, degree: int) -> None:
     finer = bisect(part, scheme, np.array([1, 0, 2, 0]))
     widths = np.diff(breaks)
     halves = [*[widths[0] / 2] * 2, widths[1], *[widths[2] / 4] * 4, widths[3]]
-    np.testing.assert_allclose(finer.fractions, halves, atol=1e-15)
+    np.testing.assert_allclose(finer.fractions, halves, atol=1e-13)
     assert finer.duration == part.duration
     owners = [(0, 0), (0, 1), (1, 0), *[(2, k) for k in range(4)], (3, 0)]
     for k, (parent, inside) in enumerate(owners):

@@ -160,8 +160,10 @@ def test_too_short_a_duration_is_named(curves: tuple[Curve, ...]) -> None:
     ) as caught:
         plan_path(curves[0], 0.05, options, 1, duration)
     advised = read_advice(str(caught.value))
-    assert list(advised) == ["duration"] and least <= advised["duration"] < 1.03 * least
-    assert plan_path(curves[0], 0.05, options, 1, advised["duration"]).value >= 0.05
+    assert list(advised) == ["duration"]
+    # Both solves are good to 1e-6.
+    assert least * (1 - 1e-6) < advised["duration"] < 1.03 * least
+    assert plan_path(curves[0], 0.05, options, 1, advised["duration"]).value > 0.05 * (1 - 1e-6)
 
 
 def test_a_duration_for_all_phases_is_advised() -> None:

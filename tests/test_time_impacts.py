@@ -72,7 +72,8 @@ def find_impulses(formation: Formation, z: Array, v: Array, v_next: Array) -> Ar
 def test_least_times_with_impacts_agree_with_those_along_the_curves() -> None:
     within, expected = planned("time"), along("time").meta["phase_durations"]
     # The planner along curves passes impacts by a condition on speeds alone.
-    assert 0 < within.duration / sum(expected) - 1 < 3e-3
+    # Either is good to the accuracy that is asked for, 1e-4.
+    assert -1e-4 < within.duration / sum(expected) - 1 < 3e-3
     np.testing.assert_allclose(within.meta["phase_durations"], expected, rtol=5e-3)
     report = verify(problem("time"), within)
     assert report.ok, report.to_text()
@@ -149,7 +150,7 @@ def test_impacts_are_listed() -> None:
 def test_least_effort_with_impacts_is_near_that_along_the_curves() -> None:
     within = planned("effort")
     # Torques that are linear in a sixth of a phase cannot be as gentle.
-    assert 0 < within.meta["value"] / along("effort").meta["value"] - 1 < 1e-2
+    assert -1e-4 < within.meta["value"] / along("effort").meta["value"] - 1 < 1e-2
     report = verify(problem("effort"), within)
     assert report.ok, report.to_text()
 
@@ -166,5 +167,5 @@ def test_an_impact_that_is_not_possible_next_to_a_landing_is_a_stop() -> None:
     assert row["least_impulse"] < 0 and row["least_impulse_contact"] in row["reason"]
     # That phase is planned in the time domain then, and what follows is what it was.
     got = struck.meta["phase_durations"]
-    assert 0 < got[0] / expected[0] - 1 < 1e-2
+    assert -1e-4 < got[0] / expected[0] - 1 < 1e-2
     assert sum(got[1:]) == pytest.approx(sum(expected[1:]), rel=1e-3)

@@ -108,7 +108,7 @@ def test_points_have_newton_and_euler_and_closed_contacts(formation: Formation) 
             np.array([*shares, *[least] * formation.n_contacts]),
         )
         gaps, rates, bends, balance, senses = np.split(y, np.cumsum([n_p, n_p, n_p, 5]))
-        np.testing.assert_allclose(gaps[:n_c], measure_gaps(formation, z), atol=1e-15)
+        np.testing.assert_allclose(gaps[:n_c], measure_gaps(formation, z), atol=1e-13)
         expected = constraints(formation, z, v, a)
         for got, one, size in zip((rates, bends), expected, (1e-7, 1e-5), strict=True):
             np.testing.assert_allclose(got, one, atol=size)
@@ -131,7 +131,7 @@ def test_rolling_contacts_keep_what_has_rolled_by(formation: Formation) -> None:
     first = draw(rng)[0] if formation.rolling else z[:0]
     y = call(end_kernel(formation), [z, w, first])
     assert y.shape == (2 * formation.n_constraints,)
-    np.testing.assert_allclose(y[:n_c], measure_gaps(formation, z), atol=1e-15)
+    np.testing.assert_allclose(y[:n_c], measure_gaps(formation, z), atol=1e-13)
     rates, _ = constraints(formation, z, w, 0 * w)
     np.testing.assert_allclose(y[formation.n_constraints :], rates, atol=1e-7)
     if formation.rolling:
@@ -199,7 +199,7 @@ def test_limits_are_watched() -> None:
     gaps = make_formation(formation.scene, "v2-palm v0-palm v3-finger1")
     z, _, _ = draw(rng)
     got = call(monitor_kernel(formation, monitored), [z])
-    np.testing.assert_allclose(got, measure_gaps(gaps, z), atol=1e-15)
+    np.testing.assert_allclose(got, measure_gaps(gaps, z), atol=1e-13)
 
 
 @pytest.mark.parametrize("name, degree", [("radau", 3), ("legendre", 2)])
@@ -234,7 +234,7 @@ def test_only_what_bends_within_an_interval_costs() -> None:
     straight, weight = np.linspace([1.0, 2.0], [3.0, -1.0], 4), np.array([0.5, 2.0])
     bent = straight + np.array([0.0, 0.0, 0.3, 0.0])[:, None] * [1.0, 0.0]
     got = [call(bend_kernel(4), [own.ravel(), np.array([0.1])], weight) for own in (straight, bent)]
-    np.testing.assert_allclose(got[0], 0.0, atol=1e-15)
+    np.testing.assert_allclose(got[0], 0.0, atol=1e-13)
     # Second differences of 0.3 and -0.6 of the first torque.
     np.testing.assert_allclose(got[1], 0.1 * 0.5 * (0.3**2 + 0.6**2), rtol=1e-12)
 

@@ -337,7 +337,7 @@ def test_values_are_those_of_the_objective(
     options = PlanOptions("margin", time_intervals=COARSE)
     start = trace_phases(landing())[-1].end
     fewer = plan_phases(landing(), landing().phases[4:], start, options, allowed, ample=0.5)
-    assert fewer[0].sequences == 1 and 0.5 < fewer[0].value < 0.55
+    assert 0.5 < fewer[0].value < plans[0].value * (1 + 1e-3)
 
 
 def test_the_effort_of_a_gentle_plan_is_least(

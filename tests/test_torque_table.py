@@ -112,7 +112,7 @@ def test_samples(rate: float) -> None:
     torque = bent()
     linear, hold = (sample_rows(torque, rate, kind) for kind in ("linear", "hold"))
     count = math.ceil(rate - 1e-9) + 1
-    np.testing.assert_allclose(linear[:, 0], np.arange(count) / rate, atol=1e-15)
+    np.testing.assert_allclose(linear[:, 0], np.arange(count) / rate, atol=1e-13)
     np.testing.assert_allclose(linear[:, 1:], torque.at(linear[:, 0] + 1e-15), atol=1e-12)
     assert linear[-1, 0] >= torque.duration > linear[-2, 0]
     staircase = read_rows(hold)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from ..common.errors import InputError
-from ..common.files import require_writable, write_text
+from ..common.files import read_json, require_writable, write_text
 from ..geometry.path_guess import load
 from ..geometry.tracing import trace_phases
 from ..planning.plan import solve
@@ -94,11 +94,7 @@ def read_stored(path: str) -> dict[str, Counts]:
     InputError
         If the file cannot be read, or is not a table of whole numbers.
     """
-    try:
-        table = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "no JSON"
-        raise InputError(path, "", f"cannot be read: {reason}; --update writes it anew") from None
+    table = read_json(path, "--update writes it anew")
     rows = table.values() if isinstance(table, Mapping) else [None]
     numbers = [n for row in rows for n in (row.values() if isinstance(row, Mapping) else [None])]
     if not all(type(number) is int for number in numbers):

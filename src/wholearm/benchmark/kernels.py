@@ -1,11 +1,12 @@
-"""Every problem, planned and verified on a machine that rounds differently.
+"""Answers of every problem where numbers are rounded differently.
 
 OpenBLAS has kernels for each processor, which differ in the last bits; ``OPENBLAS_CORETYPE`` makes
-one machine stand in for another.
+one machine stand in for another. Further Pythons bring other versions of the libraries. Seeds
+change the numbers of the scenes themselves in the last bits, see `rounding`.
 
-``python -m wholearm.benchmark.kernels PROBLEM...`` takes a kernel that is not the machine's
-own, prints one line for each problem and exits with 1 if any plan fails, or a least time is not
-that of the reference figures beside its problem.
+Each problem is planned and verified for every objective, in a process for each environment. Its
+answer is the value of the objective and the sequence of contact modes of each phase. Answers are
+held against those that are stored.
 """
 
 from __future__ import annotations
@@ -13,144 +14,210 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import re
 import subprocess
 import sys
-import time
-from collections import defaultdict
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from itertools import groupby, product
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from ..planning.result import Plan
 
 OBJECTIVES = ("time", "effort", "margin")
-X86 = ("Haswell", "Sandybridge")
-"""Kernels to choose from, both for any processor with AVX2."""
-_SAME = {"Zen": "Haswell", "Excavator": "Haswell"}
-"""Processors that have the kernels of another."""
-_OFF = 5e-4
-"""Most that a least time may differ from its reference figure, relatively."""
+KERNELS = ("Haswell", "Zen", "Sandybridge", "Nehalem", "Prescott", "SkylakeX")
+TOLERANCE = 1e-6
+"""Largest relative difference of values: what Ipopt and the refinement of limits leave open."""
+BRIEF = 1e-3
+"""Duration below which a stretch with other contact modes does not count, over the phase's."""
+SUPPORTED = re.compile(r"^Core: (\w+)", re.M)
 
 
-class Outcome(NamedTuple):
-    """A problem that was planned and verified for one objective.
+class Environment(NamedTuple):
+    """Where problems are planned.
 
     Attributes
     ----------
-    objective : str
-    value : float or None
-        Of the objective; None without a plan.
-    fault : str
-        Why there is no plan that holds, or empty.
-    seconds : float
-    """
-
-    objective: str
-    value: float | None
-    fault: str
-    seconds: float
-
-
-def find_kernel(kernel: str = "") -> str:
-    """Name of the kernel that NumPy takes, empty if it has no OpenBLAS.
-
-    Parameters
-    ----------
+    python : str
+        An interpreter that has the package.
     kernel : str
-        What is asked for; empty for the machine's own.
+        Of OpenBLAS; empty for the processor's own.
+    seed : int
+        Of the changes to the numbers of scenes in the last bits; zero leaves them as they are.
     """
-    asked = {"OPENBLAS_VERBOSE": "2"} | _ask_for(kernel)
-    command = [sys.executable, "-c", "import numpy"]
-    run = subprocess.run(command, env=os.environ | asked, capture_output=True, text=True)
-    match = re.search(r"Core: (\w+)", run.stdout + run.stderr)
+
+    python: str = sys.executable
+    kernel: str = ""
+    seed: int = 0
+
+    def run(self, arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
+        """Run the interpreter with this kernel and one thread."""
+        asked = {"OPENBLAS_CORETYPE": self.kernel} if self.kernel else {}
+        known = os.environ | {"OPENBLAS_NUM_THREADS": "1"} | asked
+        command = [self.python, *arguments]
+        return subprocess.run(command, env=known, capture_output=True, text=True, check=False)
+
+    def describe(self) -> str:
+        """Versions, kernel and seed in words."""
+        code = (
+            "import platform, casadi, numpy, scipy;"
+            "print('Python', platform.python_version(), 'NumPy', numpy.__version__,"
+            " 'SciPy', scipy.__version__, 'CasADi', casadi.__version__)"
+        )
+        kernel = find_kernel(self.kernel, self.python) or "no OpenBLAS"
+        text = f"{self.run(['-c', code]).stdout.strip()}, {kernel}"
+        return f"{text}, seed {self.seed}" if self.seed else text
+
+
+def find_kernel(kernel: str = "", python: str = sys.executable) -> str:
+    """Name of the kernel that NumPy takes where one is asked for, empty if it has no OpenBLAS."""
+    code = "import os; os.environ['OPENBLAS_VERBOSE'] = '2'; import numpy"
+    run = Environment(python, kernel).run(["-c", code])
+    match = SUPPORTED.search(run.stdout + run.stderr)
     return match[1] if match else ""
 
 
-def _ask_for(kernel: str) -> dict[str, str]:
-    return {"OPENBLAS_CORETYPE": kernel} if kernel else {}
+def answer(path: str, objective: str) -> dict[str, Any]:
+    """Plan a problem and replay the plan.
 
-
-def choose_kernel(own: str) -> str:
-    """A kernel other than the machine's own, empty if there is none to choose."""
-    if not own or platform.machine() not in ("x86_64", "AMD64"):
-        return ""
-    return next(kernel for kernel in X86 if kernel != _SAME.get(own, own))
-
-
-def plan_and_verify(path: str, objective: str) -> Outcome:
-    """Plan a problem and replay the plan."""
-    # Only now: the kernel is chosen when NumPy is loaded.
+    Returns
+    -------
+    dict
+        ``value`` of the objective, None without a plan; ``modes``, a list for each phase; ``fault``
+        says why there is no plan that holds, and is empty where there is one.
+    """
     from ..common.errors import WholearmError
     from ..geometry.path_guess import load
     from ..planning.plan import solve
     from ..verification.verify import verify
 
-    started, value = time.perf_counter(), None
     try:
         problem = load(path)
         plan = solve(problem, objective)
-        value = plan.value
-        faults = [*verify(problem, plan).failures, *compare(path, objective, value)]
-        fault = "; ".join(faults)
+        fault = "; ".join(verify(problem, plan).failures)
     except WholearmError as error:
-        fault = str(error)
-    return Outcome(objective, value, fault, time.perf_counter() - started)
+        return {"value": None, "modes": [], "fault": str(error)}
+    return {"value": plan.value, "modes": list_modes(plan), "fault": fault}
 
 
-def compare(path: str, objective: str, value: float) -> list[str]:
-    """What is wrong with a least time by the reference figures beside its problem, if there are."""
-    stored = Path(path).with_suffix(".reference.json")
-    if objective != "time" or not stored.exists():
-        return []
-    known = sum(json.loads(stored.read_text(encoding="utf-8"))["phase_durations"])
-    off = value / known - 1
-    return [f"least time is {off:+.2%} off its reference figure"] if abs(off) > _OFF else []
+def list_modes(plan: Plan) -> list[list[str]]:
+    """Contact modes and directions of the joints that follow each other in every phase."""
+    found = []
+    for phase in plan.phases:
+        spans = [s for s in phase.modes if s.stop - s.start > BRIEF * phase.duration]
+        texts = (f"{' '.join(s.contacts.values())} {' '.join(s.joints)}" for s in spans)
+        found.append([text for text, _ in groupby(texts)])
+    return found
 
 
-def run_all(paths: list[str], workers: int) -> int:
-    """Plan and verify problems on `workers` processes; returns how many fail."""
-    outcomes: dict[str, list[Outcome]] = defaultdict(list)
-    failed = 0
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        jobs = {pool.submit(plan_and_verify, p, goal): p for p in paths for goal in OBJECTIVES}
-        for job in as_completed(jobs):
-            path = jobs[job]
-            outcomes[path].append(job.result())
-            if len(outcomes[path]) == len(OBJECTIVES):
-                failed += any(outcome.fault for outcome in outcomes[path])
-                print(describe(path, outcomes[path]), flush=True)
-    return failed
+Answers = dict[str, dict[str, Any]]
 
 
-def describe(path: str, outcomes: list[Outcome]) -> str:
-    """One line on a problem: its values, or what fails."""
-    parts = []
-    for outcome in sorted(outcomes, key=lambda outcome: OBJECTIVES.index(outcome.objective)):
-        value = "-" if outcome.value is None else f"{outcome.value:.6f}"
-        fault = f" FAILS: {outcome.fault}" if outcome.fault else ""
-        parts.append(f"{outcome.objective} {value}{fault}")
-    seconds = sum(outcome.seconds for outcome in outcomes)
-    return f"{Path(path).stem}: {', '.join(parts)}; {seconds:.1f} s"
+def answer_all(environment: Environment, paths: Sequence[str]) -> Iterator[tuple[str, Any]]:
+    """Answers of an environment by problem and objective, each when it is there."""
+    for path, objective in product(paths, OBJECTIVES):
+        given = ["--answer", path, objective, str(environment.seed)]
+        run = environment.run(["-m", "wholearm.benchmark.kernels", *given])
+        if run.returncode:
+            found = {"value": None, "modes": [], "fault": run.stderr.strip()[-300:]}
+        else:
+            found = json.loads(run.stdout)
+        yield f"{Path(path).stem} {objective}", found
 
 
-def main() -> int:
-    """Run from the command line."""
+def compare(found: Mapping[str, Any], stored: Mapping[str, Any] | None) -> list[str]:
+    """Differences of an answer from the one that is stored."""
+    if found["fault"]:
+        return [found["fault"]]
+    if stored is None:
+        return ["no answer is stored; --update stores it"]
+    texts, off = [], found["value"] / stored["value"] - 1
+    if abs(off) > TOLERANCE:
+        texts.append(f"value {found['value']:.9g} is off {stored['value']:.9g} by {off:+.1e}")
+    if found["modes"] != stored["modes"]:
+        texts.append(f"contact modes {found['modes']} are not {stored['modes']}")
+    return texts
+
+
+def run_kernels(
+    paths: Sequence[str],
+    environments: Sequence[Environment],
+    stored: str,
+    update: bool,
+    workers: int,
+    progress: Callable[[str], None] | None = None,
+) -> tuple[str, int]:
+    """Hold the answers of all environments against those that are stored.
+
+    Parameters
+    ----------
+    paths : sequence of str
+        Problem files.
+    stored : str
+        File of answers (JSON).
+    update : bool
+        Whether the answers of the first environment are stored.
+    workers : int
+        Environments at the same time.
+
+    Returns
+    -------
+    table : str
+        A row for each environment (Markdown), then what differs.
+    count : int
+        Number of differences.
+    """
+    from ..common.files import read_json, write_text
+
+    with ThreadPoolExecutor(workers) as pool:
+
+        def collect(environment: Environment) -> Answers:
+            found: Answers = {}
+            for name, own in answer_all(environment, paths):
+                found[name] = own
+                if progress is not None:
+                    progress(f"{environment.kernel or 'own kernel'}: {name}")
+            return found
+
+        first = collect(environments[0]) if update else {}
+        if update:
+            write_text(stored, json.dumps(first, indent=1, sort_keys=True) + "\n")
+        known = first or read_json(stored, "--update writes it anew")
+        others = environments[1:] if update else environments
+        jobs = {pool.submit(collect, environment): environment for environment in others}
+        results = {jobs[job]: job.result() for job in as_completed(jobs)}
+    if update:
+        results[environments[0]] = first
+    lines = ["| environment | answers | as stored | largest difference of a value |"]
+    lines.append("|---|---|---|---|")
+    faults = []
+    for environment in environments:
+        found, label = results[environment], environment.describe()
+        texts = {name: compare(own, known.get(name)) for name, own in found.items()}
+        faults += [f"{label}: {name}: {'; '.join(own)}" for name, own in texts.items() if own]
+        offs = [
+            abs(own["value"] / known[name]["value"] - 1)
+            for name, own in found.items()
+            if own["value"] and known.get(name, {}).get("value")
+        ]
+        same = sum(not own for own in texts.values())
+        lines.append(f"| {label} | {len(found)} | {same} | {max(offs, default=0.0):.1e} |")
+    return "\n".join([*lines, "", *faults]).rstrip() + "\n", len(faults)
+
+
+def _answer() -> None:
+    """Print the answer that the parent process asks for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("problems", nargs="+")
-    parser.add_argument("--kernel", help="OPENBLAS_CORETYPE (default: not the machine's own)")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    options = parser.parse_args()
-    own = find_kernel()
-    kernel = choose_kernel(own) if options.kernel is None else options.kernel
-    # Worker processes inherit both, and load NumPy anew.
-    os.environ |= {"OPENBLAS_NUM_THREADS": "1"} | _ask_for(kernel)
-    print(f"kernel {find_kernel(kernel) or 'unknown'}; the machine's own is {own or 'unknown'}")
-    count = len(options.problems)
-    failed = run_all(options.problems, options.workers)
-    print(f"{count - failed} of {count} problems planned and verified")
-    return int(failed > 0)
+    parser.add_argument("--answer", nargs=3, required=True)
+    path, objective, seed = parser.parse_args().answer
+    if int(seed):
+        from .rounding import perturb_scenes
+
+        perturb_scenes(int(seed))
+    print(json.dumps(answer(path, objective)))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    _answer()

@@ -5,12 +5,15 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import sys
 from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
+from ..common.files import write_text
 from .progress import clear_progress, show_progress
 
-STUDIES = ("problem", "precision", "stress", "guard", "skip", "growth")
+STUDIES = ("problem", "precision", "stress", "guard", "kernels", "skip", "growth")
 """Words that can follow ``bench``; the word ``problem`` may be left out."""
 
 
@@ -56,6 +59,23 @@ def add_bench(bench: argparse.ArgumentParser) -> None:
     guard.add_argument("--counts", default="results/bench_guard.json", help="file of stored counts")
     guard.add_argument("--update", action="store_true", help="store the counts anew")
     guard.set_defaults(run=_guard)
+
+    text = "plan for all objectives under other roundings, and compare with stored answers"
+    kernels = studies.add_parser("kernels", help=text, description=text)
+    kernels.add_argument("problems", nargs="+", metavar="FILE", help="problem files (TOML)")
+    words = "kernels of OpenBLAS, as for OPENBLAS_CORETYPE (default: the processor's own)"
+    kernels.add_argument("--kernels", nargs="+", default=[""], metavar="NAME", help=words)
+    words = "seeds of changes to all numbers in the last bits; 0 for none (0)"
+    kernels.add_argument("--seeds", nargs="+", type=int, default=[0], metavar="K", help=words)
+    words = "interpreters that have the package (default: this one)"
+    kernels.add_argument("--pythons", nargs="+", default=[sys.executable], help=words)
+    words = "file of stored answers (results/bench_kernels.json)"
+    kernels.add_argument("--answers", default="results/bench_kernels.json", help=words)
+    words = "store the answers of the first environment"
+    kernels.add_argument("--update", action="store_true", help=words)
+    kernels.add_argument("--jobs", type=int, help="environments at a time (default: all cores)")
+    kernels.add_argument("-o", "--output", metavar="FILE", help="write the table (Markdown)")
+    kernels.set_defaults(run=_compare_kernels)
 
     text = "measure what each part of the model costs when a scene has it and when it has not"
     skip = studies.add_parser("skip", help=text, description=text)
@@ -149,6 +169,22 @@ def _guard(options: argparse.Namespace) -> int:
     elif not grown:
         print(f"{len(options.problems)} problems: no count has grown")
     return 1 if grown else 0
+
+
+def _compare_kernels(options: argparse.Namespace) -> int:
+    from ..benchmark.kernels import Environment, run_kernels
+
+    given = product(options.pythons, options.kernels, options.seeds)
+    environments = [Environment(*own) for own in given]
+    jobs = options.jobs or os.cpu_count() or 1
+    stored, update = options.answers, options.update
+    text, count = run_kernels(options.problems, environments, stored, update, jobs, show_progress())
+    clear_progress()
+    print(text, end="")
+    if options.output:
+        write_text(options.output, text)
+        print(f"wrote {options.output}")
+    return 1 if count else 0
 
 
 def _skip(options: argparse.Namespace) -> int:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import BinaryIO
+from pathlib import Path
+from typing import Any, BinaryIO
 
 from .errors import InputError
 from .interrupts import held, on_end
@@ -95,6 +97,21 @@ def together() -> Iterator[None]:
 def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write a text file as a whole; see `write_whole`."""
     write_whole(path, lambda stream: stream.write(text.encode()))
+
+
+def read_json(path: str, hint: str = "") -> Any:
+    """Contents of a JSON file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, with a `hint` at what to do.
+    """
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "no JSON"
+        raise InputError(path, "", f"cannot be read: {reason}{hint and '; '}{hint}") from None
 
 
 def make_folder(path: str) -> None:
