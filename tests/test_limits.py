@@ -197,13 +197,13 @@ def test_another_limit_is_short_and_gives_way(heptagon: Problem, curves: tuple[C
     assert advised
     # Over time there are more motions than along the curve: what is advised is enough.
     allowed = 1.03 * float(advised[1])
-    strong = Search.of(change_limit(heptagon, "fingers.1.torque_limit", allowed), COARSE)
-    guess = guess_stages(strong.problem, strong.problem.phases[3:4], start, strong.scheme, 6, 2.0)
-    kept = strong.solve(guess)
+    strong = change_limit(heptagon, "fingers.1.torque_limit", allowed)
+    search = Search.of(strong, COARSE)
+    kept = search.solve(guess_stages(strong, strong.phases[3:4], start, search.scheme, 6, 2.0))
     assert kept.success
     # What that motion is short of with the limits as they are, but no more than was added.
     stages = [replace(stage, formation=phases[0].formation) for stage in kept.stages]
-    short = {one.limit: one.amount for one in list_shortfalls(problem, stages, strong.scheme)}
+    short = {one.limit: one.amount for one in list_shortfalls(problem, stages, search.scheme)}
     assert set(short) == {"torque limit of finger 1 = 0.5 N m", "motor curve of finger 1"}
     assert 0.0 < max(short.values()) < allowed - 0.5 + 1e-6
 
@@ -241,7 +241,7 @@ def test_a_speed_limit_gives_way_over_time_as_along_a_curve() -> None:
     (parameter,) = make_limits(stages[0].formation, search.problem.epsilon).only(SPEED).parameters
     elastic = solve_elastic(search, stages)
     assert elastic is not None and list_shortfalls(problem, elastic, search.scheme) != []
-    relaxed = search.aiming(Objective.RELAX, parameter).solve(feasible)
+    relaxed = search.aiming(Objective.RELAX, parameter).solve(elastic)
     assert relaxed.success
     least = 0.3 + relaxed.cost / problem.scene.scales.time
     assert least == pytest.approx(advised, rel=0.1)
