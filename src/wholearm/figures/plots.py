@@ -219,7 +219,7 @@ def _title(trajectory: Trajectory, scene: Scene, epsilon: float, between: str) -
         gap = float(evaluate_finger_gap(scene, trajectory.z).min())
         text = f"{1e3 * gap:.3g} mm" if gap < 0.9995 else f"{gap:.3g} m"
         parts.append(f"finger gap \u2265 {text}".replace("-", "\u2212"))
-    return between.join(filter(None, parts))
+    return between.join(part.replace(" ", "\u00a0") for part in parts if part)
 
 
 __all__ = [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -80,14 +80,16 @@ def draw_snapshot(
     scale = 72 / axes.figure.dpi * float(np.ptp(ends[:, 0]))
     corners = [parse_contact(name, scene) for name in contacts]
     first = [own.index for own in corners if own.feature == "v"]
-    look: Any = {"va": "center", "fontsize": NUMBER, "color": "#555555", "zorder": 5.5}
-    look["path_effects"] = [withStroke(linewidth=1.5, foreground="white", alpha=0.7)]
-    for index, shift in choose_numbers(scale * vertices, first).items():
-        write(axes, str(index), vertices[index], shift, **look)
+    style: Any = {"va": "center", "fontsize": NUMBER, "color": "#555555", "zorder": 5.5}
+    style["path_effects"] = [withStroke(linewidth=1.5, foreground="white", alpha=0.7)]
+    for index, shift in choose_numbers(scale * vertices, first, 0.0).items():
+        write(axes, str(index), vertices[index], shift, **style)
     return artists
 
 
-def choose_numbers(vertices: Array, first: Sequence[int] = ()) -> dict[int, Array]:
+def choose_numbers(
+    vertices: Array, first: Sequence[int] = (), lowest: float = -math.inf
+) -> dict[int, Array]:
     """Choose which vertices of a polygon are numbered, and where the numbers stand.
 
     All of them where there is room, or every second, fifth, tenth, ... one, and those of `first`
@@ -97,6 +99,8 @@ def choose_numbers(vertices: Array, first: Sequence[int] = ()) -> dict[int, Arra
     ----------
     vertices : ndarray, shape (n, 2), [points]
     first : sequence of int
+    lowest : float
+        Least height of the middle of a number [points].
 
     Returns
     -------
@@ -109,30 +113,38 @@ def choose_numbers(vertices: Array, first: Sequence[int] = ()) -> dict[int, Arra
     inwards = along - np.roll(along, 1, axis=0)
     sharp = np.hypot(*inwards.T)  # 2 cos(half the angle at the vertex)
     blunt = np.sqrt(np.maximum(1 - sharp**2 / 4, 1e-3))
-    shifts = (np.clip(5.5 / blunt, 8.5, 14.0) / np.maximum(sharp, 1e-9))[:, None] * inwards
-    found: dict[int, Array] = {}
-    for step in (k * 10**n for n in range(4) for k in (1, 2, 5)):
-        every = range(0, count, step)
-        found = {}
-        for index in dict.fromkeys([*first, *every]):
+    shifts = (np.clip(5.5 / blunt, 8.5, 14.0) / sharp)[:, None] * inwards
+
+    def put(chosen: Iterable[int]) -> dict[int, Array]:
+        """Those of the chosen that stand clear of the ones before."""
+        found: dict[int, Array] = {}
+        for index in chosen:
             for shift in (shifts[index], -shifts[index])[: 1 + (count <= _FEW)]:
+                place = vertices[index] + shift
                 far = [
-                    np.hypot(*(vertices[k] + own - vertices[index] - shift))
-                    - 0.32 * NUMBER * (len(str(index)) + len(str(k)))
+                    np.abs(vertices[k] + own - place)
+                    > NUMBER * np.array([0.34 * (len(str(index)) + len(str(k))), 1.2])
                     for k, own in found.items()
                 ]
-                if min(far, default=1.0) > 0:
+                if all(apart.any() for apart in far) and place[1] > lowest:
                     found[index] = shift
                     break
-        if set(every) <= set(found) or step >= count:
-            break
-    return found
+        return found
+
+    steps = (k * 10**n for n in range(4) for k in (1, 2, 5))
+    every = next(own for step in steps if len(put(own := range(0, count, step))) == len(own))
+    return dict(sorted(put(dict.fromkeys([*first, *every])).items()))
 
 
 def place_vertices(scene: Scene, z: Array) -> Array:
     """World positions of the object's vertices, shape (n_v, 2) [m]."""
+    return turn(z, scene.polygon.vertices)
+
+
+def turn(z: Array, points: Array) -> Array:
+    """World positions of points of the object, shape (n, 2) [m]."""
     c, s = math.cos(z[2]), math.sin(z[2])
-    return np.asarray(z[:2] + scene.polygon.vertices @ np.array([[c, s], [-s, c]]))
+    return np.asarray(z[:2] + points @ np.array([[c, s], [-s, c]]))
 
 
 @exclusive

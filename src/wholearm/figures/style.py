@@ -86,10 +86,10 @@ def unit_of(axes: Axes) -> str:
     return label[label.index("[") : label.index("]") + 1]
 
 
-def list_contacts(axes: Axes, room: float) -> None:
+def list_contacts(axes: Axes, room: float, largest: float = 9.0) -> None:
     """Write the legend of axes to their right, in so small letters that `room` [points] do."""
     count = len(axes.get_legend_handles_labels()[1])
-    size = min(9.0, room / (1.1 * max(count, 1)))
+    size = min(largest, room / (1.1 * max(count, 1)))
     look: Any = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.02), "fontsize": size}
     axes.legend(**look, labelspacing=min(0.5, max(room / (size * max(count, 1)) - 1.0, 0.05)))
 
