@@ -33,7 +33,7 @@ STYLE: Any = {
     "pdf.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "wholearm",
 }  # fmt: skip
 SIMULATED: Any = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 1.0, "zorder": 5}
-SIMULATED_2: Any = SIMULATED | {"linestyle": (0, (4, 1.5, 1, 1.5)), "linewidth": 0.8}
+SIMULATED_2: Any = SIMULATED | {"linestyle": (0, (3, 5)), "linewidth": 0.9}
 """What is simulated; the torque of finger 2, to be told from that of finger 1."""
 PALM = 0.12
 """Thickness of the palm, over the object's radius of gyration."""

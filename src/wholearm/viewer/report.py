@@ -9,6 +9,7 @@ from ..comparison.compare import compare
 from ..comparison.side_by_side import Comparison, Contender
 from ..mapping.formation_map import FormationMap, build_map, choose_window
 from ..problem.definition import Problem
+from ..results.report_text import fixed
 from . import page
 from .chart import describe_map
 from .motion import describe_motion
@@ -74,7 +75,7 @@ def _summarise(comparison: Comparison) -> str:
             own.verdict,
             f"{own.duration:.6g}",
             f"{own.effort:.6g}",
-            "" if own.margin is None else f"{round(own.margin, 4) + 0.0:.4f}",
+            "" if own.margin is None else f"{own.margin:{fixed(comparison.epsilon or 0.05)}}",
             f"{own.contact} in phase {own.phase}" if own.contact else "",
         )
         for own in comparison.contenders
