@@ -27,7 +27,7 @@ from .style import FINGERS, INK, PALM, STRIP, Sheet, Styles, count_decimals, wri
 
 NUMBER = 8.0
 """Size of the numbers at vertices [points]."""
-_FEW = 8
+_FEW = 5
 """Most vertices of an object whose numbers may stand outside; case: a ruler, 120 x 15 mm."""
 _CAPTION = 0.42
 """Height of the caption of a snapshot [in]."""
