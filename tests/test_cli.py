@@ -113,7 +113,7 @@ def test_solve_writes_the_plan(folder: Path, capsys: pytest.CaptureFixture[str])
     assert lines[4].startswith("wrote a.csv: ") and " rows; its replay holds: " in lines[4]
     took = f"{plan.duration:.6f} s"
     error = f"{max(plan.meta['error'], 1e-9):.0e}"
-    assert lines[5].startswith("least minor 0.")
+    assert lines[5].startswith("contact forces unique: margin 0.")
     assert lines[6] == f"solved: time = {took} (to {error}), {took} in all; wrote a.npz"
     assert main(["verify", path, "a.csv"]) == 0
     assert len(plan.t) == 2 * 21
@@ -360,6 +360,7 @@ def test_problems_without_a_plan(
     [
         (b"", "epsilon: is missing"),
         (b"epsilon = ", "is not TOML: "),
+        (b"PK\x03\x04", "is no problem file but an archive"),
         (b"\xff\xfe\x00", "is not TOML: "),
         (None, "cannot be read: No such file or directory"),
     ],
@@ -385,7 +386,7 @@ def test_unreadable_problems(
 @pytest.mark.parametrize(
     "target, words",
     [
-        ("absent/out", "is not a folder"),
+        ("absent/out", "no folder "),
         (".", "is a folder"),
         ("file/out", "is not a folder"),
     ],

@@ -140,8 +140,37 @@ def test_strip_has_one_scale_and_its_bar(figure: Figure) -> None:
         box, (left, right), (low, high) = axes.bbox, axes.get_xlim(), axes.get_ylim()
         scales += [box.width / (right - left), box.height / (high - low)]
     np.testing.assert_allclose(scales, scales[0], rtol=1e-6)
-    assert "50 mm" in [text.get_text() for text in figure.axes[0].texts]
-    assert np.ptp(data_of(figure.axes[0].lines[-1])[0]) == pytest.approx(0.05)
+    assert "50 mm" in [text.get_text() for text in figure.texts]
+    (bar,) = (own for own in figure.artists if isinstance(own, Line2D))
+    assert np.ptp(data_of(bar)[0]) * figure.dpi / scales[0] == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("count", [3, 4, 7, 12, 30, 50])
+@pytest.mark.parametrize("thin", [1.0, 0.12])
+def test_numbers_at_vertices_stand_apart(count: int, thin: float) -> None:
+    angles = 2 * np.pi * (np.arange(count) + 0.5) / count
+    vertices = 40 * np.column_stack([np.cos(angles), thin * np.sin(angles)])
+    found = plots.choose_numbers(vertices, [1])
+    places = {str(k): vertices[k] + own for k, own in found.items()}
+    for (one, a), (other, b) in itertools.combinations(places.items(), 2):
+        wide = 0.32 * 8 * (len(one) + len(other))
+        assert abs(a[0] - b[0]) > wide or abs(a[1] - b[1]) > 8
+    assert 1 in found
+    assert len(found) >= 3 or (thin < 1.0 and count > 4)
+    if count <= 7 and thin == 1.0:
+        assert len(found) == count
+
+
+@pytest.mark.parametrize(
+    ("size", "prefix"), [(5e-4, "m"), (2e-6, "\u00b5"), (2.0, ""), (400.0, ""), (1e5, "k")]
+)
+def test_units_suit_the_size(axes: Axes, size: float, prefix: str) -> None:
+    torque = TorqueProfile(np.array([0.0, 1.0]), np.full((1, 2, 1), 0.5 * size))
+    plots.draw_torques(axes, torque, np.array([size, size]))
+    axes.figure.canvas.draw()
+    assert f"[{prefix}N m]" in axes.get_ylabel()
+    labels = [tick.get_text() for tick in axes.get_yticklabels()]
+    assert max(map(len, labels)) <= 5
 
 
 def test_snapshots_say_when_and_which_phase(figure: Figure, planned: Trajectory) -> None:
@@ -344,7 +373,10 @@ def test_simulation_is_drawn_over_the_plan(planned: Trajectory) -> None:
     assert (~rows).sum() == 4
     np.testing.assert_array_equal(values[rows], c_n[:, 0] - 0.05)
     assert margins.get_ylim()[0] < -3.05
-    assert line.is_dashed() and line_of(torques, "simulated").is_dashed()
+    both = [line_of(torques, f"simulated {number}") for number in (1, 2)]
+    assert line.is_dashed() and both[0].is_dashed()
+    # The torque of one finger is told from that of the other.
+    assert both[0].get_linewidth() != both[1].get_linewidth()
     check_layout(figure)
 
 

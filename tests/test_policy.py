@@ -309,7 +309,12 @@ def test_no_policy_is_written_that_does_not_carry_out_its_plan(
     assert main(["policy", str(tmp_path / "plan.npz"), "-o", str(output)]) == 1
     said = capsys.readouterr().err
     assert "no policy is written" in said and "phase 2, and opens by" in said
+    assert "--period 0.0002 --delay 0 would not do either; --write-anyway" in said
     assert not output.exists()
+    given = ["policy", str(tmp_path / "plan.npz"), "-o", str(output), "--write-anyway"]
+    assert main(given) == 0
+    assert "phase 2, and opens by" in capsys.readouterr().err
+    assert any("opens by" in text for text in Policy.load(output).about["failures"])
 
 
 def test_an_end_without_a_gained_contact_is_held(problem: Problem) -> None:

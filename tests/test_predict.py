@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 from functools import cache
 from pathlib import Path
 
@@ -221,3 +222,18 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert main(["predict", str(file), "--speed", "1"]) == 2
     with pytest.raises(InputError, match="squeeze"):
         predict(first_phase(), squeeze=math.nan)
+
+
+def test_without_quasistatic_torques_the_table_is_printed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Torques too weak to hold the object; the file begins with a byte order mark.
+    text = HEPTAGON.read_text(encoding="utf-8")
+    file, table = tmp_path / "weak.toml", tmp_path / "a.csv"
+    weak = re.sub("torque_limit = .*", "torque_limit = 0.02", text)
+    file.write_text(weak, encoding="utf-8-sig")
+    assert main(["predict", str(file), "--torques", str(table)]) == 1
+    out, err = capsys.readouterr()
+    assert "keeps epsilon to" in out and "torque of finger 2 and finger 2" not in out
+    assert err.startswith("wholearm: no quasistatic torques to write: phase 1")
+    assert not table.exists()

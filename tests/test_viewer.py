@@ -11,12 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageColor
 
 from shipped import HEPTAGON, LANDING, chart, plan_of, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.contacts.closing import contact_table, evaluate_contacts
+from wholearm.figures.style import choose_styles
 from wholearm.mapping.template import write_template
 from wholearm.viewer import page
 from wholearm.viewer.chart import describe_map
@@ -115,6 +116,9 @@ def test_a_movie_shows_the_whole_motion(tmp_path: Path) -> None:
         assert frames == len(movie.times)
         assert image.info["duration"] * FRAMES == 1000
         first = np.array(image.convert("RGB"), dtype=int)
+        # Each contact has its own colour.
+        for colour in {own.colour for own in choose_styles(plan.contacts).values()}:
+            assert (first == ImageColor.getrgb(colour)).all(axis=2).any()
         image.seek(frames - 1)
         assert (np.abs(np.array(image.convert("RGB")) - first).max(axis=2) > 60).mean() > 0.01
 

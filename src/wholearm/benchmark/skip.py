@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..common.files import require_writable, write_text
+from ..common.files import make_folder, require_writable, write_text
 from ..geometry.path_guess import load
 from ..geometry.tracing import trace_phases
 from ..planning.plan import solve
@@ -146,6 +146,7 @@ def spend(case: Case) -> Expense:
 
 def run_skip(folder: str, output: str, progress: Callable[[str], None] | None = None) -> str:
     """Measure every part in fresh processes and write a table; returns the path of its file."""
+    make_folder(output)
     path = str(Path(output) / "bench_skip.md")
     require_writable(path)
     lines = [*HEAD]

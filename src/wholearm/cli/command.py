@@ -176,9 +176,10 @@ def _solve(options: argparse.Namespace) -> int:
         else:
             plan, found = solve_with(problem, plan_options, show_progress()), ""
         table = None if options.torques is None else _make_table(options, plan)
-    except WholearmError:
+    except WholearmError as error:
         clear_progress()
-        for path in filter(None, (output, options.torques)):
+        # Of bad input one line says everything.
+        for path in filter(None, (output, options.torques) if error.exit_status == 1 else ()):
             if os.path.exists(path):
                 _complain(f"{path}: left as it was, from an earlier run")
         raise

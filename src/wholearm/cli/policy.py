@@ -5,10 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import sys
 from typing import TYPE_CHECKING
 
 from ..common.errors import name_source
 from .progress import clear_progress, show_progress
+
+_QUICK = 2e-4
+"""Period of the loop that is tried where a policy fails [s]; case: flips onto another edge."""
 
 if TYPE_CHECKING:
     from ..policy.policy import Policy
@@ -33,6 +37,8 @@ def add_policy(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--torque-limit", type=float, help=text)
     text = "also look for how many times as wide ranges a policy can keep contacts in"
     parser.add_argument("--largest", action="store_true", help=text)
+    text = "write the policy although its simulation does not hold, marked so in its file"
+    parser.add_argument("--write-anyway", action="store_true", help=text)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
     parser.set_defaults(run=_policy)
 
@@ -59,6 +65,16 @@ def _policy(options: argparse.Namespace) -> int:
     def plan_anew(own: Problem) -> Trajectory:
         return solve(own, replay=False, progress=say).trajectory
 
+    def advise() -> str:
+        """Whether a faster loop would do: what is lost between two periods is lost by lateness."""
+        quick = {**given, "period": min(_QUICK, options.period), "delay": 0.0}
+        if (quick["period"], 0.0) == (options.period, options.delay):
+            return f"a period below {options.period:g} s may do"
+        own = make_policy(problem, plan, **quick, planner=plan_anew)
+        words = f"--period {quick['period']:g} --delay 0"
+        held = verify_policy(problem, plan, own).ok
+        return f"{words} would do" if held else f"{words} would not do either"
+
     with name_source(options.plan):
         say("making the policy")
         policy = make_policy(problem, plan, **given, planner=plan_anew)
@@ -69,10 +85,16 @@ def _policy(options: argparse.Namespace) -> int:
             each = find_widest(problem, plan, options.delay)
             policy.about["largest"] = {str(number): factor for number, factor in each.items()}
     clear_progress()
-    if not report.ok:
-        failures = "; ".join(report.failures)
+    failures = "; ".join(report.failures)
+    if not report.ok and options.write_anyway:
+        # The mark by which a program, or a reader of the file, knows.
+        policy.about["failures"] = list(report.failures)
+        text = f"{output}: written although in the free simulation, {failures}"
+        print(f"wholearm: warning: {text}", file=sys.stderr)
+    elif not report.ok:
         raise ReplayError(
-            f"{options.plan}: no policy is written: in the free simulation, {failures}"
+            f"{options.plan}: no policy is written: in the free simulation, {failures}; "
+            f"{advise()}; --write-anyway writes it all the same"
         )
     policy.save(output)
     print(json.dumps(policy.about, indent=2) if options.json else _describe(policy))

@@ -34,17 +34,17 @@ def predict(options: argparse.Namespace) -> int:
     )
     clear_progress()
     wrote = []
-    if options.torques is not None:
-        from ..results.narrow import save
-
-        save(make_torques(prediction, options.speed or _SPEED), options.torques)
-        wrote.append(options.torques)
     if options.output is not None:
         from ..figures.prediction import draw_prediction
 
         plots.save(draw_prediction(prediction), options.output)
         wrote.append(options.output)
     print(json.dumps(prediction.to_dict()) if options.json else prediction.to_text())
+    if options.torques is not None:
+        from ..results.narrow import save
+
+        save(make_torques(prediction, options.speed or _SPEED), options.torques)
+        wrote.append(options.torques)
     if wrote and not options.json:
         print(f"wrote {', '.join(wrote)}")
     return 0

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from ..planning.phase_plan import combine
 from ..problem.uncertainty import PARAMETERS
+from ..results.report_text import fixed
 
 if TYPE_CHECKING:
     from ..planning.result import Plan
+    from ..problem.definition import Problem
     from ..results.certificate import Certificate
     from ..results.range_figures import RangeFigures
     from ..results.replay_figures import ReplayFigures
@@ -35,22 +37,27 @@ def summarise(plan: Plan, output: str, table: Mapping[str, Any] | None = None) -
     lines = [
         f"{'phase':>5}  {'duration [s]':>12}  {'least c_n [N]':>13}  {'largest |tau| [N m]':>19}"
     ]
+    # Six decimals of what is some hundredths of a newton, and of some newton metres.
+    forces = fixed(plan.problem.epsilon or 0.05, 5)
+    torques = fixed(float(plan.problem.scene.torque_limit.max()), 7)
     for index, phase in enumerate(plan.phases):
         rows = trajectory.phase == index
         c_n = trajectory.c_n[rows]
         least = c_n[c_n == c_n].min()
         torque = abs(trajectory.tau[rows]).max()
-        lines.append(f"{phase.number:>5}  {phase.duration:>12.6f}  {least:>13.6f}  {torque:>19.6f}")
+        figures = f"{format(least, forces):>13}  {format(torque, torques):>19}"
+        lines.append(f"{phase.number:>5}  {phase.duration:>12.6f}  {figures}")
     lines += _list_modes(plan)
     lines += _list_transitions(plan)
     lines += _list_settlings(plan)
     lines += _describe_held(plan)
-    lines += [_describe_replay(plan.replay)]
+    lines += [_describe_replay(plan.replay, plan.problem)]
     lines += [] if plan.certificate is None else _list_bounds(plan.certificate)
     lines += [] if plan.ranges is None else _describe_ranges(plan, plan.ranges)
     lines += _list_table(table) if table is not None else []
     lines += _describe_sureness(plan)
-    value = f"{plan.status.value}: {plan.options.goal.value} = {plan.value:.6f} {plan.unit}"
+    figure = f"{plan.value:.6f}" if abs(plan.value) >= 1e-2 else f"{plan.value:.6g}"
+    value = f"{plan.status.value}: {plan.options.goal.value} = {figure} {plan.unit}"
     value += "" if math.isnan(plan.error) else f" (to {max(plan.error, _LEAST_ERROR):.0e})"
     return "\n".join([*lines, f"{value}, {plan.duration:.6f} s in all; wrote {output}"])
 
@@ -66,14 +73,17 @@ def _describe_held(plan: Plan) -> list[str]:
     return [f"{text} {more} with free ones, {value:.6f} {plan.unit}"]
 
 
-def _describe_replay(replay: ReplayFigures | None) -> str:
+def _describe_replay(replay: ReplayFigures | None, problem: Problem) -> str:
     """What the replay of the plan has shown, in a line."""
     if replay is None:
         return "the plan was not replayed"
     ends = [phase.end_deviation for phase in replay.phases if phase.end_deviation]
     least, finer = replay.least_c_n, max(replay.refinements)
+    short = problem.epsilon - least.value
+    below = f", {short:.1e} N below epsilon between samples" if short > 1e-6 * least.value else ""
     text = (
-        f"replayed: least c_n {least.value:.6f} N on {least.contact}, off by at most "
+        f"replayed: least c_n {least.value:{fixed(problem.epsilon or 0.05, 5)}} N on "
+        f"{least.contact}{below}, off by at most "
         f"{max((end.position for end in ends), default=0.0):.1e} m and "
         f"{max((end.angle for end in ends), default=0.0):.1e} rad at the ends of phases"
     )
@@ -86,7 +96,8 @@ def _describe_sureness(plan: Plan) -> list[str]:
     if not known:
         return []
     least, number = min(known)
-    text = f"least minor {least.ratio:.4f}, of {least.contacts} in phase {number}"
+    text = f"contact forces unique: margin {least.ratio:.2f} (1 without friction, 0 ambiguous)"
+    text += f", least in phase {number}"
     wedged = [
         f"; phase {phase.number} may stay wedged for {1e3 * phase.wedged:.3g} ms"
         for phase in plan.phases

@@ -28,7 +28,8 @@ def require_writable(path: str | os.PathLike[str]) -> None:
     if os.path.isdir(target):
         raise InputError(target, "", "cannot be written: is a folder")
     if not os.path.isdir(folder):
-        raise InputError(target, "", f"cannot be written: {folder} is not a folder")
+        what = f"{folder} is not a folder" if os.path.exists(folder) else f"no folder {folder}"
+        raise InputError(target, "", f"cannot be written: {what}")
     if not os.access(folder, os.W_OK) and not _is_special(target):
         raise InputError(target, "", f"cannot be written: no permission in {folder}")
 

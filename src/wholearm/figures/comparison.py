@@ -14,7 +14,7 @@ from ..common.sharing import exclusive
 from ..comparison.side_by_side import Comparison, Contender
 from ..results.trajectory import Trajectory
 from .curves import draw_margins, draw_phases
-from .style import INK, STYLE, choose_styles
+from .style import INK, STYLE, choose_styles, list_contacts, unit_of
 
 _WIDTH, _HEIGHT = 10.0, 2.7
 """Width of the figure, and height of a panel with what is written above it [in]."""
@@ -53,8 +53,8 @@ def draw_comparison(comparison: Comparison) -> Figure:
             draw_margins(axes, motion, comparison.epsilon, styles, covered)
             axes.set_xlim(0.0, longest)
             draw_phases(axes, motion.phase_starts, span=longest)
-            axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.02), labelspacing=0.2)
-            axes.set_ylabel("$c_n - \\varepsilon$ [N]")
+            list_contacts(axes, 72 * (_HEIGHT - _ABOVE))
+            axes.set_ylabel(f"$c_n - \\varepsilon$ {unit_of(axes)}")
             axes.set_xlabel("time $t$ [s]" if motion is motions[-1] else "")
             high -= _BOTTOM
         title = (

@@ -20,7 +20,19 @@ from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 from .data import cone_shares, find_steps, sample_torques
-from .style import BAND, FINGERS, GRID, INK, LOST, LOW, SIMULATED, Styles, write
+from .style import (
+    BAND,
+    FINGERS,
+    GRID,
+    INK,
+    LOST,
+    LOW,
+    SIMULATED,
+    SIMULATED_2,
+    Styles,
+    choose_prefix,
+    write,
+)
 
 if TYPE_CHECKING:
     from ..simulation.events import Simulation
@@ -64,7 +76,9 @@ def scale_margins(axes: Axes, margins: Array, epsilon: float) -> None:
     low, high = (float(end) for end in transform.inverted().transform(ends + pad))
     axes.set_yscale("symlog", linthresh=linear, linscale=1.0)
     axes.set_ylim(low, high)
-    axes.set_ylabel(f"force margin $c_n - \\varepsilon$ [N], linear to {linear:g}")
+    prefix, factor = choose_prefix(reach)
+    unit, bound = f"[{prefix}N]", f"linear to {factor * linear:g}"
+    axes.set_ylabel(f"force margin $c_n - \\varepsilon$ {unit}, {bound}")
     axes.axhspan(-epsilon, 0.0, color=LOW, linewidth=0, zorder=1.5)
     axes.axhspan(low, -epsilon, color=LOST, linewidth=0, zorder=1.5)
     look: Any = {"xycoords": "axes fraction", "ha": "left", "fontsize": 8, "color": "#7a2a12"}
@@ -76,7 +90,16 @@ def scale_margins(axes: Axes, margins: Array, epsilon: float) -> None:
     axes.yaxis.set_major_locator(FixedLocator(every[(every >= low) & (every <= high)].tolist()))
     axes.yaxis.set_minor_locator(NullLocator())
     axes.grid(axis="y", color=GRID, linewidth=0.4)
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:.6g}".replace("-", "\u2212")))
+    _scale_ticks(axes, factor)
+
+
+def _scale_ticks(axes: Axes, factor: float) -> None:
+    """Have the values at the ticks written times a factor."""
+
+    def show(y: float, _: object) -> str:
+        return f"{factor * y:.6g}".replace("-", "\u2212")
+
+    axes.yaxis.set_major_formatter(FuncFormatter(show))
 
 
 def draw_cones(
@@ -130,7 +153,9 @@ def draw_torques(axes: Axes, torque: TorqueProfile, limits: Array) -> list[Line2
         axes.axhline(-limits[index], **look)
     axes.axhline(0.0, color=GRID, linewidth=0.5, zorder=1.6)
     reach = 1.12 * max(float(limits.max()), float(np.abs(tau).max()))
-    axes.set(ylim=(-reach, reach), ylabel="joint torque $\\tau$ [N m]")
+    prefix, factor = choose_prefix(reach)
+    axes.set(ylim=(-reach, reach), ylabel=f"joint torque $\\tau$ [{prefix}N m]")
+    _scale_ticks(axes, factor)
     return lines
 
 
@@ -163,9 +188,10 @@ def draw_simulation(
     gaps = np.flatnonzero((np.diff(t) <= 0) | (np.diff(simulation.phase) != 0)) + 1
     c_n = np.insert(simulation.c_n, gaps, np.nan, axis=0)
     lines = margins.plot(np.insert(t, gaps, np.nan), c_n - epsilon, **SIMULATED)
-    lines += torques.plot(t, simulation.tau, **SIMULATED)
-    for line in (lines[0], lines[-1]):
-        line.set_label("simulated")
+    lines[0].set_label("simulated")
+    for index, look in enumerate((SIMULATED, SIMULATED_2)):
+        label = f"simulated {index + 1}"
+        lines += torques.plot(t, simulation.tau[:, index], label=label, **look)
     return lines
 
 
@@ -174,18 +200,26 @@ def draw_phases(
 ) -> list[Artist]:
     """Shade every other phase and write each one's number above it, where there is room.
 
+    Numbers of phases too short for them stand above the axes in two rows.
+
     `starts` holds when each phase starts and the last one ends, shape (n_phases + 1,) [s]. The axes
     must be at their final place, which decides what there is room for; they cover `span` [s], or
     just the phases.
     """
     artists: list[Artist] = []
     points = axes.bbox.width / axes.figure.dpi * 72 / (span or starts[-1] - starts[0])
+    taken = [-math.inf, -math.inf]  # where each row of numbers ends [points]
     for index, (start, end) in enumerate(pairwise(starts)):
         colour = "white" if index % 2 else BAND
         artists.append(axes.axvspan(start, end, facecolor=colour, linewidth=0, zorder=0.5))
-        for text in (f"phase {index + 1}", str(index + 1)) if labels else ():
-            if 6.5 * len(text) < points * (end - start):
-                place, units = ((start + end) / 2, 1.0), ("data", "axes fraction")
-                artists.append(write(axes, text, place, (0, 4), xycoords=units))
-                break
+        middle, text = points * (start + end) / 2, f"phase {index + 1}"
+        if 6.5 * len(text) >= points * (end - start):
+            text = str(index + 1)
+        half = 3.2 * len(text)
+        row = next((k for k, stop in enumerate(taken) if stop < middle - half), None)
+        if not labels or row is None:
+            continue
+        taken[row] = middle + half
+        place, units = ((start + end) / 2, 1.0), ("data", "axes fraction")
+        artists.append(write(axes, text, place, (0, 4 + 10 * row), xycoords=units))
     return artists

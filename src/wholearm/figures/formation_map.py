@@ -26,6 +26,7 @@ from ..results.trajectory import Trajectory
 from .map_lines import (
     find_middle,
     name_palm_lines,
+    place_discs,
     place_heads,
     shift,
     shorten,
@@ -52,6 +53,8 @@ _ASIDE = 2.6
 """Offset of directed lines from the border [points]."""
 _ARROW = 8.0
 """Length of the arrows inside cells [points]."""
+_DISC = 16.0
+"""Room for the number of a phase [points]."""
 _LETTER, _HEIGHT = 4.4, 9.0
 """Size of a letter of a label [points]."""
 
@@ -210,25 +213,34 @@ def _write_inside(
     """Write in the widest place of a region, if there is room; returns the text's corners."""
     scale = _points_per_unit(axes)
     step = np.array([phi[1] - phi[0], x[1] - x[0]]) * scale[::-1]
-    half = np.array([_HEIGHT / 2 + 2.0, _LETTER * len(text) / 2 + 1.0])
+    flat = np.array([_HEIGHT / 2 + 2.0, _LETTER * len(text) / 2 + 1.0])
     # Measured in half labels, the room around a place is the largest label that fits.
-    row, column, room = find_room(region, step / half)
-    if room < 1.15:
+    tried = ((find_room(region, step / half), half, turn) for half, turn in _turn(flat))
+    found = next((own for own in tried if own[0][2] >= 1.15), None)
+    if found is None:
         return None
+    (row, column, _), half, turn = found
     look: Any = {"ha": "center", "va": "center", "fontsize": 7.6, "color": color, "zorder": 7}
     look |= {"path_effects": [withStroke(linewidth=2.2, foreground="white")]}
-    look |= {"style": "italic" if italic else "normal"}
+    look |= {"style": "italic" if italic else "normal", "rotation": turn}
     axes.text(x[column], phi[row], text, **look)
     place, size = np.array([x[column], phi[row]]), (half[::-1] + 3.0) / scale
     return np.stack([place - size, place + size])
 
 
+def _turn(half: Array) -> tuple[tuple[Array, float], tuple[Array, float]]:
+    """Half of a label as it is, and upright, with the angle [deg]: cells of discs are narrow."""
+    return (half, 0.0), (half[::-1], 90.0)
+
+
 def _draw_paths(axes: Axes, paths: Sequence[Array]) -> None:
-    for number, path in enumerate(paths, start=1):
-        points = _to_axes(path)
+    scale, every = _points_per_unit(axes), [_to_axes(path) for path in paths]
+    corners = scale * np.array([axes.get_xlim(), axes.get_ylim()]).T
+    places = place_discs([points * scale for points in every], _DISC, *corners) / scale
+    for number, (points, middle) in enumerate(zip(every, places, strict=True), start=1):
         axes.plot(*points.T, color=INK, lw=5.0, alpha=0.42, solid_capstyle="round", zorder=3.5)
-        scale = _points_per_unit(axes)
-        middle = find_middle(points * scale) / scale
+        ends = np.array([find_middle(points * scale) / scale, middle])
+        axes.plot(*ends.T, color=INK, lw=0.8, zorder=8.5)
         look: Any = {"ha": "center", "va": "center", "fontsize": 8.0, "color": "white"}
         look |= {"fontweight": "bold", "zorder": 9}
         look["bbox"] = {"boxstyle": "circle,pad=0.22", "fc": INK, "ec": "white", "lw": 0.8}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ..common.arrays import Array
@@ -55,7 +57,38 @@ def place_heads(points: Array, way: float) -> Array:
     return np.stack([here + corner for corner in corners], axis=1)
 
 
-def find_middle(points: Array) -> Array:
-    """The place half way along a polyline, shape (2,)."""
+def place_discs(paths: Sequence[Array], size: float, low: Array, high: Array) -> Array:
+    """Places for the numbers of paths, on them or beside them, none over another.
+
+    Parameters
+    ----------
+    paths : sequence of ndarray, shape (n, 2)
+        In units of the paper.
+    size : float
+        Diameter of the discs.
+    low, high : ndarray, shape (2,)
+        Corners of the paper.
+
+    Returns
+    -------
+    ndarray, shape (m, 2)
+    """
+    angles = np.pi / 8 * (np.arange(16) + 4)
+    ring = np.column_stack([np.cos(angles), np.sin(angles)])
+    aside = np.concatenate([radius * size * ring for radius in (1.0, 1.6, 2.3, 3.2, 4.2)])
+    found = np.empty((0, 2))
+    for path in paths:
+        middle = find_middle(path)
+        shares = np.array([0.5, 0.4, 0.6, 0.3, 0.7, 0.2, 0.8])
+        every = np.concatenate([[find_middle(path, share) for share in shares], middle + aside])
+        clear = np.hypot(*(every[:, None] - found[None]).transpose(2, 0, 1)) >= size
+        inside = ((every >= low + size / 2) & (every <= high - size / 2)).all(axis=1)
+        free = clear.all(axis=1) & inside
+        found = np.vstack([found, every[free.argmax() if free.any() else 0]])
+    return found
+
+
+def find_middle(points: Array, share: float = 0.5) -> Array:
+    """The place half way along a polyline, or a share of it, shape (2,)."""
     s = np.concatenate([[0.0], np.hypot(*np.diff(points, axis=0).T).cumsum()])
-    return np.array([np.interp(s[-1] / 2, s, column) for column in points.T])
+    return np.array([np.interp(share * s[-1], s, column) for column in points.T])

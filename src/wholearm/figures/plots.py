@@ -34,6 +34,7 @@ from .curves import (
     draw_torques,
 )
 from .snapshots import (
+    choose_numbers,
     draw_snapshot,
     draw_strip,
     lay_out_strip,
@@ -41,7 +42,7 @@ from .snapshots import (
     place_vertices,
     trace_link,
 )
-from .style import STYLE, WIDTH, WIDTHS, Sheet, choose_styles
+from .style import STYLE, WIDTH, WIDTHS, Sheet, choose_styles, list_contacts, unit_of
 
 if TYPE_CHECKING:
     from ..simulation.events import Simulation
@@ -116,15 +117,18 @@ def _draw(
     """Lay the figure out from its foot to its title, and draw it."""
     styles = choose_styles(trajectory.contacts)
     rolls = bool(trajectory.rolling.any())
-    strip = lay_out_strip(trajectory, scene, width - 0.3)
     slim = width < _SLIM
+    strip = lay_out_strip(trajectory, scene, width - 0.3, slim)
     columns = max(1, int((width - 0.3) / 1.05))
     keys = len(trajectory.contacts) + 3 + (simulation is not None)
     foot = _BOTTOM + (_LINE * math.ceil(keys / columns) + 0.1 if slim else 0.0)
     share = _SHORT if slim else 1.0
     sizes = [_MOTION * share] * 3 * motion + [_TORQUES * share] + [_CONES] * rolls
     sizes.append(_MARGINS * share)
-    title = textwrap.wrap(_title(trajectory, scene, epsilon), max(24, int(11.5 * width)))
+    bold: Any = {"fontsize": 8.5 if slim else 10.5, "fontweight": "bold", "parse_math": False}
+    between = " \u00b7 " if slim else "  \u00b7  "
+    whole = _title(trajectory, scene, epsilon, between)
+    title = textwrap.wrap(whole, max(24, int(11.5 * width * 10.5 / bold["fontsize"])))
     above = _TOP + _LINE * (len(title) - 1)
     panels_high = sum(sizes) + _GAP * (len(sizes) - 1) + 0.3
     sheet = Sheet(width, foot + panels_high + strip.height + above)
@@ -151,13 +155,12 @@ def _draw(
         draw_motion(own, trajectory)
         panels += own
     if slim:
-        margins.set_ylabel("margin [N]")
-        torques.set_ylabel("torque [N m]")
+        for axes, name in ((margins, "margin"), (torques, "torque")):
+            axes.set_ylabel(f"{name} {unit_of(axes)}")
         _draw_legend(figure, [margins, torques], columns)
     _label(figure, panels, panels[-1] if motion else torques, trajectory, slim)
-    look: Any = {"fontsize": 10.5, "fontweight": "bold", "parse_math": False}
     top = 1 - 0.12 / sheet.height
-    figure.text(0.2 / width, top, "\n".join(title), va="top", **look)
+    figure.text(0.2 / width, top, "\n".join(title), va="top", **bold)
     return figure
 
 
@@ -170,8 +173,7 @@ def _label(
         if axes is not lowest:
             axes.tick_params(labelbottom=False)
         if not slim:
-            spacing = 0.5 if len(trajectory.contacts) < 14 else 0.1
-            axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.02), labelspacing=spacing)
+            list_contacts(axes, 72 * axes.get_position().height * figure.get_figheight())
     lowest.set(xlabel="time $t$ [s]", xlim=(0.0, trajectory.duration))
     figure.align_ylabels([*panels])
 
@@ -208,19 +210,21 @@ def save(figure: Figure, path: str | os.PathLike[str], *, resolution: int = 180)
         write_whole(path, lambda stream: figure.savefig(stream, **options))
 
 
-def _title(trajectory: Trajectory, scene: Scene, epsilon: float) -> str:
+def _title(trajectory: Trajectory, scene: Scene, epsilon: float, between: str) -> str:
     parts = [textwrap.shorten(str(trajectory.meta.get("name", "")), 36, placeholder="\u2026")]
     known = trajectory.meta.get("objective")
     parts.append(f"objective {known}" if known else str(trajectory.meta.get("status", "")))
     parts += [f"duration {trajectory.duration:.4g} s", f"\u03b5 = {epsilon:g} N"]
     if scene.fingers_collide:
-        gap = 1e3 * float(evaluate_finger_gap(scene, trajectory.z).min())
-        parts.append(f"finger gap \u2265 {gap:.3g} mm".replace("-", "\u2212"))
-    return "  \u00b7  ".join(filter(None, parts))
+        gap = float(evaluate_finger_gap(scene, trajectory.z).min())
+        text = f"{1e3 * gap:.3g} mm" if gap < 0.9995 else f"{gap:.3g} m"
+        parts.append(f"finger gap \u2265 {text}".replace("-", "\u2212"))
+    return between.join(part.replace(" ", "\u00a0") for part in parts if part)
 
 
 __all__ = [
     "WIDTH",
+    "choose_numbers",
     "choose_styles",
     "draw_cones",
     "draw_margins",

@@ -74,6 +74,9 @@ def _draw_phase(axes: Axes, phase: PhasePrediction, epsilon: float) -> None:
         if own.speed:
             axes.plot(own.speed, epsilon, "o", color=PALETTE[k], markersize=5, zorder=6)
         _write(axes, k, own)
+    if not any(np.isfinite(force).any() for force in curves.force.values()):
+        middle: Any = {"transform": axes.transAxes, "ha": "center", "va": "center", "zorder": 7}
+        axes.text(0.5, 0.5, "no slow motion keeps its limits", color=INK, **middle)
     title = f"phase {phase.number}, until {phase.until}"
     place: Any = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "bottom"}
     axes.annotate(title, (0, 1), (0, 41), fontsize=9, fontweight="bold", color=INK, **place)

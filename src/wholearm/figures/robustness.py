@@ -16,7 +16,7 @@ from matplotlib.patches import Rectangle
 from ..robustness.study import Robustness
 from ..robustness.trial import ANGLE, DISTANCE
 from .snapshots import place_vertices, trace_link
-from .style import FINGERS, INK, PALETTE, STYLE
+from .style import FINGERS, INK, PALETTE, PALM, STYLE
 
 _KINDS = (
     ("contacts kept too", PALETTE[2], "o"),
@@ -70,7 +70,8 @@ def _draw_motion(axes: Axes, study: Robustness) -> None:
     axes.plot(*(1e3 * nominal[:, :2].T), color=INK, linewidth=1.6, zorder=4)
     axes.autoscale_view()
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
-    axes.add_patch(Rectangle((left, -4.0), right - left, 4.0, fc=INK, linewidth=0, zorder=1))
+    deep = 1e3 * PALM * scene.scales.length
+    axes.add_patch(Rectangle((left, -deep), right - left, deep, fc=INK, linewidth=0, zorder=1))
     axes.set(xlim=(left, right), ylim=(low, high), xlabel="x [mm]", ylabel="y [mm]")
     axes.set_title("centroid's paths, poses at the start (dashed) and the end", fontsize=9)
 
@@ -84,8 +85,8 @@ def _draw_ends(axes: Axes, study: Robustness) -> None:
         text = f"{label}: {len(own)}"
         axes.plot(across, up, marker, ms=3.5, color=colour, alpha=0.7, label=text, mew=0.9)
     goal = (1e3 * DISTANCE, math.degrees(ANGLE))
-    axes.set(xscale="log", yscale="log", xlabel="distance from the goal [mm]")
-    axes.set_ylabel("angle from the goal [deg]")
+    axes.set(xscale="log", yscale="log", xlabel=f"distance from the goal [mm], {_LEAST:g} or more")
+    axes.set_ylabel(f"angle from the goal [deg], {_LEAST:g} or more")
     axes.set(
         xlim=(min(axes.get_xlim()[0], 0.05), None), ylim=(_LEAST / 2, max(axes.get_ylim()[1], 2.0))
     )

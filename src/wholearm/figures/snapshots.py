@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -12,8 +12,10 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon as Outline
 from matplotlib.patches import Rectangle
+from matplotlib.patheffects import withStroke
 
 from ..common.arrays import Array
 from ..common.sharing import exclusive
@@ -21,28 +23,43 @@ from ..contacts.elemental import build_features, build_geometry, parse_contact
 from ..results.trajectory import Trajectory
 from ..scene.model import Finger, Scene
 from .data import choose_snapshots
-from .style import FINGERS, INK, STRIP, Sheet, Styles, write
+from .style import FINGERS, INK, PALM, STRIP, Sheet, Styles, count_decimals, write
 
+NUMBER = 8.0
+"""Size of the numbers at vertices [points]."""
+_FEW = 5
+"""Most vertices of an object whose numbers may stand outside; case: a ruler, 120 x 15 mm."""
 _CAPTION = 0.42
 """Height of the caption of a snapshot [in]."""
-_ROOM = 1.38
-"""Width that a snapshot needs for its caption, on average [in]."""
+_ROOM = (1.38, 0.78)
+"""Width that a snapshot needs for its caption, on average, in wide and in slim figures [in]."""
+_ROWS = 3
+"""Most rows of a strip; of more snapshots some are left out, evenly."""
+_BAR = 0.2
+"""Height of the bar that gives the scale, above a strip [in]."""
 
 
 def draw_snapshot(
-    axes: Axes, scene: Scene, z: Array, contacts: Sequence[str], styles: Styles
+    axes: Axes,
+    scene: Scene,
+    z: Array,
+    contacts: Sequence[str],
+    styles: Styles,
+    box: Array | None = None,
 ) -> list[Artist]:
     """Draw palm, links, object with numbered vertices, and contacts, to scale.
 
     The configuration `z` has shape (5,) [m, m, rad, rad, rad]; the axes lose their frame, and
-    their unit is 1 m. Returns palm, link 1, link 2, object, and one marker per contact.
+    their unit is 1 m. They show `box`, lower left and upper right corner, shape (2, 2) [m], or
+    everything. Returns palm, link 1, link 2, object, and one marker per contact.
     """
     axes.set_axis_off()
     axes.set_aspect("equal", adjustable="datalim")
     vertices = place_vertices(scene, z)
     bases = [np.asarray(finger.base)[0] for finger in scene.fingers]
     ends = np.concatenate([bases, vertices[vertices[:, 1] < scene.touching, 0]])
-    palm = Rectangle((ends.min(), -0.004), np.ptp(ends), 0.004, fc=INK, linewidth=0, zorder=1)
+    deep = PALM * scene.scales.length
+    palm = Rectangle((ends.min(), -deep), np.ptp(ends), deep, fc=INK, linewidth=0, zorder=1)
     artists: list[Artist] = [axes.add_patch(palm)]
     for finger, angle, (line, face) in zip(scene.fingers, z[3:], FINGERS, strict=True):
         link = Outline(trace_link(finger, angle), fc=face, ec=line, linewidth=0.9, zorder=2)
@@ -50,21 +67,84 @@ def draw_snapshot(
         axes.plot(*np.asarray(finger.base), "o", ms=3.2, mfc="white", mec=line, mew=0.9, zorder=3)
     body = Outline(vertices, fc="#fbf3df", ec=INK, linewidth=1.1, zorder=4)
     artists.append(axes.add_patch(body))
-    for index, vertex in enumerate(vertices):
-        inwards = 8.5 * (z[:2] - vertex) / np.hypot(*(z[:2] - vertex))
-        write(axes, str(index), vertex, inwards, va="center", fontsize=8, color="#555555")
     for name, point in zip(contacts, place_contacts(scene, z, contacts), strict=True):
         face, _, marker = styles[name]
         look: Any = {"mfc": face, "mec": "white", "mew": 0.9, "zorder": 6, "label": name}
         artists += axes.plot(*point, marker, ms=6.5, **look)
-    axes.autoscale_view()
+    if box is None:
+        axes.autoscale_view()
+    else:
+        axes.set(xlim=box[:, 0], ylim=box[:, 1])
+    axes.apply_aspect()
+    ends = axes.transData.transform([[0.0, 0.0], [1.0, 0.0]])
+    scale = 72 / axes.figure.dpi * float(np.ptp(ends[:, 0]))
+    corners = [parse_contact(name, scene) for name in contacts]
+    first = [own.index for own in corners if own.feature == "v"]
+    style: Any = {"va": "center", "fontsize": NUMBER, "color": "#555555", "zorder": 5.5}
+    style["path_effects"] = [withStroke(linewidth=1.5, foreground="white", alpha=0.7)]
+    for index, shift in choose_numbers(scale * vertices, first, 0.0).items():
+        write(axes, str(index), vertices[index], shift, **style)
     return artists
+
+
+def choose_numbers(
+    vertices: Array, first: Sequence[int] = (), lowest: float = -math.inf
+) -> dict[int, Array]:
+    """Choose which vertices of a polygon are numbered, and where the numbers stand.
+
+    All of them where there is room, or every second, fifth, tenth, ... one, and those of `first`
+    before others. A number stands inside, or outside of a thin object with few vertices.
+
+    Parameters
+    ----------
+    vertices : ndarray, shape (n, 2), [points]
+    first : sequence of int
+    lowest : float
+        Least height of the middle of a number [points].
+
+    Returns
+    -------
+    dict of ndarray, shape (2,), [points]
+        By vertex, where the middle of its number is, from it. Turns with the object.
+    """
+    count = len(vertices)
+    along = np.roll(vertices, -1, axis=0) - vertices
+    along /= np.hypot(*along.T)[:, None]
+    inwards = along - np.roll(along, 1, axis=0)
+    sharp = np.hypot(*inwards.T)  # 2 cos(half the angle at the vertex)
+    blunt = np.sqrt(np.maximum(1 - sharp**2 / 4, 1e-3))
+    shifts = (np.clip(5.5 / blunt, 8.5, 14.0) / sharp)[:, None] * inwards
+
+    def put(chosen: Iterable[int]) -> dict[int, Array]:
+        """Those of the chosen that stand clear of the ones before."""
+        found: dict[int, Array] = {}
+        for index in chosen:
+            for shift in (shifts[index], -shifts[index])[: 1 + (count <= _FEW)]:
+                place = vertices[index] + shift
+                far = [
+                    np.abs(vertices[k] + own - place)
+                    > NUMBER * np.array([0.34 * (len(str(index)) + len(str(k))), 1.2])
+                    for k, own in found.items()
+                ]
+                if all(apart.any() for apart in far) and place[1] > lowest:
+                    found[index] = shift
+                    break
+        return found
+
+    steps = (k * 10**n for n in range(4) for k in (1, 2, 5))
+    every = next(own for step in steps if len(put(own := range(0, count, step))) == len(own))
+    return dict(sorted(put(dict.fromkeys([*first, *every])).items()))
 
 
 def place_vertices(scene: Scene, z: Array) -> Array:
     """World positions of the object's vertices, shape (n_v, 2) [m]."""
+    return turn(z, scene.polygon.vertices)
+
+
+def turn(z: Array, points: Array) -> Array:
+    """World positions of points of the object, shape (n, 2) [m]."""
     c, s = math.cos(z[2]), math.sin(z[2])
-    return np.asarray(z[:2] + scene.polygon.vertices @ np.array([[c, s], [-s, c]]))
+    return np.asarray(z[:2] + points @ np.array([[c, s], [-s, c]]))
 
 
 @exclusive
@@ -106,14 +186,16 @@ class Strip(NamedTuple):
 
     @property
     def height(self) -> float:
-        """Of all rows with their captions [in]."""
-        return len(self.rows) * (self.scale * (self.high - self.low) + _CAPTION)
+        """Of all rows with their captions and the bar above them [in]."""
+        return _BAR + len(self.rows) * (self.scale * (self.high - self.low) + _CAPTION)
 
 
-def lay_out_strip(trajectory: Trajectory, scene: Scene, width: float) -> Strip:
+def lay_out_strip(trajectory: Trajectory, scene: Scene, width: float, slim: bool) -> Strip:
     """Choose the snapshots of a strip that is `width` wide [in]."""
-    chosen = [int(row) for row in choose_snapshots(trajectory)]
-    lines = math.ceil(len(chosen) / max(2, int(width / _ROOM)))
+    every, wide = choose_snapshots(trajectory), max(2, int(width / _ROOM[slim]))
+    kept = np.linspace(0, len(every) - 1, min(len(every), _ROWS * wide)).round().astype(int)
+    chosen = [int(row) for row in every[kept]]
+    lines = math.ceil(len(chosen) / wide)
     cuts = np.linspace(0, len(chosen), lines + 1).round().astype(int)
     rows = tuple(tuple(chosen[a:b]) for a, b in pairwise(cuts))
     boxes = {row: _measure(scene, trajectory.z[row]) for row in chosen}
@@ -138,20 +220,27 @@ def draw_strip(
     """Draw the snapshots of a strip whose upper end is at `top` [in]."""
     room, last = sheet.width - 0.3, strip.rows[-1][-1]
     height = strip.scale * (strip.high - strip.low)
+    _draw_scale(figure, top, strip)
+    top -= _BAR
     for line, row in enumerate(strip.rows):
         bottom = top - (line + 1) * height - line * _CAPTION
         widths = [strip.scale * float(np.ptp(strip.boxes[k][:, 0])) for k in row]
         left, space = 0.15, (room - sum(widths)) / max(1, len(row) - 1)
         for k, width in zip(row, widths, strict=True):
             axes = figure.add_axes(sheet.inset(left, bottom, width, height))
-            _draw_sample(axes, trajectory, k, k == last, scene, styles)
-            axes.set(xlim=strip.boxes[k][:, 0], ylim=(strip.low, strip.high))
+            box = np.column_stack([strip.boxes[k][:, 0], [strip.low, strip.high]])
+            _draw_sample(axes, trajectory, k, k == last, scene, styles, box)
             left += width + space
-    _draw_scale(figure.axes[0], strip)
 
 
 def _draw_sample(
-    axes: Axes, trajectory: Trajectory, row: int, end: bool, scene: Scene, styles: Styles
+    axes: Axes,
+    trajectory: Trajectory,
+    row: int,
+    end: bool,
+    scene: Scene,
+    styles: Styles,
+    box: Array,
 ) -> None:
     """Draw hand and object at a sample, with its time and phase below."""
     own = trajectory.motions[trajectory.phase[row]].contacts
@@ -159,25 +248,27 @@ def _draw_sample(
     known = dict(zip(trajectory.contacts, np.isfinite(trajectory.c_n[row]), strict=True))
     names = [name for name in trajectory.contacts if name in own]
     names = [name for name in names if known[name]] or names
-    draw_snapshot(axes, scene, trajectory.z[row], names, styles)
+    draw_snapshot(axes, scene, trajectory.z[row], names, styles, box)
     place = "end" if end else f"phase {trajectory.phase[row] + 1}"
-    caption = f"{trajectory.t[row]:.3f} s\n{place}"
+    caption = f"{trajectory.t[row]:.{count_decimals(trajectory.duration)}f} s\n{place}"
     write(axes, caption, (0.5, 0), (0, -3), xycoords="axes fraction", va="top")
 
 
-def _draw_scale(axes: Axes, strip: Strip) -> None:
-    """Draw a bar of a round length, about a quarter of an inch long, into the first snapshot."""
-    start = strip.boxes[strip.rows[0][0]][0, 0]
+def _draw_scale(figure: Figure, top: float, strip: Strip) -> None:
+    """Draw a bar of a round length, about a quarter of an inch long, below `top` [in]."""
     power = 10.0 ** math.floor(math.log10(0.5 / strip.scale))
     length = next(k * power for k in (5.0, 2.0, 1.0) if k * power <= 0.5 / strip.scale)
-    level = strip.high - 0.03 / strip.scale
-    axes.plot([start, start + length], [level] * 2, color=INK, linewidth=2.0)
+    ends, inches = [0.2, 0.2 + strip.scale * length], figure.dpi_scale_trans
+    bar = Line2D(ends, [top - 0.06] * 2, color=INK, linewidth=2.0, transform=inches)
+    figure.add_artist(bar)
     text = f"{1e3 * length:g} mm" if length < 1 else f"{length:g} m"
-    write(axes, text, (start, level), (0, -4), va="top", ha="left", fontsize=8)
+    look: Any = {"va": "center", "fontsize": 8, "transform": inches}
+    figure.text(ends[1] + 0.06, top - 0.06, text, **look)
 
 
 def _measure(scene: Scene, z: Array) -> Array:
     """Corners of the box around hand and object, shape (2, 2) [m]."""
     links = [trace_link(f, float(a)) for f, a in zip(scene.fingers, z[3:], strict=True)]
     every = np.concatenate([place_vertices(scene, z), *links])
-    return np.array([every.min(axis=0) - 0.004, every.max(axis=0) + 0.004])
+    pad = PALM * scene.scales.length
+    return np.array([every.min(axis=0) - pad, every.max(axis=0) + pad])

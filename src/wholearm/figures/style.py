@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -32,6 +33,12 @@ STYLE: Any = {
     "pdf.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "wholearm",
 }  # fmt: skip
 SIMULATED: Any = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 1.0, "zorder": 5}
+SIMULATED_2: Any = SIMULATED | {"linestyle": (0, (3, 5)), "linewidth": 0.9}
+"""What is simulated; the torque of finger 2, to be told from that of finger 1."""
+PALM = 0.12
+"""Thickness of the palm, over the object's radius of gyration."""
+_PREFIXES = ((3e4, "k", 1e-3), (0.3, "", 1.0), (3e-4, "m", 1e3), (0.0, "\u00b5", 1e6))
+"""Least size of a quantity, its prefix, and the factor that goes with it."""
 
 
 class ContactStyle(NamedTuple):
@@ -61,6 +68,30 @@ class Sheet(NamedTuple):
     def inset(self, left: float, bottom: float, width: float, height: float) -> Any:
         """The same [in] as fractions of the figure."""
         return tuple(np.array([left, bottom, width, height]) / (2 * tuple(self)))
+
+
+def choose_prefix(size: float) -> tuple[str, float]:
+    """SI prefix with which values up to `size` have few digits, and the factor to it."""
+    return next((prefix, factor) for least, prefix, factor in _PREFIXES if size >= least)
+
+
+def count_decimals(size: float, digits: int = 3) -> int:
+    """Decimals that show so many significant digits of a value of this size, at least 3."""
+    return max(3, digits - 1 - math.floor(math.log10(size))) if size > 0 else 3
+
+
+def unit_of(axes: Axes) -> str:
+    """The unit in the label of axes, in brackets."""
+    label = axes.get_ylabel()
+    return label[label.index("[") : label.index("]") + 1]
+
+
+def list_contacts(axes: Axes, room: float, largest: float = 9.0) -> None:
+    """Write the legend of axes to their right, in so small letters that `room` [points] do."""
+    count = len(axes.get_legend_handles_labels()[1])
+    size = min(largest, room / (1.1 * max(count, 1)))
+    look: Any = {"loc": "upper left", "bbox_to_anchor": (1.01, 1.02), "fontsize": size}
+    axes.legend(**look, labelspacing=min(0.5, max(room / (size * max(count, 1)) - 1.0, 0.05)))
 
 
 def choose_styles(contacts: Sequence[str]) -> dict[str, ContactStyle]:

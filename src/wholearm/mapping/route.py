@@ -117,6 +117,7 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
             raise InputError("", "route", text)
     z, start, given, notes = _begin(problem, given)
     here, stretches, legs = z[[0, 2]], list[Stretch](), list[int]()
+    origin = here
     for leg, there in enumerate(given):
         miss = find_miss(problem.scene, here, there)
         note = "" if miss is None else describe_miss(problem.scene, miss)
@@ -131,6 +132,8 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
             _append(stretches, legs, leg, entry)
         z = walked[-1][2]
         here = z[[0, 2]]
+    # The end of a leg may be moved to a change of contacts, but not the start.
+    stretches[0] = replace(stretches[0], start=origin)
     return Route(tuple(stretches), start, tuple(notes))
 
 

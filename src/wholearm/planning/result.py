@@ -103,8 +103,8 @@ class Timings(NamedTuple):
     Attributes
     ----------
     trace, plan, replay, assess : float
-        Tracing curves; everything up to the first plan; its replay, with what that made plan again;
-        what impacts save.
+        Tracing curves; everything up to the first plan; its replay, with what that made plan again,
+        which is in `plan` where a search has replayed the parts of a route; what impacts save.
     build, solve : float
         Building NLPs and solving them, in all of these.
     """

@@ -65,7 +65,12 @@ def read_problem(path: str) -> Problem:
     """
     try:
         with open(path, "rb") as stream:
-            table = tomllib.load(stream)
+            content = stream.read()
+        if content.startswith(b"PK"):
+            text = "is no problem file but an archive, as a trajectory is; the problem comes first"
+            raise InputError(str(path), "", text)
+        # Editors on Windows may begin a file with a byte order mark.
+        table = tomllib.loads(content.decode("utf-8-sig").replace("\r\n", "\n"))
     except OSError as error:
         raise InputError(str(path), "", f"cannot be read: {error.strerror}") from None
     except ValueError as error:

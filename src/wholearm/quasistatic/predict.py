@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.errors import InputError, name_source
+from ..common.errors import InfeasibleError, InputError, name_source
 from ..common.require import require_number
 from ..common.sharing import exclusive
 from ..geometry.path_guess import find_end
@@ -97,15 +97,16 @@ def make_torques(prediction: Prediction, speed: float) -> TorqueProfile:
 
     Raises
     ------
-    InputError
+    InfeasibleError
         If a phase has no quasistatic torques.
     """
     speed, start = require_number(speed, "speed", positive=True), 0.0
     times, rows = [], []
     for phase in prediction.phases:
         if phase.torques is None:
-            text = f"phase {phase.number} has no quasistatic torques all along"
-            raise InputError("", "--torques", text)
+            raise InfeasibleError(
+                f"no quasistatic torques to write: phase {phase.number} is not kept all along"
+            )
         times.append(start + phase.torques.s / speed)
         rows.append(phase.torques.tau)
         start = float(times[-1][-1])
@@ -211,7 +212,7 @@ def _name(road: Road, least: Least) -> Weakest:
     contacts = dict.fromkeys(limit.part for limit in limits if limit.kind in (PRESS, CONE))
     kinds = dict.fromkeys(limit.kind for limit in limits if limit.kind not in (PRESS, CONE))
     others = (
-        f"{kind} of {' and '.join(limit.part for limit in limits if limit.kind == kind)}"
+        f"{kind} of {' and '.join(dict.fromkeys(own.part for own in limits if own.kind == kind))}"
         for kind in kinds
     )
     force = least.force if math.isfinite(least.force) else None

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from ..common.arrays import Array
 from ..results.report import plain
-from ..results.report_text import align, show
+from ..results.report_text import align, fixed, show
 
 
 class Place(NamedTuple):
@@ -194,7 +194,8 @@ class Prediction:
         return "\n".join([head, "", *self._list_slow(), "", *self._list_speeds()])
 
     def _list_slow(self) -> list[str]:
-        rows = []
+        known = [abs(phase.slow.force) for phase in self.phases if phase.slow and phase.slow.force]
+        rows, form = [], fixed(self.epsilon or 1e-3 * max(known, default=0.0))
         for phase in self.phases:
             row = [str(phase.number), phase.until, phase.path]
             if phase.slow is None:
@@ -202,7 +203,7 @@ class Prediction:
                 continue
             parts = "; ".join(f"{a.to_text()} to {b.to_text()}" for a, b in phase.kept)
             kept = "all along" if phase.is_kept else parts or "nowhere"
-            figures = [show(phase.length, ".4f"), show(phase.slow.force, "+.4f")]
+            figures = [show(phase.length, ".4g"), show(phase.slow.force, f"+{form}")]
             rows.append([*row, *figures, phase.slow.name, phase.slow.place.to_text(), kept])
         header = ["phase", "until", "along", "length [m]", "least c_n [N]", "of", "at", "kept"]
         return align(header, rows, {1, 2, 5, 6, 7})
@@ -212,10 +213,11 @@ class Prediction:
         for phase in self.phases:
             for own in phase.survivals:
                 first = f"{own.first.name} at {own.first.place.to_text()}"
-                speed, lost = ("any" if v is None else f"{v:.4f}" for v in (own.speed, own.lost))
+                speeds = own.speed, own.lost
+                speed, lost = ("any speed" if v is None else f"{v:.4g}" for v in speeds)
                 if own.again is not None:
-                    speed = f"0; from {own.again:.4f} on"
-                row = [str(phase.number), own.motion, speed, show(own.duration, ".4f"), lost]
-                rows.append([*row, first if own.speed is not None else "-"])
+                    speed = f"0; from {own.again:.4g} on"
+                row = [str(phase.number), own.motion, speed, show(own.duration, ".4g"), lost]
+                rows.append([*row, first if own.speed is not None else "nothing gives way"])
         header = ["phase", "motion", "keeps epsilon to [m/s]", "lasting [s]", "contacts to [m/s]"]
         return align([*header, "first"], rows, {1, 5})

@@ -29,9 +29,16 @@ def write(report: Report) -> str:
     return "\n".join(parts)
 
 
+def _force_form(report: Report) -> str:
+    """How forces are written: epsilon with three digits, or what is a thousandth of the largest."""
+    known = [c.least for p in report.phases for c in p.contacts if not math.isnan(c.least)]
+    return fixed(report.epsilon or 1e-3 * max(known, default=0.0))
+
+
 def _contact_table(report: Report) -> list[str]:
+    form = _force_form(report)
     rows = [
-        [str(p.number), c.contact, show(c.least, ".4f"), show(c.margin, "+.4f"),
+        [str(p.number), c.contact, show(c.least, form), show(c.margin, f"+{form}"),
          show(c.time, ".5f")]
         for p in report.phases
         for c in p.contacts
@@ -47,7 +54,7 @@ def _loss_table(report: Report) -> list[str]:
             continue
         when = show(loss.time, ".5f")
         for own in loss.forces:
-            figures = [show(value, "+.4f") for value in (own.c_n, own.c_t)]
+            figures = [show(value, f"+{_force_form(report)}") for value in (own.c_n, own.c_t)]
             figures += [show(value, "+.3f") for value in own.per_tau]
             rows.append([when, f"c_n of {own.contact}", *figures])
         if loss.closing:
@@ -61,7 +68,7 @@ def _loss_table(report: Report) -> list[str]:
 def _rolling_table(report: Report) -> list[str]:
     """Margins to slipping; nothing if no contact rolls."""
     rows = [
-        [str(p.number), r.contact, show(r.least, "+.4f"), show(r.time, ".5f")]
+        [str(p.number), r.contact, show(r.least, f"+{_force_form(report)}"), show(r.time, ".5f")]
         for p in report.phases
         for r in p.rolling
     ]
@@ -86,7 +93,7 @@ def _phase_table(report: Report) -> list[str]:
             show(p.end_speed, ".1e"),
         ]
         if impacts:
-            row += [show(p.impact.impulse, ".4f"), p.impact.contact] if p.impact else ["-", "-"]
+            row += [show(p.impact.impulse, ".4g"), p.impact.contact] if p.impact else ["-", "-"]
         for deviation in (p.end_deviation, p.deviation) if planned else ():
             pair = (deviation.position, deviation.angle) if deviation else (None, None)
             row += [show(value, ".1e") for value in pair]
@@ -106,7 +113,8 @@ def _sure_table(report: Report) -> list[str]:
         ]
         for p in report.phases
     ]
-    return align(["phase", "least minor", "of", "at t [s]", "wedged [ms]"], rows, {2})
+    header = ["phase", "uniqueness of forces", "least of", "at t [s]", "wedged [ms]"]
+    return align(header, rows, {2})
 
 
 def _change_table(report: Report) -> list[str]:
@@ -144,6 +152,12 @@ def _energy_table(report: Report) -> list[str]:
 
 def _after_blank(lines: list[str]) -> list[str]:
     return ["", *lines] if lines else []
+
+
+def fixed(size: float, digits: int = 3) -> str:
+    """The format that gives a value of this size so many significant digits; no zero is minus."""
+    places = digits - 1 - math.floor(math.log10(size)) if size > 0 else digits
+    return f"z.{min(max(places, 0), 15)}f"
 
 
 def show(value: float | None, form: str) -> str:

@@ -194,8 +194,10 @@ def read_notes(path: str) -> dict[str, str]:
     try:
         with open(path, encoding="utf-8-sig") as stream:
             comments = [line[1:].split("=", 1) for line in stream if line.startswith("#")]
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(str(path), "", f"cannot be read: {error}") from None
+    except OSError as error:
+        raise InputError(str(path), "", f"cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise InputError(str(path), "", f"is not CSV: {error}") from None
     return {pair[0].strip(): pair[1].strip() for pair in comments if len(pair) == 2}
 
 

@@ -176,7 +176,8 @@ def describe_block(
         text += "no border leads on from there, and no way through a cell"
     else:
         many = len(cut) != 1
-        text += f"{len(cut)} border{'s'[:many]} lead{'s'[many:]} on from there, all blocked"
+        text += f"{len(cut)} border{'s'[:many]} lead{'s'[many:]} on from there, "
+        text += "all of them blocked" if many else "and is blocked"
     # What would help beside the plan itself is in the first part of a reason.
     reasons = list(dict.fromkeys(own.reason.split("; ")[0] for own in failures))[:FAILED]
     reasons += [f"{_describe_way(own)}: {explain(own)}" for own in cut[: LISTED - len(reasons)]]

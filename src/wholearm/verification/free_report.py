@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from ..free_simulation.result import FreeSimulation
 from ..results.report import Deviation, plain
-from ..results.report_text import align, show
+from ..results.report_text import align, fixed, show
 from ..results.trajectory import Trajectory
 
 MOST = 60
@@ -145,8 +145,10 @@ class FreeReport:
         return "\n".join(lines)
 
     def _list_contacts(self) -> list[str]:
+        known = [s.least for s in self.whole.stretches if s.least > 0]
+        form = fixed(1e-3 * max(known, default=0.0))
         rows = [
-            [s.contact, f"{s.start:.6f}", f"{s.stop:.6f}", show(s.least, ".4f"), f"{s.time:.6f}"]
+            [s.contact, f"{s.start:.6f}", f"{s.stop:.6f}", show(s.least, form), f"{s.time:.6f}"]
             for s in self.whole.stretches[:MOST]
         ]
         header = ["contact", "presses from [s]", "to [s]", "least c_n [N]", "at [s]"]

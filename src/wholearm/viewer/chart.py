@@ -19,12 +19,11 @@ from ..mapping.route import trace_problem
 from ..results.trajectory import Trajectory
 from ..search.times import time_borders
 from .map_drawing import draw_legend, draw_map
-from .motion import describe_hand
+from .motion import count_places, describe_hand
+from .paper import BOX, SHEET
 
 _MOST = 40
 """Points of a line that is clicked; more cannot be told apart."""
-_DIGITS = 5
-"""Decimals of poses [m, rad]."""
 
 
 class Chart(NamedTuple):
@@ -36,7 +35,8 @@ class Chart(NamedTuple):
         SVG, and the HTML of what it means.
     places : dict
         Under "hand" the hand and the object; under "places", in the order in which the drawing
-        has them, for each thing that can be clicked its `contacts`, a `text` and its poses `z`.
+        has them, for each thing that can be clicked its `contacts`, a `text` and its poses `z`;
+        under "axes" where the drawing has which x [mm] and phi [deg].
     """
 
     drawing: str
@@ -77,13 +77,20 @@ def describe_map(chart: FormationMap, plan: Trajectory | None = None) -> Chart:
         [border.points[rows] for border, rows in zip(held, few, strict=True)],
         np.array([own.point for own in chart.crossings]).reshape(-1, 2),
     )
-    places = {"hand": describe_hand(scene), "places": cells + borders + crossings}
+    every = cells + borders + crossings
+    for own in every:
+        own["z"] = np.round(own["z"], count_places(scene)).tolist()
+    for own in cells:
+        own["wide"] = True
+    low, high = ([1e3 * float(chart.x[k]), math.degrees(chart.phi[k])] for k in (0, -1))
+    axes = {"low": low, "high": high, "box": BOX, "tall": SHEET[1]}
+    places = {"hand": describe_hand(scene), "places": every, "axes": axes}
     return Chart(drawing, draw_legend(chart, bool(paths)), places)
 
 
 def _describe(contacts: Iterable[Contact], text: str, z: Array) -> dict[str, Any]:
     names = [contact.name for contact in contacts]
-    return {"contacts": names, "text": text, "z": np.round(z, _DIGITS).tolist()}
+    return {"contacts": names, "text": text, "z": z}
 
 
 def _name_place(point: Array) -> str:
@@ -92,7 +99,7 @@ def _name_place(point: Array) -> str:
 
 
 def _describe_cell(point: Array) -> str:
-    return f"a cell, two freedoms; drawn at {_name_place(point)}"
+    return f"a cell, two freedoms; its middle is at {_name_place(point)}"
 
 
 def _describe_border(border: Border, times: Array) -> str:

@@ -11,6 +11,7 @@ from ..contacts.closing import Flags
 from ..figures.map_lines import (
     find_middle,
     name_palm_lines,
+    place_discs,
     place_heads,
     shift,
     shorten,
@@ -37,6 +38,8 @@ _ARROW = 8.0
 """Length of the arrows inside cells."""
 _LETTER, _HEIGHT = 6.2, 13.0
 """Size of a letter of a label."""
+_DISC = 18.0
+"""Room for the number of a phase."""
 _CLEAR = 9.0
 """Distance of labels from the plan."""
 
@@ -194,8 +197,12 @@ def _draw_paths(paper: Paper, paths: Sequence[Array]) -> Iterable[str]:
 
 
 def _number_paths(paper: Paper, paths: Sequence[Array]) -> Iterable[str]:
-    for number, own in enumerate(map(paper.place, paths), start=1):
-        x, y = find_middle(own)
+    lines = [paper.place(own) for own in paths]
+    corners = np.array([BOX[:2], np.add(BOX[:2], BOX[2:])])
+    places = place_discs(lines, _DISC, *corners)
+    for number, (own, (x, y)) in enumerate(zip(lines, places, strict=True), start=1):
+        leader = np.array([find_middle(own), [x, y]])
+        yield f'<path stroke="{INK}" d="{write_path([leader])}"/>'
         yield f'<circle cx="{x:.1f}" cy="{SHEET[1] - y:.1f}" r="8" class="disc"/>'
         yield write_text(str(number), (x, y - 4), ' class="number"')
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -19,9 +20,8 @@ from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 
-_DIGITS, _DECIMALS = 6, 5
-"""Significant digits of numbers in a page, and decimals of places and angles [m, rad]: more than
-a screen shows."""
+_DIGITS = 6
+"""Significant digits of numbers in a page: more than a screen shows."""
 MOST = 4000
 """Samples of a motion in a page."""
 
@@ -83,18 +83,18 @@ def describe_motion(
             "colour": styles[name].colour,
             "dashes": _list_dashes(styles[name].line),
             "friction": scene.friction.of(parse_contact(name, scene).finger),
-            "spans": _list_spans(trajectory, pushes, index, rows),
+            "spans": _list_spans(scene, trajectory, pushes, index, rows),
         }
         for index, name in enumerate(trajectory.contacts)
     ]
     behind = None
     if ghost is not None:
         few = _choose_rows(ghost, every[:0], most)
-        behind = {"t": _round(ghost.t[few]), "z": _fix(ghost.z[few])}
+        behind = {"t": _round(ghost.t[few]), "z": _fix(ghost.z[few], scene)}
     return describe_hand(scene) | {
         "epsilon": problem.epsilon,
         "t": _round(trajectory.t[rows]),
-        "z": _fix(trajectory.z[rows]),
+        "z": _fix(trajectory.z[rows], scene),
         "tau": _round(trajectory.tau[rows]),
         "phase": trajectory.phase[rows].tolist(),
         "starts": _round(trajectory.phase_starts),
@@ -113,15 +113,15 @@ def _choose_rows(trajectory: Trajectory, steps: Numbers, most: int) -> Numbers:
 
 
 def _list_spans(
-    trajectory: Trajectory, pushes: Pushes, index: int, rows: Numbers
+    scene: Scene, trajectory: Trajectory, pushes: Pushes, index: int, rows: Numbers
 ) -> list[dict[str, Any]]:
     """When a contact presses: the first row, and from there on places, normals and forces."""
     c = np.column_stack([trajectory.c_n[rows, index], trajectory.c_t[rows, index]])
     return [
         {
             "first": own.start,
-            "point": _fix(pushes.points[rows[own], index]),
-            "normal": _fix(pushes.normals[rows[own], index]),
+            "point": _fix(pushes.points[rows[own], index], scene),
+            "normal": _fix(pushes.normals[rows[own], index], scene),
             "c": _round(c[own]),
         }
         for own in find_runs(np.isfinite(c).all(axis=1))
@@ -150,9 +150,14 @@ def _list_dashes(line: Any) -> Sequence[float]:
     return [] if isinstance(line, str) else list(line[1])
 
 
-def _fix(values: Array) -> Any:
-    """Nested lists of places, directions or angles."""
-    return np.round(values, _DECIMALS).tolist()
+def _fix(values: Array, scene: Scene) -> Any:
+    """Nested lists of places, directions or angles [m, rad]."""
+    return np.round(values, count_places(scene)).tolist()
+
+
+def count_places(scene: Scene) -> int:
+    """Decimals of places and angles in a page: 5 for an object of a centimetre or more."""
+    return max(5, 3 - math.floor(math.log10(scene.scales.length)))
 
 
 def _round(values: Array) -> Any:

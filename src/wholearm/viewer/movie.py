@@ -7,7 +7,7 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import matplotlib
@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
-from PIL import Image
+from PIL import Image, ImageColor
 
 from ..common.arrays import Array
 from ..common.errors import InputError
@@ -26,8 +26,22 @@ from ..common.require import require_number
 from ..common.sharing import exclusive
 from ..contacts.elemental import parse_contact
 from ..figures.curves import draw_margins, draw_phases, draw_torques
-from ..figures.snapshots import place_vertices, trace_link
-from ..figures.style import FINGERS, INK, STYLE, choose_styles
+from ..figures.snapshots import NUMBER, choose_numbers, place_vertices, trace_link, turn
+from ..figures.style import (
+    BAND,
+    FINGERS,
+    GRID,
+    INK,
+    LOST,
+    LOW,
+    PALETTE,
+    PALM,
+    STYLE,
+    choose_styles,
+    count_decimals,
+    list_contacts,
+    unit_of,
+)
 from ..problem.definition import Problem
 from ..results.trajectory import Trajectory
 from .motion import place_pushes
@@ -43,6 +57,8 @@ _REACH = 0.3
 """Length of the largest force's arrow, over the picture's."""
 _BEYOND = 1.15
 """Length of friction cones over that of the arrows in them."""
+BODY, TURNS, GHOST = "#fbf3df", "#D55E00", "#bbbbbb"
+"""Colours of the object, of torques and the cursor, and of what is drawn behind."""
 _TURN = 1.5 * math.pi
 """Angle of the arc of a torque at its limit."""
 
@@ -66,11 +82,9 @@ class _Scene:
         axes.set(xlim=(low[0] - pad, high[0] + pad), ylim=(low[1] - pad, high[1] + pad))
         axes.set_aspect("equal")
         axes.set_axis_off()
-        width = high[0] - low[0] + 2 * pad
-        axes.add_patch(
-            Rectangle((low[0] - pad, -0.01 * self._size), width, 0.01 * self._size, fc=INK)
-        )
-        self._behind = [] if ghost is None else self._add_bodies(axes, "#bbbbbb", "none")
+        width, deep = high[0] - low[0] + 2 * pad, PALM * self._scene.scales.length
+        axes.add_patch(Rectangle((low[0] - pad, -deep), width, deep, fc=INK))
+        self._behind = [] if ghost is None else self._add_bodies(axes, GHOST, "none")
         self._bodies = self._add_bodies(axes, INK, None)
         styles = choose_styles(trajectory.contacts)
         colours = [styles[name].colour for name in trajectory.contacts]
@@ -86,7 +100,17 @@ class _Scene:
             for colour in colours
         ]
         self._arcs = [
-            axes.plot([], [], color="#D55E00", lw=1.6, zorder=8)[0] for _ in self._scene.fingers
+            axes.plot([], [], color=TURNS, lw=1.6, zorder=8)[0] for _ in self._scene.fingers
+        ]
+        axes.apply_aspect()
+        ends = axes.transData.transform([[0.0, 0.0], [1.0, 0.0]])
+        scale = 72 / axes.figure.dpi * float(np.ptp(ends[:, 0]))
+        vertices, look = self._scene.polygon.vertices, dict[str, Any](ha="center", va="center")
+        shifts = choose_numbers(scale * vertices)
+        self._places = np.array([vertices[k] + own / scale for k, own in shifts.items()])
+        self._numbers = [
+            axes.text(0.0, 0.0, str(k), fontsize=NUMBER, color="#555555", zorder=5, **look)
+            for k in shifts
         ]
         for finger, (line, _) in zip(self._scene.fingers, FINGERS, strict=True):
             axes.plot(*np.asarray(finger.base), "o", ms=4, mfc="white", mec=line, zorder=8)
@@ -95,7 +119,7 @@ class _Scene:
     def artists(self) -> list[Artist]:
         """What moves, in the order of drawing."""
         forces = [*self._cones, *self._arrows, *self._dots, *self._arcs]
-        return [*self._behind, *self._bodies, *forces]
+        return [*self._behind, *self._bodies, *self._numbers, *forces]
 
     def _cover_cones(self, low: Array, high: Array) -> tuple[Array, Array]:
         """Corners of a box, moved so far that arrows and their cones are inside, too."""
@@ -114,7 +138,7 @@ class _Scene:
         none, bodies = np.zeros((3, 2)), []
         for _, own in FINGERS:
             bodies.append(Polygon(none, fc=face or own, ec=ink, lw=0.9, zorder=2))
-        bodies.append(Polygon(none, fc=face or "#fbf3df", ec=ink, lw=1.1, zorder=4))
+        bodies.append(Polygon(none, fc=face or BODY, ec=ink, lw=1.1, zorder=4))
         for body in bodies:
             axes.add_patch(body)
         return bodies
@@ -126,10 +150,12 @@ class _Scene:
         self._pose(self._bodies, z)
         if self._ghost is not None:
             self._pose(self._behind, _blend(self._ghost.t, self._ghost.z, t))
+        for text, place in zip(self._numbers, turn(z, self._places), strict=True):
+            text.set_position(place)
         self._push(row)
         for arc, finger, angle in zip(self._arcs, self._scene.fingers, own.tau[row], strict=True):
-            turn = _TURN * float(angle) / finger.torque_limit
-            arc.set_data(*_trace_arc(np.asarray(finger.base), turn, 0.05 * self._size).T)
+            swept = _TURN * float(angle) / finger.torque_limit
+            arc.set_data(*_trace_arc(np.asarray(finger.base), swept, 0.05 * self._size).T)
 
     def _pose(self, bodies: list[Polygon], z: Array) -> None:
         for body, finger, angle in zip(bodies, self._scene.fingers, z[3:], strict=False):
@@ -248,14 +274,18 @@ class Movie:
             torques = figure.add_axes((0.09, 0.06, 0.74, 0.14), sharex=margins)
             draw_margins(margins, own, problem.epsilon, choose_styles(own.contacts))
             draw_torques(torques, own.torque, problem.scene.torque_limit)
-            for axes in (margins, torques):
+            for axes, room in ((margins, 0.235), (torques, 0.14)):
                 draw_phases(axes, own.phase_starts, labels=axes is margins)
-                axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.04), fontsize=8)
-            margins.set_ylabel("margin [N]")
+                list_contacts(axes, 72 * _SIZE[1] * room, 8.0)
+            margins.set_ylabel(f"margin {unit_of(margins)}")
             margins.tick_params(labelbottom=False)
-            torques.set(xlabel="time $t$ [s]", ylabel=r"$\tau$ [N m]", xlim=(0.0, own.duration))
+            torques.set(
+                xlabel="time $t$ [s]",
+                ylabel=rf"$\tau$ {unit_of(torques)}",
+                xlim=(0.0, own.duration),
+            )
             figure.align_ylabels([margins, torques])
-            cursors = [axes.axvline(0.0, color="#D55E00", lw=1.3) for axes in (margins, torques)]
+            cursors = [axes.axvline(0.0, color=TURNS, lw=1.3) for axes in (margins, torques)]
             clock = figure.text(0.02, 0.975, "", va="top", fontsize=10.5, fontweight="bold")
             moving = [*scene.artists, *cursors, clock]
             for artist in moving:
@@ -267,7 +297,8 @@ class Movie:
                 scene.move(t)
                 for cursor in cursors:
                     cursor.set_xdata([t, t])
-                clock.set_text(f"{problem.name}   t = {t:.3f} s".replace("$", r"\$"))
+                time = f"{t:.{count_decimals(own.duration)}f} s"
+                clock.set_text(f"{problem.name}   t = {time}".replace("$", r"\$"))
                 for artist in moving:
                     figure.draw_artist(artist)
                 yield np.array(canvas.buffer_rgba())
@@ -287,7 +318,7 @@ def write_movie(
     if str(path).lower().endswith(".gif"):
         images = [Image.fromarray(picture[..., :3]) for picture in pictures]
         # One palette for all, so that what stays the same is stored once.
-        palette = images[len(images) // 2].quantize(64)
+        palette = _choose_palette(images)
         frames = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
         options: Any = {"format": "GIF", "save_all": True, "loop": 0, "optimize": False}
         options |= {"append_images": frames[1:], "duration": 1000 // FRAMES}
@@ -295,6 +326,24 @@ def write_movie(
     else:
         content = _encode(pictures, path)
         write_whole(path, lambda stream: stream.write(content))
+
+
+def _choose_palette(images: Sequence[Image.Image]) -> Image.Image:
+    """A palette for all of a movie in which every colour that has a meaning is there as it is.
+
+    The rest are the colours of four pictures, mostly tints of these.
+    """
+    own = [*PALETTE, BAND, LOW, LOST, INK, GRID, "#ffffff", BODY, TURNS, GHOST]
+    own += [colour for pair in FINGERS for colour in pair]
+    exact = [part for colour in own for part in ImageColor.getrgb(colour)]
+    some = [images[k] for k in np.linspace(0, len(images) - 1, 4).astype(int)]
+    strip = Image.new("RGB", (some[0].width, 4 * some[0].height))
+    for k, image in enumerate(some):
+        strip.paste(image, (0, k * image.height))
+    tints = strip.quantize(96).getpalette() or []
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(exact + tints[: 3 * 96])
+    return palette
 
 
 def _count(movie: Movie, progress: Callable[[str], None]) -> Iterator[Array]:

@@ -9,6 +9,7 @@ from ..comparison.compare import compare
 from ..comparison.side_by_side import Comparison, Contender
 from ..mapping.formation_map import FormationMap, build_map, choose_window
 from ..problem.definition import Problem
+from ..results.report_text import fixed
 from . import page
 from .chart import describe_map
 from .motion import describe_motion
@@ -74,7 +75,7 @@ def _summarise(comparison: Comparison) -> str:
             own.verdict,
             f"{own.duration:.6g}",
             f"{own.effort:.6g}",
-            "" if own.margin is None else f"{round(own.margin, 4) + 0.0:.4f}",
+            "" if own.margin is None else f"{own.margin:{fixed(comparison.epsilon or 0.05)}}",
             f"{own.contact} in phase {own.phase}" if own.contact else "",
         )
         for own in comparison.contenders
@@ -105,7 +106,9 @@ def _describe(contender: Contender, most: int) -> list[str]:
         parts.append(page.write_text(contender.report.to_text(), "what verify says"))
     timings = shown.meta.get("timings")
     if isinstance(timings, dict):
-        rows = [(str(name), f"{value:.4g}") for name, value in timings.items() if value is not None]
+        # Routes are planned from parts that are replayed before: then nothing is left of a step.
+        known = {name: value for name, value in timings.items() if value and value >= 1e-3}
+        rows = [(str(name), f"{value:.4g}") for name, value in known.items()]
         parts.append(page.write_table(("planning took", "s"), rows))
     return parts
 

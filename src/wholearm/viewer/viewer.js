@@ -53,7 +53,7 @@ function place(motion, z) {
   return motion.vertices.map(([u, v]) => [z[0] + c * u - s * v, z[1] + s * u + c * v]);
 }
 
-const join = (points) => points.map((p) => p.map((v) => v.toFixed(5)).join(",")).join(" ");
+const join = (points) => points.map((p) => p.map((v) => v.toPrecision(6)).join(",")).join(" ");
 
 function tip(finger, angle) {
   return [finger.base[0] + finger.length * Math.cos(angle),
@@ -118,6 +118,11 @@ function makeScene(parent, motion) {
   const numbers = motion.vertices.map((_, i) => add(svg, "text", {
     style: `font-size: ${0.027 * size}px`, "text-anchor": "middle", "dominant-baseline": "central" },
     String(i)));
+  // Every number, or every second, fifth, ... one: neighbours are to stand apart.
+  const edges = motion.vertices.map((v, i) => Math.hypot(
+    ...v.map((value, j) => value - motion.vertices[(i + 1) % motion.vertices.length][j])));
+  const step = [1, 2, 5, 10, 20].find((k) => 0.84 * k * Math.min(...edges) > 0.03 * size) || 20;
+  numbers.forEach((own, i) => change(own, { visibility: i % step ? "hidden" : "visible" }));
   const cones = motion.contacts.map((own) => add(world, "polygon", { fill: own.colour, opacity: 0.18 }));
   const arrows = motion.contacts.map((own) => add(world, "polyline", {
     fill: "none", stroke: own.colour, "stroke-width": 1.4 * thin, "stroke-linejoin": "round" }));
@@ -221,6 +226,8 @@ function makePlot(parent, motion, height, title, lines, options) {
     line.values.forEach((value, k) => {
       if (value === null) { open = false; return; }
       if (steps.has(k) && !line.upright) open = false;
+      // A step is upright: the value before it lasts until then.
+      if (steps.has(k) && open) path += `H${x(motion.t[k]).toFixed(1)}`;
       path += `${open ? "L" : "M"}${x(motion.t[k]).toFixed(1)} ${y(value).toFixed(1)}`;
       open = true;
     });
@@ -355,6 +362,46 @@ function touch(hand, z, name) {
   return [a[0] + share * way[0], a[1] + share * way[1]];
 }
 
+// The angle of a finger that touches as `name` says, the one nearest to `near`; NaN if none does.
+function closeFinger(hand, i, corners, name, near) {
+  const [, kind, number, surface] = /^([ve])(\d+)-([a-z]+)/.exec(name);
+  const { base, length, radius } = hand.fingers[i], p = corners[number];
+  const way = [p[0] - base[0], p[1] - base[1]], far = Math.hypot(...way);
+  let middle = Math.atan2(way[1], way[0]), half;
+  if (kind === "v" && surface === "finger") {
+    middle += (i ? 1 : -1) * Math.asin(radius / far);
+    half = 0;
+  } else if (kind === "v") {
+    half = Math.acos((length ** 2 + far ** 2 - radius ** 2) / (2 * length * far));
+  } else {
+    const next = corners[(Number(number) + 1) % corners.length];
+    const along = [next[0] - p[0], next[1] - p[1]], size = Math.hypot(...along);
+    const out = [along[1] / size, -along[0] / size];
+    middle = Math.atan2(out[1], out[0]);
+    half = Math.acos((radius + out[0] * way[0] + out[1] * way[1]) / length);
+  }
+  const turn = 2 * Math.PI, found = [middle - half, middle + half].map(
+    (angle) => angle + turn * Math.round((near - angle) / turn));
+  return Math.abs(found[0] - near) < Math.abs(found[1] - near) ? found[0] : found[1];
+}
+
+// The configuration of a cell with the object at x [m] and phi [rad]; null if no finger reaches it.
+function closeHand(hand, own, x, phi) {
+  const [palm, ...names] = own.contacts, level = place(hand, [x, 0, phi]);
+  const y = -level[Number(/\d+/.exec(palm)[0])][1], corners = place(hand, [x, y, phi]);
+  const angles = names.map((name, i) => closeFinger(hand, i, corners, name, own.z[0][3 + i]));
+  return angles.every(Number.isFinite) ? [x, y, phi, ...angles] : null;
+}
+
+// x [m] and phi [rad] at which a map is clicked.
+function read(axes, element, event) {
+  const at = new DOMPoint(event.clientX, event.clientY).matrixTransform(element.getScreenCTM().inverse());
+  const [left, bottom, width, height] = axes.box;
+  const share = [(at.x - left) / width, (axes.tall - at.y - bottom) / height];
+  const [x, phi] = share.map((s, i) => axes.low[i] + s * (axes.high[i] - axes.low[i]));
+  return [x / 1e3, phi * Math.PI / 180];
+}
+
 // The hand and the object at rest, with what touches.
 function showPose(parent, hand, own, z) {
   const contacts = own.contacts.map((name) => ({
@@ -379,8 +426,11 @@ function makeMap(parent, chart) {
         });
         nearest = far.indexOf(Math.min(...far));
       }
-      const z = own.z[nearest], at = `${(1e3 * z[0]).toFixed(1)} mm, ${(z[2] * 180 / Math.PI).toFixed(1)} deg`;
-      text.textContent = `${own.contacts.join(" ")}: ${own.text}${own.z.length > 1 ? `; drawn at ${at}` : ""}`;
+      const clicked = own.wide && closeHand(chart.hand, own, ...read(chart.axes, element, event));
+      const z = clicked || own.z[nearest], given = [1e3 * z[0], z[2] * 180 / Math.PI];
+      const at = `x = ${given[0].toPrecision(4)} mm, phi = ${given[1].toPrecision(4)} deg`;
+      const shown = clicked || own.z.length > 1 ? `; drawn at ${at}` : "";
+      text.textContent = `${own.contacts.join(" ")}: ${own.text}${shown}`;
       showPose(pose, chart.hand, own, z);
     });
   });
