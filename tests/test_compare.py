@@ -71,7 +71,7 @@ def test_figures_are_those_of_verify(tmp_path: Path) -> None:
 def test_what_does_not_fit_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     problem, (moved, *_) = first_phase(), write(tmp_path)
     for other, text in (
-        (problem.with_(mass=0.3), r"object\.mass: 0\.2 in the trajectory, 0\.3 in the problem"),
+        (problem.with_(mass=0.3), r"object\.mass: 0\.\d+ in the trajectory, 0\.\d+ in the problem"),
         (problem_of(HEPTAGON), "phases: 1 entries in the trajectory, 5 in the problem"),
         (problem.with_({"phases[1].until": {"x": 0.02}}), r"phases\[1\]\.until"),
     ):

@@ -204,7 +204,7 @@ def test_formation_knows_its_contacts_and_friction() -> None:
     formation = make_formation(scene, "v0-palm v1-finger1 e2-tip2")
     assert formation.n_contacts == 3
     assert formation.names == ("v0-palm", "v1-finger1", "e2-tip2")
-    assert formation.friction.tolist() == [0.1, 0.2, 0.3]
+    assert formation.friction == pytest.approx([0.1, 0.2, 0.3])
 
 
 ROLLING = ["v0-palm", "v2-finger1", "v3-finger2", "e1-tip1", "v2-tip1"]
@@ -217,7 +217,7 @@ def test_a_rolling_contact_adds_its_tangential_row(name: str) -> None:
     formation = Formation(scene, sliding.contacts, (parse_contact(name, scene),))
     assert (formation.n_contacts, formation.n_rolling, formation.n_constraints) == (3, 1, 4)
     assert formation.rolling_rows == (1,) and formation.contacts == sliding.contacts
-    assert formation.sliding_friction.tolist() == [0.1, 0.0, 0.1]
+    assert formation.sliding_friction == pytest.approx([0.1, 0.0, 0.1])
     rng = np.random.default_rng(8)
     z, v = rng.uniform([-0.1, 0.02, -3, 0.3, 0.3], [0.1, 0.15, 3, 2.8, 2.8], (9, 5)), 1e-6
     speed = rng.uniform(-1, 1, z.shape)

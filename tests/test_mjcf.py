@@ -89,7 +89,7 @@ def test_gaps_are_those_of_points_and_links(root: Element) -> None:
             )
     for name in problem_of(HEPTAGON).phases[0].formation.names:
         pair = find(root, "pair", name)
-        assert numbers(pair, "friction")[0] == 0.1
+        assert numbers(pair, "friction")[0] == pytest.approx(0.1)
 
 
 def play(root: Element, finger: int, clock: Array) -> Array:

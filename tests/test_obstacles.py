@@ -148,7 +148,8 @@ def test_the_gap_of_link_and_object_is_the_distance_measured(radius: float) -> N
         z = np.array([approach(rng, scene, finger) for _ in range(100)])
         z[:, :2] += rng.uniform(-0.01, 0.01, (100, 2))
         measured = link_gaps(scene, finger, z)
-        outside = measured > -radius
+        # As far inside as the link's middle, the distance measured ends.
+        outside = measured > -radius + 1e-9
         found = function(z.T).full()[0]
         np.testing.assert_allclose(found[outside], measured[outside], atol=1e-14)
         assert (found[~outside] <= 0).all() and outside.sum() > 30 and (~outside).sum() > 5

@@ -205,7 +205,7 @@ def test_what_friction_may_hold_grows_with_the_ranges(problem: Problem) -> None:
     formation, tau = problem.phases[0].formation, np.array([0.05, -0.02])
     ranges = {"friction_palm": 0.3, "friction_finger1": 0.3, "mass": 0.1, "gain2": 0.05}
     exact = find_static_torques([formation], problem.start).measure(tau[None])[0]
-    assert measure_holds(list_holds(formation, problem.start, {}), tau) == exact
+    assert measure_holds(list_holds(formation, problem.start, {}), tau) == pytest.approx(exact)
     rng, within = np.random.default_rng(3), list_holds(formation, problem.start, ranges)
     for tau in rng.uniform(-1.0, 1.0, (20, 2)):
         least = measure_holds(within, tau)

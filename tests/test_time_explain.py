@@ -184,7 +184,7 @@ def test_a_changed_limit_is_the_only_change(index: int, key: str) -> None:
     changed = change_limit(problem, key, 0.123)
     limits = np.append(problem.scene.torque_limit, problem.epsilon)
     limits[index] = 0.123
-    np.testing.assert_array_equal(np.append(changed.scene.torque_limit, changed.epsilon), limits)
+    assert np.append(changed.scene.torque_limit, changed.epsilon) == pytest.approx(limits)
     for before, after in zip(problem.phases, changed.phases, strict=True):
         assert after.formation.scene is changed.scene
         assert after.formation.contacts == before.formation.contacts

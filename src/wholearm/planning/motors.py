@@ -71,7 +71,8 @@ def name_motors(scene: Scene) -> str:
     for key, unit, free in kinds:
         values = list(dict.fromkeys(getattr(finger, key) for finger in scene.fingers))
         if values != [free]:
-            given.append(f"{key} = {' and '.join(f'{value:g}' for value in values)} {unit}")
+            texts = dict.fromkeys(f"{value:g}" for value in values)
+            given.append(f"{key} = {' and '.join(texts)} {unit}")
     return " and ".join(given)
 
 
