@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
-from multiprocessing import get_context, parent_process
+from multiprocessing import parent_process
 from multiprocessing.connection import wait
 from threading import Thread
 from typing import Any, Protocol
@@ -22,6 +22,7 @@ from ..common.arrays import Array
 from ..common.crowd import DiedError, run_all
 from ..common.errors import InputError
 from ..common.journal import Journal
+from ..common.workers import Spawning
 from ..policy.policy import Policy
 from ..problem.definition import Problem
 from ..results.narrow import Torques, narrow, require_same_phases
@@ -186,7 +187,7 @@ def _run(trial: Runs, task: Task) -> dict[str, Any]:
 
 def use_processes(jobs: int | None = None) -> Executor:
     """Processes of one thread each, on all cores or as many as `jobs` says."""
-    return ProcessPoolExecutor(jobs or os.cpu_count(), get_context("spawn"), _end_with_parent)
+    return ProcessPoolExecutor(jobs or os.cpu_count(), Spawning(), _end_with_parent)
 
 
 def _end_with_parent() -> None:
