@@ -72,19 +72,22 @@ def guard(
                 # Some extension modules turn the interrupt of an import into an error of their own.
                 if _received is None:
                     raise
-            # From here on no signal raises anything: a second one often follows the first at once.
-            _holding, sys.stderr = True, errors
-            return _end_command(status, tidy, leave)
+            return _end_command(status, errors, tidy, leave)
     except KeyboardInterrupt:
         # It came before the handlers were in place.
         _received = signal.SIGINT
-        return _end_command(status, tidy, leave)
+        return _end_command(status, errors, tidy, leave)
     finally:
         sys.stderr, _guarded, _holding = errors, False, False
 
 
-def _end_command(status: int, tidy: Callable[[], object], leave: Callable[[int], object]) -> int:
+def _end_command(
+    status: int, errors: TextIO, tidy: Callable[[], object], leave: Callable[[int], object]
+) -> int:
     """Say which signal has come, if one has; returns the exit status."""
+    global _holding
+    # From here on no signal raises anything: a second one often follows the first at once.
+    _holding, sys.stderr = True, errors
     if _received is not None:
         status = 128 + _received
         tidy()
