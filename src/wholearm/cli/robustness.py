@@ -42,10 +42,12 @@ def add_robustness(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sample-rate", type=float, metavar="HZ", default=1000.0, help=text)
     text = "of the simulations, relative to the scene's scales (1e-6)"
     parser.add_argument("--tolerance", type=float, default=1e-6, help=text)
-    text = "file to write results to, one by one (default: NAME_robustness.jsonl); a study that is "
-    text += "there goes on where it was stopped"
+    text = "file to write results to, one by one (default: NAME_robustness.jsonl, with phase and "
+    text += "policy in the name); a study that is there goes on where it was stopped"
     parser.add_argument("-o", "--output", metavar="FILE", help=text)
-    parser.add_argument("--fresh", action="store_true", help="begin anew instead")
+    parser.add_argument(
+        "--fresh", action="store_true", help="begin the file anew, whatever it holds"
+    )
     text = "also draw the motion with its noisy copies (.png, .pdf, .svg)"
     parser.add_argument("--figure", metavar="FILE", help=text)
     parser.add_argument("--jobs", type=int, help="worker processes (default: all cores)")
@@ -63,8 +65,7 @@ def _robustness(options: argparse.Namespace) -> int:
     from ..robustness.report import to_dict, to_text
     from ..robustness.study import assess_robustness
 
-    stem = os.path.splitext(os.path.basename(options.problem))[0]
-    output = options.output or f"{stem}_robustness.jsonl"
+    output = options.output or _name_output(options)
     require_writable(output)
     require_ending(output, ".jsonl")
     if options.figure is not None:
@@ -100,6 +101,15 @@ def _robustness(options: argparse.Namespace) -> int:
     if not options.json:
         print("wrote " + ", ".join(filter(None, (output, options.figure))))
     return 0
+
+
+def _name_output(options: argparse.Namespace) -> str:
+    """A file for each study that differs by more than numbers: its problem, phase and policy."""
+    files = filter(None, (options.problem, options.policy))
+    problem, *policy = (os.path.splitext(os.path.basename(path))[0] for path in files)
+    phase = [] if options.phase is None else [f"phase{options.phase}"]
+    sensor = ["sensor"] if options.sensor else []
+    return "_".join([problem, "robustness", *phase, *policy, *sensor]) + ".jsonl"
 
 
 def _read_ranges(options: argparse.Namespace, problem: Problem) -> Uncertainty:
