@@ -7,6 +7,7 @@ import json
 from typing import TYPE_CHECKING
 
 from ..common.errors import InputError, name_source
+from .origin import tell_origin
 from .progress import clear_progress, show_progress
 
 if TYPE_CHECKING:
@@ -66,6 +67,7 @@ def _export(options: argparse.Namespace) -> int:
     plan = None
     if options.plan is not None:
         problem, plan = _load_plan(options.plan, problem)
+        tell_origin(problem, (options.plan, plan))
     with name_source(options.problem):
         write_text(options.mjcf, write_mjcf(problem, plan, step=step))
     print(f"wrote {options.mjcf}")
@@ -90,6 +92,7 @@ def _replay(options: argparse.Namespace) -> int:
         setting = setting._replace(softness=given["softness"])
     if options.policy is not None:
         return _play_policy(options, problem, plan, setting, given["departure"])
+    notes = tell_origin(problem, (options.plan, plan), silent=options.json)
     with name_source(options.problem):
         report = replay_in(
             options.engine,
@@ -102,7 +105,7 @@ def _replay(options: argparse.Namespace) -> int:
             progress=show_progress(),
         )
     clear_progress()
-    print(json.dumps(to_dict(report), indent=2) if options.json else write(report))
+    print(json.dumps(to_dict(report) | notes, indent=2) if options.json else write(report))
     return report.exit_status
 
 
@@ -119,6 +122,8 @@ def _play_policy(
     if options.refine:
         raise InputError("", "--refine", "is for plans by the clock, not with --policy")
     policy = Policy.load(options.policy)
+    named = options.policy, policy
+    notes = tell_origin(problem, (options.plan, plan), named, options.json)
     with name_source(options.policy):
         report = play_policy(
             options.engine,
@@ -131,7 +136,7 @@ def _play_policy(
             progress=show_progress(),
         )
     clear_progress()
-    print(json.dumps(report.to_dict(), indent=2) if options.json else report.to_text())
+    print(json.dumps(report.to_dict() | notes, indent=2) if options.json else report.to_text())
     return report.exit_status
 
 

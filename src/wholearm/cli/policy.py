@@ -97,7 +97,8 @@ def _policy(options: argparse.Namespace) -> int:
             f"{advise()}; --write-anyway writes it all the same"
         )
     policy.save(output)
-    print(json.dumps(policy.about, indent=2) if options.json else _describe(policy))
+    told = {key: value for key, value in policy.about.items() if key != "problem"}
+    print(json.dumps(told, indent=2) if options.json else _describe(policy))
     if not options.json:
         print(f"{policy.duration:.6f} s in all, the plan {plan.duration:.6f} s; wrote {output}")
     return 0

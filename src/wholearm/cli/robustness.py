@@ -10,6 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from ..common.errors import InputError
+from .origin import tell_origin
 from .progress import clear_progress, show_progress
 
 if TYPE_CHECKING:
@@ -79,6 +80,10 @@ def _robustness(options: argparse.Namespace) -> int:
     plan = load_trajectory(options.plan)
     problem = read_problem(options.problem)
     problem = adopt_phases(problem, plan.meta, plan.q[-1], options.plan)
+    if policy is not None:
+        policy = policy.with_sensor(options.sensor)
+    given = None if policy is None else (options.policy, policy)
+    notes = tell_origin(problem, (options.plan, plan), given, options.json)
     study = assess_robustness(
         problem,
         plan,
@@ -86,7 +91,7 @@ def _robustness(options: argparse.Namespace) -> int:
         seed=options.seed,
         uncertainty=_read_ranges(options, problem),
         phase=options.phase,
-        policy=None if policy is None else policy.with_sensor(options.sensor),
+        policy=policy,
         path=output,
         fresh=options.fresh,
         start=_choose_executor(options),
@@ -97,7 +102,7 @@ def _robustness(options: argparse.Namespace) -> int:
         from ..figures.robustness import draw_robustness
 
         plots.save(draw_robustness(study), options.figure)
-    print(json.dumps(to_dict(study), indent=2) if options.json else to_text(study))
+    print(json.dumps(to_dict(study) | notes, indent=2) if options.json else to_text(study))
     if not options.json:
         print("wrote " + ", ".join(filter(None, (output, options.figure))))
     return 0

@@ -9,7 +9,7 @@ from ..common.differences import Difference, describe_differences, find_differen
 from ..common.errors import InputError
 from ..problem.definition import Problem
 
-_FREE = (".name", ".epsilon", ".settle_gap", ".uncertainty", "settle")
+_FREE = (".name", ".epsilon", ".settle_gap", ".uncertainty", ".goal", "settle")
 """Keys of a problem in which its plans may differ from it; those with a dot at the top only."""
 _OTHER_HAND = 0.1
 """Change of a link, over its length, from which on it is another hand: no error of measurement."""
@@ -59,13 +59,13 @@ def describe_origin(problem: Problem, meta: Mapping[str, Any], what: str = "plan
         return ""
     for found in _find(own, problem):
         _require_sense(found, problem, what)
-    text = describe_differences(_find(own, problem), f"in the {what}'s", "here")
-    return f"{what} made for another problem: {text}" if text else ""
+    text = describe_differences(_find(own, problem), f"in the {what}", "here")
+    return f"made for another problem: {text}" if text else ""
 
 
 def _find(own: Mapping[str, Any], problem: Problem) -> Iterator[Difference]:
     # Phases take the place of goals in plans.
-    free = (*_FREE, ".goal", ".phases") if "goal" in problem.table else _FREE
+    free = (*_FREE, ".phases") if "goal" in problem.table else _FREE
     return find_differences(own, problem.table, free)
 
 
@@ -82,5 +82,5 @@ def _require_sense(found: Difference, problem: Problem, what: str) -> None:
             if change > _OTHER_HAND * finger.length:
                 other = "it is one of another hand"
     if other:
-        text = f"{found.one} in the {what}'s problem, {found.other} here; {other}"
+        text = f"{found.one} in the {what}, {found.other} here; {other}"
         raise InputError("", found.key, text)
