@@ -55,7 +55,8 @@ if TYPE_CHECKING:
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        raise InputError("", "", f"{message}; see {self.prog} --help")
+        text = message.removeprefix("argument ")
+        raise InputError("", "", f"{text}; see {self.prog} --help")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -230,7 +231,6 @@ def _stem(path: str) -> str:
 
 def _verify(options: argparse.Namespace) -> int:
     from ..common.files import require_ending, require_writable
-    from ..common.require import require_number
     from ..problem.read import adopt_phases, read_problem
     from ..results.trajectory import Trajectory
     from ..verification.verify import verify
@@ -239,7 +239,7 @@ def _verify(options: argparse.Namespace) -> int:
         require_writable(options.output)
         require_ending(options.output, ".npz")
     given = {
-        key: require_number(getattr(options, key), f"--{key.replace('_', '-')}", positive=True)
+        key: getattr(options, key)
         for key in ("tolerance", "departure", "rest_speed")
         if getattr(options, key) is not None
     }
