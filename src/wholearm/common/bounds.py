@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 from .errors import InputError
@@ -22,13 +21,12 @@ class Bounds(NamedTuple):
     def describe(self, given: object) -> str:
         """What is wrong with a value; empty if nothing is."""
         kinds = (int,) if self.whole else (int, float)
-        known = isinstance(given, kinds) and not isinstance(given, bool) and math.isfinite(given)
+        known = isinstance(given, kinds) and not isinstance(given, bool)
         if known and self.low <= given <= self.high:  # type: ignore[operator]
             return ""
         low, high = (f"{own}" if self.whole else f"{own:g}" for own in self)
-        text = f"{given:g}" if isinstance(given, float) else repr(given)
         kind = "whole numbers from " if self.whole else ""
-        return f"{text} given; allowed are {kind}{low} to {high}"
+        return f"{given!r} given; allowed are {kind}{low} to {high}"
 
     def check(self, key: str, given: object) -> None:
         """Raise an `InputError` that names `key` if a value is out of its range."""
