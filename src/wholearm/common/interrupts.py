@@ -74,8 +74,8 @@ def guard(
                     raise
             return _end_command(status, errors, tidy, leave)
     except KeyboardInterrupt:
-        # It came before the handlers were in place.
-        _received = signal.SIGINT
+        # It came before all handlers were in place.
+        _received = _received or signal.SIGINT
         return _end_command(status, errors, tidy, leave)
     finally:
         sys.stderr, _guarded, _holding = errors, False, False

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, BinaryIO
 
 from .differences import describe_differences, find_differences
@@ -50,7 +51,7 @@ class Journal:
             self._stream: BinaryIO = open(path, "ab+", buffering=0)
             try:
                 if stat.S_ISREG(os.fstat(self._stream.fileno()).st_mode):
-                    self._lock()
+                    _lock(self._stream.fileno(), path)
                     if fresh:
                         self._stream.truncate(0)
                     self._begin(self._read(), again)
@@ -88,16 +89,6 @@ class Journal:
         """The tasks that have a record under `key`."""
         return {name(record[key]) for record in self.records if key in record}
 
-    def _lock(self) -> None:
-        """Keep others from the file, until this process ends."""
-        if fcntl is None:
-            return
-        try:
-            fcntl.flock(self._stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            text = "another run is writing to it; wait for its end, or name another file"
-            raise InputError(self.path, "", text) from None
-
     def _read(self) -> bytes:
         self._stream.seek(0)
         return self._stream.read()
@@ -127,12 +118,12 @@ class Journal:
         other, own = _parse(given.split(b"\n", 1)[0]), self._stamp
         kind = own.get("study", "")
         if other is None or other.get("study") != kind:
-            text = f"holds no {kind} study; --fresh begins anew, or name another file"
+            text = f"holds no {kind} study; --fresh begins anew, or choose another with -o"
             raise InputError(self.path, "", text)
         found = find_differences(other, own)
         text = describe_differences(found, "in the file", "now")
         if text:
-            what = f"holds another study: {text}; --fresh begins anew, or name another file"
+            what = f"holds another study: {text}; --fresh begins anew, or choose another with -o"
             raise InputError(self.path, "", what)
 
     def _write(self, line: bytes) -> None:
@@ -142,6 +133,34 @@ class Journal:
 
     def _fail(self, error: OSError) -> InputError:
         return InputError(self.path, "", f"cannot be written: {error.strerror}")
+
+
+@contextmanager
+def locked(folder: str) -> Iterator[None]:
+    """Keep other runs, that ask for it too, from a folder.
+
+    Raises
+    ------
+    InputError
+        If another run has it.
+    """
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        _lock(descriptor, folder)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int, path: str) -> None:
+    """Keep others from a file until it is closed, or this process ends."""
+    if fcntl is None:
+        return
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        text = "another run is writing to it; wait for its end, or choose another with -o"
+        raise InputError(path, "", text) from None
 
 
 def _to_line(record: dict[str, Any]) -> bytes:
