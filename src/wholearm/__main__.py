@@ -24,7 +24,11 @@ def run() -> None:
         sys.stdout = open(os.devnull, "w", encoding="utf-8")
     if sys.stderr is None:
         sys.stderr = open(os.devnull, "w", encoding="utf-8")
-    guard(start, leave=_leave)
+    try:
+        guard(start, leave=_leave)
+    finally:
+        # Only an error that nobody expected comes here.
+        end_children()
 
 
 def _leave(status: int) -> None:

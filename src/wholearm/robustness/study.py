@@ -20,6 +20,7 @@ import numpy as np
 
 from .. import __version__
 from ..common.arrays import Array
+from ..common.bounds import Bounds
 from ..common.crowd import DiedError, run_all
 from ..common.errors import InputError
 from ..common.journal import Journal
@@ -34,6 +35,8 @@ from .uncertainty import Uncertainty
 
 Task = tuple[int, tuple[float, ...]]
 """Number and values of a sample."""
+SAMPLES = Bounds(1, 10**6)
+"""Samples of a study."""
 DRAWN = 200
 """Samples whose paths are kept, for figures."""
 
@@ -144,8 +147,7 @@ def assess_robustness(
     _, trajectory = narrow(plan)
     if trajectory is None:
         raise InputError("", "plan", "torques alone given; a plan with its motion is needed")
-    if isinstance(samples, bool) or not isinstance(samples, int) or samples < 1:
-        raise InputError("", "samples", f"{samples!r} given; allowed are 1 and more")
+    SAMPLES.check("samples", samples)
     require_same_phases(problem, trajectory)
     own = uncertainty or Uncertainty(problem.uncertainty or {})
     trial = make_trial(problem, trajectory, own, phase, policy)
