@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from functools import cache
 from pathlib import Path
 
@@ -14,8 +15,12 @@ from wholearm.common.errors import InputError
 from wholearm.comparison.compare import compare
 from wholearm.figures.comparison import draw_comparison
 from wholearm.problem.definition import Problem
+from wholearm.problem.read import NAMES
+from wholearm.problem.table import change_table
 from wholearm.results.narrow import save
+from wholearm.results.origin import describe_origin
 from wholearm.results.torque import TorqueProfile, read_notes, read_torque_csv
+from wholearm.results.trajectory_file import load_trajectory
 from wholearm.simulation.simulate import simulate
 from wholearm.verification.verify import verify
 
@@ -92,3 +97,34 @@ def test_comments_of_torques_are_read(tmp_path: Path) -> None:
     file.write_text("# found by hand\n# a = 1\nt,tau1,tau2\n0,1,2\n# b= c d\n1,3,4\n")
     assert read_notes(str(file)) == {"a": "1", "b": "c d"}
     assert read_torque_csv(str(file)).at(np.array([0.5]))[0] == pytest.approx([2.0, 3.0])
+
+
+def test_what_differs_from_the_problem_of_a_plan_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    problem, (moved, *_) = first_phase(), write(tmp_path)
+    meta = load_trajectory(moved).meta
+    assert describe_origin(problem, meta) == ""
+    other = problem.with_(mass=0.3, length1=problem.scene.fingers[0].length * 1.01)
+    text = describe_origin(other, meta)
+    assert text.startswith("made for another problem: object.mass (0.2 in the plan, 0.3 here)")
+    assert "fingers.1.length" in text
+    vertices = [*problem.table["object"]["vertices"]]
+    chipped = problem.table["object"] | {"vertices": vertices[:-1]}
+    for senseless, key in (
+        ({"length1": problem.scene.fingers[0].length * 1.5}, "fingers.1.length"),
+        ({"base2": [-0.5, 0.1]}, r"fingers.2.base"),
+    ):
+        with pytest.raises(InputError, match=f"{key}.*another hand"):
+            describe_origin(problem, {"problem": change_table(meta["problem"], senseless, NAMES)})
+    with pytest.raises(InputError, match=r"object\.vertices: 6 entries in the plan, 7 here"):
+        describe_origin(problem, {"problem": meta["problem"] | {"object": chipped}})
+    own = tmp_path / "own.toml"
+    text = HEPTAGON.read_text(encoding="utf-8")
+    first = "[[phases]]".join(text.split("[[phases]]")[:2])
+    own.write_text(re.sub(r"(?m)^mass = .*", "mass = 0.21", first), encoding="utf-8")
+    for command in (["verify"], ["verify", "--json"]):
+        main([command[0], str(own), moved, *command[1:]])
+        out = capsys.readouterr().out
+        notes = json.loads(out)["notes"] if command[1:] else out.splitlines()[:1]
+        assert notes == ["made for another problem: object.mass (0.2 in the plan, 0.21 here)"]

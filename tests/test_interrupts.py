@@ -188,6 +188,43 @@ def test_planning_is_interrupted(delay: float, tmp_path: Path) -> None:
     assert set(trial.faults) <= {"late"}
 
 
+WORKS = """
+import time
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+import wholearm.__main__ as m
+from wholearm.common.crowd import run_all
+from wholearm.common.workers import Spawning
+
+def work():
+    pool = partial(ProcessPoolExecutor, 2, Spawning())
+    for _ in run_all(time.sleep, [0, 60, 60, 60, 60], pool):
+        print("ready", flush=True)
+        {then}
+    return 0
+
+m.start = work
+m.run()
+"""
+
+
+@pytest.mark.parametrize("then", ["pass", "raise OSError('full')", "return 2"])
+def test_workers_end_with_their_command(then: str, tmp_path: Path) -> None:
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    command = [sys.executable, "-c", WORKS.format(then=then)]
+    with subprocess.Popen(command, text=True, **streams) as process:  # type: ignore[call-overload]
+        assert process.stdout.readline() == "ready\n"
+        # A terminal and `timeout` may send it twice.
+        for _ in range(2 * (then == "pass")):
+            process.send_signal(signal.SIGINT)
+        # Far below what the tasks take; pipes close when the last worker has ended.
+        _, errors = process.communicate(timeout=30)
+    if then == "pass":
+        assert (process.returncode, errors) == (130, "wholearm: interrupted\n")
+    else:
+        assert process.returncode == (2 if "return" in then else 1)
+
+
 class Stopped:
     """A solver as CasADi leaves it when an interrupt comes."""
 

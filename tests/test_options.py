@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+import argparse
 import math
 from typing import Any
 
 import pytest
 
+from wholearm.cli.command import build_parser
+from wholearm.common.bounds import PLANNER
 from wholearm.common.errors import InputError
 from wholearm.planning.options import CHOICES, Objective, PlanOptions
 
@@ -85,3 +88,34 @@ def test_only_the_margin_has_a_duration(objective: str) -> None:
 def test_only_the_least_time_has_a_bound(objective: str) -> None:
     with pytest.raises(InputError, match="certify: is for the objective time only"):
         PlanOptions(objective=objective, certify=True)
+
+
+def list_numbers(parser: argparse.ArgumentParser) -> list[tuple[str, argparse.Action]]:
+    """Every option of every command that takes a number."""
+    found = []
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for own in action.choices.values():
+                found += list_numbers(own)
+        elif action.type is not None:
+            found.append((parser.prog, action))
+    return found
+
+
+def test_every_number_among_the_options_has_a_range() -> None:
+    numbers = list_numbers(build_parser())
+    assert len(numbers) > 40
+    for _, action in numbers:
+        assert callable(action.type) and action.type not in (int, float)
+        for wrong in ("1e300", "1" + 40 * "0", "-1e300", "nan", "inf", "much"):
+            with pytest.raises(argparse.ArgumentTypeError, match="given; allowed are"):
+                action.type(wrong)
+        if isinstance(action.default, int | float):
+            assert action.type(str(action.default)) == action.default
+
+
+@pytest.mark.parametrize("key", PLANNER)
+def test_what_would_take_all_memory_is_refused(key: str) -> None:
+    given: dict[str, Any] = {key: 10**400}
+    with pytest.raises(InputError, match=f"^{key}: .* given; allowed are"):
+        PlanOptions(**given)

@@ -288,7 +288,7 @@ def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str], plan: Pla
     assert main(["verify", str(HEPTAGON), str(file), "--free", "--policy", str(file)]) == 2
     assert "meta: is not that of a policy" in capsys.readouterr().err
     assert main(["policy", str(file), "--reserve", "-1", "-o", str(tmp_path / "p.npz")]) == 2
-    assert "reserve: -1.0 is not a number >= 0" in capsys.readouterr().err
+    assert "--reserve: -1.0 given; allowed are 0 to 1000" in capsys.readouterr().err
     assert not (tmp_path / "p.npz").exists()
 
 

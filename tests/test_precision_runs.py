@@ -17,6 +17,7 @@ from wholearm.benchmark.precision.runs import (
     read_runs,
     repeat,
 )
+from wholearm.common.errors import InputError
 
 FINE = Run("study", "phase 1", "a, b", "1e-6", 0, 0.5, 0.2, 1e-7)
 RUNS = [
@@ -33,6 +34,14 @@ def test_runs_are_read_as_they_were_written(tmp_path: Path) -> None:
     assert read_runs(str(path)) == []
     path.write_text(format_runs(RUNS))
     assert list(map(str, read_runs(str(path)))) == list(map(str, RUNS))
+
+
+@pytest.mark.parametrize("given", ["", "a,b\n1,2\n", "\0", "study,instance\n"])
+def test_no_other_file_is_taken_for_runs(given: str, tmp_path: Path) -> None:
+    path = tmp_path / "runs.csv"
+    path.write_text(given)
+    with pytest.raises(InputError, match="holds no runs of this study"):
+        read_runs(str(path))
 
 
 def test_some_errors_count_or_all() -> None:

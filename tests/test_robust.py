@@ -190,7 +190,7 @@ def test_no_ranges_cost_nothing(curve: Curve) -> None:
 @pytest.mark.parametrize(
     "given, text",
     [
-        ({"robust": -1.0}, "robust: -1.0 is not a number >= 0"),
+        ({"robust": -1.0}, "robust: -1.0 given; allowed are 0 to 1000"),
         ({"robust": 10.0}, "robust: 10 makes the range of friction_palm 1; a relative range is"),
         ({"robust": 1.0, "certify": True}, "certify: does not go with robust"),
         ({"largest": True}, "largest: is for robust plans only"),

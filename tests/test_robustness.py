@@ -89,13 +89,13 @@ def test_a_study_that_was_stopped_ends_the_same(
 ) -> None:
     path, calls = tmp_path / "part.jsonl", list[str]()
     lines = written.read_text().splitlines(keepends=True)
-    assert len(lines) == 6
-    path.write_text("".join(lines[:4]) + lines[4][:20])
+    assert len(lines) == 7
+    path.write_text("".join(lines[:5]) + lines[5][:20])
     again = assess_robustness(
         problem, plan, samples=5, uncertainty=FEW, path=path, start=THREADS, progress=calls.append
     )
     assert len(calls) == 2 and calls[-1].startswith("5 of 5 samples")
-    numbers = [json.loads(line)["sample"] for line in path.read_text().splitlines()[1:]]
+    numbers = [json.loads(line)["sample"] for line in path.read_text().splitlines()[2:]]
     assert sorted(numbers) == list(range(5))
     assert again.records == study.records
 
@@ -104,8 +104,32 @@ def test_another_range_is_another_study(problem: Problem, plan: Plan, tmp_path: 
     path, calls = tmp_path / "study.jsonl", list[str]()
     run = partial(assess_robustness, problem, plan, samples=1, path=path, start=THREADS)
     run(uncertainty=FEW)
-    run(uncertainty=Uncertainty({**FEW.widths, "mass": 0.01}, None), progress=calls.append)
+    before, other = path.read_text(), Uncertainty({**FEW.widths, "mass": 0.01}, None)
+    with pytest.raises(InputError, match=r"widths.mass \(0.05 in the file, 0.01 now\)"):
+        run(uncertainty=other)
+    with pytest.raises(InputError, match=r"seed \(0 in the file, 1 now\)"):
+        run(uncertainty=FEW, seed=1)
+    assert path.read_text() == before
+    run(uncertainty=other, fresh=True, progress=calls.append)
     assert len(calls) == 1
+
+
+def test_a_study_grows_and_is_reported_in_part(
+    problem: Problem, plan: Plan, study: Robustness, written: Path, tmp_path: Path
+) -> None:
+    path, calls = tmp_path / "study.jsonl", list[str]()
+    path.write_text(written.read_text())
+    run = partial(assess_robustness, problem, plan, uncertainty=FEW, path=path, start=THREADS)
+    part = run(samples=2, progress=calls.append)
+    assert part.records == study.records[:2] and "2 of 5 samples" in to_text(part)
+    assert not calls and path.read_text() == written.read_text()
+    more = run(samples=7, progress=calls.append)
+    assert len(calls) == 2 and more.records[:5] == study.records
+    assert path.read_text().startswith(written.read_text())
+    # What is added is a Latin hypercube, too, and the same one when it is drawn again.
+    mass = np.sort(more.samples[5:, 0])
+    assert mass[0] < 0 < mass[1] and not np.isin(more.samples[5:], more.samples[:5]).any()
+    assert np.array_equal(run(samples=7).samples, more.samples)
 
 
 def test_the_report_says_what_was_counted(study: Robustness) -> None:

@@ -218,7 +218,7 @@ def test_route_prints_phases_that_load(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(["route", str(path), "--alternatives", "-1"]) == 2
     assert "--alternatives: -1 given" in capsys.readouterr().err
     assert main(["route", str(path), "--jobs", "0"]) == 2
-    assert "--jobs: 0 given; allowed is 1 or more" in capsys.readouterr().err
+    assert "--jobs: 0 given; allowed are whole numbers from 1" in capsys.readouterr().err
     # What needs phases says where they come from.
     assert main(["predict", str(path)]) == 2
     assert "`wholearm route FILE` finds" in capsys.readouterr().err

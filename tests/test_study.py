@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -97,19 +98,51 @@ def test_what_counts_as_an_unclear_end(
 
 
 def test_a_journal_goes_on_after_half_a_line(tmp_path: Path) -> None:
-    path, stamp = str(tmp_path / "records.jsonl"), {"seed": 1}
-    journal = Journal(path, stamp)
-    journal.add({"scene": [0, "time"]})
+    path, stamp = str(tmp_path / "records.jsonl"), {"study": "any", "seed": 1}
+    with Journal(path, stamp) as journal:
+        journal.add({"scene": [0, "time"]})
     with open(path, "a", encoding="utf-8") as stream:
         stream.write('{"scene": [1, "ti')
-    again = Journal(path, stamp)
-    again.add({"scene": [2, "time"]})
-    assert [r["scene"][0] for r in Journal(path, stamp).records] == [0, 2]
-    again.add({"scene": [3, "time"], "findings": [["hang", ""]]})
-    again.add({"scene": [4, "time"], "findings": []})
-    kept = Journal(path, stamp, again=True).records
-    assert [record["scene"][0] for record in kept] == [0, 2, 4]
-    assert Journal(path, {"seed": 2}).records == []
+    with Journal(path, stamp) as again:
+        again.add({"scene": [2, "time"]})
+    with Journal(path, stamp) as journal:
+        assert [r["scene"][0] for r in journal.records] == [0, 2]
+        journal.add({"scene": [3, "time"], "findings": [["hang", ""]]})
+        journal.add({"scene": [4, "time"], "findings": []})
+    for drop in (True, False):
+        with Journal(path, stamp, again=drop) as journal:
+            assert [record["scene"][0] for record in journal.records] == [0, 2, 4]
+
+
+@pytest.mark.parametrize(
+    "given, text",
+    [
+        ('{"study": "any", "seed": 2}\n{"a": 1}\n', "holds another study: seed (2 in the file, 1"),
+        ('{"my": "data"}\n', "holds no any study"),
+        ("t,tau1,tau2\n", "holds no any study"),
+        ("\0\xff", "holds no any study"),
+    ],
+)
+def test_no_journal_overwrites_anything_else(given: str, text: str, tmp_path: Path) -> None:
+    path, stamp = tmp_path / "records.jsonl", {"study": "any", "seed": 1}
+    path.write_text(given, encoding="latin-1")
+    with pytest.raises(InputError, match=re.escape(text)) as caught:
+        Journal(str(path), stamp)
+    assert caught.value.source == str(path) and "--fresh" in str(caught.value)
+    assert path.read_text(encoding="latin-1") == given
+    with Journal(str(path), stamp, fresh=True) as journal:
+        assert journal.records == []
+    assert path.read_text(encoding="utf-8") == json.dumps(stamp) + "\n"
+
+
+def test_two_runs_do_not_write_to_one_file(tmp_path: Path) -> None:
+    path, stamp = str(tmp_path / "records.jsonl"), {"study": "any"}
+    with Journal(path, stamp) as journal:
+        journal.add({"scene": 0})
+        with pytest.raises(InputError, match="another run is writing to it"):
+            Journal(path, stamp, fresh=True)
+    with Journal(path, stamp) as journal:
+        assert journal.records == [{"scene": 0}]
 
 
 def test_values_that_noise_changes_are_found() -> None:

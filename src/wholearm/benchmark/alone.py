@@ -7,9 +7,10 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from ..common.workers import Spawning
 
 
 class Cost(NamedTuple):
@@ -31,7 +32,7 @@ class Cost(NamedTuple):
 
 def measure_alone(work: Callable[..., Any], *given: object) -> Cost:
     """Call a function of a module with `given`, in a new process."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(1, mp_context=Spawning()) as pool:
         return pool.submit(_measure, work, given).result()
 
 

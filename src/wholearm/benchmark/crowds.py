@@ -48,13 +48,13 @@ class Cheap(NamedTuple):
 
 def collect(path: str, samples: int, address: str) -> None:
     """Run the samples that a file does not have yet, on Dask's workers if there is an address."""
-    journal = Journal(path, {"study": "crowds", "samples": samples})
-    done = journal.done("sample")
     drawn = Uncertainty().draw(samples, 0)
-    tasks = ((k, tuple(drawn[k].tolist())) for k in range(samples) if k not in done)
     start = partial(connect, address) if address else partial(use_processes, WORKERS)
-    for record in list_records(Cheap(), tasks, start):
-        journal.add(record)
+    with Journal(path, {"study": "crowds", "samples": samples}) as journal:
+        done = journal.done("sample")
+        tasks = ((k, tuple(drawn[k].tolist())) for k in range(samples) if k not in done)
+        for record in list_records(Cheap(), tasks, start):
+            journal.add(record)
 
 
 def _launch(path: Path, samples: int, address: str) -> subprocess.Popen[bytes]:

@@ -3,10 +3,39 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+
+from ..common.bounds import PLANNER, Bounds
 
 SIMULATORS = ("told", "free")
 """What `plot --simulate` takes; the first one if it is left out."""
+
+
+def number(low: float, high: float) -> Callable[[str], float]:
+    """What reads an option that is a number from `low` to `high`, a whole one if `low` is."""
+    bounds = Bounds(low, high)
+
+    def read(text: str) -> float:
+        value: float | str
+        try:
+            value = int(text) if bounds.whole else float(text)
+        except ValueError:
+            value = text
+        if wrong := bounds.describe(value):
+            raise argparse.ArgumentTypeError(wrong)
+        return value  # type: ignore[return-value]
+
+    return read
+
+
+JOBS = number(1, 256)
+"""Processes."""
+DEPARTURE = number(1e-9, 1e3)
+"""How far a motion may be from another one, relative to the scene."""
+TOLERANCE = number(1e-14, 1e-2)
+"""Of simulators, relative to the scene."""
+STEP = number(1e-15, 1e6)
+"""Time step [s], which has a range of its own in each scene, too."""
 
 
 def name_simulator(given: Sequence[str]) -> list[str]:
@@ -27,37 +56,44 @@ def add_solve(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", help="trajectory file to write (default: NAME.npz)")
     parser.add_argument("--torques", metavar="FILE", help="also write the torques as CSV")
     text = "write samples at this rate [Hz] instead, and say what becomes of the motion (none)"
-    parser.add_argument("--sample-rate", metavar="HZ", type=float, help=text)
+    parser.add_argument("--sample-rate", metavar="HZ", type=number(1e-9, 1e12), help=text)
     text = "of samples: linear, or hold for sample-and-hold (linear)"
     parser.add_argument("--interpolation", help=text)
     parser.add_argument("--objective", default="time", help="time, effort or margin (time)")
     text = "relative error of the objective below which refining ends (1e-4)"
-    parser.add_argument("--accuracy", type=float, help=text)
+    parser.add_argument("--accuracy", type=number(*PLANNER["accuracy"]), help=text)
     text = "intervals of each phase along a curve (as many as the accuracy needs)"
-    parser.add_argument("--intervals", type=int, help=text)
+    parser.add_argument("--intervals", type=number(*PLANNER["intervals"]), help=text)
     text = "longest duration, for margin [s] (twice the least time)"
-    parser.add_argument("--duration", type=float, help=text)
+    parser.add_argument("--duration", type=number(*PLANNER["duration"]), help=text)
     text = "weight of time, for effort [(N m)^2] (1)"
-    parser.add_argument("--time-weight", type=float, help=text)
+    parser.add_argument("--time-weight", type=number(*PLANNER["time_weight"]), help=text)
     text = "rows per phase of the trajectory file (201)"
-    parser.add_argument("--samples", type=int, help=text)
+    parser.add_argument("--samples", type=number(*PLANNER["samples"]), help=text)
     text = "auto, or time for the time domain throughout (auto)"
     parser.add_argument("--transcription", help=text)
     text = "least acceleration of contacts that are let go, over gravity (0.01)"
-    parser.add_argument("--opening", type=float, help=text)
+    parser.add_argument("--opening", type=number(*PLANNER["opening"]), help=text)
     text = "least gap of contacts that were let go, over the radius of gyration (5e-4)"
-    parser.add_argument("--clearance", type=float, help=text)
+    parser.add_argument("--clearance", type=number(*PLANNER["clearance"]), help=text)
     text = "intervals of a phase in the time domain (as many as the accuracy needs)"
-    parser.add_argument("--time-intervals", type=int, help=text)
+    parser.add_argument("--time-intervals", type=number(*PLANNER["time_intervals"]), help=text)
     text = "collocation points of an interval there (3)"
-    parser.add_argument("--degree", type=int, help=text)
+    parser.add_argument("--degree", type=number(*PLANNER["degree"]), help=text)
     parser.add_argument("--scheme", help="radau or legendre points (radau)")
     text = "keep the contact modes of the first plan that is found"
     parser.add_argument("--no-mode-search", dest="mode_search", action="store_false", help=text)
     text = "return the plan without replaying it"
     parser.add_argument("--no-replay", dest="replay", action="store_false", help=text)
     text = "keep limits within the problem's ranges, [uncertainty], or FACTOR times these (0)"
-    parser.add_argument("--robust", metavar="FACTOR", nargs="?", type=float, const=1.0, help=text)
+    parser.add_argument(
+        "--robust",
+        metavar="FACTOR",
+        nargs="?",
+        type=number(*PLANNER["robust"]),
+        const=1.0,
+        help=text,
+    )
     text = "also look for the largest factor with which there is a plan"
     parser.add_argument("--largest", action="store_true", help=text)
     text = "bound the least time along curves from below, and print the gap"
@@ -71,7 +107,7 @@ def add_solve(parser: argparse.ArgumentParser) -> None:
 def add_jobs(parser: argparse.ArgumentParser) -> None:
     """Add `--jobs` of a search for a goal."""
     text = "processes that a search for a [goal] uses (2, or 1 where there is one core)"
-    parser.add_argument("--jobs", metavar="N", type=int, help=text)
+    parser.add_argument("--jobs", metavar="N", type=JOBS, help=text)
 
 
 def add_cache(parser: argparse.ArgumentParser) -> None:
@@ -87,16 +123,16 @@ def add_verify(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("torques", help="trajectory file (.npz) or torques (.csv: t,tau1,tau2)")
     parser.add_argument(
         "--tolerance",
-        type=float,
+        type=TOLERANCE,
         default=1e-9,
         help="of the simulator's steps, relative to the scene's scales (1e-9)",
     )
     text = (
         "how far the replay may be from the plan, over the object's radius of gyration, and in rad"
     )
-    parser.add_argument("--departure", type=float, help=f"{text} (1e-3)")
+    parser.add_argument("--departure", type=DEPARTURE, help=f"{text} (1e-3)")
     text = "speed that passes for rest, over the root of that radius times gravity"
-    parser.add_argument("--rest-speed", type=float, help=f"{text} (2e-2)")
+    parser.add_argument("--rest-speed", type=DEPARTURE, help=f"{text} (2e-2)")
     _add_least_minor(parser)
     text = "also list the paper's scalar equation of motion where a phase has four constraints"
     parser.add_argument("--reduced", action="store_true", help=text)
@@ -107,7 +143,7 @@ def add_verify(parser: argparse.ArgumentParser) -> None:
     text = "with --policy: measured normal forces are handed to it, exact ones"
     parser.add_argument("--sensor", action="store_true", help=text)
     text = "Poisson's coefficient of impacts, 0 to 1, with --free (0: plastic)"
-    parser.add_argument("--restitution", type=float, help=text)
+    parser.add_argument("--restitution", type=number(0.0, 1.0), help=text)
     text = "trajectory file to write (.npz) of the replayed motion, for plot"
     parser.add_argument("-o", "--output", metavar="FILE", help=text)
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
@@ -115,7 +151,7 @@ def add_verify(parser: argparse.ArgumentParser) -> None:
 
 def _add_least_minor(parser: argparse.ArgumentParser) -> None:
     text = "least principal minor of the contact problem, over that without friction (0.1)"
-    parser.add_argument("--least-minor", type=float, help=text)
+    parser.add_argument("--least-minor", type=number(-1e3, 0.999), help=text)
 
 
 def add_plot(parser: argparse.ArgumentParser) -> None:
@@ -126,7 +162,7 @@ def add_plot(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", required=True, help="figure to write (.png, .pdf, .svg)")
     text = "overlay the simulated forces; free: simulated without telling which contacts hold"
     parser.add_argument("--simulate", choices=SIMULATORS, metavar="[free]", help=text)
-    parser.add_argument("--width", type=float, help="of the figure [in], 3 to 40 (10)")
+    parser.add_argument("--width", type=number(3.0, 40.0), help="of the figure [in], 3 to 40 (10)")
     text = "also draw the object's pose, and the joints' angles and speeds"
     parser.add_argument("--motion", action="store_true", help=text)
 
@@ -137,11 +173,11 @@ def add_predict(parser: argparse.ArgumentParser) -> None:
     text = "figure to write (.png, .pdf, .svg) of the least normal force over speed"
     parser.add_argument("-o", "--output", metavar="FILE", help=text)
     text = "how hard quasistatic torques squeeze: 0 as little as needed, 1 as hard as helps (0.5)"
-    parser.add_argument("--squeeze", type=float, default=0.5, help=text)
+    parser.add_argument("--squeeze", type=number(0.0, 1.0), default=0.5, help=text)
     text = "write the quasistatic torques as CSV, which hand tuning starts from"
     parser.add_argument("--torques", metavar="FILE", help=text)
     text = "mean speed along the phases for these [m/s], over which they are spread in time (0.05)"
-    parser.add_argument("--speed", metavar="V", type=float, help=text)
+    parser.add_argument("--speed", metavar="V", type=number(1e-9, 1e6), help=text)
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
 
 
@@ -152,11 +188,11 @@ def add_tune(parser: argparse.ArgumentParser) -> None:
     text = "let each phase have one more step of its torques, which stops it at its end"
     parser.add_argument("--brake", action="store_true", help=text)
     text = "with --brake: let a phase that fails stop up to N times on its way, 0 to 7 (0)"
-    parser.add_argument("--stops", metavar="N", type=int, default=0, help=text)
+    parser.add_argument("--stops", metavar="N", type=number(0, 7), default=0, help=text)
     text = "how hard quasistatic torques squeeze: 0 as little as needed, 1 as hard as helps (0.5)"
-    parser.add_argument("--squeeze", type=float, default=0.5, help=text)
+    parser.add_argument("--squeeze", type=number(0.0, 1.0), default=0.5, help=text)
     text = "raises beyond the first that reaches the end: 0 none, 1 all that keep contacts (1)"
-    parser.add_argument("--share", type=float, default=1.0, help=text)
+    parser.add_argument("--share", type=number(0.0, 1.0), default=1.0, help=text)
     parser.add_argument("--json", action="store_true", help="print every trial as JSON")
 
 

@@ -11,6 +11,7 @@ from itertools import product
 from typing import Any
 
 from ..common.files import write_text
+from .arguments import JOBS, number
 from .progress import clear_progress, show_progress
 
 STUDIES = ("problem", "precision", "stress", "guard", "kernels", "skip", "growth")
@@ -40,13 +41,19 @@ def add_bench(bench: argparse.ArgumentParser) -> None:
 
     text = "plan generated scenes and read damaged files, and count what must not happen"
     stress = studies.add_parser("stress", help=text, description=text)
-    stress.add_argument("--scenes", type=int, default=1000, help="generated scenes (1000)")
-    stress.add_argument("--files", type=int, default=0, help="damaged files (0)")
+    stress.add_argument(
+        "--scenes", type=number(0, 10**7), default=1000, help="generated scenes (1000)"
+    )
+    stress.add_argument("--files", type=number(0, 10**7), default=0, help="damaged files (0)")
     words = "problem files to plan with noise, and with other masses and forces"
     stress.add_argument("--problems", nargs="+", default=[], metavar="FILE", help=words)
-    stress.add_argument("--seed", type=int, default=0, help="of everything that is drawn (0)")
-    stress.add_argument("--only", type=int, metavar="K", help="run scene K alone and print it")
-    stress.add_argument("--jobs", type=int, help="worker processes (default: all cores)")
+    stress.add_argument(
+        "--seed", type=number(0, 2**63), default=0, help="of everything that is drawn (0)"
+    )
+    stress.add_argument(
+        "--only", type=number(0, 10**9), metavar="K", help="run scene K alone and print it"
+    )
+    stress.add_argument("--jobs", type=JOBS, help="worker processes (default: all cores)")
     words = "start anew instead of going on with the records in the folder"
     stress.add_argument("--fresh", action="store_true", help=words)
     stress.add_argument("--again", action="store_true", help="run again what had findings")
@@ -66,14 +73,16 @@ def add_bench(bench: argparse.ArgumentParser) -> None:
     words = "kernels of OpenBLAS, as for OPENBLAS_CORETYPE (default: the processor's own)"
     kernels.add_argument("--kernels", nargs="+", default=[""], metavar="NAME", help=words)
     words = "seeds of changes to all numbers in the last bits; 0 for none (0)"
-    kernels.add_argument("--seeds", nargs="+", type=int, default=[0], metavar="K", help=words)
+    kernels.add_argument(
+        "--seeds", nargs="+", type=number(0, 2**63), default=[0], metavar="K", help=words
+    )
     words = "interpreters that have the package (default: this one)"
     kernels.add_argument("--pythons", nargs="+", default=[sys.executable], help=words)
     words = "file of stored answers (results/bench_kernels.json)"
     kernels.add_argument("--answers", default="results/bench_kernels.json", help=words)
     words = "store the answers of the first environment"
     kernels.add_argument("--update", action="store_true", help=words)
-    kernels.add_argument("--jobs", type=int, help="environments at a time (default: all cores)")
+    kernels.add_argument("--jobs", type=JOBS, help="environments at a time (default: all cores)")
     kernels.add_argument("-o", "--output", metavar="FILE", help="write the table (Markdown)")
     kernels.set_defaults(run=_compare_kernels)
 
@@ -100,7 +109,7 @@ def _add_precision(studies: Any) -> None:
     words = "measure these methods only, by the names that the table has"
     precision.add_argument("--peers", nargs="+", default=[], metavar="NAME", help=words)
     words = "processor time that one setting of a method may take on one phase [s] (60)"
-    precision.add_argument("--limit", type=float, default=60.0, help=words)
+    precision.add_argument("--limit", type=number(1e-3, 1e6), default=60.0, help=words)
     words = "measure again what the folder has runs of"
     precision.add_argument("--fresh", action="store_true", help=words)
     words = "folder for runs, table and figure"

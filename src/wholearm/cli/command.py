@@ -32,6 +32,7 @@ from .completion import add_completion
 from .engines import add_export, add_replay
 from .map import draw, protect
 from .new import add_new, add_schema
+from .origin import tell_origin
 from .overlay import overlay
 from .policy import add_policy
 from .predict import predict
@@ -44,6 +45,7 @@ from .viewer import add_animate, add_gallery, add_report
 if TYPE_CHECKING:
     from ..planning.result import Plan
     from ..planning.table_check import Table
+    from ..policy.policy import Policy
     from ..problem.definition import Problem
     from ..results.report import Report
     from ..results.torque import TorqueProfile
@@ -53,7 +55,8 @@ if TYPE_CHECKING:
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        raise InputError("", "", f"{message}; see {self.prog} --help")
+        text = message.removeprefix("argument ")
+        raise InputError("", "", f"{text}; see {self.prog} --help")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -228,7 +231,6 @@ def _stem(path: str) -> str:
 
 def _verify(options: argparse.Namespace) -> int:
     from ..common.files import require_ending, require_writable
-    from ..common.require import require_number
     from ..problem.read import adopt_phases, read_problem
     from ..results.trajectory import Trajectory
     from ..verification.verify import verify
@@ -237,7 +239,7 @@ def _verify(options: argparse.Namespace) -> int:
         require_writable(options.output)
         require_ending(options.output, ".npz")
     given = {
-        key: require_number(getattr(options, key), f"--{key.replace('_', '-')}", positive=True)
+        key: getattr(options, key)
         for key in ("tolerance", "departure", "rest_speed")
         if getattr(options, key) is not None
     }
@@ -246,8 +248,11 @@ def _verify(options: argparse.Namespace) -> int:
         given["least_minor"] = options.least_minor
     problem = read_problem(options.problem)
     torques = _read_torques(options.torques)
+    policy, notes = _read_policy(options, torques), {}
     if isinstance(torques, Trajectory):
         problem = adopt_phases(problem, torques.meta, torques.q[-1], options.torques)
+        named = None if policy is None else (options.policy, policy)
+        notes = tell_origin(problem, (options.torques, torques), named, options.json)
     if getattr(torques, "meta", {}).get("problem") != problem.table:
         # What has been planned or replayed can be carried out.
         from ..geometry.path_guess import check_phases
@@ -255,37 +260,47 @@ def _verify(options: argparse.Namespace) -> int:
         check_phases(problem)
     if options.free:
         rate = {} if options.restitution is None else {"restitution": options.restitution}
-        report: Report | FreeReport = _simulate_free(options, problem, torques, {**given, **rate})
+        given = {**given, **rate}
+        report: Report | FreeReport = _simulate_free(problem, torques, policy, given)
     else:
         announce(f"replaying {len(problem.phases)} phases")
         report = verify(problem, torques, reduced=options.reduced, **given)
     clear_progress()
     if options.output is not None:
         report.trajectory.save(options.output)
-    print(json.dumps(report.to_dict(), indent=2) if options.json else report.to_text())
+    print(json.dumps(report.to_dict() | notes, indent=2) if options.json else report.to_text())
     if options.output is not None and not options.json:
         print(f"wrote {options.output}")
     return report.exit_status
 
 
-def _simulate_free(
-    options: argparse.Namespace,
-    problem: Problem,
-    torques: Trajectory | TorqueProfile,
-    given: dict[str, float],
-) -> FreeReport:
-    """The report of torques, or of a policy, with no contacts told."""
+def _read_policy(options: argparse.Namespace, torques: Trajectory | TorqueProfile) -> Policy | None:
+    """The policy that is to carry out a plan, if one is given."""
     if options.policy is None:
-        from ..verification.free import verify_free
-
-        return verify_free(problem, torques, progress=show_progress(), **given)
+        return None
     from ..policy.policy import Policy
     from ..results.torque import TorqueProfile
-    from ..verification.policy import verify_policy
 
     if isinstance(torques, TorqueProfile):
         raise InputError(options.torques, "", "torques alone given; --policy needs the plan (.npz)")
-    policy = Policy.load(options.policy).with_sensor(options.sensor)
+    return Policy.load(options.policy).with_sensor(options.sensor)
+
+
+def _simulate_free(
+    problem: Problem,
+    torques: Trajectory | TorqueProfile,
+    policy: Policy | None,
+    given: dict[str, float],
+) -> FreeReport:
+    """The report of torques, or of a policy, with no contacts told."""
+    from ..results.trajectory import Trajectory
+
+    if policy is None or not isinstance(torques, Trajectory):
+        from ..verification.free import verify_free
+
+        return verify_free(problem, torques, progress=show_progress(), **given)
+    from ..verification.policy import verify_policy
+
     return verify_policy(problem, torques, policy, **given)
 
 

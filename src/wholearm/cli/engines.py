@@ -7,6 +7,8 @@ import json
 from typing import TYPE_CHECKING
 
 from ..common.errors import InputError, name_source
+from .arguments import DEPARTURE, STEP, number
+from .origin import tell_origin
 from .progress import clear_progress, show_progress
 
 if TYPE_CHECKING:
@@ -26,7 +28,7 @@ def add_export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("plan", nargs="?", help="trajectory file (.npz) that the model plays")
     text = "file to write (.xml): the scene in MuJoCo's format"
     parser.add_argument("--mjcf", metavar="FILE", required=True, help=text)
-    parser.add_argument("--step", type=float, help="time step of the model [s] (from the scene)")
+    parser.add_argument("--step", type=STEP, help="time step of the model [s] (from the scene)")
     parser.set_defaults(run=_export)
 
 
@@ -40,14 +42,14 @@ def add_replay(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--whole", action="store_true", help=text)
     text = "torques by this policy (.npz), at its own period, instead of the plan's by the clock"
     parser.add_argument("--policy", metavar="FILE", help=text)
-    parser.add_argument("--step", type=float, help="longest time step [s] (from the scene)")
+    parser.add_argument("--step", type=STEP, help="longest time step [s] (from the scene)")
     text = "softness of contacts, over the default, which is in proportion to the step (1)"
-    parser.add_argument("--softness", type=float, help=text)
+    parser.add_argument("--softness", type=number(1e-6, 1e6), help=text)
     text = "how far a replay may be from the plan, over the object's radius of gyration, and in rad"
     words = "3e-3 for mujoco, 1.5e-3 for drake; of a policy's end, 3e-2"
-    parser.add_argument("--departure", type=float, help=f"{text} ({words})")
+    parser.add_argument("--departure", type=DEPARTURE, help=f"{text} ({words})")
     text = "also replay with steps of a half, a quarter, ... to N halvings (0)"
-    parser.add_argument("--refine", type=int, metavar="N", default=0, help=text)
+    parser.add_argument("--refine", type=number(0, MOST), metavar="N", default=0, help=text)
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
     parser.set_defaults(run=_replay)
 
@@ -59,15 +61,15 @@ def _export(options: argparse.Namespace) -> int:
 
     require_writable(options.mjcf)
     require_ending(options.mjcf, ".xml")
-    step = _read_positive(options, "step")
     problem = read_problem(options.problem)
-    if step is not None:
-        _read_step(step, problem.scene.scales.time)
+    if options.step is not None:
+        _read_step(options.step, problem.scene.scales.time)
     plan = None
     if options.plan is not None:
         problem, plan = _load_plan(options.plan, problem)
+        tell_origin(problem, (options.plan, plan))
     with name_source(options.problem):
-        write_text(options.mjcf, write_mjcf(problem, plan, step=step))
+        write_text(options.mjcf, write_mjcf(problem, plan, step=options.step))
     print(f"wrote {options.mjcf}")
     return 0
 
@@ -78,18 +80,16 @@ def _replay(options: argparse.Namespace) -> int:
     from ..problem.read import read_problem
 
     require_engine(options.engine)
-    given = {key: _read_positive(options, key) for key in ("step", "softness", "departure")}
-    if not 0 <= options.refine <= MOST:
-        raise InputError("", "--refine", f"{options.refine} given; allowed are 0 to {MOST}")
     problem = read_problem(options.problem)
     problem, plan = _load_plan(options.plan, problem)
     setting, time = ENGINES[options.engine].setting, problem.scene.scales.time
-    if given["step"] is not None:
-        setting = setting._replace(step=_read_step(given["step"], time))
-    if given["softness"] is not None:
-        setting = setting._replace(softness=given["softness"])
+    if options.step is not None:
+        setting = setting._replace(step=_read_step(options.step, time))
+    if options.softness is not None:
+        setting = setting._replace(softness=options.softness)
     if options.policy is not None:
-        return _play_policy(options, problem, plan, setting, given["departure"])
+        return _play_policy(options, problem, plan, setting, options.departure)
+    notes = tell_origin(problem, (options.plan, plan), silent=options.json)
     with name_source(options.problem):
         report = replay_in(
             options.engine,
@@ -97,12 +97,12 @@ def _replay(options: argparse.Namespace) -> int:
             plan,
             whole=options.whole,
             setting=setting,
-            allowed=given["departure"],
+            allowed=options.departure,
             halvings=options.refine,
             progress=show_progress(),
         )
     clear_progress()
-    print(json.dumps(to_dict(report), indent=2) if options.json else write(report))
+    print(json.dumps(to_dict(report) | notes, indent=2) if options.json else write(report))
     return report.exit_status
 
 
@@ -119,6 +119,8 @@ def _play_policy(
     if options.refine:
         raise InputError("", "--refine", "is for plans by the clock, not with --policy")
     policy = Policy.load(options.policy)
+    named = options.policy, policy
+    notes = tell_origin(problem, (options.plan, plan), named, options.json)
     with name_source(options.policy):
         report = play_policy(
             options.engine,
@@ -131,7 +133,7 @@ def _play_policy(
             progress=show_progress(),
         )
     clear_progress()
-    print(json.dumps(report.to_dict(), indent=2) if options.json else report.to_text())
+    print(json.dumps(report.to_dict() | notes, indent=2) if options.json else report.to_text())
     return report.exit_status
 
 
@@ -142,13 +144,6 @@ def _read_step(step: float, time: float) -> float:
         text = f"{step:g} s given; allowed are {least:.3g} to {most:.3g} s"
         raise InputError("", "--step", text)
     return step / time
-
-
-def _read_positive(options: argparse.Namespace, key: str) -> float | None:
-    from ..common.require import require_number
-
-    value = getattr(options, key)
-    return None if value is None else require_number(value, f"--{key}", positive=True)
 
 
 def _load_plan(path: str, problem: Problem) -> tuple[Problem, Trajectory]:

@@ -7,6 +7,7 @@ import os
 import sys
 
 from ..common.errors import InputError
+from .origin import tell_origin
 from .progress import clear_progress, show_progress
 
 
@@ -43,6 +44,8 @@ def _draw_map(options: argparse.Namespace, phi: tuple[float, float] | None) -> i
     require_writable(output)
     problem = read_problem(options.problem)
     plan = None if options.plan is None else load_trajectory(options.plan)
+    if plan is not None:
+        tell_origin(problem, (options.plan, plan), silent=bool(options.list))
     window = choose_window(problem, phi)
     limit = {} if options.least_minor is None else {"least_minor": options.least_minor}
     known = build_map(problem, window=window, progress=show_progress(), **limit)

@@ -5,16 +5,18 @@ from __future__ import annotations
 import argparse
 import os
 
+from .arguments import number
+
 
 def add_new(parser: argparse.ArgumentParser) -> None:
     """Add what `new` takes."""
     parser.add_argument("name", help="the problem's name; NAME.toml is written")
     text = "corners of the regular polygon, 3 to 50 (7)"
-    parser.add_argument("--polygon", type=int, default=7, metavar="CORNERS", help=text)
+    parser.add_argument("--polygon", type=number(3, 50), default=7, metavar="CORNERS", help=text)
     text = "from its centre to its corners [m] (0.05)"
-    parser.add_argument("--size", type=float, default=0.05, help=text)
+    parser.add_argument("--size", type=number(1e-6, 1e6), default=0.05, help=text)
     text = "of the object [kg] (0.2 at a size of 0.05 m, growing with the area)"
-    parser.add_argument("--mass", type=float, help=text)
+    parser.add_argument("--mass", type=number(1e-6, 1e6), help=text)
     parser.set_defaults(run=_write)
 
 

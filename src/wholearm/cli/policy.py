@@ -9,6 +9,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from ..common.errors import name_source
+from .arguments import number
 from .progress import clear_progress, show_progress
 
 _QUICK = 2e-4
@@ -28,13 +29,13 @@ def add_policy(parser: argparse.ArgumentParser) -> None:
     text = "normal force that is kept in reserve along the way: where plan or problem have ranges "
     text += "of numbers, for so many times these (1); otherwise over what usual errors of masses, "
     text += "friction and torques take away (2.5); 0 is as fast as the plan"
-    parser.add_argument("--reserve", type=float, help=text)
+    parser.add_argument("--reserve", type=number(0.0, 1e3), help=text)
     text = "of the control loop [s] (1e-3)"
-    parser.add_argument("--period", type=float, default=1e-3, help=text)
+    parser.add_argument("--period", type=number(1e-5, 10.0), default=1e-3, help=text)
     text = "time from measuring to when torques take effect [s] (5e-4)"
-    parser.add_argument("--delay", type=float, default=5e-4, help=text)
+    parser.add_argument("--delay", type=number(0.0, 10.0), default=5e-4, help=text)
     text = "of both fingers, if it is more than the plan was made with [N m] (default: the same)"
-    parser.add_argument("--torque-limit", type=float, help=text)
+    parser.add_argument("--torque-limit", type=number(1e-12, 1e12), help=text)
     text = "also look for how many times as wide ranges a policy can keep contacts in"
     parser.add_argument("--largest", action="store_true", help=text)
     text = "write the policy although its simulation does not hold, marked so in its file"
@@ -97,7 +98,8 @@ def _policy(options: argparse.Namespace) -> int:
             f"{advise()}; --write-anyway writes it all the same"
         )
     policy.save(output)
-    print(json.dumps(policy.about, indent=2) if options.json else _describe(policy))
+    told = {key: value for key, value in policy.about.items() if key != "problem"}
+    print(json.dumps(told, indent=2) if options.json else _describe(policy))
     if not options.json:
         print(f"{policy.duration:.6f} s in all, the plan {plan.duration:.6f} s; wrote {output}")
     return 0

@@ -10,6 +10,8 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from ..common.errors import InputError
+from .arguments import JOBS, TOLERANCE, number
+from .origin import tell_origin
 from .progress import clear_progress, show_progress
 
 if TYPE_CHECKING:
@@ -24,10 +26,10 @@ def add_robustness(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("problem", help="problem file (TOML)")
     parser.add_argument("plan", help="trajectory file (.npz)")
     text = "samples to replay, a Latin hypercube of all ranges (1000)"
-    parser.add_argument("--samples", type=int, default=1000, help=text)
-    parser.add_argument("--seed", type=int, default=0, help="of the samples (0)")
+    parser.add_argument("--samples", type=number(1, 10**6), default=1000, help=text)
+    parser.add_argument("--seed", type=number(0, 2**63), default=0, help="of the samples (0)")
     text = "only this phase, from its planned start at rest (default: the whole plan)"
-    parser.add_argument("--phase", type=int, metavar="K", help=text)
+    parser.add_argument("--phase", type=number(1, 1000), metavar="K", help=text)
     text = "torques by this policy (.npz), at its own period, instead of the plan's by the clock"
     parser.add_argument("--policy", metavar="FILE", help=text)
     text = "with --policy: measured normal forces are handed to it, exact ones"
@@ -39,16 +41,20 @@ def add_robustness(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--vary", metavar="NAME=WIDTH", nargs="+", default=[], help=text)
     text = "of a sample-and-hold of the torques [Hz] (1000; 0: torques as planned)"
-    parser.add_argument("--sample-rate", type=float, metavar="HZ", default=1000.0, help=text)
+    parser.add_argument(
+        "--sample-rate", type=number(0.0, 1e6), metavar="HZ", default=1000.0, help=text
+    )
     text = "of the simulations, relative to the scene's scales (1e-6)"
-    parser.add_argument("--tolerance", type=float, default=1e-6, help=text)
-    text = "file to write results to, one by one (default: NAME_robustness.jsonl); a study that is "
-    text += "there goes on where it was stopped"
+    parser.add_argument("--tolerance", type=TOLERANCE, default=1e-6, help=text)
+    text = "file to write results to, one by one (default: NAME_robustness.jsonl, with phase and "
+    text += "policy in the name); a study that is there goes on where it was stopped"
     parser.add_argument("-o", "--output", metavar="FILE", help=text)
-    parser.add_argument("--fresh", action="store_true", help="begin anew instead")
+    parser.add_argument(
+        "--fresh", action="store_true", help="begin the file anew, whatever it holds"
+    )
     text = "also draw the motion with its noisy copies (.png, .pdf, .svg)"
     parser.add_argument("--figure", metavar="FILE", help=text)
-    parser.add_argument("--jobs", type=int, help="worker processes (default: all cores)")
+    parser.add_argument("--jobs", type=JOBS, help="worker processes (default: all cores)")
     text = "run on the cluster of this Dask scheduler (extra: cluster)"
     parser.add_argument("--scheduler", metavar="ADDRESS", help=text)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
@@ -63,8 +69,7 @@ def _robustness(options: argparse.Namespace) -> int:
     from ..robustness.report import to_dict, to_text
     from ..robustness.study import assess_robustness
 
-    stem = os.path.splitext(os.path.basename(options.problem))[0]
-    output = options.output or f"{stem}_robustness.jsonl"
+    output = options.output or _name_output(options)
     require_writable(output)
     require_ending(output, ".jsonl")
     if options.figure is not None:
@@ -78,6 +83,10 @@ def _robustness(options: argparse.Namespace) -> int:
     plan = load_trajectory(options.plan)
     problem = read_problem(options.problem)
     problem = adopt_phases(problem, plan.meta, plan.q[-1], options.plan)
+    if policy is not None:
+        policy = policy.with_sensor(options.sensor)
+    given = None if policy is None else (options.policy, policy)
+    notes = tell_origin(problem, (options.plan, plan), given, options.json)
     study = assess_robustness(
         problem,
         plan,
@@ -85,7 +94,7 @@ def _robustness(options: argparse.Namespace) -> int:
         seed=options.seed,
         uncertainty=_read_ranges(options, problem),
         phase=options.phase,
-        policy=None if policy is None else policy.with_sensor(options.sensor),
+        policy=policy,
         path=output,
         fresh=options.fresh,
         start=_choose_executor(options),
@@ -96,10 +105,19 @@ def _robustness(options: argparse.Namespace) -> int:
         from ..figures.robustness import draw_robustness
 
         plots.save(draw_robustness(study), options.figure)
-    print(json.dumps(to_dict(study), indent=2) if options.json else to_text(study))
+    print(json.dumps(to_dict(study) | notes, indent=2) if options.json else to_text(study))
     if not options.json:
         print("wrote " + ", ".join(filter(None, (output, options.figure))))
     return 0
+
+
+def _name_output(options: argparse.Namespace) -> str:
+    """A file for each study that differs by more than numbers: its problem, phase and policy."""
+    files = filter(None, (options.problem, options.policy))
+    problem, *policy = (os.path.splitext(os.path.basename(path))[0] for path in files)
+    phase = [] if options.phase is None else [f"phase{options.phase}"]
+    sensor = ["sensor"] if options.sensor else []
+    return "_".join([problem, "robustness", *phase, *policy, *sensor]) + ".jsonl"
 
 
 def _read_ranges(options: argparse.Namespace, problem: Problem) -> Uncertainty:
@@ -120,8 +138,6 @@ def _read_ranges(options: argparse.Namespace, problem: Problem) -> Uncertainty:
 
 
 def _choose_executor(options: argparse.Namespace) -> Callable[[], Executor] | None:
-    if options.jobs is not None and options.jobs < 1:
-        raise InputError("", "--jobs", f"{options.jobs} given; allowed are 1 and more")
     if options.scheduler is not None:
         from ..robustness.cluster import connect
 

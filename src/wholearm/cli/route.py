@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .arguments import add_cache, add_jobs
+from .arguments import add_cache, add_jobs, number
 from .progress import clear_progress, show_progress
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ def add_route(parser: argparse.ArgumentParser) -> None:
     text = "figure to write (.png, .pdf, .svg) of the route over the map"
     parser.add_argument("-o", "--output", metavar="FILE", help=text)
     text = "how many routes of other formations are listed beside the best one (0)"
-    parser.add_argument("--alternatives", metavar="N", type=int, default=0, help=text)
+    parser.add_argument("--alternatives", metavar="N", type=number(0, 100), default=0, help=text)
     text = "of the plans: time, effort or margin (time); routes are looked for by time"
     parser.add_argument("--objective", default="time", help=text)
     add_cache(parser)
@@ -36,14 +36,10 @@ def add_route(parser: argparse.ArgumentParser) -> None:
 
 def route(options: argparse.Namespace) -> int:
     """Find a route, print its phases, and draw it if that is asked for."""
-    from ..common.errors import InputError
     from ..common.files import require_writable
     from ..planning.options import PlanOptions
     from ..problem.read import read_problem
 
-    if options.alternatives < 0:
-        given = f"{options.alternatives} given; allowed is 0 or more"
-        raise InputError("", "--alternatives", given)
     if options.output is not None:
         from ..figures import plots
 
@@ -70,12 +66,10 @@ def find(
     jobs: int | None = None,
 ) -> Answer:
     """Find a route, with a progress line."""
-    from ..common.errors import InputError, WholearmError
+    from ..common.errors import WholearmError
     from ..common.workers import count_cores
     from ..search.route import find_route_with
 
-    if jobs is not None and jobs < 1:
-        raise InputError("", "--jobs", f"{jobs} given; allowed is 1 or more")
     count = min(MOST_JOBS, count_cores()) if jobs is None else jobs
     try:
         folder = None if cache is None else Path(cache)

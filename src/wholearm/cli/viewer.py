@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 
-from .arguments import SIMULATORS
+from .arguments import SIMULATORS, number
 from .overlay import overlay
 from .progress import clear_progress, show_progress
 
@@ -16,7 +16,7 @@ def add_animate(parser: argparse.ArgumentParser) -> None:
     text = "what to write: .gif, .mp4 (needs ffmpeg), or .html, which plays in any browser"
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help=text)
     text = "speed over real time (0.1: ten times slower)"
-    parser.add_argument("--speed", type=float, default=0.1, help=text)
+    parser.add_argument("--speed", type=number(1e-6, 1e3), default=0.1, help=text)
     text = "draw the simulated motion behind; free: simulated without telling which contacts hold"
     parser.add_argument("--simulate", choices=SIMULATORS, metavar="[free]", help=text)
     parser.set_defaults(run=_animate)
@@ -65,12 +65,10 @@ def _animate(options: argparse.Namespace) -> int:
         problem = read_own_problem(trajectory.meta)
         ghost = overlay(options.simulate, trajectory).trajectory if options.simulate else None
         if ending == ".html":
-            from ..common.require import require_number
             from ..viewer import page
             from ..viewer.motion import describe_motion
 
-            speed = require_number(options.speed, "--speed", positive=True)
-            motion = describe_motion(trajectory, problem, ghost) | {"speed": speed}
+            motion = describe_motion(trajectory, problem, ghost) | {"speed": options.speed}
             player = page.write_player(motion)
             write_text(options.output, page.build_page(problem.name, [player]))
         else:

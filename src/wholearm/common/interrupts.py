@@ -29,14 +29,18 @@ ENDED = tuple(128 + number for number in _WORDS)
 
 _guarded = False
 _received: int | None = None
-_holding = False
+_holding = _said = False
 _yielding = _pardoned = False
 _ending = threading.RLock()
 """Held while something is done that may not be left half done, ending the process included."""
 _cleanups: list[Callable[[], object]] = []
 
 
-def guard(run: Callable[[], int], tidy: Callable[[], object] = int) -> int:
+def guard(
+    run: Callable[[], int],
+    tidy: Callable[[], object] = int,
+    leave: Callable[[int], object] = int,
+) -> int:
     """Run a command with signals that end it, and return its exit status: 128 + the signal's.
 
     Parameters
@@ -45,32 +49,51 @@ def guard(run: Callable[[], int], tidy: Callable[[], object] = int) -> int:
         The command. One inside another leaves signals to the outer one.
     tidy : callable
         Called before the line that says why the command ends.
+    leave : callable
+        Called last, with the status. No signal interrupts it; after one it may take `PATIENCE`.
     """
-    global _guarded, _received
+    global _guarded, _received, _holding, _said
     if _guarded or threading.current_thread() is not threading.main_thread():
         try:
             return run()
         except KeyboardInterrupt:
             tidy()
             raise
-    errors, _guarded, _received = sys.stderr, True, None
+    errors, _guarded, _received, _said = sys.stderr, True, None, False
     status = 0
     try:
         with _handlers(), _watcher():
-            status = run()
+            try:
+                status = run()
+                _holding = True
+            except KeyboardInterrupt:
+                _received = _received or signal.SIGINT
+            except BaseException:
+                # Some extension modules turn the interrupt of an import into an error of their own.
+                if _received is None:
+                    raise
+            return _end_command(status, errors, tidy, leave)
     except KeyboardInterrupt:
+        # It came before all handlers were in place.
         _received = _received or signal.SIGINT
-    except BaseException:
-        # Some extension modules turn the interrupt of an import into an error of their own.
-        if _received is None:
-            raise
+        return _end_command(status, errors, tidy, leave)
     finally:
-        sys.stderr, _guarded = errors, False
-    if _received is None:
-        return status
-    tidy()
-    _say(_received)
-    return 128 + _received
+        sys.stderr, _guarded, _holding = errors, False, False
+
+
+def _end_command(
+    status: int, errors: TextIO, tidy: Callable[[], object], leave: Callable[[int], object]
+) -> int:
+    """Say which signal has come, if one has; returns the exit status."""
+    global _holding
+    # From here on no signal raises anything: a second one often follows the first at once.
+    _holding, sys.stderr = True, errors
+    if _received is not None:
+        status = 128 + _received
+        tidy()
+        _say(_received)
+    leave(status)
+    return status
 
 
 def check() -> None:
@@ -187,15 +210,25 @@ def _end(number: int, errors: TextIO) -> None:
     """End the process now."""
     for cleanup in _cleanups:
         cleanup()
-    processes = sys.modules.get("multiprocessing")
-    for child in processes.active_children() if processes else ():
-        child.terminate()
+    end_children()
     sys.stderr = errors
     _say(number)
     os._exit(128 + number)
 
 
+def end_children() -> None:
+    """Kill the processes that `multiprocessing` has started."""
+    processes = sys.modules.get("multiprocessing")
+    for child in processes.active_children() if processes else ():
+        child.kill()
+
+
 def _say(number: int) -> None:
+    """Say once why the command ends."""
+    global _said
+    if _said:
+        return
+    _said = True
     try:
         print(f"wholearm: {_WORDS[signal.Signals(number)]}", file=sys.stderr, flush=True)
     except OSError:

@@ -4,70 +4,173 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
-from typing import Any
+import stat
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, BinaryIO
 
+from .differences import describe_differences, find_differences
 from .errors import InputError
+from .interrupts import held
+
+try:
+    import fcntl
+except ImportError:  # not on Windows
+    fcntl = None  # type: ignore[assignment]
 
 
 class Journal:
     """A file of one JSON object per line, begun by a line that says what the study is.
 
+    Nothing in the file is lost unless that is asked for. While the journal exists nobody else can
+    have one of the same file.
+
     Parameters
     ----------
     path : str
     stamp : dict
-        What the records belong to; those of another stamp are dropped.
+        What the records belong to; `study` is its kind.
     fresh : bool
-        Drop all records that are there.
+        Begin the file anew, whatever it holds.
     again : bool
-        Drop those with findings, so that their tasks are run again.
+        Drop records with findings, so that their tasks are run again.
 
     Raises
     ------
     InputError
-        If the file cannot be written.
+        If the file holds something else, another study of the same kind included, or is being
+        written by another run, or cannot be written.
     """
 
     def __init__(
         self, path: str, stamp: dict[str, Any], fresh: bool = False, again: bool = False
     ) -> None:
-        self.path = path
-        self.records: list[dict[str, Any]] = [] if fresh else _read(path, stamp)
-        if again:
-            self.records = [record for record in self.records if not record.get("findings")]
+        self.path, self._stamp = path, json.loads(json.dumps(stamp))
+        self.records: list[dict[str, Any]] = []
         try:
-            # Written anew, so that what an interrupt left of a last line is gone.
-            with open(f"{path}.part", "w", encoding="utf-8") as stream:
-                for line in (stamp, *self.records):
-                    stream.write(json.dumps(line) + "\n")
-            os.replace(f"{path}.part", path)
+            self._stream: BinaryIO = open(path, "ab+", buffering=0)
+            try:
+                if stat.S_ISREG(os.fstat(self._stream.fileno()).st_mode):
+                    _lock(self._stream.fileno(), path)
+                    if fresh:
+                        self._stream.truncate(0)
+                    self._begin(self._read(), again)
+            except BaseException:
+                self.close()
+                raise
         except OSError as error:
-            raise InputError(path, "", f"cannot be written: {error.strerror}") from None
+            raise self._fail(error) from None
+
+    def __enter__(self) -> Journal:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let others have the file."""
+        self._stream.close()
 
     def add(self, record: dict[str, Any]) -> None:
-        """Keep a record."""
+        """Keep a record.
+
+        Raises
+        ------
+        InputError
+            If it cannot be written.
+        """
         self.records.append(record)
-        with open(self.path, "a", encoding="utf-8") as stream:
-            stream.write(json.dumps(record) + "\n")
+        try:
+            self._write(_to_line(record))
+        except OSError as error:
+            raise self._fail(error) from None
 
     def done(self, key: str, name: Callable[[Any], Any] = lambda value: value) -> set[Any]:
         """The tasks that have a record under `key`."""
         return {name(record[key]) for record in self.records if key in record}
 
+    def _read(self) -> bytes:
+        self._stream.seek(0)
+        return self._stream.read()
 
-def _read(path: str, stamp: dict[str, Any]) -> list[dict[str, Any]]:
+    def _begin(self, given: bytes, again: bool) -> None:
+        """Take the records that are there, and leave whole lines, begun by the stamp."""
+        head = _to_line(self._stamp)
+        # Half of the first line is what a full disk leaves.
+        if not head.startswith(given):
+            self._require_stamp(given)
+            lines = given[: given.rfind(b"\n") + 1].splitlines(keepends=True)
+            known = [(line, _parse(line)) for line in lines[1:]]
+            kept = [own for own in known if not (again and (own[1] or {}).get("findings"))]
+            self.records = [record for _, record in kept if record is not None]
+            whole = b"".join([lines[0], *(line for line, _ in kept)])
+        else:
+            whole = head
+        with held():
+            if given.startswith(whole):
+                self._stream.truncate(len(whole))
+            else:
+                self._stream.truncate(0)
+                self._write(whole)
+
+    def _require_stamp(self, given: bytes) -> None:
+        """Check that the file is one of this study."""
+        other, own = _parse(given.split(b"\n", 1)[0]), self._stamp
+        kind = own.get("study", "")
+        if other is None or other.get("study") != kind:
+            text = f"holds no {kind} study; --fresh begins anew, or choose another with -o"
+            raise InputError(self.path, "", text)
+        found = find_differences(other, own)
+        text = describe_differences(found, "in the file", "now")
+        if text:
+            what = f"holds another study: {text}; --fresh begins anew, or choose another with -o"
+            raise InputError(self.path, "", what)
+
+    def _write(self, line: bytes) -> None:
+        left = memoryview(line)
+        while left:
+            left = left[self._stream.write(left) :]
+
+    def _fail(self, error: OSError) -> InputError:
+        return InputError(self.path, "", f"cannot be written: {error.strerror}")
+
+
+@contextmanager
+def locked(folder: str) -> Iterator[None]:
+    """Keep other runs, that ask for it too, from a folder.
+
+    Raises
+    ------
+    InputError
+        If another run has it.
+    """
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
-        with open(path, encoding="utf-8") as stream:
-            lines = stream.read().split("\n")
-    except (OSError, UnicodeDecodeError):
-        return []
-    records = []
-    for line in lines:
-        try:
-            record = json.loads(line)
-        except json.JSONDecodeError:
-            continue
-        if isinstance(record, dict):
-            records.append(record)
-    return records[1:] if records and records[0] == json.loads(json.dumps(stamp)) else []
+        _lock(descriptor, folder)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int, path: str) -> None:
+    """Keep others from a file until it is closed, or this process ends."""
+    if fcntl is None:
+        return
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        text = "another run is writing to it; wait for its end, or choose another with -o"
+        raise InputError(path, "", text) from None
+
+
+def _to_line(record: dict[str, Any]) -> bytes:
+    return (json.dumps(record) + "\n").encode()
+
+
+def _parse(line: bytes) -> dict[str, Any] | None:
+    """The record of a line; None if it is none."""
+    try:
+        record = json.loads(line)
+    except ValueError:
+        return None
+    return record if isinstance(record, dict) else None

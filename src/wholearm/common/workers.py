@@ -17,9 +17,10 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnContext, SpawnProcess
 from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple, TypeVar
 
@@ -117,17 +118,42 @@ def _start(tasks: Sequence[Task[Any]], source: int, numbers: dict[int, int]) -> 
     answers, far = context.Pipe(duplex=False)
     given = tasks, source, (answers, far), numbers, os.getpid()
     process = context.Process(target=_serve, args=given, daemon=True)
-    # No signal may meet the child before it has said what it does about it.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
     try:
-        with warnings.catch_warnings():
+        # No signal may meet the child before it has said what it does about it.
+        with _blocked(*_SIGNALS), warnings.catch_warnings():
             # Of other threads there is the one that waits for signals, and holds nothing.
             warnings.simplefilter("ignore", DeprecationWarning)
             process.start()
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
         far.close()
     return _Child(process, answers)
+
+
+@contextmanager
+def _blocked(*numbers: signal.Signals) -> Iterator[None]:
+    """Have signals wait, and for good in processes that are started meanwhile."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class _Spawned(SpawnProcess):
+    """A process that a Ctrl-C in its terminal leaves to its parent, from the first moment on."""
+
+    def start(self) -> None:
+        with _blocked(signal.SIGINT):
+            super().start()
+
+
+class Spawning(SpawnContext):
+    """Starts processes anew, not forked, in which SIGINT is blocked."""
+
+    Process = _Spawned
 
 
 def _serve(

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from ..common.files import require_ending
 from ..problem.check import require_phases
 from ..problem.definition import Problem
 from ..problem.read import adopt_phases
+from ..results.origin import require_made_for
 from ..results.report import Report
 from ..results.torque import TorqueProfile, read_notes, read_torque_csv
 from ..results.trajectory import Trajectory
@@ -26,8 +26,6 @@ from .side_by_side import Comparison, Contender
 
 SIMULATIONS = "simulations"
 """Key of a comment of torques, and of the `meta` of a trajectory, with how many it took."""
-_FREE = ("name", "epsilon", "settle_gap", "uncertainty")
-"""Keys of a problem in which trajectories may differ from it; so may `settle`, of a phase too."""
 
 
 def compare(
@@ -74,44 +72,10 @@ def _read(problem: Problem, path: str) -> tuple[Problem, Trajectory | TorqueProf
     trajectory = load_trajectory(path)
     problem = adopt_phases(problem, trajectory.meta, trajectory.q[-1], path)
     with name_source(path):
-        _require_fit(problem, trajectory)
+        require_made_for(problem, trajectory.meta)
     replay = trajectory.meta.get("replay")
     known = (replay or {}).get(SIMULATIONS, trajectory.meta.get(SIMULATIONS))
     return problem, trajectory, known if isinstance(known, int) else None
-
-
-def _require_fit(problem: Problem, trajectory: Trajectory) -> None:
-    """Check that a trajectory is one of this problem."""
-    own = trajectory.meta.get("problem")
-    if not isinstance(own, Mapping):
-        raise InputError("", "meta.problem", "the trajectory does not hold its problem's tables")
-    found = _find_difference(own, problem.table, "")
-    if found is not None:
-        key, one, other = found
-        text = f"{one} in the trajectory, {other} in the problem; it is one of another problem"
-        raise InputError("", key, text)
-
-
-def _find_difference(own: Any, other: Any, key: str) -> tuple[str, str, str] | None:
-    """The first key in which two tables differ, and both of its values."""
-    if isinstance(own, Mapping) and isinstance(other, Mapping):
-        for name in dict.fromkeys([*own, *other]):
-            if name != "settle" and (key or name not in _FREE):
-                inner = f"{key}.{name}" if key else str(name)
-                found = _find_difference(own.get(name), other.get(name), inner)
-                if found is not None:
-                    return found
-        return None
-    if isinstance(own, list | tuple) and isinstance(other, list | tuple):
-        if len(own) != len(other):
-            return key, f"{len(own)} entries", f"{len(other)}"
-        pairs = enumerate(zip(own, other, strict=True), start=1)
-        every = (_find_difference(*pair, f"{key}[{k}]") for k, pair in pairs)
-        return next((found for found in every if found is not None), None)
-    if own == other:
-        return None
-    one, two = ("nothing" if value is None else repr(value) for value in (own, other))
-    return key, one, two
 
 
 def _judge(

@@ -6,8 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
+import numpy as np
+
+from ..common.bounds import PLANNER
 from ..common.errors import InputError
-from ..common.require import require_number
 from ..mechanics.uniqueness import LEAST_MINOR, require_minor
 from ..problem.uncertainty import PARAMETERS, read_widths
 
@@ -32,8 +34,8 @@ CHOICES = tuple(
 )
 """Objectives that a user can ask for."""
 
-ACCURACIES = (1e-8, 0.1)
-"""Least and largest relative error of an objective that can be asked for."""
+_LEFT_OUT = ("intervals", "time_intervals", "duration")
+"""Options that the planner chooses where they are not given."""
 OPENING = 0.01
 """Least acceleration of a gap that opens, over gravity."""
 CLEARANCE = 5e-4
@@ -77,14 +79,13 @@ class PlanOptions:
         if given not in CHOICES and given not in [Objective(choice) for choice in CHOICES]:
             raise InputError("", "objective", f"{given!r} given; allowed are {', '.join(CHOICES)}")
         object.__setattr__(self, "objective", Objective(given))
-        for key, least in (("intervals", 10), ("samples", 2), ("time_intervals", 4), ("degree", 2)):
+        for key, bounds in PLANNER.items():
             value = getattr(self, key)
-            if value is None and key.endswith("intervals"):
-                continue
-            if not isinstance(value, int) or isinstance(value, bool) or value < least:
-                raise InputError("", key, f"{value!r} is not a whole number of {least} or more")
-        if self.degree > 6:
-            raise InputError("", "degree", f"{self.degree} given; allowed are 2 to 6")
+            if value is not None or key not in _LEFT_OUT:
+                if isinstance(value, np.number):
+                    value = value.item()
+                bounds.check(key, value)
+                object.__setattr__(self, key, value if bounds.whole else float(value))
         if self.scheme not in ("radau", "legendre"):
             given = self.scheme
             raise InputError("", "scheme", f"{given!r} given; allowed are radau and legendre")
@@ -94,23 +95,9 @@ class PlanOptions:
         for key in ("replay", "mode_search", "certify", "largest"):
             if not isinstance(value := getattr(self, key), bool):
                 raise InputError("", key, f"{value!r} given; allowed are true and false")
-        for key in ("opening", "clearance", "robust"):
-            value = require_number(getattr(self, key), key, nonnegative=True)
-            object.__setattr__(self, key, value)
-        weight = require_number(self.time_weight, "time_weight", positive=True)
-        object.__setattr__(self, "time_weight", weight)
-        accuracy = require_number(self.accuracy, "accuracy", positive=True)
-        if not ACCURACIES[0] <= accuracy <= ACCURACIES[1]:
-            allowed = "{:g} to {:g}".format(*ACCURACIES)
-            raise InputError("", "accuracy", f"{accuracy:g} given; allowed are {allowed}")
-        object.__setattr__(self, "accuracy", accuracy)
         object.__setattr__(self, "least_minor", require_minor(self.least_minor))
-        if self.duration is not None:
-            duration = require_number(self.duration, "duration", positive=True)
-            object.__setattr__(self, "duration", duration)
-            if self.objective is not Objective.MARGIN:
-                raise InputError("", "duration", "is for the objective margin only")
-
+        if self.duration is not None and self.objective is not Objective.MARGIN:
+            raise InputError("", "duration", "is for the objective margin only")
         if self.certify and self.objective in (Objective.EFFORT, Objective.MARGIN):
             raise InputError("", "certify", "is for the objective time only")
         if self.certify and self.robust:

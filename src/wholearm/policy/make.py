@@ -121,6 +121,7 @@ def make_policy(
         about += found
     whole = sum(own["duration"] for own in about)
     known: dict[str, Any] = {"name": problem.name, "duration": whole, "phases": about}
+    known["problem"] = problem.table
     if ranges is not None and reserve:
         known.update(ranges=dict(ranges), reserve=reserve)
     return Policy(tables, pace, known)

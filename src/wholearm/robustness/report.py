@@ -18,8 +18,10 @@ def to_text(study: Robustness) -> str:
     """What a reader wants to know, the most important first."""
     phases = [window.phase for window in study.trial.windows]
     place = "whole plan" if len(phases) > 1 else f"phase {phases[0]}"
+    count = len(study.records)
+    many = f"{count} of {study.known}" if study.known > count else f"{count}"
     lines = [
-        f"{study.trial.problem.name}, {place}: {len(study.records)} samples, seed {study.seed}",
+        f"{study.trial.problem.name}, {place}: {many} samples, seed {study.seed}",
         f"goal reached within 1 mm and 1 deg  {study.reached}",
         f"and all planned contacts kept       {study.kept}",
     ]

@@ -6,11 +6,12 @@ import hashlib
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
-from multiprocessing import get_context, parent_process
+from multiprocessing import parent_process
 from multiprocessing.connection import wait
 from threading import Thread
 from typing import Any, Protocol
@@ -19,9 +20,11 @@ import numpy as np
 
 from .. import __version__
 from ..common.arrays import Array
+from ..common.bounds import Bounds
 from ..common.crowd import DiedError, run_all
 from ..common.errors import InputError
 from ..common.journal import Journal
+from ..common.workers import Spawning
 from ..policy.policy import Policy
 from ..problem.definition import Problem
 from ..results.narrow import Torques, narrow, require_same_phases
@@ -32,6 +35,8 @@ from .uncertainty import Uncertainty
 
 Task = tuple[int, tuple[float, ...]]
 """Number and values of a sample."""
+SAMPLES = Bounds(1, 10**6)
+"""Samples of a study."""
 DRAWN = 200
 """Samples whose paths are kept, for figures."""
 
@@ -48,12 +53,15 @@ class Robustness:
     seed : int
     records : tuple of dict
         As `Trial.run` gives them, in the order of the samples.
+    known : int
+        Samples that the file has, these included; 0 without a file.
     """
 
     trial: Trial
     samples: Array
     seed: int
     records: tuple[dict[str, Any], ...]
+    known: int = 0
 
     @cached_property
     def nominal(self) -> dict[str, Any]:
@@ -111,6 +119,7 @@ def assess_robustness(
     problem : Problem
     plan : Plan or Trajectory
     samples : int
+        More than the file has add a Latin hypercube of the rest; of fewer the first are counted.
     seed : int
         Of the samples, a Latin hypercube of all ranges.
     uncertainty : Uncertainty, optional
@@ -122,6 +131,8 @@ def assess_robustness(
     path : path, optional
         File to which results are written one by one. A study that is there already goes on where it
         was stopped, and ends the same to the last bit, unless it is to be `fresh`.
+    fresh : bool
+        Begin the file anew, whatever it holds.
     start : callable, optional
         Makes a `concurrent.futures.Executor`, anew when its workers have died; processes on all
         cores if left out.
@@ -130,31 +141,46 @@ def assess_robustness(
     Raises
     ------
     InputError
-        If the plan has no such phase, or the file cannot be written.
+        If the plan has no such phase, or the file holds another study or anything else, is being
+        written by another run, or cannot be written.
     """
     _, trajectory = narrow(plan)
     if trajectory is None:
         raise InputError("", "plan", "torques alone given; a plan with its motion is needed")
-    if isinstance(samples, bool) or not isinstance(samples, int) or samples < 1:
-        raise InputError("", "samples", f"{samples!r} given; allowed are 1 and more")
+    SAMPLES.check("samples", samples)
     require_same_phases(problem, trajectory)
     own = uncertainty or Uncertainty(problem.uncertainty or {})
     trial = make_trial(problem, trajectory, own, phase, policy)
-    drawn = own.draw(samples, seed)
-    stamp = _stamp(trial, samples, seed)
-    journal = None if path is None else Journal(os.fspath(path), stamp, fresh)
-    found = {} if journal is None else {own["sample"]: own for own in journal.records}
-    tasks = ((k, tuple(drawn[k].tolist())) for k in range(samples) if k not in found)
-    good = sum(own["reached"] for own in found.values())
-    for record in list_records(trial, tasks, start or use_processes):
-        found[record["sample"]] = record
-        good += record["reached"]
-        if journal is not None:
-            journal.add(record)
-        if progress is not None:
-            progress(f"{len(found)} of {samples} samples, {good} reach the goal")
+    journal = None if path is None else Journal(os.fspath(path), _stamp(trial, seed), fresh)
+    with journal or nullcontext():
+        kept = [] if journal is None else journal.records
+        sizes = [record["samples"] for record in kept if "samples" in record]
+        known = {record["sample"]: record for record in kept if "sample" in record}
+        if samples > sum(sizes):
+            sizes.append(samples - sum(sizes))
+            if journal is not None:
+                journal.add({"samples": sizes[-1]})
+        found = {k: record for k, record in known.items() if k < samples}
+        drawn = _draw(own, sizes, seed)[:samples]
+        tasks = ((k, tuple(drawn[k].tolist())) for k in range(samples) if k not in found)
+        good = sum(record["reached"] for record in found.values())
+        for record in list_records(trial, tasks, start or use_processes):
+            found[record["sample"]] = record
+            good += record["reached"]
+            if journal is not None:
+                journal.add(record)
+            if progress is not None:
+                progress(f"{len(found)} of {samples} samples, {good} reach the goal")
     records = tuple(found[number] for number in range(samples))
-    return Robustness(trial, drawn, seed, records)
+    known_now = 0 if journal is None else len({*known, *found})
+    return Robustness(trial, drawn, seed, records, known_now)
+
+
+def _draw(uncertainty: Uncertainty, sizes: Sequence[int], seed: int) -> Array:
+    """Latin hypercubes one after another: a study has one more each time that it is enlarged."""
+    starts = [sum(sizes[:k]) for k in range(len(sizes))]
+    parts = zip(starts, sizes, strict=True)
+    return np.vstack([uncertainty.draw(n, (seed, k) if k else seed) for k, n in parts])
 
 
 class Runs(Protocol):
@@ -186,7 +212,7 @@ def _run(trial: Runs, task: Task) -> dict[str, Any]:
 
 def use_processes(jobs: int | None = None) -> Executor:
     """Processes of one thread each, on all cores or as many as `jobs` says."""
-    return ProcessPoolExecutor(jobs or os.cpu_count(), get_context("spawn"), _end_with_parent)
+    return ProcessPoolExecutor(jobs or os.cpu_count(), Spawning(), _end_with_parent)
 
 
 def _end_with_parent() -> None:
@@ -201,22 +227,26 @@ def _end_with_parent() -> None:
         Thread(target=watch, daemon=True).start()
 
 
-def _stamp(trial: Trial, samples: int, seed: int) -> dict[str, Any]:
+def _stamp(trial: Trial, seed: int) -> dict[str, Any]:
     """What records belong to: another plan, range or version makes them another study's."""
-    known = [trial.torque.breaks, trial.torque.coefficients, trial.state]
-    if trial.policy is not None:
-        known += [part for tables in trial.policy.tables for part in tables.values()]
-        known.append(np.array([*trial.policy.pace[:-1], float(trial.policy.sensor)]))
-    digest = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in known))
+    policy = trial.policy
+    known = [] if policy is None else [own for t in policy.tables for own in t.values()]
     return {
         "study": "robustness",
         "version": __version__,
         "problem": trial.problem.table,
-        "plan": digest.hexdigest(),
+        "plan": _digest([trial.torque.breaks, trial.torque.coefficients, trial.state]),
+        "policy": None if policy is None else _digest(known),
+        "pace": None if policy is None else policy.pace._asdict(),
+        "sensor": policy is not None and policy.sensor,
         "phases": [own.phase for own in trial.windows],
         "widths": trial.uncertainty.widths,
         "sample_rate": trial.uncertainty.sample_rate,
         "tolerance": trial.uncertainty.tolerance,
-        "samples": samples,
         "seed": seed,
     }
+
+
+def _digest(arrays: Iterable[Array]) -> str:
+    data = b"".join(np.ascontiguousarray(part).tobytes() for part in arrays)
+    return hashlib.sha256(data).hexdigest()[:12]

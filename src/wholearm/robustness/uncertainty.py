@@ -52,7 +52,7 @@ class Uncertainty:
         """The parameters with a range."""
         return tuple(own for own in PARAMETERS if self.widths[own.name] > 0)
 
-    def draw(self, count: int, seed: int) -> Array:
+    def draw(self, count: int, seed: int | tuple[int, int]) -> Array:
         """Samples of a Latin hypercube, shape (count, len(varied) + 1).
 
         Each parameter has one sample in each of `count` slices of its range, so that its effect

@@ -11,6 +11,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple, TypeVar
 
+from ...common.errors import InputError
+
 REPEATS = 3
 """Largest number of runs that a median is of."""
 BUDGET = 0.3
@@ -145,12 +147,24 @@ def format_runs(runs: Sequence[Run]) -> str:
 
 
 def read_runs(path: str) -> list[Run]:
-    """Runs of an earlier study, none without a file."""
+    """Runs of an earlier study, none without a file.
+
+    Raises
+    ------
+    InputError
+        If the file holds anything else.
+    """
     if not os.path.exists(path):
         return []
-    with open(path, newline="", encoding="utf-8") as stream:
-        _, *rows = csv.reader(stream)
-    return [_read_run(*row) for row in rows]
+    try:
+        with open(path, newline="", encoding="utf-8") as stream:
+            head, *rows = csv.reader(stream)
+        if head != list(Run._fields):
+            raise ValueError
+        return [_read_run(*row) for row in rows]
+    except (ValueError, TypeError, IndexError):
+        text = "holds no runs of this study; move it away, or choose another folder with -o"
+        raise InputError(path, "", text) from None
 
 
 def _read_run(study: str, instance: str, method: str, setting: str, repeat: str, *rest: str) -> Run:

@@ -11,6 +11,7 @@ from typing import Any
 
 from ...common.errors import InputError
 from ...common.files import make_folder, require_writable, together, write_text
+from ...common.journal import locked
 from ...figures.plots import save
 from ..stress.workers import Answer, run_tasks
 from .figure import draw_runs
@@ -91,6 +92,14 @@ def run_precision(
     files = find_files(options.folder)
     if not files:
         raise InputError("", "--problems", f"{options.folder} has no problem files (*.toml)")
+    with locked(output):
+        return _run(options, files, paths, say)
+
+
+def _run(
+    options: StudyOptions, files: tuple[str, ...], paths: list[str], say: Callable[[str], None]
+) -> list[str]:
+    """Measure what the file of runs, the first of `paths`, does not have yet."""
     runs = read_runs(paths[0])
     if options.fresh:
         runs = [run for run in runs if not _is_chosen(options, run.method)]

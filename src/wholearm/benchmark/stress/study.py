@@ -83,13 +83,13 @@ def run_stress(
     make_folder(folder)
     stem = os.path.join(folder, "bench_stress")
     stamp = {"study": "stress", "seed": options.seed, "version": __version__}
-    journal = Journal(f"{stem}.jsonl", stamp, options.fresh, options.again)
     report = progress or (lambda _: None)
     scenes = _scenes(options)
-    _run_part(journal, "scene", run_scene, scenes, SCENE_BOUND, options, report, _find_scene)
-    _run_part(journal, "file", run_file, _files(options), FILE_BOUND, options, report)
-    trials = {tuple(trial): trial for trial in list_trials(list(options.problems))}
-    _run_part(journal, "problem", run_trial, trials, TRIAL_BOUND, options, report)
+    with Journal(f"{stem}.jsonl", stamp, options.fresh, options.again) as journal:
+        _run_part(journal, "scene", run_scene, scenes, SCENE_BOUND, options, report, _find_scene)
+        _run_part(journal, "file", run_file, _files(options), FILE_BOUND, options, report)
+        trials = {tuple(trial): trial for trial in list_trials(list(options.problems))}
+        _run_part(journal, "problem", run_trial, trials, TRIAL_BOUND, options, report)
     records = _select(journal.records, options)
     noise = compare_values([record for record in records if "problem" in record])
     text, count = format_summary(records, noise, {**stamp, **stamp_machine(options.jobs)})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing as mp
 import os
 import signal
 import sys
@@ -13,6 +12,8 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple
+
+from ...common.workers import Spawning
 
 MEMORY = 6 * 2**30
 """Address space that a worker may take [byte]: a claim beyond it fails instead of swapping."""
@@ -114,7 +115,7 @@ def run_tasks(
     kind : callable, optional
         Of a task: one worker runs those of one kind, as far as others have something else to do.
     """
-    context = mp.get_context("spawn")
+    context = Spawning()
     waiting = _Queue(tasks, kind)
     workers: list[_Worker] = []
     try:
@@ -157,8 +158,6 @@ def _look(worker: _Worker, bound: float) -> Answer | None:
 
 def _serve(pipe: Connection, run: Callable[[Any], Any], bound: float) -> None:
     """Run what comes through the pipe until it closes."""
-    # The parent alone answers an interrupt, and takes its workers with it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     _limit_memory()
     with tempfile.TemporaryFile() as printed:
         for stream in (1, 2):
