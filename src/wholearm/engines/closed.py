@@ -14,6 +14,7 @@ from ..policy.closed_loop import ROOM, ClosedLoop
 from ..policy.policy import Policy
 from ..problem.definition import Problem
 from ..results.report_text import align
+from ..results.narrow import Moved, adopt_motion
 from ..results.trajectory import Trajectory
 from .between import find_between
 from .replay import ENGINES, require_engine
@@ -124,7 +125,7 @@ class PolicyReport(NamedTuple):
 def play_policy(
     engine: str,
     problem: Problem,
-    plan: Trajectory,
+    plan: Trajectory | Moved,
     policy: Policy,
     *,
     whole: bool = False,
@@ -138,7 +139,7 @@ def play_policy(
     ----------
     engine : {"mujoco", "drake"}
     problem : Problem
-    plan : Trajectory
+    plan : Plan or Trajectory
         Where phases start and end.
     policy : Policy
     whole : bool
@@ -152,6 +153,7 @@ def play_policy(
     InputError
         If the engine is unknown or not installed, or the policy is of other phases.
     """
+    problem, plan = adopt_motion(problem, plan)
     play = require_engine(engine)
     if policy.count != len(problem.phases):
         given = f"{policy.count} given; the problem has {len(problem.phases)}"

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from ..common.errors import InputError
 from ..problem.definition import Problem
-from ..results.narrow import require_same_phases
+from ..results.narrow import Moved, adopt_motion, require_same_phases
 from ..results.trajectory import Trajectory
 from .applied import apply_friction
 from .between import find_between
@@ -102,7 +102,7 @@ def require_engine(name: str) -> Engine:
 def replay_in(
     engine: str,
     problem: Problem,
-    plan: Trajectory,
+    plan: Trajectory | Moved,
     *,
     whole: bool = False,
     setting: Setting | None = None,
@@ -116,7 +116,7 @@ def replay_in(
     ----------
     engine : {"mujoco", "drake"}
     problem : Problem
-    plan : Trajectory
+    plan : Plan or Trajectory
     whole : bool
         From the start to the end; otherwise phase by phase, each from its planned start.
     setting : Setting, optional
@@ -135,6 +135,7 @@ def replay_in(
     """
     known, play = ENGINES.get(engine), require_engine(engine)
     assert known is not None
+    problem, plan = adopt_motion(problem, plan)
     require_same_phases(problem, plan)
     setting = known.setting if setting is None else setting
     allowed = known.allowed if allowed is None else allowed

@@ -9,6 +9,7 @@ from ..common.errors import InputError
 from ..common.files import require_ending, write_text
 from ..problem.check import require_phases
 from ..problem.definition import Problem
+from ..problem.read import adopt_phases
 from .torque import TorqueProfile
 from .trajectory import Trajectory
 
@@ -31,6 +32,30 @@ def narrow(what: Torques) -> tuple[TorqueProfile, Trajectory | None]:
         return what, None
     trajectory = what if isinstance(what, Trajectory) else what.trajectory
     return trajectory.torque, trajectory
+
+
+def adopt_motion(problem: Problem, plan: Trajectory | Moved) -> tuple[Problem, Trajectory]:
+    """The motion of a plan, and the problem with its phases where that has goals instead.
+
+    Raises
+    ------
+    InputError
+        If torques alone are given, or the plan ends elsewhere than at the last goal.
+    """
+    problem, _, trajectory = adopt_torques(problem, plan)
+    if trajectory is None:
+        raise InputError("", "plan", "torques alone given; a plan with its motion is needed")
+    return problem, trajectory
+
+
+def adopt_torques(
+    problem: Problem, what: Torques
+) -> tuple[Problem, TorqueProfile, Trajectory | None]:
+    """The problem as of `adopt_motion`, and the torques and motion as of `narrow`."""
+    torque, trajectory = narrow(what)
+    if trajectory is not None:
+        problem = adopt_phases(problem, trajectory.meta, trajectory.q[-1])
+    return problem, torque, trajectory
 
 
 def require_same_phases(problem: Problem, plan: Trajectory) -> None:

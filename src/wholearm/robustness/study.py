@@ -24,7 +24,8 @@ from ..common.errors import InputError
 from ..common.journal import Journal
 from ..policy.policy import Policy
 from ..problem.definition import Problem
-from ..results.narrow import Torques, narrow, require_same_phases
+from ..results.narrow import Moved, adopt_motion, require_same_phases
+from ..results.trajectory import Trajectory
 from .sensitivity import Sensitivities, measure_sensitivities
 from .statistics import Share, count_share
 from .trial import Trial, make_trial
@@ -92,7 +93,7 @@ def _name_loss(record: dict[str, Any]) -> str:
 
 def assess_robustness(
     problem: Problem,
-    plan: Torques,
+    plan: Trajectory | Moved,
     *,
     samples: int = 1000,
     seed: int = 0,
@@ -132,9 +133,7 @@ def assess_robustness(
     InputError
         If the plan has no such phase, or the file cannot be written.
     """
-    _, trajectory = narrow(plan)
-    if trajectory is None:
-        raise InputError("", "plan", "torques alone given; a plan with its motion is needed")
+    problem, trajectory = adopt_motion(problem, plan)
     if isinstance(samples, bool) or not isinstance(samples, int) or samples < 1:
         raise InputError("", "samples", f"{samples!r} given; allowed are 1 and more")
     require_same_phases(problem, trajectory)
