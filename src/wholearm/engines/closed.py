@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..common.brief import write_brief
 from ..common.errors import InputError
 from ..policy.closed_loop import ROOM, ClosedLoop
 from ..policy.policy import Policy
 from ..problem.definition import Problem
-from ..results.report_text import align
 from ..results.narrow import Moved, adopt_motion
+from ..results.report_text import align
 from ..results.trajectory import Trajectory
 from .between import find_between
 from .replay import ENGINES, require_engine
@@ -80,6 +81,9 @@ class PolicyReport(NamedTuple):
         if not own.over:
             return f"phase {name_phases(own.stretch)} does not end within {own.duration:.4g} s"
         return None
+
+    def __repr__(self) -> str:
+        return write_brief(self)
 
     def to_text(self) -> str:
         """The report as lines of text; lengths in mm and angles in degrees."""

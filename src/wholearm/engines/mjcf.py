@@ -147,10 +147,11 @@ def _add_links(world: Element, scene: Scene, theta: Array) -> None:
         place = [*np.asarray(link.base), 0.0]
         # The weight of links is no part of the model.
         body = add(world, "body", name=LINKS[k], pos=place, gravcomp="1")
-        # MuJoCo's contacts are as stiff as fits how bodies move at their centres of mass: half of
-        # the inertia is that of a point at the tip. At the joint it would take links for fixed.
-        half, tip = link.inertia / 2, link.length * np.array([np.cos(theta[k]), np.sin(theta[k])])
-        add(body, "inertial", pos=[*tip, 0], mass=half / link.length**2, diaginertia=[half] * 3)
+        # A uniform rod. MuJoCo makes the stiffness of a contact of how bodies move at their centres
+        # of mass: at the joint that is not at all, and contacts of light links are too stiff.
+        middle = link.length / 2 * np.array([np.cos(theta[k]), np.sin(theta[k]), 0.0])
+        rod = {"mass": 3 * link.inertia / link.length**2, "diaginertia": [link.inertia / 4] * 3}
+        add(body, "inertial", pos=middle, **rod)
         turn = {"axis": [0, 0, 1], "ref": theta[k], "damping": link.viscous}
         add(body, "joint", name=f"theta{k + 1}", type="hinge", **turn)
         _add_shapes(body, scene, theta[k])

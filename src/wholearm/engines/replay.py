@@ -8,6 +8,7 @@ from collections.abc import Callable
 from importlib.metadata import version
 from typing import NamedTuple
 
+from ..common.brief import write_brief
 from ..common.errors import InputError
 from ..problem.definition import Problem
 from ..results.narrow import Moved, adopt_motion, require_same_phases
@@ -70,6 +71,15 @@ class EngineReport(NamedTuple):
     allowed: float
     stretches: tuple[Stretch, ...]
     levels: tuple[Level, ...]
+
+    def __repr__(self) -> str:
+        return write_brief(self)
+
+    def to_text(self) -> str:
+        """The report as lines of text."""
+        from .report_text import write
+
+        return write(self)
 
     @property
     def ok(self) -> bool:

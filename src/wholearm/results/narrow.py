@@ -10,6 +10,7 @@ from ..common.files import require_ending, write_text
 from ..problem.check import require_phases
 from ..problem.definition import Problem
 from ..problem.read import adopt_phases
+from ..problem.write import save_problem
 from .torque import TorqueProfile
 from .trajectory import Trajectory
 
@@ -66,12 +67,12 @@ def require_same_phases(problem: Problem, plan: Trajectory) -> None:
         raise InputError("", "phases", "the plan's contacts are not those of the problem's phases")
 
 
-def save(what: Torques, path: str | os.PathLike[str]) -> None:
-    """Write a motion to a ``.npz`` file, or torques as CSV, by the ending of `path`.
+def save(what: Torques | Problem, path: str | os.PathLike[str]) -> None:
+    """Write a motion to a ``.npz`` file, torques as CSV or a problem as TOML, by the ending.
 
     Parameters
     ----------
-    what : Plan, Simulation, Report, Trajectory or TorqueProfile
+    what : Plan, Simulation, Report, Trajectory, TorqueProfile or Problem
     path : path
         A ``.csv`` file has the columns ``t,tau1,tau2``, a repeated time being a step, and rows as
         dense as the torques are bent.
@@ -81,6 +82,8 @@ def save(what: Torques, path: str | os.PathLike[str]) -> None:
     InputError
         If the file has another ending or cannot be written, or torques alone are to be a motion.
     """
+    if isinstance(what, Problem):
+        return save_problem(what, path)
     torque, trajectory = narrow(what)
     if require_ending(path, ".npz", ".csv") == ".csv":
         from .torque_table import format_rows, place_rows

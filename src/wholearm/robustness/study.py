@@ -19,6 +19,7 @@ import numpy as np
 
 from .. import __version__
 from ..common.arrays import Array
+from ..common.brief import write_brief
 from ..common.crowd import DiedError, run_all
 from ..common.errors import InputError
 from ..common.journal import Journal
@@ -67,6 +68,14 @@ class Robustness:
         if self.trial.policy is not None:
             return Sensitivities("", math.nan, math.nan, ())
         return measure_sensitivities(self.trial)
+
+    __repr__ = write_brief
+
+    @property
+    def headline(self) -> str:
+        """What it is, in a line."""
+        count = len(self.records)
+        return f"{count} samples, goal reached {self.reached}, contacts kept {self.kept}"
 
     @property
     def reached(self) -> Share:

@@ -14,8 +14,8 @@ from ..free_simulation.simulate import simulate_free
 from ..policy.closed_loop import ROOM, ClosedLoop
 from ..policy.policy import Policy
 from ..problem.definition import Phase, Problem
-from ..results.report import Deviation
 from ..results.narrow import Moved, adopt_motion
+from ..results.report import Deviation
 from ..results.trajectory import Trajectory
 from ..simulation.events import OutcomeKind
 from .free import find_losses, warn
