@@ -41,8 +41,8 @@ class Softness(NamedTuple):
         Impedance of friction over that of the gap.
     """
 
-    press: float = 10.0
-    rub: float = 400.0
+    press: float = 7.5
+    rub: float = 300.0
     impedance: float = 0.01
     ratio: float = 100.0
 

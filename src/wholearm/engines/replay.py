@@ -87,6 +87,14 @@ class EngineReport(NamedTuple):
         return all(each.time is None for each in self.levels[0].departures)
 
     @property
+    def converged(self) -> bool:
+        """Whether every stretch that departs does so with the finer settings, too."""
+        rows = zip(*(level.departures for level in self.levels), strict=True)
+        return all(
+            own.time is None or all(each.time is not None for each in finer) for own, *finer in rows
+        )
+
+    @property
     def exit_status(self) -> int:
         """Exit status of the command line."""
         return 0 if self.ok else 1
