@@ -15,7 +15,6 @@ from ..geometry.tracing import runs_on_curve
 from ..mechanics.arrival import Standstill, find_hold
 from ..mechanics.metric import metric_weights
 from ..problem.definition import End, Phase, Problem
-from ..problem.uncertainty import read_widths
 from ..results.narrow import Moved, adopt_motion
 from ..results.trajectory import Trajectory
 from .curve_rows import find_forces, leave_one
@@ -234,4 +233,4 @@ def find_ranges(problem: Problem, plan: Trajectory) -> Mapping[str, float] | Non
     figures = plan.meta.get("ranges")
     if figures:
         return dict(figures["radii"])
-    return None if problem.uncertainty is None else read_widths(problem.uncertainty)
+    return None if problem.uncertainty is None else problem.ranges

@@ -79,7 +79,7 @@ class Robustness:
 
     @property
     def reached(self) -> Share:
-        """How many reach the goal within 1 mm and 1 degree."""
+        """How many reach the goal, as near as the uncertainty says."""
         return count_share(sum(own["reached"] for own in self.records), len(self.records))
 
     @property
@@ -146,7 +146,7 @@ def assess_robustness(
     if isinstance(samples, bool) or not isinstance(samples, int) or samples < 1:
         raise InputError("", "samples", f"{samples!r} given; allowed are 1 and more")
     require_same_phases(problem, trajectory)
-    own = uncertainty or Uncertainty(problem.uncertainty or {})
+    own = uncertainty or Uncertainty(problem.ranges)
     trial = make_trial(problem, trajectory, own, phase, policy)
     drawn = own.draw(samples, seed)
     stamp = _stamp(trial, samples, seed)
@@ -225,6 +225,7 @@ def _stamp(trial: Trial, samples: int, seed: int) -> dict[str, Any]:
         "widths": trial.uncertainty.widths,
         "sample_rate": trial.uncertainty.sample_rate,
         "tolerance": trial.uncertainty.tolerance,
+        "goal": [trial.uncertainty.distance, trial.uncertainty.angle],
         "samples": samples,
         "seed": seed,
     }
