@@ -35,7 +35,7 @@ def narrow(what: Torques) -> tuple[TorqueProfile, Trajectory | None]:
     return trajectory.torque, trajectory
 
 
-def adopt_motion(problem: Problem, plan: Trajectory | Moved) -> tuple[Problem, Trajectory]:
+def adopt_motion(problem: Problem, plan: Torques) -> tuple[Problem, Trajectory]:
     """The motion of a plan, and the problem with its phases where that has goals instead.
 
     Raises

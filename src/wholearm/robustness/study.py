@@ -25,8 +25,7 @@ from ..common.errors import InputError
 from ..common.journal import Journal
 from ..policy.policy import Policy
 from ..problem.definition import Problem
-from ..results.narrow import Moved, adopt_motion, require_same_phases
-from ..results.trajectory import Trajectory
+from ..results.narrow import Torques, adopt_motion, require_same_phases
 from .sensitivity import Sensitivities, measure_sensitivities
 from .statistics import Share, count_share
 from .trial import Trial, make_trial
@@ -102,7 +101,7 @@ def _name_loss(record: dict[str, Any]) -> str:
 
 def assess_robustness(
     problem: Problem,
-    plan: Trajectory | Moved,
+    plan: Torques,
     *,
     samples: int = 1000,
     seed: int = 0,
