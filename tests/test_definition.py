@@ -21,6 +21,7 @@ from wholearm.problem.definition import End, Problem
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.problem.table import write_table
 from wholearm.results.narrow import save
+from wholearm.scene.ranges import find_unit_hint
 
 TEXT = HEPTAGON.read_text(encoding="utf-8")
 Edit = Callable[[dict[str, Any]], object]
@@ -417,3 +418,12 @@ def test_default_ranges_follow_the_size() -> None:
     assert problem.ranges["start_x"] == pytest.approx(2e-4, rel=0.2)
     assert problem.ranges["start_x"] / length == pytest.approx(6e-3)
     assert problem.with_(uncertainty={"start_x": 1e-3}).ranges["start_x"] == 1e-3
+
+
+def test_units_that_look_like_a_mistake_are_named() -> None:
+    scene = problem_of(HEPTAGON).scene
+    assert find_unit_hint(scene) == ""
+    slow = dataclasses.replace(scene, control_period=2.0)
+    assert find_unit_hint(slow).startswith("control_period: 2 s is ")
+    large = wholearm.Polygon(1e3 * scene.polygon.vertices, scene.polygon.mass)
+    assert "in mm?" in find_unit_hint(dataclasses.replace(scene, polygon=large))
