@@ -13,13 +13,15 @@ import pytest
 
 import wholearm
 from plane import finger_gap, place_corners
-from shipped import HEPTAGON
+from shipped import HEPTAGON, problem_of
 from wholearm.common.errors import InputError
 from wholearm.geometry.path_guess import load
 from wholearm.mapping.walk import format_until
 from wholearm.problem.definition import End, Problem
 from wholearm.problem.read import build_problem, read_problem
 from wholearm.problem.table import write_table
+from wholearm.results.narrow import save
+from wholearm.scene.ranges import find_unit_hint
 
 TEXT = HEPTAGON.read_text(encoding="utf-8")
 Edit = Callable[[dict[str, Any]], object]
@@ -390,3 +392,39 @@ def test_the_first_phase_may_let_go_of_what_touches() -> None:
 
     first = read_edited(edit).phases[0].formation
     assert first.names == ("v1-palm", "v2-finger1", "v5-finger2")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"friction": 0.11, "name": 'a "b" \\ \u00fc', "fingers_collide": False, "inertia": 3e-4},
+        {"uncertainty": {"mass": 0.1, "friction": 0.2}, "settle": "10 %", "settle_gap": 1e-4},
+        {"phases": None, "goal": [{"flush": 1}, {"phi_deg": -50.0, "x": 0.01}]},
+        {"phases[5].until": {"phi_deg": -50.0}, "speed_limit1": 20.0, "control_period": 0.005},
+    ],
+)
+def test_a_problem_that_is_saved_loads_as_the_same(
+    changes: dict[str, object], tmp_path: Path
+) -> None:
+    problem = problem_of(HEPTAGON).with_(changes)
+    save(problem, tmp_path / "x.toml")
+    loaded = read_problem(str(tmp_path / "x.toml"))
+    assert loaded.table == problem.table
+    assert loaded.goals == problem.goals and (loaded.start == problem.start).all()
+
+
+def test_default_ranges_follow_the_size() -> None:
+    problem = problem_of(HEPTAGON)
+    length = problem.scene.scales.length
+    assert problem.ranges["start_x"] == pytest.approx(2e-4, rel=0.2)
+    assert problem.ranges["start_x"] / length == pytest.approx(6e-3)
+    assert problem.with_(uncertainty={"start_x": 1e-3}).ranges["start_x"] == 1e-3
+
+
+def test_units_that_look_like_a_mistake_are_named() -> None:
+    scene = problem_of(HEPTAGON).scene
+    assert find_unit_hint(scene) == ""
+    slow = dataclasses.replace(scene, control_period=2.0)
+    assert find_unit_hint(slow).startswith("control_period: 2 s is ")
+    large = wholearm.Polygon(1e3 * scene.polygon.vertices, scene.polygon.mass)
+    assert "in mm?" in find_unit_hint(dataclasses.replace(scene, polygon=large))

@@ -13,28 +13,32 @@ from shipped import HEPTAGON, plan_of, problem_of
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.engines.closed import play_policy
+from wholearm.engines.departure import Departure
 from wholearm.engines.drive import Drive
 from wholearm.engines.mjcf import write_mjcf
-from wholearm.engines.replay import list_settings, replay_in
+from wholearm.engines.replay import EngineReport, Level, list_settings, replay_in
 from wholearm.engines.report_text import to_dict, write
-from wholearm.engines.stretch import Setting
+from wholearm.engines.stretch import Setting, list_stretches
 from wholearm.planning.plan import solve
+from wholearm.planning.result import Plan
 from wholearm.policy.closed_loop import ClosedLoop
 from wholearm.policy.make import make_policy
 from wholearm.problem.definition import Problem
+from wholearm.problem.read import build_problem
 from wholearm.results.narrow import require_same_phases
-from wholearm.results.trajectory import Trajectory
+from wholearm.search.route import find_route
+from wholearm.verification.verify import verify
 
 EXTRAS = {"mujoco": "mujoco", "drake": "pydrake"}
 COARSE = Setting(6.4e-4)
 
 
 @cache
-def slide() -> tuple[Problem, Trajectory]:
+def slide() -> tuple[Problem, Plan]:
     """The first phase of the heptagon's slide, alone."""
     whole = problem_of(HEPTAGON)
     problem = replace(whole, phases=whole.phases[:1])
-    return problem, solve(problem).trajectory
+    return problem, solve(problem)
 
 
 @pytest.mark.parametrize("engine", EXTRAS)
@@ -101,9 +105,9 @@ def test_what_mujoco_opens_plays_the_plan() -> None:
     np.testing.assert_allclose(begun, data.qpos, atol=1e-13)
     while data.time < plan.duration - step / 2:
         mujoco.mj_step(model, data)
-    error = data.qpos[:3] - plan.at(min(data.time, plan.duration)).z[0, :3]
+    error = data.qpos[:3] - plan.at([min(data.time, plan.duration)]).z[0, :3]
     assert np.hypot(*error[:2]) < 1e-4 and abs(error[2]) < 3.5e-3
-    assert np.hypot(*(plan.z[-1] - plan.z[0])[:2]) > 1e-2
+    assert np.hypot(*(plan.trajectory.z[-1] - plan.trajectory.z[0])[:2]) > 1e-2
 
 
 @pytest.mark.parametrize("engine", EXTRAS)
@@ -114,6 +118,38 @@ def test_an_engine_with_other_friction_departs(engine: str) -> None:
     assert report.exit_status == 1
     lines = write(report).splitlines()
     assert "DEPARTS" in lines[0] and lines[1].startswith("phase 1 departs at t = ")
+
+
+def test_contacts_of_light_links_are_no_stiffer_than_the_step_allows() -> None:
+    pytest.importorskip("mujoco", reason="wholearm[mujoco] is not installed")
+    side, joint = 1.0, {"length": 1.6, "radius": 0.06, "inertia": 3.0, "torque_limit": 400.0}
+    table = {
+        "epsilon": 5.0,
+        "object": {"vertices": [[0, 0], [side, 0], [side, side], [0, side]], "mass": 20},
+        "fingers": {"1": {"base": [1.1, -0.1], **joint}, "2": {"base": [-1.1, -0.1], **joint}},
+        "friction": dict.fromkeys(("palm", "finger1", "finger2"), 0.2),
+        "start": {"flush": 0, "x": 0.0},
+        "goal": {"x": -0.3, "flush": 0},
+    }
+    problem = build_problem(table)
+    plan = find_route(problem).plan
+    # The problem with its goal, and a plan, go where phases and a motion do.
+    report = replay_in("mujoco", problem, plan)
+    assert report.ok and report.converged
+    assert report.levels[0].departures[0].position.max() < 5e-4
+    assert verify(problem, plan).ok
+
+
+def test_what_departs_with_some_settings_only_has_not_converged() -> None:
+    problem, plan = slide()
+    (stretch,) = list_stretches(plan.trajectory, False)
+    nothing = np.zeros(1)
+    held = Departure(nothing, nothing, nothing, (), None, "")
+    lost = held._replace(time=0.01, reason="v0-palm opens at t = 0.01 s")
+    for finer, verdict in ((held, "NOT CONVERGED"), (lost, "DEPARTS")):
+        levels = tuple(Level(COARSE, (own,)) for own in (lost, finer))
+        report = EngineReport(problem, "MuJoCo", 3e-3, (stretch,), levels)
+        assert report.exit_status == 1 and f": {verdict}: " in write(report).splitlines()[0]
 
 
 def test_settings_get_finer() -> None:

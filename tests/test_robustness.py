@@ -199,7 +199,7 @@ def follow(
 ) -> dict[str, Any]:
     """The verdict on a motion of 1 s in which contacts press as given."""
     names = tuple(dict.fromkeys(name for window in windows for name in window.contacts))
-    scales = SimpleNamespace(time=0.1)
+    scales = SimpleNamespace(time=0.1, length=1 / 30)
     scene: Any = SimpleNamespace(scene=SimpleNamespace(scales=scales))
     trial = Trial(scene, None, np.zeros(5), windows, np.zeros(3), FEW)  # type: ignore[arg-type]
     t = np.linspace(0, 1, 11)

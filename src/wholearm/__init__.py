@@ -26,12 +26,19 @@ if TYPE_CHECKING:
     )
     from .common.shortfalls import Change, Shortfall
     from .comparison.compare import compare
+    from .comparison.side_by_side import Comparison
     from .contacts.elemental import Contact
     from .contacts.formation import Formation
+    from .engines.closed import PolicyReport, play_policy
+    from .engines.mjcf import write_mjcf
+    from .engines.replay import EngineReport, replay_in
     from .figures import plots
+    from .figures.formation_map import draw_map
     from .free_simulation.result import FreeSimulation
     from .free_simulation.simulate import simulate_free
     from .geometry.path_guess import load
+    from .mapping.formation_map import FormationMap, build_map
+    from .mapping.route import format_route, list_formations
     from .planning.options import Objective, PlanOptions
     from .planning.result import Plan, Status
     from .planning.saved import load_plan
@@ -41,11 +48,14 @@ if TYPE_CHECKING:
     from .problem.goal import Goal
     from .problem.read import place_start, read_formation, read_until
     from .quasistatic.predict import predict
+    from .quasistatic.prediction import Prediction
     from .results.narrow import save
     from .results.report import Report
     from .results.torque import TorqueProfile, read_torque_csv
     from .results.trajectory import Trajectory
     from .results.trajectory_file import load_trajectory
+    from .robustness.study import Robustness, assess_robustness
+    from .robustness.uncertainty import Uncertainty
     from .scene.model import Finger, Friction, Scene
     from .scene.polygon import Polygon
     from .search.result import Answer
@@ -63,51 +73,65 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
+    "AmbiguityError": "common.errors",
     "Answer": "search.result",
     "Change": "common.shortfalls",
+    "Comparison": "comparison.side_by_side",
     "Contact": "contacts.elemental",
     "End": "problem.definition",
+    "EngineReport": "engines.replay",
     "Finger": "scene.model",
     "Formation": "contacts.formation",
-    "Friction": "scene.model",
+    "FormationMap": "mapping.formation_map",
     "FreeReport": "verification.free_report",
     "FreeSimulation": "free_simulation.result",
+    "Friction": "scene.model",
     "Goal": "problem.goal",
     "InfeasibleError": "common.errors",
     "InputError": "common.errors",
-    "AmbiguityError": "common.errors",
     "JammingError": "common.errors",
     "Objective": "planning.options",
     "Phase": "problem.definition",
     "Plan": "planning.result",
     "PlanOptions": "planning.options",
     "Policy": "policy.policy",
+    "PolicyReport": "engines.closed",
     "Polygon": "scene.polygon",
+    "Prediction": "quasistatic.prediction",
     "Problem": "problem.definition",
     "ReplayError": "common.errors",
     "Report": "results.report",
+    "Robustness": "robustness.study",
     "Scene": "scene.model",
-    "Simulation": "simulation.events",
     "Shortfall": "common.shortfalls",
+    "Simulation": "simulation.events",
     "SimulationError": "common.errors",
     "SolverError": "common.errors",
     "Status": "planning.result",
     "TorqueProfile": "results.torque",
-    "Tuning": "tuning.result",
     "Trajectory": "results.trajectory",
+    "Tuning": "tuning.result",
+    "Uncertainty": "robustness.uncertainty",
     "Until": "problem.definition",
     "WholearmError": "common.errors",
+    "assess_robustness": "robustness.study",
+    "build_map": "mapping.formation_map",
     "compare": "comparison.compare",
+    "draw_map": "figures.formation_map",
     "find_route": "search.route",
+    "format_route": "mapping.route",
+    "list_formations": "mapping.route",
     "load": "geometry.path_guess",
     "load_plan": "planning.saved",
     "load_trajectory": "results.trajectory_file",
     "make_policy": "policy.make",
     "place_start": "problem.read",
+    "play_policy": "engines.closed",
     "predict": "quasistatic.predict",
     "read_formation": "problem.read",
     "read_torque_csv": "results.torque",
     "read_until": "problem.read",
+    "replay_in": "engines.replay",
     "save": "results.narrow",
     "simulate": "simulation.simulate",
     "simulate_free": "free_simulation.simulate",
@@ -116,16 +140,20 @@ _HOMES = {
     "verify": "verification.verify",
     "verify_free": "verification.free",
     "verify_policy": "verification.policy",
+    "write_mjcf": "engines.mjcf",
 }
 
 __all__ = [
     "AmbiguityError",
     "Answer",
     "Change",
+    "Comparison",
     "Contact",
     "End",
+    "EngineReport",
     "Finger",
     "Formation",
+    "FormationMap",
     "FreeReport",
     "FreeSimulation",
     "Friction",
@@ -138,10 +166,13 @@ __all__ = [
     "Plan",
     "PlanOptions",
     "Policy",
+    "PolicyReport",
     "Polygon",
+    "Prediction",
     "Problem",
     "ReplayError",
     "Report",
+    "Robustness",
     "Scene",
     "Shortfall",
     "Simulation",
@@ -151,21 +182,29 @@ __all__ = [
     "TorqueProfile",
     "Trajectory",
     "Tuning",
+    "Uncertainty",
     "Until",
     "WholearmError",
     "__version__",
+    "assess_robustness",
+    "build_map",
     "compare",
+    "draw_map",
     "find_route",
+    "format_route",
+    "list_formations",
     "load",
     "load_plan",
     "load_trajectory",
     "make_policy",
     "place_start",
+    "play_policy",
     "plots",
     "predict",
     "read_formation",
     "read_torque_csv",
     "read_until",
+    "replay_in",
     "save",
     "simulate",
     "simulate_free",
@@ -174,6 +213,7 @@ __all__ = [
     "verify",
     "verify_free",
     "verify_policy",
+    "write_mjcf",
 ]
 
 

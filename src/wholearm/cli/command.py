@@ -153,6 +153,7 @@ def _solve(options: argparse.Namespace) -> int:
     from ..geometry.path_guess import load
     from ..planning.options import PlanOptions
     from ..planning.plan import solve_with
+    from ..scene.ranges import find_unit_hint
     from .summary import summarise
 
     output = options.output or _stem(options.problem) + ".npz"
@@ -168,6 +169,8 @@ def _solve(options: argparse.Namespace) -> int:
             require_ending(path, ending)
     _check_sampling(options)
     problem = load(options.problem)
+    if hint := find_unit_hint(problem.scene):
+        _complain(f"{options.problem}: {hint}")
     if options.cache is not None and not problem.goals:
         raise InputError("", "--cache", "is for problems with [goal]")
     if options.jobs is not None and not problem.goals:

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import argparse
 import os
+from typing import TYPE_CHECKING
 
 from .arguments import number
+
+if TYPE_CHECKING:
+    from ..common.arrays import Array
 
 
 def add_new(parser: argparse.ArgumentParser) -> None:
@@ -15,6 +19,8 @@ def add_new(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--polygon", type=number(3, 50), default=7, metavar="CORNERS", help=text)
     text = "from its centre to its corners [m] (0.05)"
     parser.add_argument("--size", type=number(1e-6, 1e6), default=0.05, help=text)
+    text = "corners of the object instead, anticlockwise [m], as in '0,0 0.08,0 0.08,0.03 0,0.09'"
+    parser.add_argument("--vertices", metavar="'X,Y ...'", help=text)
     text = "of the object [kg] (0.2 at a size of 0.05 m, growing with the area)"
     parser.add_argument("--mass", type=number(1e-6, 1e6), help=text)
     parser.set_defaults(run=_write)
@@ -27,7 +33,7 @@ def add_schema(parser: argparse.ArgumentParser) -> None:
 
 
 def _write(options: argparse.Namespace) -> int:
-    from ..common.errors import InputError
+    from ..common.errors import InputError, name_source
     from ..common.files import require_writable, write_text
     from ..mapping.template import write_template
 
@@ -36,9 +42,25 @@ def _write(options: argparse.Namespace) -> int:
     if os.path.exists(output):
         raise InputError(output, "", "is there already; choose another name")
     name = os.path.splitext(os.path.basename(output))[0]
-    write_text(output, write_template(name, options.polygon, options.size, options.mass))
+    vertices = None if options.vertices is None else _read_vertices(options.vertices)
+    with name_source("--vertices" if vertices is not None else ""):
+        text = write_template(name, options.polygon, options.size, options.mass, vertices)
+    write_text(output, text)
     print(f"wrote {output}; next: wholearm solve {output}")
     return 0
+
+
+def _read_vertices(text: str) -> Array:
+    """Corners, shape (n, 2) [m]."""
+    import numpy as np
+
+    from ..common.errors import InputError
+
+    try:
+        return np.array([[float(part) for part in own.split(",")] for own in text.split()])
+    except ValueError:
+        given = f"{text!r} given; needed are corners as x,y in m, such as '0,0 0.08,0 0.04,0.06'"
+        raise InputError("", "--vertices", given) from None
 
 
 def _show_schema(options: argparse.Namespace) -> int:

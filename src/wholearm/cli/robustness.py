@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 from collections.abc import Callable
 from functools import partial
@@ -37,7 +38,8 @@ def add_robustness(parser: argparse.ArgumentParser) -> None:
     text = (
         "half widths of ranges, instead of the problem's: mass, inertia (0.05), friction (0.1), "
         "gain of the torques (0.01), "
-        "all relative; geometry, start_x (2e-4 m), delay (1e-3 s); 0 leaves a number as it is"
+        "all relative; geometry, start_x [m] (6e-3 radii of gyration), "
+        "delay (1e-3 s); 0 leaves a number as it is"
     )
     parser.add_argument("--vary", metavar="NAME=WIDTH", nargs="+", default=[], help=text)
     text = "of a sample-and-hold of the torques [Hz] (1000; 0: torques as planned)"
@@ -46,6 +48,12 @@ def add_robustness(parser: argparse.ArgumentParser) -> None:
     )
     text = "of the simulations, relative to the scene's scales (1e-6)"
     parser.add_argument("--tolerance", type=TOLERANCE, default=1e-6, help=text)
+    text = "how far from the plan's end the goal counts as reached [m] (0.03 radii of gyration)"
+    parser.add_argument("--goal-distance", type=number(1e-9, 1e6), metavar="M", help=text)
+    text = "and how far from its angle [degrees] (1)"
+    parser.add_argument(
+        "--goal-angle", type=number(1e-9, 360.0), metavar="DEG", default=1.0, help=text
+    )
     text = "file to write results to, one by one (default: NAME_robustness.jsonl, with phase and "
     text += "policy in the name); a study that is there goes on where it was stopped"
     parser.add_argument("-o", "--output", metavar="FILE", help=text)
@@ -122,7 +130,7 @@ def _name_output(options: argparse.Namespace) -> str:
 
 def _read_ranges(options: argparse.Namespace, problem: Problem) -> Uncertainty:
     """The ranges of the problem or their defaults, and what is given in their place."""
-    from ..problem.uncertainty import read_widths, spread_widths
+    from ..problem.uncertainty import spread_widths
     from ..robustness.uncertainty import Uncertainty
 
     widths: dict[str, float] = {}
@@ -133,8 +141,9 @@ def _read_ranges(options: argparse.Namespace, problem: Problem) -> Uncertainty:
         except ValueError:
             given = f"{text!r} given; NAME=WIDTH is needed, such as mass=0.1"
             raise InputError("", "--vary", given) from None
-    known = read_widths(problem.uncertainty or {}) | spread_widths(widths, "range of {}")
-    return Uncertainty(known, options.sample_rate or None, options.tolerance)
+    known = problem.ranges | spread_widths(widths, "range of {}")
+    goal = options.goal_distance, math.radians(options.goal_angle)
+    return Uncertainty(known, options.sample_rate or None, options.tolerance, *goal)
 
 
 def _choose_executor(options: argparse.Namespace) -> Callable[[], Executor] | None:

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
+from ..common.brief import write_brief
 from ..problem.definition import Problem
 from ..results.report import Report, plain
 from ..results.report_text import align, show
@@ -83,6 +84,14 @@ class Comparison(NamedTuple):
     name: str
     epsilon: float
     contenders: tuple[Contender, ...]
+
+    def __repr__(self) -> str:
+        return write_brief(self)
+
+    @property
+    def headline(self) -> str:
+        """Verdicts, in a line."""
+        return "; ".join(f"{own.name}: {own.verdict}" for own in self.contenders)
 
     @property
     def exit_status(self) -> int:

@@ -9,10 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..common.brief import write_brief
 from ..common.errors import InputError
 from ..policy.closed_loop import ROOM, ClosedLoop
 from ..policy.policy import Policy
 from ..problem.definition import Problem
+from ..results.narrow import Moved, adopt_motion
 from ..results.report_text import align
 from ..results.trajectory import Trajectory
 from .between import find_between
@@ -80,6 +82,9 @@ class PolicyReport(NamedTuple):
             return f"phase {name_phases(own.stretch)} does not end within {own.duration:.4g} s"
         return None
 
+    def __repr__(self) -> str:
+        return write_brief(self)
+
     def to_text(self) -> str:
         """The report as lines of text; lengths in mm and angles in degrees."""
         failures = [self.find_failure(own) for own in self.arrivals]
@@ -124,7 +129,7 @@ class PolicyReport(NamedTuple):
 def play_policy(
     engine: str,
     problem: Problem,
-    plan: Trajectory,
+    plan: Trajectory | Moved,
     policy: Policy,
     *,
     whole: bool = False,
@@ -138,7 +143,7 @@ def play_policy(
     ----------
     engine : {"mujoco", "drake"}
     problem : Problem
-    plan : Trajectory
+    plan : Plan or Trajectory
         Where phases start and end.
     policy : Policy
     whole : bool
@@ -152,6 +157,7 @@ def play_policy(
     InputError
         If the engine is unknown or not installed, or the policy is of other phases.
     """
+    problem, plan = adopt_motion(problem, plan)
     play = require_engine(engine)
     if policy.count != len(problem.phases):
         given = f"{policy.count} given; the problem has {len(problem.phases)}"

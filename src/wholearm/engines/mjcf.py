@@ -14,6 +14,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..problem.definition import Problem
+from ..results.narrow import Moved, adopt_motion
 from ..results.trajectory import Trajectory
 from ..scene.model import Scene
 from .clock import add_clock
@@ -40,8 +41,8 @@ class Softness(NamedTuple):
         Impedance of friction over that of the gap.
     """
 
-    press: float = 10.0
-    rub: float = 400.0
+    press: float = 7.5
+    rub: float = 300.0
     impedance: float = 0.01
     ratio: float = 100.0
 
@@ -52,7 +53,7 @@ class Softness(NamedTuple):
 
 def write_mjcf(
     problem: Problem,
-    plan: Trajectory | None = None,
+    plan: Trajectory | Moved | None = None,
     *,
     step: float | None = None,
     softness: Softness | None = None,
@@ -62,7 +63,7 @@ def write_mjcf(
     Parameters
     ----------
     problem : Problem
-    plan : Trajectory, optional
+    plan : Plan or Trajectory, optional
         Its torques are part of the model, and each of its phases has a keyframe at its start.
     step : float, optional, [s]
         `STEP` of the scene's time when left out.
@@ -73,8 +74,10 @@ def write_mjcf(
     InputError
         If a link has no thickness.
     """
-    scene = problem.scene
-    home = problem.start if plan is None else plan.z[0]
+    scene, home = problem.scene, problem.start
+    if plan is not None:
+        problem, plan = adopt_motion(problem, plan)
+        home = plan.z[0]
     root = Element("mujoco", model=problem.name)
     step = STEP * scene.scales.time if step is None else step
     softness = Softness() if softness is None else softness
@@ -141,10 +144,14 @@ def _add_object(world: Element, scene: Scene, q: Array) -> None:
 
 def _add_links(world: Element, scene: Scene, theta: Array) -> None:
     for k, link in enumerate(scene.fingers):
-        body = add(world, "body", name=LINKS[k], pos=[*np.asarray(link.base), 0.0])
-        # The weight of links is no part of the model, so their mass is at the joint.
-        mass = link.inertia / link.length**2
-        add(body, "inertial", pos=[0, 0, 0], mass=mass, diaginertia=[link.inertia] * 3)
+        place = [*np.asarray(link.base), 0.0]
+        # The weight of links is no part of the model.
+        body = add(world, "body", name=LINKS[k], pos=place, gravcomp="1")
+        # A uniform rod. MuJoCo makes the stiffness of a contact of how bodies move at their centres
+        # of mass: at the joint that is not at all, and contacts of light links are too stiff.
+        middle = link.length / 2 * np.array([np.cos(theta[k]), np.sin(theta[k]), 0.0])
+        rod = {"mass": 3 * link.inertia / link.length**2, "diaginertia": [link.inertia / 4] * 3}
+        add(body, "inertial", pos=middle, **rod)
         turn = {"axis": [0, 0, 1], "ref": theta[k], "damping": link.viscous}
         add(body, "joint", name=f"theta{k + 1}", type="hinge", **turn)
         _add_shapes(body, scene, theta[k])

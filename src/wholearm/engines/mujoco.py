@@ -43,6 +43,7 @@ def play(
     numbers = _number_pairs(model, problem)
     data.qpos[:], data.qvel[:] = _press(problem, stretch, model, data, numbers), steps.v
     states, press, start = [(stretch.z, stretch.z_dot)], [], 0
+    mujoco.set_mju_user_warning(_ignore)
     for end in steps.ends:
         total = np.zeros(len(names))
         for step in range(start, end):
@@ -62,9 +63,17 @@ def play(
         start = end
         if drive is not None and drive.over:
             break
+    mujoco.set_mju_user_warning(None)
     z, z_dot = (np.array(part) for part in zip(*states, strict=True))
     t = stretch.start + steps.h * np.array([0, *steps.ends[: len(press)]])
     return Run(t, z, z_dot, names, np.array(press))
+
+
+def _ignore(_: str) -> None:
+    """Take a warning of MuJoCo, which else goes to stderr and to a file in the current folder.
+
+    What it warns of, states that are not finite, shows as a departure.
+    """
 
 
 def _number_pairs(model: Any, problem: Problem) -> NDArray[np.int64]:

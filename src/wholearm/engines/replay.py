@@ -8,9 +8,10 @@ from collections.abc import Callable
 from importlib.metadata import version
 from typing import NamedTuple
 
+from ..common.brief import write_brief
 from ..common.errors import InputError
 from ..problem.definition import Problem
-from ..results.narrow import require_same_phases
+from ..results.narrow import Moved, adopt_motion, require_same_phases
 from ..results.trajectory import Trajectory
 from .applied import apply_friction
 from .between import find_between
@@ -71,10 +72,27 @@ class EngineReport(NamedTuple):
     stretches: tuple[Stretch, ...]
     levels: tuple[Level, ...]
 
+    def __repr__(self) -> str:
+        return write_brief(self)
+
+    def to_text(self) -> str:
+        """The report as lines of text."""
+        from .report_text import write
+
+        return write(self)
+
     @property
     def ok(self) -> bool:
         """Whether no stretch departs by more than is allowed."""
         return all(each.time is None for each in self.levels[0].departures)
+
+    @property
+    def converged(self) -> bool:
+        """Whether every stretch that departs does so with the finer settings, too."""
+        rows = zip(*(level.departures for level in self.levels), strict=True)
+        return all(
+            own.time is None or all(each.time is not None for each in finer) for own, *finer in rows
+        )
 
     @property
     def exit_status(self) -> int:
@@ -102,7 +120,7 @@ def require_engine(name: str) -> Engine:
 def replay_in(
     engine: str,
     problem: Problem,
-    plan: Trajectory,
+    plan: Trajectory | Moved,
     *,
     whole: bool = False,
     setting: Setting | None = None,
@@ -116,7 +134,7 @@ def replay_in(
     ----------
     engine : {"mujoco", "drake"}
     problem : Problem
-    plan : Trajectory
+    plan : Plan or Trajectory
     whole : bool
         From the start to the end; otherwise phase by phase, each from its planned start.
     setting : Setting, optional
@@ -135,6 +153,7 @@ def replay_in(
     """
     known, play = ENGINES.get(engine), require_engine(engine)
     assert known is not None
+    problem, plan = adopt_motion(problem, plan)
     require_same_phases(problem, plan)
     setting = known.setting if setting is None else setting
     allowed = known.allowed if allowed is None else allowed

@@ -26,14 +26,16 @@ def write(report: EngineReport) -> str:
     millimetres, degrees = report.allowed * scales.length * 1e3, math.degrees(report.allowed)
     worst = max(float(np.max(each.position)) for each in departures) * 1e3
     turned = math.degrees(max(float(np.max(each.angle)) for each in departures))
+    verdict = "ok" if report.ok else "DEPARTS" if report.converged else "NOT CONVERGED"
+    says = "departs" if report.converged else "departs with some settings only, here"
     lost = [
-        f"phase {name_phases(stretch)} departs at t = {found.time:.5g} s: {found.reason}"
+        f"phase {name_phases(stretch)} {says} at t = {found.time:.5g} s: {found.reason}"
         for stretch, found in zip(report.stretches, departures, strict=True)
         if found.time is not None
     ]
     lines = [
         f"{report.problem.name} in {report.title}: "
-        f"{'ok' if report.ok else 'DEPARTS'}: within {worst:.4f} mm and {turned:.4f} degrees of "
+        f"{verdict}: within {worst:.4f} mm and {turned:.4f} degrees of "
         f"the plan (allowed {millimetres:.4g} mm, {degrees:.3g} degrees)",
         *lost,
         f"steps of up to {setting.step * scales.time:.3g} s, softness {setting.softness:g}; "
@@ -118,6 +120,7 @@ def to_dict(report: EngineReport) -> dict[str, Any]:
         "problem": report.problem.name,
         "engine": report.title,
         "ok": report.ok,
+        "converged": report.converged,
         "allowed": {"position": report.allowed * scales.length, "angle": report.allowed},
         "levels": levels,
     }

@@ -22,6 +22,7 @@ from ..common.sharing import exclusive
 from ..contacts.closing import Flags
 from ..mapping.formation_map import CROSSED, Border, FormationMap
 from ..mapping.route import trace_problem
+from ..results.narrow import Moved, adopt_motion
 from ..results.trajectory import Trajectory
 from .map_lines import (
     find_middle,
@@ -60,13 +61,13 @@ _LETTER, _HEIGHT = 4.4, 9.0
 
 
 @exclusive
-def draw_map(chart: FormationMap, plan: Trajectory | None = None) -> Figure:
+def draw_map(chart: FormationMap, plan: Trajectory | Moved | None = None) -> Figure:
     """Draw a contact-formation map.
 
     Parameters
     ----------
     chart : FormationMap
-    plan : Trajectory, optional
+    plan : Plan or Trajectory, optional
         Its path is drawn over the map, phase by phase; by default that of the problem's own
         phases, as far as geometry alone gives it.
 
@@ -85,7 +86,11 @@ def draw_map(chart: FormationMap, plan: Trajectory | None = None) -> Figure:
         axes.set(xlim=(x[0], x[-1]), ylim=(phi[0], phi[-1]))
         axes.set(xlabel="$x$ of the centroid [mm]", ylabel=r"orientation $\phi$ [deg]")
         _draw_cells(axes, chart, x, phi)
-        paths = trace_problem(chart.problem) if plan is None else trace_plan(plan)
+        paths = (
+            trace_problem(chart.problem)
+            if plan is None
+            else trace_plan(adopt_motion(chart.problem, plan)[1])
+        )
         boxes = _draw_labels(axes, chart, x, phi, paths)
         _draw_directions(axes, chart, boxes)
         _draw_borders(axes, chart.borders)

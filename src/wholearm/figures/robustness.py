@@ -14,7 +14,6 @@ from matplotlib.patches import Polygon as Outline
 from matplotlib.patches import Rectangle
 
 from ..robustness.study import Robustness
-from ..robustness.trial import ANGLE, DISTANCE
 from .snapshots import place_vertices, trace_link
 from .style import FINGERS, INK, PALETTE, PALM, STYLE
 
@@ -84,7 +83,8 @@ def _draw_ends(axes: Axes, study: Robustness) -> None:
         up = np.maximum([math.degrees(record["angle"]) for record in own], _LEAST)
         text = f"{label}: {len(own)}"
         axes.plot(across, up, marker, ms=3.5, color=colour, alpha=0.7, label=text, mew=0.9)
-    goal = (1e3 * DISTANCE, math.degrees(ANGLE))
+    known = study.trial.uncertainty
+    goal = 1e3 * known.find_distance(study.trial.problem.scene), math.degrees(known.angle)
     axes.set(xscale="log", yscale="log", xlabel=f"distance from the goal [mm], {_LEAST:g} or more")
     axes.set_ylabel(f"angle from the goal [deg], {_LEAST:g} or more")
     axes.set(

@@ -53,7 +53,7 @@ def list_pauses(
     return [*pauses, (at, stop)]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class FreeSimulation(Simulation):
     """A simulated motion for which no contact was assumed, at every step.
 

@@ -13,7 +13,7 @@ from ..common.errors import InputError, SimulationError
 from ..common.require import require_number
 from ..common.sharing import exclusive
 from ..problem.definition import Problem
-from ..results.narrow import Torques, narrow
+from ..results.narrow import Torques, adopt_torques
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..simulation.tolerances import SLOW, is_slower
@@ -89,7 +89,7 @@ def simulate_free(
             raise InputError("", "until", "none given; a law of torques needs an end")
         feedback = Feedback(what, end)
         return _simulate(problem, feedback, state, [0.0], None, rate, tolerance, halt)
-    profile, plan = narrow(what)
+    problem, profile, plan = adopt_torques(problem, what)
     profile = profile if end is None else profile.cut(0.0, end)
     starts = [0.0] if plan is None else plan.phase_starts[:-1].tolist()
     hint = None if plan is None or start is not None else _recall(problem, plan, 0)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.arrays import Array
+from ..common.brief import draw_html, write_brief
 from ..common.errors import InputError
 from ..common.sharing import exclusive
 from ..contacts.closing import (
@@ -139,6 +140,17 @@ class FormationMap:
     places: Array
     possible: Flags
     ambiguous: Flags
+
+    __repr__ = write_brief
+    _repr_html_ = draw_html
+
+    @property
+    def headline(self) -> str:
+        """What there is, in a line."""
+        return (
+            f"{self.problem.name!r}, {len(self.formations)} formations, {len(self.borders)} "
+            f"borders, {len(self.crossings)} crossings"
+        )
 
 
 @exclusive

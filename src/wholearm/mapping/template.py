@@ -7,9 +7,11 @@ import tomllib
 
 import numpy as np
 
+from ..common.arrays import Array
 from ..common.errors import InputError
 from ..common.require import require_number
 from ..problem.read import build_problem
+from ..scene.polygon import Polygon
 from .route import format_route, list_formations
 
 _MOST = 50
@@ -19,14 +21,20 @@ _SIZE, _MASS = 0.05, 0.2
 _LEFT, _START, _SLIDE = (-1.6, -0.2), (0.3, 1.2), 0.4
 """Left joint and start, over the size, of polygons with five and more corners and of others, whose
 fingers would meet above them; and how far they slide. The right joint is at 1.6."""
+_OTHERS = tuple((wide, start) for wide in (True, False) for start in (1.2, 0.8, 0.3, 0.0))
+"""Other hands and starts, where the corners are given and the first does not close on them."""
 _COMMENTS = 31
 """Column of the comments."""
 
 
 def write_template(
-    name: str, corners: int = 7, size: float = _SIZE, mass: float | None = None
+    name: str,
+    corners: int = 7,
+    size: float = _SIZE,
+    mass: float | None = None,
+    vertices: Array | None = None,
 ) -> str:
-    """Write a problem file about a regular polygon that slides to the left on one edge.
+    """Write a problem file about a polygon that slides to the left on one edge.
 
     Parameters
     ----------
@@ -36,20 +44,40 @@ def write_template(
         From the centroid to the corners.
     mass : float, [kg]
         By default that of a plate as thick and heavy as those in `problems/`.
+    vertices : ndarray, shape (n, 2), [m], optional
+        Corners, anticlockwise, in place of those of a regular polygon; they say the size, too.
 
     Raises
     ------
     InputError
         If a number is out of its range.
     """
+    given = vertices is not None
+    if vertices is not None:
+        body = Polygon(vertices, 1.0)
+        corners, size = body.n_vertices, float(np.hypot(*body.vertices.T).max())
     if not 3 <= corners <= _MOST:
         raise InputError("", "--polygon", f"{corners} given; allowed are 3 to {_MOST}")
     scale = require_number(size, "--size", positive=True) / _SIZE
     weight = _MASS * scale**2 if mass is None else require_number(mass, "--mass", positive=True)
-    heavy, few = weight / _MASS, corners < 5
-    angles = -math.pi / 2 + math.pi * (2 * np.arange(corners) - 1) / corners
-    # Rounded, so that a corner above the centroid is at zero.
-    vertices = size * np.column_stack([np.cos(angles), np.sin(angles)]).round(12)
+    if vertices is None:
+        angles = -math.pi / 2 + math.pi * (2 * np.arange(corners) - 1) / corners
+        # Rounded, so that a corner above the centroid is at zero.
+        vertices = size * np.column_stack([np.cos(angles), np.sin(angles)]).round(12)
+    few = corners < 5
+    tried = [(few, _START[few]), *(_OTHERS if given else ())]
+    for last, (wide, start) in zip([*tried[1:], None], tried, strict=True):
+        try:
+            return _write(name, vertices, size, weight, wide, start)
+        except InputError:
+            if last is None:
+                raise
+    raise AssertionError
+
+
+def _write(name: str, vertices: Array, size: float, weight: float, few: bool, start: float) -> str:
+    """The file for one of the hands and a start, over the size."""
+    corners, scale, heavy = len(vertices), size / _SIZE, weight / _MASS
     finger = {
         "length": ((0.22 if few else 0.14) * scale, "m, joint to tip centre"),
         "radius": (0.005 * scale, "m, half thickness of the link"),
@@ -75,9 +103,9 @@ def write_template(
     lines.append(f"\n{'[friction]':<{_COMMENTS}}# coefficient with the object")
     lines += [_row(part, "0.05", "") for part in ("palm", "finger1", "finger2")]
     lines += ["\n[start]", _row("flush", "0", "this edge lies on the palm")]
-    lines += [_row("x", _show(_START[few] * size), "m, centroid; both fingers close on the object")]
+    lines += [_row("x", _show(start * size), "m, centroid; both fingers close on the object")]
     text = "\n".join(lines) + "\n"
-    return text + "\n" + _list_phases(text, (_START[few] - _SLIDE) * size)
+    return text + "\n" + _list_phases(text, (start - _SLIDE) * size)
 
 
 def _list_phases(text: str, x: float) -> str:

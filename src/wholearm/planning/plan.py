@@ -111,7 +111,7 @@ def solve_with(
     """Plan with `options` given as one object; see `solve`."""
     require_phases(problem)
     report = progress or (lambda _: None)
-    options = options.scale_ranges(problem.uncertainty or {})
+    options = options.scale_ranges(problem.ranges)
     if problem.scene.control_period:
         options = replace(options, transcription="time")
     with open_ledger() as ledger:

@@ -38,12 +38,12 @@ def assess_ranges(planning: Planning, report: Callable[[str], None]) -> RangeFig
     figures = RangeFigures(dict(options.ranges), nominal, held=tuple(_list_held(planning)))
     if not options.largest:
         return figures
-    unit = options.scale_ranges(problem.uncertainty or {}, 1.0).ranges
+    unit = options.scale_ranges(problem.ranges, 1.0).ranges
     relative = [unit[own.name] for own in PARAMETERS if not own.unit]
     most = WIDEST / max(max(relative), WIDEST / _MOST)
 
     def scale(factor: float) -> PlanOptions:
-        wider = options.scale_ranges(problem.uncertainty or {}, factor)
+        wider = options.scale_ranges(problem.ranges, factor)
         return replace(wider, objective=Objective.TIME, duration=None)
 
     found: dict[int, float] = {}

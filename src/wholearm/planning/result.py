@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
+from ..common.brief import draw_html, write_brief
 from ..problem.definition import Problem
 from ..results.certificate import Certificate
 from ..results.modes import ModeSpan
@@ -157,9 +158,14 @@ class Plan:
     certificate: Certificate | None = None
     ranges: RangeFigures | None = None
 
-    def __repr__(self) -> str:
+    __repr__ = write_brief
+    _repr_html_ = draw_html
+
+    @property
+    def headline(self) -> str:
+        """Name, value and status, in a line."""
         value = f"{self.options.goal.value} = {self.value:.6g} {self.unit}"
-        return f"Plan({self.problem.name!r}, {value}, {self.status.value})"
+        return f"{self.problem.name!r}, {value}, {self.status.value}"
 
     @property
     def unit(self) -> str:

@@ -109,7 +109,7 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
     count = len(trajectory.motions)
     given = {name: meta[name] for name in _OPTIONS if name in meta}
     options = PlanOptions(meta["objective"], **given, replay=meta.get("replay") is not None)
-    options = options.scale_ranges(problem.uncertainty or {})
+    options = options.scale_ranges(problem.ranges)
 
     def column(key: str, missing: Any) -> list[Any]:
         values = meta.get(key, [missing] * count)

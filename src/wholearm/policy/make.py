@@ -15,7 +15,7 @@ from ..geometry.tracing import runs_on_curve
 from ..mechanics.arrival import Standstill, find_hold
 from ..mechanics.metric import metric_weights
 from ..problem.definition import End, Phase, Problem
-from ..problem.uncertainty import read_widths
+from ..results.narrow import Moved, adopt_motion
 from ..results.trajectory import Trajectory
 from .curve_rows import find_forces, leave_one
 from .pace import Pace
@@ -43,7 +43,7 @@ MOST = 0.5
 
 def make_policy(
     problem: Problem,
-    plan: Trajectory,
+    plan: Trajectory | Moved,
     *,
     reserve: float | None = None,
     period: float = 1e-3,
@@ -56,7 +56,7 @@ def make_policy(
     Parameters
     ----------
     problem : Problem
-    plan : Trajectory
+    plan : Plan or Trajectory
     reserve : float, optional
         How much normal force is kept in reserve along the way. Where the plan was made for ranges
         of numbers, or the problem has them: for so many times these ranges (1). Otherwise in what
@@ -79,6 +79,7 @@ def make_policy(
     InputError
         If a number is out of its range, or the plan is of another problem.
     """
+    problem, plan = adopt_motion(problem, plan)
     ranges = find_ranges(problem, plan)
     reserve = (USUAL if ranges is None else 1.0) if reserve is None else reserve
     reserve = require_number(reserve, "reserve", nonnegative=True)
@@ -233,4 +234,4 @@ def find_ranges(problem: Problem, plan: Trajectory) -> Mapping[str, float] | Non
     figures = plan.meta.get("ranges")
     if figures:
         return dict(figures["radii"])
-    return None if problem.uncertainty is None else read_widths(problem.uncertainty)
+    return None if problem.uncertainty is None else problem.ranges

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..common.archive import read_arrays
+from ..common.brief import write_brief
 from ..common.errors import InputError
 from ..common.files import require_ending, write_whole
 from ..common.require import require_number
@@ -107,6 +108,13 @@ class Policy:
                 law.sensing = Sensing(names, gained, table, late)
                 found.update(dict.fromkeys([*names, gained] if gained else names))
         return list(found)
+
+    __repr__ = write_brief
+
+    @property
+    def headline(self) -> str:
+        """Name, phases and duration, in a line."""
+        return f"{self.about.get('name', '')!r}, {self.count} phases, {self.duration:.6g} s"
 
     @property
     def count(self) -> int:

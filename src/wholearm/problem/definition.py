@@ -16,6 +16,7 @@ from ..contacts.formation import Formation
 from ..scene.model import Scene
 from .goal import Goal
 from .table import change_table, match_table, write_table
+from .uncertainty import read_widths
 
 ROWS = {"x": 0, "phi": 2}
 """Rows of z that may be given where a phase ends."""
@@ -225,6 +226,11 @@ class Problem:
         with name_source(self.source):
             table = change_table(self.table, {**(changes or {}), **named}, NAMES)
         return build_problem(table, self.source)
+
+    @property
+    def ranges(self) -> dict[str, float]:
+        """Half widths of all ranges, those of lengths that are left out by the scene's length."""
+        return read_widths(self.uncertainty or {}, length=self.scene.scales.length)
 
     @property
     def settle_share(self) -> float:

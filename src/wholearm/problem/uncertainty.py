@@ -20,7 +20,7 @@ class Parameter:
     ----------
     name : str
     default : float
-        Half width of its range.
+        Half width of its range; of lengths over the scene's length.
     unit : str
         Of the half width; empty for a relative one.
     """
@@ -30,19 +30,21 @@ class Parameter:
     unit: str = ""
 
 
+LENGTH = 1 / 30
+"""Length of a scene, where none is known [m]: about that of the scenes in `problems/`."""
 PARAMETERS = (
     Parameter("mass", 0.05),
     Parameter("inertia", 0.05),
     Parameter("friction_palm", 0.1),
     Parameter("friction_finger1", 0.1),
     Parameter("friction_finger2", 0.1),
-    Parameter("length1", 2e-4, "m"),
-    Parameter("length2", 2e-4, "m"),
-    Parameter("base1_x", 2e-4, "m"),
-    Parameter("base1_y", 2e-4, "m"),
-    Parameter("base2_x", 2e-4, "m"),
-    Parameter("base2_y", 2e-4, "m"),
-    Parameter("start_x", 2e-4, "m"),
+    Parameter("length1", 6e-3, "m"),
+    Parameter("length2", 6e-3, "m"),
+    Parameter("base1_x", 6e-3, "m"),
+    Parameter("base1_y", 6e-3, "m"),
+    Parameter("base2_x", 6e-3, "m"),
+    Parameter("base2_y", 6e-3, "m"),
+    Parameter("start_x", 6e-3, "m"),
     Parameter("gain1", 0.01),
     Parameter("gain2", 0.01),
     Parameter("delay", 1e-3, "s"),
@@ -58,15 +60,19 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
 """Names that stand for several."""
 
 
-def read_widths(given: Mapping[str, object], label: str = "uncertainty.{}") -> dict[str, float]:
+def read_widths(
+    given: Mapping[str, object], label: str = "uncertainty.{}", length: float = LENGTH
+) -> dict[str, float]:
     """Half widths of all ranges; what is left out has its default.
 
     Parameters
     ----------
     given, label
         As for `spread_widths`.
+    length : float, [m]
+        The scene's, which defaults of lengths are in proportion to.
     """
-    defaults = {parameter.name: parameter.default for parameter in PARAMETERS}
+    defaults = {own.name: own.default * (length if own.unit == "m" else 1) for own in PARAMETERS}
     return defaults | spread_widths(given, label)
 
 

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 from ..common.arrays import Array
+from ..common.brief import write_brief
 from ..results.report import plain
 from ..results.report_text import align, fixed, show
 
@@ -180,6 +181,8 @@ class Prediction:
         """Everything as plain values for JSON, with None where there is no number."""
         phases = [phase.to_dict() for phase in self.phases]
         return {"name": self.name, "epsilon": self.epsilon, "phases": phases}
+
+    __repr__ = write_brief
 
     def to_text(self) -> str:
         """Tables of quasistatic motions, and of the speeds at which they break."""

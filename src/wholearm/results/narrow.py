@@ -9,6 +9,8 @@ from ..common.errors import InputError
 from ..common.files import require_ending, write_text
 from ..problem.check import require_phases
 from ..problem.definition import Problem
+from ..problem.read import adopt_phases
+from ..problem.write import save_problem
 from .torque import TorqueProfile
 from .trajectory import Trajectory
 
@@ -33,6 +35,30 @@ def narrow(what: Torques) -> tuple[TorqueProfile, Trajectory | None]:
     return trajectory.torque, trajectory
 
 
+def adopt_motion(problem: Problem, plan: Torques) -> tuple[Problem, Trajectory]:
+    """The motion of a plan, and the problem with its phases where that has goals instead.
+
+    Raises
+    ------
+    InputError
+        If torques alone are given, or the plan ends elsewhere than at the last goal.
+    """
+    problem, _, trajectory = adopt_torques(problem, plan)
+    if trajectory is None:
+        raise InputError("", "plan", "torques alone given; a plan with its motion is needed")
+    return problem, trajectory
+
+
+def adopt_torques(
+    problem: Problem, what: Torques
+) -> tuple[Problem, TorqueProfile, Trajectory | None]:
+    """The problem as of `adopt_motion`, and the torques and motion as of `narrow`."""
+    torque, trajectory = narrow(what)
+    if trajectory is not None:
+        problem = adopt_phases(problem, trajectory.meta, trajectory.q[-1])
+    return problem, torque, trajectory
+
+
 def require_same_phases(problem: Problem, plan: Trajectory) -> None:
     """Check that a plan has the phases of a problem."""
     require_phases(problem)
@@ -41,12 +67,12 @@ def require_same_phases(problem: Problem, plan: Trajectory) -> None:
         raise InputError("", "phases", "the plan's contacts are not those of the problem's phases")
 
 
-def save(what: Torques, path: str | os.PathLike[str]) -> None:
-    """Write a motion to a ``.npz`` file, or torques as CSV, by the ending of `path`.
+def save(what: Torques | Problem, path: str | os.PathLike[str]) -> None:
+    """Write a motion to a ``.npz`` file, torques as CSV or a problem as TOML, by the ending.
 
     Parameters
     ----------
-    what : Plan, Simulation, Report, Trajectory or TorqueProfile
+    what : Plan, Simulation, Report, Trajectory, TorqueProfile or Problem
     path : path
         A ``.csv`` file has the columns ``t,tau1,tau2``, a repeated time being a step, and rows as
         dense as the torques are bent.
@@ -56,6 +82,8 @@ def save(what: Torques, path: str | os.PathLike[str]) -> None:
     InputError
         If the file has another ending or cannot be written, or torques alone are to be a motion.
     """
+    if isinstance(what, Problem):
+        return save_problem(what, path)
     torque, trajectory = narrow(what)
     if require_ending(path, ".npz", ".csv") == ".csv":
         from .torque_table import format_rows, place_rows

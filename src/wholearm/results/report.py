@@ -6,6 +6,7 @@ import math
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
+from ..common.brief import write_brief
 from .narrow import Moved
 from .trajectory import Trajectory
 from .tuning import TuningHelp
@@ -297,6 +298,13 @@ class Report:
     reduced: tuple[ReducedState, ...] = ()
     help: TuningHelp = field(default_factory=TuningHelp)
     replay: Moved | None = field(default=None, repr=False, compare=False)
+
+    __repr__ = write_brief
+
+    @property
+    def headline(self) -> str:
+        """The verdict, in a line."""
+        return f"{self.name!r}: {'ok' if self.ok else 'FAILED'}: {self.reason}"
 
     @property
     def trajectory(self) -> Trajectory:

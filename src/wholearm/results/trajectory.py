@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.arrays import Array
+from ..common.brief import draw_html, write_brief
 from ..common.files import require_ending, write_text
 from .torque import TorqueProfile
 
@@ -95,9 +96,14 @@ class Trajectory:
     motions: tuple[Motion, ...]
     meta: Mapping[str, Any]
 
-    def __repr__(self) -> str:
+    __repr__ = write_brief
+    _repr_html_ = draw_html
+
+    @property
+    def headline(self) -> str:
+        """Phases and duration, in a line."""
         count = len(self.motions)
-        return f"Trajectory({count} phase{'s' if count > 1 else ''}, {self.duration:.6g} s)"
+        return f"{count} phase{'s' if count > 1 else ''}, {self.duration:.6g} s"
 
     @property
     def duration(self) -> float:

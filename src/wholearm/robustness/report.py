@@ -20,10 +20,13 @@ def to_text(study: Robustness) -> str:
     place = "whole plan" if len(phases) > 1 else f"phase {phases[0]}"
     count = len(study.records)
     many = f"{count} of {study.known}" if study.known > count else f"{count}"
+    given = study.trial.uncertainty
+    near = 1e3 * given.find_distance(study.trial.problem.scene)
+    reached = f"goal reached within {near:.3g} mm and {math.degrees(given.angle):.3g} deg"
     lines = [
         f"{study.trial.problem.name}, {place}: {many} samples, seed {study.seed}",
-        f"goal reached within 1 mm and 1 deg  {study.reached}",
-        f"and all planned contacts kept       {study.kept}",
+        f"{reached}  {study.reached}",
+        f"{'and all planned contacts kept':{len(reached)}s}  {study.kept}",
     ]
     if not study.nominal["reached"]:
         lines.append(

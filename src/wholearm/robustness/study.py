@@ -21,13 +21,14 @@ import numpy as np
 from .. import __version__
 from ..common.arrays import Array
 from ..common.bounds import Bounds
+from ..common.brief import write_brief
 from ..common.crowd import DiedError, run_all
 from ..common.errors import InputError
 from ..common.journal import Journal
 from ..common.workers import Spawning
 from ..policy.policy import Policy
 from ..problem.definition import Problem
-from ..results.narrow import Torques, narrow, require_same_phases
+from ..results.narrow import Torques, adopt_motion, require_same_phases
 from .sensitivity import Sensitivities, measure_sensitivities
 from .statistics import Share, count_share
 from .trial import Trial, make_trial
@@ -75,9 +76,17 @@ class Robustness:
             return Sensitivities("", math.nan, math.nan, ())
         return measure_sensitivities(self.trial)
 
+    __repr__ = write_brief
+
+    @property
+    def headline(self) -> str:
+        """What it is, in a line."""
+        count = len(self.records)
+        return f"{count} samples, goal reached {self.reached}, contacts kept {self.kept}"
+
     @property
     def reached(self) -> Share:
-        """How many reach the goal within 1 mm and 1 degree."""
+        """How many reach the goal, as near as the uncertainty says."""
         return count_share(sum(own["reached"] for own in self.records), len(self.records))
 
     @property
@@ -144,12 +153,10 @@ def assess_robustness(
         If the plan has no such phase, or the file holds another study or anything else, is being
         written by another run, or cannot be written.
     """
-    _, trajectory = narrow(plan)
-    if trajectory is None:
-        raise InputError("", "plan", "torques alone given; a plan with its motion is needed")
+    problem, trajectory = adopt_motion(problem, plan)
     SAMPLES.check("samples", samples)
     require_same_phases(problem, trajectory)
-    own = uncertainty or Uncertainty(problem.uncertainty or {})
+    own = uncertainty or Uncertainty(problem.ranges)
     trial = make_trial(problem, trajectory, own, phase, policy)
     journal = None if path is None else Journal(os.fspath(path), _stamp(trial, seed), fresh)
     with journal or nullcontext():
@@ -243,6 +250,7 @@ def _stamp(trial: Trial, seed: int) -> dict[str, Any]:
         "widths": trial.uncertainty.widths,
         "sample_rate": trial.uncertainty.sample_rate,
         "tolerance": trial.uncertainty.tolerance,
+        "goal": [trial.uncertainty.distance, trial.uncertainty.angle],
         "seed": seed,
     }
 

@@ -22,10 +22,6 @@ from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, OutcomeKind
 from .uncertainty import Uncertainty, change_problem, change_torques
 
-DISTANCE = 1e-3
-"""How far from the planned place a goal counts as reached [m]."""
-ANGLE = math.radians(1.0)
-"""How far from the planned angle [rad]."""
 PAUSE = 1e-3
 """Time for which a planned contact may be open, in the scene's unit of time, and still be kept."""
 CLOSING = 0.1
@@ -169,10 +165,12 @@ class Trial:
         lost, phase, time, least = self._follow(simulation, delay)
         even = np.linspace(0.0, simulation.t[-1], SNAPSHOTS)
         path = np.column_stack([np.interp(even, simulation.t, column) for column in simulation.z.T])
+        near = distance <= self.uncertainty.find_distance(self.problem.scene)
+        near = near and angle <= self.uncertainty.angle
         return {
             "distance": distance,
             "angle": angle,
-            "reached": distance <= DISTANCE and angle <= ANGLE and not given_up,
+            "reached": near and not given_up,
             "kept": not lost and not given_up,
             "lost": lost,
             "phase": phase,

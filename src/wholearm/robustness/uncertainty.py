@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -12,7 +13,10 @@ from ..common.require import require_number
 from ..problem.definition import Problem
 from ..problem.uncertainty import PARAMETERS, Parameter, change_scene, read_widths
 from ..results.torque import TorqueProfile
+from ..scene.model import Scene
 
+REACHED = 0.03
+"""How far from the planned place a goal counts as reached, over the scene's length: 1 mm of 33."""
 TOLERANCE = 1e-6
 """Of the simulations of samples, if no other is given, relative to the scene."""
 
@@ -30,6 +34,11 @@ class Uncertainty:
         torques as planned.
     tolerance : float
         Of the simulations of samples, relative to the scene: far below what counts as the goal.
+    distance : float or None, [m]
+        How far from the planned place a goal counts as reached; `REACHED` of the scene's length if
+        left out.
+    angle : float, [rad]
+        How far from the planned angle.
 
     Raises
     ------
@@ -41,11 +50,20 @@ class Uncertainty:
     widths: Mapping[str, float] = field(default_factory=dict)
     sample_rate: float | None = 1000.0
     tolerance: float = TOLERANCE
+    distance: float | None = None
+    angle: float = math.radians(1.0)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "widths", read_widths(self.widths, "range of {}"))
         if self.sample_rate is not None:
             require_number(self.sample_rate, "sample rate", positive=True)
+        if self.distance is not None:
+            require_number(self.distance, "goal distance", positive=True)
+        require_number(self.angle, "goal angle", positive=True)
+
+    def find_distance(self, scene: Scene) -> float:
+        """How far from the planned place a goal counts as reached [m]."""
+        return REACHED * scene.scales.length if self.distance is None else self.distance
 
     @property
     def varied(self) -> tuple[Parameter, ...]:

@@ -73,6 +73,13 @@ EPSILON = Range(0.0, 1e3)
 """Least normal force, over the weight or what the stronger finger can press with."""
 
 
+LARGE, THIN = 2.0, 1e-2
+"""Size [m] from which on so little mass over its square [kg/m^2] looks like corners in mm: a sheet
+of paper has 0.08."""
+SLOW = 1.0
+"""Control period over the scene's time that looks like one in ms: shipped scenes have 0.06 s."""
+
+
 def check_ranges(scene: Scene) -> None:
     """Check the numbers of a scene.
 
@@ -103,6 +110,18 @@ def check_ranges(scene: Scene) -> None:
     )
     for finger in scene.fingers:
         _check_friction(scene, finger)
+
+
+def find_unit_hint(scene: Scene) -> str:
+    """What looks as if it were in mm or ms, with the key first; empty where nothing does."""
+    size, time = scene.polygon.size, scene.scales.time
+    if size > LARGE and scene.polygon.mass < THIN * size**2:
+        return f"object.vertices: {size:g} m across at {scene.polygon.mass:g} kg; are they in mm?"
+    if scene.control_period > SLOW * time:
+        many = scene.control_period / time
+        text = f"{scene.control_period:g} s is {many:.3g} times a fall over the radius of gyration"
+        return f"control_period: {text}; is it in ms?"
+    return ""
 
 
 def check_epsilon(scene: Scene, epsilon: float) -> None:

@@ -94,7 +94,7 @@ def join_route(
     aside : Aside, optional
         What else is to be done then.
     """
-    options = options.scale_ranges(problem.uncertainty or {})
+    options = options.scale_ranges(problem.ranges)
     begun = time.perf_counter()
     ways, culprit = [[*measured, None] for _, measured in links], None
     try:

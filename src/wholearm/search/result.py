@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ..common.brief import write_brief
 from ..contacts.formation import describe
 from ..mapping.walk import format_until
 from ..planning.options import Objective
@@ -41,6 +42,13 @@ class Alternative:
 
     plan: Plan
     problem: Problem
+
+    __repr__ = write_brief
+
+    @property
+    def headline(self) -> str:
+        """What it is, in a line."""
+        return f"{self.plan.headline}, phases: {len(self.problem.phases)}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +97,13 @@ class Answer:
         if self.bound is None or self.bound.value <= 0 or self.route.in_cells or not timed:
             return None
         return max(0.0, self.plan.duration / self.bound.value - 1.0)
+
+    __repr__ = write_brief
+
+    @property
+    def headline(self) -> str:
+        """What it is, in a line."""
+        return f"{self.plan.headline}, phases: {len(self.problem.phases)}"
 
     def to_text(self) -> str:
         """The route as ``[[phases]]``, and how good it is, as comments."""

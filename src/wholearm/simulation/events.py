@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
+from ..common.brief import draw_html, write_brief
 from ..mechanics.dynamics import energy
 from ..problem.definition import Phase, Problem
 from ..results.torque import TorqueProfile
@@ -209,6 +210,14 @@ class Simulation:
     missed_by: float
     steps: int
     rejected: int
+
+    __repr__ = write_brief
+    _repr_html_ = draw_html
+
+    @property
+    def headline(self) -> str:
+        """How it ended, in a line."""
+        return f"{self.problem.name!r}, {self.t[-1]:.6g} s: {self.outcome.text}"
 
     @property
     def trajectory(self) -> Trajectory:

@@ -29,7 +29,7 @@ from ..common.errors import InputError, JammingError, SimulationError
 from ..common.sharing import exclusive
 from ..problem.check import require_phases
 from ..problem.definition import End, Phase, Problem
-from ..results.narrow import Torques, narrow
+from ..results.narrow import Torques, adopt_torques
 from .events import EventKind, Glimpses, Outcome, OutcomeKind, Simulation, collect, list_glimpses
 from .jumps import Arrival, Ending, Released, Rested, Switched, is_there
 from .moving import move
@@ -94,8 +94,8 @@ def simulate(
         If a formation does not close at its start, or the step size underflows. Both errors say in
         which phase.
     """
+    problem, profile, _ = adopt_torques(problem, torque)
     require_phases(problem)
-    profile, _ = narrow(torque)
     if not 1e-14 <= tolerance <= 1e-2:
         raise InputError("", "tolerance", f"{tolerance!r} is not between 1e-14 and 1e-2")
     wanted = _sort_times(times)

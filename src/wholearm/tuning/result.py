@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..common.arrays import Array
+from ..common.brief import write_brief
 from ..results.report import plain
 from ..results.report_text import align, show
 from ..results.torque import TorqueProfile
@@ -93,6 +94,8 @@ class Tuning:
     rows: Array | None
     report: FreeReport | None
     reason: str
+
+    __repr__ = write_brief
 
     @property
     def torque(self) -> TorqueProfile | None:

@@ -20,7 +20,7 @@ from ..free_simulation.result import FreeSimulation, list_pauses
 from ..free_simulation.simulate import simulate_free, simulate_phases
 from ..geometry.curve import describe_pose
 from ..problem.definition import Phase, Problem
-from ..results.narrow import Torques, narrow
+from ..results.narrow import Torques, adopt_torques
 from ..results.report import Deviation
 from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, OutcomeKind
@@ -63,7 +63,7 @@ def verify_free(
     SimulationError
         If bodies overlap at the start.
     """
-    torque, plan = narrow(what)
+    problem, torque, plan = adopt_torques(problem, what)
     allowed = require_number(departure, "departure", positive=True)
     names = {contact.name for contact in problem.contacts}
     if plan is not None and set(plan.contacts) != names:

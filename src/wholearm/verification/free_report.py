@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+from ..common.brief import write_brief
 from ..free_simulation.result import FreeSimulation
 from ..results.report import Deviation, plain
 from ..results.report_text import align, fixed, show
@@ -72,6 +73,8 @@ class FreeReport:
     phases: tuple[FreePhase, ...]
     failures: tuple[str, ...]
     warnings: tuple[str, ...]
+
+    __repr__ = write_brief
 
     @property
     def trajectory(self) -> Trajectory:

@@ -14,6 +14,7 @@ from ..free_simulation.simulate import simulate_free
 from ..policy.closed_loop import ROOM, ClosedLoop
 from ..policy.policy import Policy
 from ..problem.definition import Phase, Problem
+from ..results.narrow import Moved, adopt_motion
 from ..results.report import Deviation
 from ..results.trajectory import Trajectory
 from ..simulation.events import OutcomeKind
@@ -28,7 +29,7 @@ REACHED, TURNED = 0.03, math.radians(1.0)
 @exclusive
 def verify_policy(
     problem: Problem,
-    plan: Trajectory,
+    plan: Trajectory | Moved,
     policy: Policy,
     *,
     tolerance: float = 1e-9,
@@ -42,7 +43,7 @@ def verify_policy(
     Parameters
     ----------
     problem : Problem
-    plan : Trajectory
+    plan : Plan or Trajectory
         Where phases are to end.
     policy : Policy
     tolerance, restitution
@@ -56,6 +57,7 @@ def verify_policy(
         If the policy or the plan has other phases than the problem, or a number is out of its
         range.
     """
+    problem, plan = adopt_motion(problem, plan)
     allowed = require_number(departure, "departure", positive=True)
     count = len(problem.phases)
     for name, given in (("policy", policy.count), ("plan", len(plan.phase_starts) - 1)):

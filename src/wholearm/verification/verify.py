@@ -13,7 +13,7 @@ from ..common.errors import InputError
 from ..common.sharing import exclusive
 from ..mechanics.uniqueness import LEAST_MINOR
 from ..problem.definition import End, Phase, Problem
-from ..results.narrow import Torques, narrow
+from ..results.narrow import Torques, adopt_torques
 from ..results.report import (
     Deviation,
     EnergyBalance,
@@ -123,7 +123,7 @@ def verify(
     JammingError, SimulationError
         If the simulation cannot go on.
     """
-    torque, plan = narrow(what)
+    problem, torque, plan = adopt_torques(problem, what)
     allowance = Allowance(departure, rest_speed, least_minor=least_minor)
     names = {contact.name for contact in problem.contacts}
     if plan is not None and set(plan.contacts) != names:
