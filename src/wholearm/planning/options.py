@@ -34,6 +34,8 @@ CHOICES = tuple(
 
 ACCURACIES = (1e-8, 0.1)
 """Least and largest relative error of an objective that can be asked for."""
+DEFAULT_ACCURACY = 1e-4
+"""The error that is asked for by default."""
 OPENING = 0.01
 """Least acceleration of a gap that opens, over gravity."""
 CLEARANCE = 5e-4
@@ -66,7 +68,7 @@ class PlanOptions:
     replay: bool = True
     mode_search: bool = True
     certify: bool = False
-    accuracy: float = 1e-4
+    accuracy: float = DEFAULT_ACCURACY
     least_minor: float = LEAST_MINOR
     robust: float = 0.0
     largest: bool = False
