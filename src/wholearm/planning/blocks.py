@@ -33,7 +33,7 @@ from .ahead import look_ahead
 from .block_plan import BEGUN, FINEST, PLAIN, BlockPlan, Planning
 from .durations import share_again, share_duration
 from .motors import explain_motors, require_steps
-from .options import DEFAULT_ACCURACY, Objective, PlanOptions
+from .options import Objective, PlanOptions
 from .path_domain.impact_sequence import ImpactSequence, make_sequence
 from .path_domain.sequence_plan import plan_sequence, plan_slowly
 from .phase_plan import add_up
@@ -229,10 +229,7 @@ def find_ample(blocks: Sequence[BlockPlan]) -> float:
 
 
 def _refine(options: PlanOptions, known: BlockPlan | None, finer: int) -> PlanOptions:
-    """Options for a block whose intervals are doubled `finer` times.
-
-    Where an accuracy below the default's is asked for it is given up by tens instead.
-    """
+    """Options for a block whose intervals are doubled `finer` times."""
     if finer in (0, BEGUN):
         return options
     if finer == PLAIN:
@@ -241,10 +238,6 @@ def _refine(options: PlanOptions, known: BlockPlan | None, finer: int) -> PlanOp
     if known is not None and known.chain is None:
         doublings = 0 if known.finer == BEGUN else finer - known.finer
         wanted = min(known.intervals * 2**doublings, FINEST)
-    if options.intervals is None and options.accuracy < DEFAULT_ACCURACY:
-        # Limits nearer to being missed than a replay resolves: pent_phx at 1e-6, phases 6 to 8.
-        rough = min(options.accuracy * 10**finer, DEFAULT_ACCURACY)
-        return replace(options, accuracy=rough, time_intervals=wanted)
     along = (options.intervals or COARSE) * 2**finer
     return replace(options, intervals=along, time_intervals=wanted)
 

@@ -118,7 +118,11 @@ class Attempts:
     def _follow(self, way: PacedWay) -> Attempt:
         """Along a way, in its modes."""
         stages = self._guess(self._halvings, FALLS[0], way=way)
-        return Attempt(f"a straight path that keeps limits with {way.margin:.3g} to spare", self._halvings, stages)
+        return Attempt(
+            f"a straight path that keeps limits with {way.margin:.3g} to spare",
+            self._halvings,
+            stages,
+        )
 
     @cached_property
     def ways(self) -> list[PacedWay]:
