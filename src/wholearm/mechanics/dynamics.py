@@ -219,7 +219,7 @@ def _null_vector(wrench: Array) -> Array:
     null = np.stack([minors[0], -minors[1], minors[2], -minors[3]], axis=1)
     size = np.linalg.norm(null, axis=1)[:, None]
     # Of rank two, as where a tip is on a flush edge's vertex, it has no single null vector.
-    return np.divide(null, size, out=np.full_like(null, np.nan), where=size > 0)
+    return np.asarray(np.divide(null, size, out=np.full_like(null, np.nan), where=size > 0))
 
 
 def force_rows(formation: Formation, kinematics: Kinematics, directions: Directions) -> Array:
