@@ -40,13 +40,13 @@ def test_a_single_phase_is_tried_along_ways_and_at_several_paces() -> None:
     assert gradual[0].stages is attempts.first.stages and found[0] == gradual[0]
     plain = [name for name, attempt in zip(names, found, strict=True) if not attempt.gradual]
     plain = plain[: plain.index(NEAREST)]
-    assert all(name.startswith("a way with the margin ") for name in plain)
+    assert all(name.startswith("a straight path that keeps limits ") for name in plain)
     assert len(plain) <= len(attempts.ways)
     sure = [way.margin for way in attempts.ways if way.margin > 0]
     assert [attempt.gradual for attempt in found[1 : 1 + len(sure)]] == [False] * len(sure)
     assert {attempt.name for attempt in gradual[1:]} <= {f"{name}{GRADUAL}" for name in plain}
     # The same guess again on finer intervals counts as another, and the first one is not repeated.
-    paces = [name for name in names[at + 1 :] if name.startswith(f"{NEAREST} at ")]
+    paces = [name for name in names[at + 1 :] if name.startswith(f"{NEAREST}, ")]
     assert len(paces) == len(names) - at - 1 == 2 * len(FALLS) - 1
     for attempt in found:
         halved = 12 / 2**attempt.halvings
@@ -59,7 +59,7 @@ def test_phases_in_motion_are_tried_ahead() -> None:
     assert attempts.ways == [] and not attempts.are_far
     names = [attempt.name for attempt in attempts]
     assert names[:2] == [f"{NEAREST}{GRADUAL}", NEAREST]
-    assert all(name.startswith("an end ahead at ") for name in names[2:])
+    assert all(name.startswith("one to an end of the phases further on, ") for name in names[2:])
     # Where the first one has led nowhere, it is not among those that are made after it.
     assert [attempt.name for attempt in attempts.list_further(3)] == [names[0], names[2]]
 

@@ -21,6 +21,7 @@ from ..planning.path_domain.mesh import Mesh
 from ..planning.path_domain.nlp import build_path_nlp
 from ..planning.path_domain.terms import LimitShape
 from ..planning.plan import solve
+from ..problem.check import require_phases
 from ..problem.definition import Problem
 from ..problem.read import read_problem
 from ..simulation.simulate import simulate
@@ -54,8 +55,9 @@ def run_bench(
     Raises
     ------
     InputError
-        If the folder cannot be made or written.
+        If the problem has no phases, or the folder cannot be made or written.
     """
+    require_phases(problem)
     make_folder(folder)
     report = progress or (lambda _: None)
     curves = keep_curves(problem)

@@ -210,14 +210,16 @@ def energy(formation: Formation, z: Array, v: Array) -> Array:
 
 
 def _null_vector(wrench: Array) -> Array:
-    """Unit null vector of each (3, 4) matrix, by its minors.
+    """Unit null vector of each (3, 4) matrix, by its minors; NaN where its rank is below three.
 
     Minors change continuously along a curve. A sign chosen place by place would not: where it
     changes, a squeeze interpolated between two places would step.
     """
     minors = [np.linalg.det(np.delete(wrench, k, axis=2)) for k in range(4)]
     null = np.stack([minors[0], -minors[1], minors[2], -minors[3]], axis=1)
-    return np.asarray(null / np.linalg.norm(null, axis=1)[:, None])
+    size = np.linalg.norm(null, axis=1)[:, None]
+    # Of rank two, as where a tip is on a flush edge's vertex, it has no single null vector.
+    return np.asarray(np.divide(null, size, out=np.full_like(null, np.nan), where=size > 0))
 
 
 def force_rows(formation: Formation, kinematics: Kinematics, directions: Directions) -> Array:

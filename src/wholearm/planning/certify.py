@@ -19,16 +19,16 @@ def certify(planning: Planning) -> Certificate:
 
 
 def _bound(block: BlockPlan, epsilon: float) -> Iterator[TimeBound]:
-    durations = {
-        phase.number: plan.motion.duration
-        for phase, plan in zip(block.phases, block.plans, strict=True)
-    }
+    numbers = [phase.number for phase in block.phases]
+    durations = [plan.motion.duration for plan in block.plans]
     if block.chain is None:
-        yield TimeBound(tuple(durations), sum(durations.values()), None, None, OVER_TIME)
+        yield TimeBound(tuple(numbers), sum(durations), None, None, OVER_TIME)
         return
+    # The chain of a link of a route has numbers of its own: its phases are told by their order.
+    first = 0
     for part in block.chain.split():
-        phases = tuple(phase.number for phase in part.phases)
-        duration = sum(durations[phase] for phase in phases)
+        own = slice(first, first := first + len(part.phases))
+        phases, duration = tuple(numbers[own]), sum(durations[own])
         found = bound_least_time(part.continuous_curves, epsilon)
         if found is None:
             yield TimeBound(phases, duration, None, None, NO_MOTION)

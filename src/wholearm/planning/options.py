@@ -36,6 +36,8 @@ CHOICES = tuple(
 
 _LEFT_OUT = ("intervals", "time_intervals", "duration")
 """Options that the planner chooses where they are not given."""
+DEFAULT_ACCURACY = 1e-4
+"""The error that is asked for by default."""
 OPENING = 0.01
 """Least acceleration of a gap that opens, over gravity."""
 CLEARANCE = 5e-4
@@ -68,7 +70,7 @@ class PlanOptions:
     replay: bool = True
     mode_search: bool = True
     certify: bool = False
-    accuracy: float = 1e-4
+    accuracy: float = DEFAULT_ACCURACY
     least_minor: float = LEAST_MINOR
     robust: float = 0.0
     largest: bool = False

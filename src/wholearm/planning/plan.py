@@ -171,6 +171,9 @@ def finish_plan(
         report("bounding the least time from below")
         certificate = certify(planning)
     phases = _list_phases(planning, ledger, sure)
+    if certificate is not None:
+        gaps = certificate.gaps
+        phases = tuple(own._replace(error=gaps.get(own.number, own.error)) for own in phases)
     plan = Plan(
         problem,
         options,

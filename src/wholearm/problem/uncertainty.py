@@ -63,7 +63,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
 def read_widths(
     given: Mapping[str, object], label: str = "uncertainty.{}", length: float = LENGTH
 ) -> dict[str, float]:
-    """Half widths of all ranges; what is left out has its default.
+    """Half widths of all ranges, with the defaults of those that are not named; zero is none.
 
     Parameters
     ----------

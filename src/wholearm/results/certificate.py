@@ -45,6 +45,16 @@ class Certificate(NamedTuple):
     parts: tuple[TimeBound, ...]
 
     @property
+    def gaps(self) -> dict[int, float]:
+        """The gap of each phase that has a bound, by its number; zero where the plan is below."""
+        return {
+            phase: max(part.gap, 0.0)
+            for part in self.parts
+            if part.gap is not None
+            for phase in part.phases
+        }
+
+    @property
     def total(self) -> TimeBound | None:
         """The bound of all phases that have one, together; None without any."""
         known = [part for part in self.parts if part.bound is not None]

@@ -19,7 +19,7 @@ from ...common.errors import InfeasibleError, JammingError, SolverError, Wholear
 from ...common.shortfalls import Parameter
 from ...geometry.curve import Curve
 from ..advice import describe_changes, find_changes, name_phases
-from ..options import Objective, PlanOptions
+from ..options import DEFAULT_ACCURACY, Objective, PlanOptions
 from ..phase_plan import PhasePlan
 from ..robust.rows import Guide
 from .data import PhaseData, join
@@ -149,9 +149,31 @@ def plan_curves(
     if options.goal is Objective.MARGIN and found.plans[0].value < task.lost:
         least = SolverError(f"{task.name}: the margin found is below epsilon")
         raise _explain_duration(task) or least
+    found = _bound_error(task, found)
     # Slow motors begin a motion as they leave what holds the object.
     surely = task.is_held or (options.goal is Objective.TIME and not options.ranges)
     return found.plans if surely else _leave_rest(found)
+
+
+def _bound_error(task: Task, found: _Solved) -> _Solved:
+    """The plans with the gap to a lower bound of their time as their error, where that says more.
+
+    Limits are tightened and switches moved by estimates alone. They are checked where they are
+    above the accuracy, or where that is below that of the default.
+    """
+    options, error = task.options, found.plans[0].error
+    if options.goal is not Objective.TIME or options.ranges or task.is_held or task.quick:
+        return found
+    if error <= options.accuracy and options.accuracy >= DEFAULT_ACCURACY:
+        return found
+    from ..lower_bound.lower_bound import bound_least_time
+
+    bound = bound_least_time(task.curves, task.epsilon)
+    if bound is None or bound.value <= 0:
+        return found
+    # Limits may be missed a little, by which a plan can be below the bound.
+    gap = max(sum(plan.value for plan in found.plans) / bound.value - 1, 0.0)
+    return found._replace(plans=[plan._replace(error=gap) for plan in found.plans])
 
 
 def _explain(
@@ -326,8 +348,10 @@ def _suit(found: Round) -> Round:
         if better is None:
             break
         refined = better.solve()
-        if isinstance(refined, str) or (found.is_split and refined.merit > found.merit):
+        if isinstance(refined, str):
             return replace(found, shift=better.shift)
+        if found.is_split and refined.merit > found.merit:
+            return found.keep_before(refined)
         found = refined
     return found
 

@@ -244,6 +244,14 @@ class Round:
         """What the cost is likely to be once limits hold between nodes."""
         return self.solution.cost + self.value * float(self.due.sum())
 
+    def keep_before(self, better: Round) -> Round:
+        """The round, as another one with breaks at its switches has turned out to be no better.
+
+        What its own breaks lose by being elsewhere is no more than the two differ by.
+        """
+        differ = abs(better.merit - self.merit) / self.value
+        return replace(self, shift=min(better.shift, differ / SHIFTED))
+
     @property
     def is_kept(self) -> bool:
         """Whether a motion is known that keeps limits at nodes, or negative margins would do."""

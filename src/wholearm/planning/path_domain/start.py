@@ -140,7 +140,8 @@ class _Corners(NamedTuple):
             a = np.where(held, wanted, np.where(pushed, high, low))
             between = share * press + (1 - share) * other
             squeeze = np.where(held, between, np.where(pushed, press, other))
-            wild = np.abs(a) > _WILD * np.median(np.abs(found.slopes))
+            # Rows within ranges may coincide, and then meet nowhere: those are no corner either.
+            wild = ~(np.abs(a) <= _WILD * np.median(np.abs(found.slopes))) | ~np.isfinite(squeeze)
             if wild.any() and not wild.all():
                 a = np.where(wild, wanted, a)
                 squeeze[wild] = np.interp(grid.s[wild], grid.s[~wild], squeeze[~wild])
@@ -157,9 +158,8 @@ class _Corners(NamedTuple):
         """The motion with some slack of the sides that meet, shape (n, 2)."""
         a, b, squeeze = self.profile
         inner_a, inner_squeeze = sides.meet(b, self.sides, slack)
-        return Profile(
-            np.where(self.held, a, inner_a), b, np.where(self.held, squeeze, inner_squeeze)
-        )
+        stay = self.held | ~(np.isfinite(inner_a) & np.isfinite(inner_squeeze))
+        return Profile(np.where(stay, a, inner_a), b, np.where(stay, squeeze, inner_squeeze))
 
 
 def _find_pairs(sides: LimitSides, rows: Rows, b: Array, largest: bool) -> NDArray[np.int64]:

@@ -23,7 +23,7 @@ from .way_guess import PacedWay, list_ways, pace_straight
 
 FIRST = 10
 """Most intervals of a phase to start with."""
-NEAREST = "the nearest end"
+NEAREST = "a motion to the nearest end of the phase"
 """Name of the first guess."""
 GRADUAL = " with friction that sets in gradually"
 """What is added to the name of a guess whose modes are found that way."""
@@ -118,7 +118,11 @@ class Attempts:
     def _follow(self, way: PacedWay) -> Attempt:
         """Along a way, in its modes."""
         stages = self._guess(self._halvings, FALLS[0], way=way)
-        return Attempt(f"a way with the margin {way.margin:.3g}", self._halvings, stages)
+        return Attempt(
+            f"a straight path that keeps limits with {way.margin:.3g} to spare",
+            self._halvings,
+            stages,
+        )
 
     @cached_property
     def ways(self) -> list[PacedWay]:
@@ -152,8 +156,8 @@ class Attempts:
         for halvings in dict.fromkeys((self._halvings, 0)) if self.patient else ():
             for falls in FALLS:
                 if onwards or halvings != self._halvings or falls != FALLS[0]:
-                    end = "an end ahead" if onwards else NEAREST
-                    name = f"{end} at {falls:g} times the duration of a fall"
+                    end = "one to an end of the phases further on" if onwards else NEAREST
+                    name = f"{end}, {falls:g} times as long as a fall over that height"
                     yield Attempt(name, halvings, self._guess(halvings, falls, onwards))
 
     def list_further(self, most: int) -> Iterator[Attempt]:

@@ -148,7 +148,7 @@ def explain(
     if not short:
         names = " and ".join(" ".join(phase.formation.names) for phase in phases)
         text = f"no plan for {name_phases(numbers)} ({names}, until {phases[-1].until}): {status}"
-        return SolverError(f"{text}; try another number of time intervals")
+        return SolverError(f"{text}; try another number of intervals per phase (--time-intervals)")
 
     def sum_up(stages: list[Stage]) -> float:
         return sum(

@@ -112,8 +112,10 @@ class StageMotion:
         """The pieces and the defects.
 
         The accelerations at an interval's points are integrated twice from its start, and those
-        that follow there by forward dynamics again, until they are one motion. What is left at
-        the end, the error of collocation, is distributed over the interval.
+        that follow there by forward dynamics again, until they are one motion (Picard iteration).
+        It diverges where B h / J is large: such intervals keep the accelerations whose residual
+        is the least. What is left at the end, the error of collocation, is distributed over the
+        interval.
         """
         nodes, half = self.points.nodes, np.diff(self.breaks)[:, None, None] / 2
         z, v = nodes[:, 0], nodes[:, 1]
@@ -123,7 +125,10 @@ class StageMotion:
         tau = np.einsum("kjd,nd->knj", torque, powers[:, : torque.shape[2]])
         count = len(half)
         signs = [np.broadcast_to(part, (count * _NODES, len(part))) for part in self.directions]
-        a = _fit(2 * self.scheme.points - 1, self.points.a)
+        a = np.zeros((count, 5, _NODES))
+        a[..., : len(self.scheme.points)] = _fit(2 * self.scheme.points - 1, self.points.a)
+        weights = np.sqrt(metric_weights(self.formation.scene))[:, None]
+        kept, least = a, np.full((count, 1, 1), np.inf)
         for _ in range(_SWEEPS):
             velocity = _integrate(a, half, v[:-1])
             place = _integrate(velocity, half, z[:-1])
@@ -132,7 +137,11 @@ class StageMotion:
                 for part in (place, velocity)
             )
             forces = self._forward(*state, tau.reshape(-1, 2), *signs)
-            a = _fit(x, forces[0][..., 0].reshape(count, _NODES, 5))
+            found = _fit(x, forces[0][..., 0].reshape(count, _NODES, 5))
+            residual = np.abs(weights * (found - a)).max(axis=(1, 2), keepdims=True)
+            nearer = residual < least
+            kept, least = np.where(nearer, a, kept), np.where(nearer, residual, 0.0)
+            a = np.where(nearer, found, kept)
         velocity = _integrate(a, half, v[:-1])
         place = _integrate(velocity, half, z[:-1])
         miss = (z[1:] - place.sum(axis=2))[..., None], (v[1:] - velocity.sum(axis=2))[..., None]

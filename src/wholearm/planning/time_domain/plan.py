@@ -307,8 +307,11 @@ def _explain(
     """Why none of the attempts has led to a plan; `replan` as for `explain`."""
     from .explain import explain, refuse_ways
 
-    tried = ", ".join(dict.fromkeys([NEAREST, *(own.name for own in outcomes)]))
-    reason = f"none was found, also of least shortfalls, from {tried}"
+    tried = dict.fromkeys([NEAREST, *(own.name for own in outcomes)])
+    reason = (
+        f"the solver did not converge from {len(tried)} initial guesses ({'; '.join(tried)}), nor "
+        "when limits may be missed"
+    )
     short = [own.short for own in outcomes if own.short]
     if not short:
         refuse_ways(problem, attempts.phases[0], attempts.ways)
