@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
-from ..planning.options import PlanOptions
+from ..planning.motors import free_torques
+from ..planning.options import Objective, PlanOptions
 from ..planning.result import Plan
 from ..problem.definition import Problem
 from .bounds import BorderBound, bound_borders
-from .candidates import Failure, Lost, make_candidate, plan_candidate
+from .candidates import Failure, Lost, plan_phases
 from .find import CAREFUL, EAGER, Route, Rule, Search
 from .joining import Aside, can_join, join_route
 from .links import Link, describe_steps
@@ -115,15 +117,22 @@ class Chooser:
                 self.made.append((plan, route))
 
     def _plan(self, route: Route, report: Callable[[str], None]) -> Plan | str:
-        routes, known = [*self.before, route], self.chart.measured
-        if can_join(self.problem, self.options):
-            links = [(link, self._list_ways(link)) for own in routes for link in own.links]
-            given = self.options, self.chart.joined, report, self.jobs, self._bound_aside(route)
-            return join_route(self.problem, links, *given)
-        candidate = make_candidate(self.problem, routes, known)
-        if isinstance(candidate, Failure):
-            return candidate.reason
-        return plan_candidate(candidate, self.options, self.chart.plans)
+        """The plan of a route: what its links make or, of another kind, where these land."""
+        problem, options, ways = self.problem, self.options, self._list_ways
+        joins = can_join(problem, options)
+        if not joins:
+            options = replace(options, objective=Objective.TIME, duration=None, replay=False)
+            problem, options = free_torques(problem, options)
+        if problem is not self.problem:
+            # What was begun of them is of other motors.
+            ways = self._list_unbegun
+        links = [(own, ways(own)) for part in (*self.before, route) for own in part.links]
+        given = options, self.chart.joined, report, self.jobs, self._bound_aside(route)
+        joined = join_route(problem, links, *given)
+        if joins or isinstance(joined, str):
+            return joined
+        own = replace(self.problem, phases=joined.problem.phases, goals=())
+        return plan_phases(own, self.options, self.chart.plans)
 
     def _bound_aside(self, route: Route) -> Aside[BorderBound] | None:
         """A bound of routes along borders, up to more than a plan of a route will take."""
@@ -146,6 +155,9 @@ class Chooser:
         best = self.chart.measured.get(link)
         others = sorted(self.chart.others.get(link, []), key=lambda own: own.duration)
         return [best, *others[:OTHERS]] if isinstance(best, Measured) else []
+
+    def _list_unbegun(self, link: Link) -> list[Measured]:
+        return [own._replace(begun=[]) for own in self._list_ways(link)]
 
     def _look_by(self, rule: Rule, wanted: int, report: Callable[[str], None]) -> None:
         """Look at routes as one rule of thumb leads to them, while one may be better."""

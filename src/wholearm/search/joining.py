@@ -61,8 +61,12 @@ class Aside(Generic[T]):
 
 
 def can_join(problem: Problem, options: PlanOptions) -> bool:
-    """Whether plans from rest to rest make a plan of least time: not where motors are slow."""
-    return options.goal.value == "time" and not problem.scene.has_slow_motors
+    """Whether plans from rest to rest make the plan that is asked for.
+
+    Only of least time, where torques may change at any instant, and at once.
+    """
+    scene = problem.scene
+    return options.goal.value == "time" and not (scene.has_slow_motors or scene.control_period)
 
 
 @exclusive
