@@ -46,7 +46,7 @@ def _gallery(options: argparse.Namespace) -> int:
 
     require_ending(options.output, ".md")
     require_writable(options.output)
-    write_gallery(options.files, options.output, show_progress() or (lambda text: None))
+    write_gallery(options.files, options.output, show_progress())
     clear_progress()
     print(f"wrote {options.output}")
     return 0
@@ -77,7 +77,7 @@ def _animate(options: argparse.Namespace) -> int:
             from ..viewer.movie import Movie, write_movie
 
             movie = Movie(problem, trajectory, ghost, options.speed)
-            write_movie(movie, options.output, show_progress() or (lambda text: None))
+            write_movie(movie, options.output, show_progress())
     clear_progress()
     print(f"wrote {options.output}")
     return 0

@@ -54,7 +54,7 @@ class Lost(str):
 def plan_phases(
     problem: Problem, options: PlanOptions, kept: dict[object, Plan | str]
 ) -> Plan | str:
-    """The plan of a route's phases, or why there is none; `kept` has those that were made before."""
+    """The plan of a route's phases, or why there is none; `kept` has those made before."""
     phases = tuple((phase.formation.names, phase.until, phase.end) for phase in problem.phases)
     key = (tuple(np.round(problem.start, 12).tolist()), phases, repr(options))
     if key not in kept:

@@ -97,7 +97,7 @@ class Chooser:
 
     def plan(self, wanted: int, report: Callable[[str], None]) -> None:
         """Plan the routes that are found, the best first, until there are as many as wanted."""
-        for route in sorted(self.found, key=self._estimate):
+        for route in sorted(self.found, key=self.estimate):
             if len(self.made) >= wanted or len(self.failures) >= TRIED:
                 return
             if self._is_lost(route):
@@ -138,17 +138,18 @@ class Chooser:
         """A bound of routes along borders, up to more than a plan of a route will take."""
         if self.jobs == 1 or self.before or self._bound is not None:
             return None
-        enough = BEYOND * self._estimate(route)
+        enough = BEYOND * self.estimate(route)
         self._bound = enough, Aside(partial(bound_borders, self.search, enough))
         return self._bound[1]
 
-    def bound(self, duration: float) -> BorderBound:
-        """Bound every route along borders from below, up to a duration [s]."""
+    def bound(self, duration: float, in_cells: bool) -> BorderBound:
+        """Bound every route along borders from below; beside one `in_cells`, up to its duration."""
         enough, aside = self._bound or (0.0, None)
         known = aside.result if aside else None
-        if known is None or enough < duration:
-            return bound_borders(self.search, duration)
-        return known.up_to(duration)
+        wanted = duration if in_cells else math.inf
+        if known is None or min(enough, wanted) <= known.value < wanted:
+            return bound_borders(self.search, wanted)
+        return known.up_to(wanted)
 
     def _list_ways(self, link: Link) -> list[Measured]:
         """Ways in which a link through a cell can be gone, the fastest first."""
@@ -164,7 +165,7 @@ class Chooser:
         looked, most = 0, self._measurements + MEASURED
         for route in self.search.run(rule):
             enough = len(self.found) >= wanted
-            if enough and self._estimate(route) > self._best:
+            if enough and self.estimate(route) > self._best:
                 return
             if looked > wanted + TRIED or self._measurements >= most:
                 return
@@ -178,7 +179,7 @@ class Chooser:
     @property
     def _best(self) -> float:
         """About the least time of a route that is found [s]."""
-        return min((self._estimate(own) for own in self.found), default=float("inf"))
+        return min((self.estimate(own) for own in self.found), default=float("inf"))
 
     def _measure(self, route: Route, report: Callable[[str], None]) -> bool:
         """Plan the links of a route that lead through cells; whether all have a plan."""
@@ -205,7 +206,7 @@ class Chooser:
             for k in range(len(route.links))
         )
 
-    def _estimate(self, route: Route) -> float:
+    def estimate(self, route: Route) -> float:
         """About the least time that a plan along all routes may take [s]."""
         total = 0.0
         for link in (link for own in (*self.before, route) for link in own.links):

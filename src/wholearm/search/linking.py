@@ -147,7 +147,7 @@ def _plan_link(
 
 
 def pin_landing(phase: Phase, z: Array) -> Phase:
-    """The phase with its end given by a coordinate of the pose, too, where a contact alone does not.
+    """The phase with a coordinate of the pose at its end, where a contact leaves that open.
 
     That is the one which changes most along the border on which a phase with two freedoms lands. It
     is rounded as a problem file has it.
