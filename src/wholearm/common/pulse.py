@@ -65,6 +65,7 @@ class Reporter:
         self._progress, self.last = progress, "begun"
 
     def __call__(self, text: str) -> None:
+        """Tell it."""
         self.last = text
         if self._progress is not None:
             self._progress(text)

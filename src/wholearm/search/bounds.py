@@ -44,16 +44,16 @@ def bound_borders(search: Search, enough: float = math.inf) -> BorderBound:
 
     Links have their bounds on a coarse grid, until those of the shortest route are all refined.
     """
-    refined = set[Link]()
+    refined, known = set[Link](), dict[Key, list[Link]]()
     while True:
-        found, links = _find_shortest(search, enough, refined)
+        found, links = _find_shortest(search, enough, refined, known)
         if refined.issuperset(links):
             return found
         refined.update(links)
 
 
 def _find_shortest(
-    search: Search, enough: float, refined: set[Link]
+    search: Search, enough: float, refined: set[Link], known: dict[Key, list[Link]]
 ) -> tuple[BorderBound, tuple[Link, ...]]:
     """The shortest route along borders by bounds of its links, and these; none from `enough` on."""
     number, settled = count(), set[Key]()
@@ -72,8 +72,10 @@ def _find_shortest(
         if len(settled) >= MOST:
             return BorderBound(cost, False), ()
         settled.add(place.key)
-        for _, link in search.chart.list_along(place, search.goal):
-            if isinstance(link, Link):
-                own = link.fine_bound if link in refined else ROUGHLY * link.bound
-                heapq.heappush(queue, (cost + own, next(number), link.stop, (*links, link)))
+        if place.key not in known:
+            every = search.chart.list_along(place, search.goal)
+            known[place.key] = [link for _, link in every if isinstance(link, Link)]
+        for link in known[place.key]:
+            own = link.fine_bound if link in refined else ROUGHLY * link.bound
+            heapq.heappush(queue, (cost + own, next(number), link.stop, (*links, link)))
     return BorderBound(enough, True), ()

@@ -1,4 +1,4 @@
-"""What has come of planning routes, and plans of routes whose landings are known, which are kept."""
+"""Routes without a plan, and plans of phases whose landings are known, which are kept."""
 
 from __future__ import annotations
 
