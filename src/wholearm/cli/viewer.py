@@ -104,7 +104,7 @@ def _report(options: argparse.Namespace) -> int:
             paths = [os.path.join(folder, f"{stem}.npz")]
             solve(problem, progress=say).save(paths[0])
         text = Path(options.problem).read_text(encoding="utf-8")
-        content = build_report(problem, paths, text, say or (lambda text: None))
+        content = build_report(problem, paths, text, say)
     write_text(output, content)
     clear_progress()
     print(f"wrote {output}")

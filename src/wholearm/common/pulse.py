@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from .interrupts import check
 from .require import require_number
 
 _listeners: list[Callable[[], object]] = []
@@ -47,6 +48,7 @@ def listen(heard: Callable[[], object]) -> None:
 
 def beat() -> None:
     """Tell listeners that work goes on, and end it with OutOfTime if its time is over."""
+    check()
     for heard in _listeners:
         heard()
     if _deadline is not None and time.monotonic() > _deadline:
