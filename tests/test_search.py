@@ -11,7 +11,7 @@ import pytest
 
 from shipped import HEPTAGON, problem_of
 from wholearm.cli.command import main
-from wholearm.common.errors import InfeasibleError, InputError
+from wholearm.common.errors import InfeasibleError, InputError, SolverError
 from wholearm.common.interrupts import guard, yielding
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phase
@@ -77,7 +77,8 @@ def test_the_first_route_is_about_as_fast_as_its_certified_bounds() -> None:
 def test_no_route_along_borders_is_faster() -> None:
     own, route = to_edge_6()
     bound = bound_borders(own, 1.0)
-    assert bound.complete and 0.99 * route.duration < bound.value <= route.bound * (1 + 1e-9)
+    least = sum(link.fine_bound for link in route.links)
+    assert bound.complete and 0.99 * route.duration < bound.value <= least * (1 + 1e-9)
     assert bound_borders(own, 0.05).value == 0.05
     # A bound up to more says what one up to less does.
     assert bound.up_to(0.05) == bound_borders(own, 0.05) and bound.up_to(1.0) == bound
@@ -184,6 +185,17 @@ def test_ctrl_c_ends_a_search_that_has_an_answer() -> None:
         return 0
 
     assert guard(run) == 0 and reached == ["stopped"]
+
+
+def test_python_and_time_limits_end_a_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(SolverError, match="time limit is over, and there is no plan yet"):
+        find_route(read({"flush": 6}), time_limit=1e-9)
+    monkeypatch.setattr("wholearm.search.choosing.join_route", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        find_route(read({"flush": 6}))
 
 
 def test_a_route_whose_planning_is_interrupted_is_still_there(

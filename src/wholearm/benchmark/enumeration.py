@@ -25,10 +25,10 @@ from typing import Any, NamedTuple
 from ..planning.options import PlanOptions
 from ..planning.result import Plan
 from ..problem.definition import Problem
-from ..search.candidates import Candidate, make_candidate, plan_candidate
 from ..search.chart import Chart
 from ..search.find import Route
 from ..search.goals import is_at
+from ..search.joining import join_route
 from ..search.links import Link
 from ..search.measure import Measured
 from ..search.places import Key, Place, make_place
@@ -185,11 +185,9 @@ def _plan_route(
 ) -> tuple[Plan | None, Link]:
     """The plan of a route; without one, the first link that has none after those before."""
     for count in (len(route.links), *range(1, len(route.links))):
-        part = Route(route.links[:count])
-        candidate = make_candidate(problem, [part], chart.measured)
-        plan: Plan | str = "it cannot be carried out"
-        if isinstance(candidate, Candidate):
-            plan = plan_candidate(candidate, options, chart.plans)
+        known = [(own, chart.measured.get(own)) for own in route.links[:count]]
+        links = [(own, [way] if isinstance(way, Measured) else []) for own, way in known]
+        plan = join_route(problem, links, options, chart.joined, lambda _: None)
         if isinstance(plan, Plan):
             if count == len(route.links):
                 return plan, route.links[-1]

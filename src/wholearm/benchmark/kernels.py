@@ -121,7 +121,7 @@ def answer_all(environment: Environment, paths: Sequence[str]) -> Iterator[tuple
         given = ["--answer", path, objective, str(environment.seed)]
         run = environment.run(["-m", "wholearm.benchmark.kernels", *given])
         if run.returncode:
-            found = {"value": None, "modes": [], "fault": run.stderr.strip()[-300:]}
+            found: dict[str, Any] = {"value": None, "modes": [], "fault": run.stderr.strip()[-300:]}
         else:
             found = json.loads(run.stdout)
         yield f"{Path(path).stem} {objective}", found

@@ -28,8 +28,8 @@ def perturb_scenes(seed: int) -> None:
         _perturb(kind, seed)
 
 
-def _perturb(kind: type, seed: int) -> None:
-    check = getattr(kind.__post_init__, "exact", kind.__post_init__)  # type: ignore[attr-defined]
+def _perturb(kind: Any, seed: int) -> None:
+    check = getattr(kind.__post_init__, "exact", kind.__post_init__)
     names = [field.name for field in fields(kind) if field.init and field.name != "name"]
 
     def check_and_perturb(self: Any) -> None:
@@ -45,7 +45,7 @@ def _perturb(kind: type, seed: int) -> None:
         check(self)
 
     check_and_perturb.exact = check  # type: ignore[attr-defined]
-    kind.__post_init__ = check_and_perturb  # type: ignore[attr-defined]
+    kind.__post_init__ = check_and_perturb
 
 
 def _change(value: Any, label: str) -> Any:

@@ -101,6 +101,7 @@ def add_solve(parser: argparse.ArgumentParser) -> None:
     _add_least_minor(parser)
     add_cache(parser)
     add_jobs(parser)
+    add_time_limit(parser)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
 
 
@@ -108,6 +109,12 @@ def add_jobs(parser: argparse.ArgumentParser) -> None:
     """Add `--jobs` of a search for a goal."""
     text = "processes that a search for a [goal] uses (2, or 1 where there is one core)"
     parser.add_argument("--jobs", metavar="N", type=JOBS, help=text)
+
+
+def add_time_limit(parser: argparse.ArgumentParser) -> None:
+    """Add how long a search or planning may take."""
+    text = "longest time that this may take; a search then returns the best route so far (none)"
+    parser.add_argument("--time-limit", metavar="S", type=number(1e-3, 1e9), help=text)
 
 
 def add_cache(parser: argparse.ArgumentParser) -> None:

@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(given: Sequence[str]) -> int:
     try:
-        named = name_study([protect(text) for text in name_simulator(given)])
+        named = name_study(protect(name_simulator(given)))
         options = build_parser().parse_args(named)
         status: int = options.run(options)
         sys.stdout.flush()
@@ -175,12 +175,14 @@ def _solve(options: argparse.Namespace) -> int:
         raise InputError("", "--cache", "is for problems with [goal]")
     if options.jobs is not None and not problem.goals:
         raise InputError("", "--jobs", "is for problems with [goal]")
+    own = problem, plan_options, show_progress(), options.time_limit
     try:
         if problem.goals:
-            answer = find(problem, plan_options, cache=options.cache, jobs=options.jobs)
+            asked = {key: getattr(options, key) for key in ("cache", "jobs", "time_limit")}
+            answer = find(problem, plan_options, **asked)
             plan, found = answer.plan, answer.to_text()
         else:
-            plan, found = solve_with(problem, plan_options, show_progress()), ""
+            plan, found = solve_with(*own), ""
         table = None if options.torques is None else _make_table(options, plan)
     except WholearmError as error:
         clear_progress()

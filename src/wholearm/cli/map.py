@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from collections.abc import Sequence
 
 from ..common.errors import InputError
 from .origin import tell_origin
@@ -66,7 +67,16 @@ def _read_pair(text: str, key: str, allowed: str) -> tuple[float, float]:
     return first, second
 
 
-def protect(text: str) -> str:
-    """Keep argparse from taking a pair of numbers that starts with a minus for an option."""
-    pair = text[:1] == "-" and text[1:2] in tuple(".0123456789") and "," in text
-    return f" {text}" if pair else text
+def protect(given: Sequence[str]) -> list[str]:
+    """Keep argparse from taking pairs of numbers that start with a minus for options.
+
+    Of several pairs it would take one alone after an equals sign.
+    """
+    texts = list[str]()
+    for text in given:
+        texts += ["--list", text[7:]] if text.startswith("--list=") else [text]
+    return [f" {text}" if _is_pair(text) else text for text in texts]
+
+
+def _is_pair(text: str) -> bool:
+    return text[:1] == "-" and text[1:2] in tuple(".0123456789") and "," in text

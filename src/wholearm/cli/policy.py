@@ -61,7 +61,7 @@ def _policy(options: argparse.Namespace) -> int:
     plan = load_trajectory(options.plan)
     problem = read_own_problem(plan.meta, options.plan)
     given = {key: getattr(options, key) for key in ("reserve", "period", "delay", "torque_limit")}
-    say = show_progress() or (lambda _: None)
+    say = show_progress()
 
     def plan_anew(own: Problem) -> Trajectory:
         return solve(own, replay=False, progress=say).trajectory

@@ -1,15 +1,48 @@
-"""A progress line on stderr, where that is a terminal."""
+"""Progress on stderr: a line that changes in a terminal, and else a line every ten seconds."""
 
 from __future__ import annotations
 
+import os
 import sys
+import time
 from collections.abc import Callable
 
+from ..common.pulse import listen
 
-def show_progress() -> Callable[[str], None] | None:
-    """What shows a progress line, if anybody sees it."""
+EVERY = 10.0
+"""Time between lines where stderr is no terminal [s]."""
+
+
+class _Lines:
+    """Lines for a log: what is being done, for how long already."""
+
+    def __init__(self) -> None:
+        self._process, self._text = os.getpid(), "working"
+        self._begun = self._last = time.monotonic()
+
+    def say(self, text: str) -> None:
+        self._text = text
+        self.look()
+
+    def look(self) -> None:
+        """Print what was said last, if it is time."""
+        now = time.monotonic()
+        # A forked process has the same work, whose progress its parent tells.
+        if now - self._last < EVERY or os.getpid() != self._process:
+            return
+        self._last = now
+        try:
+            print(f"wholearm: {now - self._begun:.0f} s: {self._text}", file=sys.stderr, flush=True)
+        except OSError:
+            pass  # nobody reads it
+
+
+def show_progress() -> Callable[[str], None]:
+    """What shows progress."""
     if not sys.stderr.isatty():
-        return None
+        lines = _Lines()
+        listen(lines.look)
+        return lines.say
 
     def show(text: str) -> None:
         print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
@@ -19,9 +52,7 @@ def show_progress() -> Callable[[str], None] | None:
 
 def announce(text: str) -> None:
     """Show one progress line, if anybody sees it."""
-    show = show_progress()
-    if show is not None:
-        show(text)
+    show_progress()(text)
 
 
 def clear_progress() -> None:

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .arguments import add_cache, add_jobs, number
+from .arguments import add_cache, add_jobs, add_time_limit, number
 from .progress import clear_progress, show_progress
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ def add_route(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--objective", default="time", help=text)
     add_cache(parser)
     add_jobs(parser)
+    add_time_limit(parser)
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
 
 
@@ -47,7 +48,9 @@ def route(options: argparse.Namespace) -> int:
         require_writable(options.output)
     problem = read_problem(options.problem)
     own = PlanOptions(objective=options.objective)
-    answer = find(problem, own, options.alternatives, options.cache, options.jobs)
+    answer = find(
+        problem, own, options.alternatives, options.cache, options.jobs, options.time_limit
+    )
     clear_progress()
     print(json.dumps(answer.to_dict(), indent=2) if options.json else answer.to_text(), end="")
     if options.json:
@@ -64,6 +67,7 @@ def find(
     alternatives: int = 0,
     cache: str | None = None,
     jobs: int | None = None,
+    time_limit: float | None = None,
 ) -> Answer:
     """Find a route, with a progress line."""
     from ..common.errors import WholearmError
@@ -73,11 +77,16 @@ def find(
     count = min(MOST_JOBS, count_cores()) if jobs is None else jobs
     try:
         folder = None if cache is None else Path(cache)
-        given = options, alternatives, show_progress(), folder
-        return find_route_with(problem, *given, jobs=count)
+        given = options, alternatives, show_progress(), folder, count
+        return find_route_with(problem, *given, time_limit=time_limit, hurry=_hurry)
     except WholearmError:
         clear_progress()
         raise
+
+
+def _hurry() -> None:
+    clear_progress()
+    print("wholearm: planning the best route; again to stop", file=sys.stderr, flush=True)
 
 
 def _draw(answer: Answer, output: str) -> None:

@@ -46,7 +46,7 @@ def _gallery(options: argparse.Namespace) -> int:
 
     require_ending(options.output, ".md")
     require_writable(options.output)
-    write_gallery(options.files, options.output, show_progress() or (lambda text: None))
+    write_gallery(options.files, options.output, show_progress())
     clear_progress()
     print(f"wrote {options.output}")
     return 0
@@ -75,7 +75,7 @@ def _animate(options: argparse.Namespace) -> int:
             from ..viewer.movie import Movie, write_movie
 
             movie = Movie(problem, trajectory, ghost, options.speed)
-            write_movie(movie, options.output, show_progress() or (lambda text: None))
+            write_movie(movie, options.output, show_progress())
     clear_progress()
     print(f"wrote {options.output}")
     return 0
@@ -102,7 +102,7 @@ def _report(options: argparse.Namespace) -> int:
             paths = [os.path.join(folder, f"{stem}.npz")]
             solve(problem, progress=say).save(paths[0])
         text = Path(options.problem).read_text(encoding="utf-8")
-        content = build_report(problem, paths, text, say or (lambda text: None))
+        content = build_report(problem, paths, text, say)
     write_text(output, content)
     clear_progress()
     print(f"wrote {output}")

@@ -30,7 +30,7 @@ ENDED = tuple(128 + number for number in _WORDS)
 _guarded = False
 _received: int | None = None
 _holding = _said = False
-_yielding = _pardoned = False
+_yielding = _pardoned = _inside = False
 _ending = threading.RLock()
 """Held while something is done that may not be left half done, ending the process included."""
 _cleanups: list[Callable[[], object]] = []
@@ -98,6 +98,8 @@ def _end_command(
 
 def check() -> None:
     """Raise KeyboardInterrupt if a signal has come, though somebody swallowed it."""
+    if _inside and not _yielding:
+        raise KeyboardInterrupt
     if _guarded and _received is not None and not _holding:
         raise KeyboardInterrupt
 
@@ -122,14 +124,14 @@ def yielding() -> Iterator[None]:
 
     Where somebody swallows it, it is raised at the end.
     """
-    global _yielding
-    errors, _yielding = sys.stderr, True
+    global _yielding, _inside
+    errors, _yielding, _inside = sys.stderr, True, True
     try:
         yield
         if not _yielding:
             raise KeyboardInterrupt
     finally:
-        sys.stderr, _yielding = errors, False
+        sys.stderr, _yielding, _inside = errors, False, False
 
 
 def on_end(cleanup: Callable[[], object]) -> None:

@@ -174,7 +174,10 @@ def _serve(
     near.close()
     # What there is by now is not looked at for garbage, which would copy its pages.
     gc.freeze()
-    results = _take(tasks, source, parent)
+    try:
+        results = _take(tasks, source, parent)
+    except KeyboardInterrupt:
+        return  # The time is over, as its parent finds out and says.
     with suppress(Exception):
         far.send_bytes(_pickle(results, numbers))
 

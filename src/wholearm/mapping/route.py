@@ -129,17 +129,18 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
         if note:
             notes.append(f"leg {leg + 1} goes through cells: {note}")
         for entry in walked:
-            _append(stretches, legs, leg, entry)
-        z = walked[-1][2]
+            _append(stretches, legs, leg, z, entry)
+            z = entry[2]
         here = z[[0, 2]]
     # The end of a leg may be moved to a change of contacts, but not the start.
     stretches[0] = replace(stretches[0], start=origin)
     return Route(tuple(stretches), start, tuple(notes))
 
 
-def _append(stretches: list[Stretch], legs: list[int], leg: int, entry: Walked) -> None:
-    part, (contacts, until), _ = entry
-    stretch = Stretch(contacts, until, part.start, part.stop)
+def _append(stretches: list[Stretch], legs: list[int], leg: int, z: Array, entry: Walked) -> None:
+    """Add the stretch of a phase that starts at `z`."""
+    _, (contacts, until), end = entry
+    stretch = Stretch(contacts, until, z[[0, 2]], end[[0, 2]])
     before = stretches[-1] if stretches and legs[-1] != leg else None
     # On a border a leg may go on where the one before it stopped; a turn back is a phase.
     if before is not None and len(contacts) == 4 and set(before.contacts) == set(contacts):

@@ -25,6 +25,8 @@ from .nearby import tolerance
 
 DIGITS = 1e-5
 """Coordinates that end a phase are rounded to this, in radii of gyration and radians."""
+SAME = 9
+"""Decimals of an angle in degrees beyond which there is rounding only."""
 REPLANS = 12
 """Most times that the rest of a leg is looked at anew from where its phases so far end."""
 BEFORE = 0.98
@@ -214,9 +216,8 @@ def format_until(until: Until) -> str:
     if until.contact is not None and not until.pins:
         return f'"{until.contact}"'
     parts = [] if until.contact is None else [f'contact = "{until.contact}"']
-    digits = math.ceil(-math.log10(math.degrees(DIGITS)))
     for row, value in until.poses:
-        number = round(math.degrees(value), digits) if row else value
+        number = round(math.degrees(value), SAME) if row else value
         parts.append(f"{'phi_deg' if row else 'x'} = {number + 0.0!r}")
     return f"{{ {', '.join(parts)} }}"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from ..common.arrays import Array
 from ..common.errors import SolverError
@@ -29,8 +30,9 @@ def look_ahead(
     plan_block: Callable[..., tuple[Plans, ImpactSequence | None]],
 ) -> CostToGo | None:
     """What follows a block in the time domain, if that decides where on a curve it should end."""
-    planning, options = free_torques(planning, options)
-    problem, index = planning.problem, block[-1].index + 1
+    # How much more what follows costs from farther away is nearly the same, and known soon.
+    problem, options = free_torques(planning.problem, options)
+    planning, index = replace(planning, problem=problem), block[-1].index + 1
     if runs_along_curves(block, options) or index == len(problem.phases):
         return None
     phase, ending = problem.phases[index], block[-1]

@@ -49,17 +49,14 @@ def require_steps(problem: Problem, options: PlanOptions) -> None:
         raise InputError("", given[0][0], f"{given[0][1]:g} given; {why}")
 
 
-def free_torques(planning: Planning, options: PlanOptions) -> tuple[Planning, PlanOptions]:
-    """The same with motors that are quick, and torques that are not held.
-
-    How much more what follows a block costs from farther away is nearly the same, and known soon.
-    """
-    scene = planning.problem.scene
+def free_torques(problem: Problem, options: PlanOptions) -> tuple[Problem, PlanOptions]:
+    """The same with motors that are quick, and torques that are not held."""
+    scene = problem.scene
     if scene.control_period:
         options = replace(options, transcription="auto")
     if scene.has_slow_motors or scene.control_period:
-        planning = replace(planning, problem=planning.problem.with_(FREE))
-    return planning, options
+        problem = problem.with_(FREE)
+    return problem, options
 
 
 def name_motors(scene: Scene) -> str:
@@ -100,10 +97,11 @@ def explain_motors(
     where = name_phases([phase.number for phase in block])
     if isinstance(error, InfeasibleError):
         where += f" ({'; '.join(' '.join(phase.formation.names) for phase in block)})"
-    free, own = free_torques(replace(planning, curves=()), options)
+    free, own = free_torques(planning.problem, options)
     own = replace(own, accuracy=max(own.accuracy, _ROUGH))
     try:
-        found = plan_block(free, [free.problem.phases[phase.index] for phase in block], own)
+        phases = [free.phases[phase.index] for phase in block]
+        found = plan_block(replace(planning, problem=free, curves=()), phases, own)
     except WholearmError as other:
         return _say(error, f"{error}; without {keys} none was found either: {other}")
     lasts = sum(plan.motion.duration for plan in found)

@@ -13,7 +13,8 @@ import casadi as ca
 import numpy as np
 
 from .. import __version__
-from ..common.errors import InfeasibleError
+from ..common.errors import InfeasibleError, SolverError
+from ..common.pulse import OutOfTime, Reporter, limited
 from ..common.sharing import exclusive
 from ..geometry.curve import Curve
 from ..geometry.tracing import trace_phases
@@ -42,6 +43,7 @@ def solve(
     objective: str = "time",
     *,
     progress: Callable[[str], None] | None = None,
+    time_limit: float | None = None,
     **options: Any,
 ) -> Plan:
     """Plan joint torques that carry the object through every phase of a problem.
@@ -54,6 +56,8 @@ def solve(
         largest least normal force within `duration`.
     progress : callable, optional
         Told in a few words what is being done.
+    time_limit : float, optional, [s]
+        Longest time that planning may take.
     accuracy : float, default 1e-4
         Relative error of the objective, from 1e-8 to 0.1, below whose estimate refining ends.
     intervals : int, optional
@@ -100,17 +104,34 @@ def solve(
         If an option is out of its range or the problem's phases cannot be traced.
     InfeasibleError, JammingError, SolverError, ReplayError
         If there is no plan, or none that holds in its replay; names phase, limit, place and time.
+        A SolverError says what was being done when the time was over.
     """
-    return solve_with(problem, PlanOptions(objective=objective, **options), progress)
+    own = PlanOptions(objective=objective, **options)
+    return solve_with(problem, own, progress, time_limit)
 
 
 @exclusive
 def solve_with(
-    problem: Problem, options: PlanOptions, progress: Callable[[str], None] | None = None
+    problem: Problem,
+    options: PlanOptions,
+    progress: Callable[[str], None] | None = None,
+    time_limit: float | None = None,
 ) -> Plan:
     """Plan with `options` given as one object; see `solve`."""
     require_phases(problem)
-    report = progress or (lambda _: None)
+    report = Reporter(progress)
+    try:
+        with limited(time_limit):
+            return _solve(problem, options, report)
+    except OutOfTime:
+        if time_limit is None:
+            raise
+        text = f"the time limit of {time_limit:g} s is over, and there is no plan yet"
+        raise SolverError(f"{text}; what it was at: {report.last}") from None
+
+
+def _solve(problem: Problem, options: PlanOptions, report: Callable[[str], None]) -> Plan:
+    """Plan a problem with phases."""
     options = options.scale_ranges(problem.ranges)
     if problem.scene.control_period:
         options = replace(options, transcription="time")

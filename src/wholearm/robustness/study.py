@@ -23,7 +23,6 @@ from ..common.arrays import Array
 from ..common.bounds import Bounds
 from ..common.brief import write_brief
 from ..common.crowd import DiedError, run_all
-from ..common.errors import InputError
 from ..common.journal import Journal
 from ..common.workers import Spawning
 from ..policy.policy import Policy

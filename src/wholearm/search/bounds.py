@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import heapq
+import math
 from itertools import count
 from typing import NamedTuple
 
+from ..common.pulse import beat
 from .find import Search
 from .goals import is_at
-from .links import Link
+from .links import ROUGHLY, Link
 from .places import Key, Place
 
 MOST = 240
@@ -37,22 +39,43 @@ class BorderBound(NamedTuple):
         return self if self.value < enough else BorderBound(enough, True)
 
 
-def bound_borders(search: Search, enough: float) -> BorderBound:
-    """Bound every route along borders from below, up to `enough` [s]."""
+def bound_borders(search: Search, enough: float = math.inf) -> BorderBound:
+    """Bound every route along borders from below, up to `enough` [s].
+
+    Links have their bounds on a coarse grid, until those of the shortest route are all refined.
+    """
+    refined, known = set[Link](), dict[Key, list[Link]]()
+    while True:
+        found, links = _find_shortest(search, enough, refined, known)
+        if refined.issuperset(links):
+            return found
+        refined.update(links)
+
+
+def _find_shortest(
+    search: Search, enough: float, refined: set[Link], known: dict[Key, list[Link]]
+) -> tuple[BorderBound, tuple[Link, ...]]:
+    """The shortest route along borders by bounds of its links, and these; none from `enough` on."""
     number, settled = count(), set[Key]()
-    queue: list[tuple[float, int, Place]] = [(0.0, next(number), search.start)]
+    queue: list[tuple[float, int, Place, tuple[Link, ...]]] = [
+        (0.0, next(number), search.start, ())
+    ]
     while queue:
-        cost, _, place = heapq.heappop(queue)
+        beat()
+        cost, _, place, links = heapq.heappop(queue)
         if cost >= enough:
-            return BorderBound(enough, True)
-        if cost > 0 and is_at(place, search.goal):
-            return BorderBound(cost, True)
+            return BorderBound(enough, True), ()
+        if is_at(place, search.goal):
+            return BorderBound(cost, True), links
         if place.key in settled:
             continue
         if len(settled) >= MOST:
-            return BorderBound(cost, False)
+            return BorderBound(cost, False), ()
         settled.add(place.key)
-        for _, link in search.chart.list_along(place, search.goal):
-            if isinstance(link, Link):
-                heapq.heappush(queue, (cost + link.bound, next(number), link.stop))
-    return BorderBound(enough, True)
+        if place.key not in known:
+            every = search.chart.list_along(place, search.goal)
+            known[place.key] = [link for _, link in every if isinstance(link, Link)]
+        for link in known[place.key]:
+            own = link.fine_bound if link in refined else ROUGHLY * link.bound
+            heapq.heappush(queue, (cost + own, next(number), link.stop, (*links, link)))
+    return BorderBound(enough, True), ()

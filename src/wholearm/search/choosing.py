@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
-from ..planning.options import PlanOptions
+from ..planning.motors import free_torques
+from ..planning.options import Objective, PlanOptions
 from ..planning.result import Plan
 from ..problem.definition import Problem
 from .bounds import BorderBound, bound_borders
-from .candidates import Failure, Lost, make_candidate, plan_candidate
+from .candidates import Failure, Lost, plan_phases
 from .find import CAREFUL, EAGER, Route, Rule, Search
 from .joining import Aside, can_join, join_route
 from .links import Link, describe_steps
@@ -95,7 +97,7 @@ class Chooser:
 
     def plan(self, wanted: int, report: Callable[[str], None]) -> None:
         """Plan the routes that are found, the best first, until there are as many as wanted."""
-        for route in sorted(self.found, key=self._estimate):
+        for route in sorted(self.found, key=self.estimate):
             if len(self.made) >= wanted or len(self.failures) >= TRIED:
                 return
             if self._is_lost(route):
@@ -115,31 +117,39 @@ class Chooser:
                 self.made.append((plan, route))
 
     def _plan(self, route: Route, report: Callable[[str], None]) -> Plan | str:
-        routes, known = [*self.before, route], self.chart.measured
-        if can_join(self.problem, self.options):
-            links = [(link, self._list_ways(link)) for own in routes for link in own.links]
-            given = self.options, self.chart.joined, report, self.jobs, self._bound_aside(route)
-            return join_route(self.problem, links, *given)
-        candidate = make_candidate(self.problem, routes, known)
-        if isinstance(candidate, Failure):
-            return candidate.reason
-        return plan_candidate(candidate, self.options, self.chart.plans)
+        """The plan of a route: what its links make or, of another kind, where these land."""
+        problem, options, ways = self.problem, self.options, self._list_ways
+        joins = can_join(problem, options)
+        if not joins:
+            options = replace(options, objective=Objective.TIME, duration=None, replay=False)
+            problem, options = free_torques(problem, options)
+        if problem is not self.problem:
+            # What was begun of them is of other motors.
+            ways = self._list_unbegun
+        links = [(own, ways(own)) for part in (*self.before, route) for own in part.links]
+        given = options, self.chart.joined, report, self.jobs, self._bound_aside(route)
+        joined = join_route(problem, links, *given)
+        if joins or isinstance(joined, str):
+            return joined
+        own = replace(self.problem, phases=joined.problem.phases, goals=())
+        return plan_phases(own, self.options, self.chart.plans)
 
     def _bound_aside(self, route: Route) -> Aside[BorderBound] | None:
         """A bound of routes along borders, up to more than a plan of a route will take."""
         if self.jobs == 1 or self.before or self._bound is not None:
             return None
-        enough = BEYOND * self._estimate(route)
+        enough = BEYOND * self.estimate(route)
         self._bound = enough, Aside(partial(bound_borders, self.search, enough))
         return self._bound[1]
 
-    def bound(self, duration: float) -> BorderBound:
-        """Bound every route along borders from below, up to a duration [s]."""
+    def bound(self, duration: float, in_cells: bool) -> BorderBound:
+        """Bound every route along borders from below; beside one `in_cells`, up to its duration."""
         enough, aside = self._bound or (0.0, None)
         known = aside.result if aside else None
-        if known is None or enough < duration:
-            return bound_borders(self.search, duration)
-        return known.up_to(duration)
+        wanted = duration if in_cells else math.inf
+        if known is None or min(enough, wanted) <= known.value < wanted:
+            return bound_borders(self.search, wanted)
+        return known.up_to(wanted)
 
     def _list_ways(self, link: Link) -> list[Measured]:
         """Ways in which a link through a cell can be gone, the fastest first."""
@@ -147,12 +157,15 @@ class Chooser:
         others = sorted(self.chart.others.get(link, []), key=lambda own: own.duration)
         return [best, *others[:OTHERS]] if isinstance(best, Measured) else []
 
+    def _list_unbegun(self, link: Link) -> list[Measured]:
+        return [own._replace(begun=[]) for own in self._list_ways(link)]
+
     def _look_by(self, rule: Rule, wanted: int, report: Callable[[str], None]) -> None:
         """Look at routes as one rule of thumb leads to them, while one may be better."""
         looked, most = 0, self._measurements + MEASURED
         for route in self.search.run(rule):
             enough = len(self.found) >= wanted
-            if enough and self._estimate(route) > self._best:
+            if enough and self.estimate(route) > self._best:
                 return
             if looked > wanted + TRIED or self._measurements >= most:
                 return
@@ -166,7 +179,7 @@ class Chooser:
     @property
     def _best(self) -> float:
         """About the least time of a route that is found [s]."""
-        return min((self._estimate(own) for own in self.found), default=float("inf"))
+        return min((self.estimate(own) for own in self.found), default=float("inf"))
 
     def _measure(self, route: Route, report: Callable[[str], None]) -> bool:
         """Plan the links of a route that lead through cells; whether all have a plan."""
@@ -193,7 +206,7 @@ class Chooser:
             for k in range(len(route.links))
         )
 
-    def _estimate(self, route: Route) -> float:
+    def estimate(self, route: Route) -> float:
         """About the least time that a plan along all routes may take [s]."""
         total = 0.0
         for link in (link for own in (*self.before, route) for link in own.links):

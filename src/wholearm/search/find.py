@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from itertools import count
 from typing import NamedTuple
 
+from ..common.pulse import beat
 from ..problem.goal import Goal
 from .chains import Chain
 from .chart import Ahead, Chart
@@ -151,6 +152,7 @@ class Search:
         for _ in range(MOST):
             if not queue:
                 return
+            beat()
             cost, _, _, route, place, work = heapq.heappop(queue)
             if cost > self.limit or len(times) > rule.most:
                 return

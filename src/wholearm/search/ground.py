@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
-from ..contacts.formation import Kinematics
+from ..contacts.formation import Formation, Kinematics
 from ..geometry.curve import Curve, CurvePoint, describe_pose
 from ..mechanics.dynamics import Directions, reduced_inertia
 from ..mechanics.metric import metric_weights
@@ -183,10 +183,23 @@ def _find_ambiguity(
     if not bad.any():
         return "", curve.length
     first = s[bad].min()
+    least_place = int(np.where(bad, s, np.inf).argmin())
     clear = float(s[s < first].max(initial=0.0))
-    if lost.any():
-        return DEPENDENT, clear
-    if inertia.min() <= 0:
+    if lost[s == first].any():
+        return _describe_dependence(formation, at.z[least_place]), clear
+    if inertia[~lost].min() <= 0:
         return "friction jams it", clear
     ratio, names, row = minors.find_least()
     return f"{names} ambiguous: minor {ratio:.2f} at {describe_pose(at.z[row])}", clear
+
+
+def _describe_dependence(formation: Formation, z: Array) -> str:
+    """Where contacts depend on each other, and which limit of theirs is met there."""
+    values = formation.evaluate_limits(z[None])[0]
+    met = [
+        limit.text
+        for limit, value in zip(formation.limits, values, strict=True)
+        if abs(value) < formation.scene.touching
+    ]
+    reason = f": {met[0]}" if met else ""
+    return f"{DEPENDENT} at {describe_pose(z)}{reason}"

@@ -7,7 +7,6 @@ by one. Where a link lands on a border is left open: it is chosen with regard to
 from __future__ import annotations
 
 import time
-from collections import ChainMap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -61,8 +60,12 @@ class Aside(Generic[T]):
 
 
 def can_join(problem: Problem, options: PlanOptions) -> bool:
-    """Whether plans from rest to rest make a plan of least time: not where motors are slow."""
-    return options.goal.value == "time" and not problem.scene.has_slow_motors
+    """Whether plans from rest to rest make the plan that is asked for.
+
+    Only of least time, where torques may change at any instant, and at once.
+    """
+    scene = problem.scene
+    return options.goal.value == "time" and not (scene.has_slow_motors or scene.control_period)
 
 
 @exclusive
@@ -194,14 +197,14 @@ def _plan_part(
     kept: Kept,
 ) -> dict[Key, PlannedLink | str]:
     """What there is to keep of links, by their numbers, planned one after the other."""
-    own = ChainMap[Key, PlannedLink | str]({}, kept)
-    z = links[part[0]][0].start.z if part[0] else problem.start
+    # What is planned here is kept at once: an interrupt loses none of it.
+    before, z = set(kept), links[part[0]][0].start.z if part[0] else problem.start
     for k in part:
-        planned = _plan_one(problem, links, k, z, options, own, lambda _: None)
+        planned = _plan_one(problem, links, k, z, options, kept, lambda _: None)
         if isinstance(planned, str):
             break
         z = planned.end
-    return dict(own.maps[0])
+    return {key: kept[key] for key in set(kept) - before}
 
 
 def _plan_links(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, MutableMapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -9,22 +10,27 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError, WholearmError, name_source
+from ..contacts.formation import Formation
 from ..geometry.curve import Curve
+from ..geometry.path_guess import count_freedoms
 from ..geometry.tracing import trace_phase
 from ..planning.block_plan import BEGUN, BlockPlan, Planning
 from ..planning.blocks import plan_next
 from ..planning.options import PlanOptions
 from ..planning.splitting import split_blocks
-from ..problem.definition import End, Phase, Problem
+from ..planning.stops import end_of
+from ..problem.definition import ROWS, End, Phase, Problem
 from ..scene.model import Scene
 from ..solvers.statistics import SolverStatistics, open_ledger
-from .links import Link, Step, describe_steps, point_out
+from .links import Link, Step, describe_steps, find_headings, point_out
 from .measure import SINGULAR, Measured, make_phases
 from .places import measure_apart
 
 OFF = 1e-4
 """Distance from the end of a border's link from which on it is another end, in radii of gyration or
 radians."""
+PINNED = 1e-9
+"""Coordinates at which landings are pinned are rounded to this, in the same unit."""
 SAME = 9
 """Decimals of configurations that are one, in the same unit."""
 
@@ -133,7 +139,34 @@ def _plan_link(
                 begun = BlockPlan(part, start, BEGUN, None, [], list(measured.begun), None)
             made = plan_next(made, 0, begun, report)
     costs = tuple(ledger.of(phase.number) for phase in phases[:count])
-    return PlannedLink(tuple(phases[:count]), made.blocks, costs)
+    pinned = [
+        pin_landing(phase, end_of(plan)[0])
+        for phase, plan in zip(phases[:count], made.plans, strict=True)
+    ]
+    return PlannedLink(tuple(pinned), made.blocks, costs)
+
+
+def pin_landing(phase: Phase, z: Array) -> Phase:
+    """The phase with a coordinate of the pose at its end, where a contact leaves that open.
+
+    That is the one which changes most along the border on which a phase with two freedoms lands. It
+    is rounded as a problem file has it.
+
+    Parameters
+    ----------
+    phase : Phase
+    z : ndarray, shape (5,)
+        Where it ends.
+    """
+    until, formation = phase.until, phase.formation
+    if until.contact is None or until.pins or count_freedoms(formation, z) < 2:
+        return phase
+    length = formation.scene.scales.length
+    border = Formation(formation.scene, (*formation.contacts, until.contact), formation.rolling)
+    x, _, phi, *_ = np.abs(find_headings(border, z) or np.eye(5))[0]
+    name, digits = ("x", length) if x > length * phi else ("phi", 1.0)
+    value = round(float(z[ROWS[name]]), math.ceil(-math.log10(PINNED * digits)))
+    return replace(phase, until=replace(until, pins=((name, value),)))
 
 
 def _aim(phase: Phase, z: Array, link: Link) -> tuple[Phase, Curve]:

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ..common.errors import InfeasibleError, InputError
+from ..common.errors import InfeasibleError, InputError, SolverError
 from ..common.interrupts import yielding
+from ..common.pulse import OutOfTime, Reporter, limited
 from ..common.sharing import exclusive
 from ..planning.options import Objective, PlanOptions
 from ..problem.definition import Problem
@@ -42,6 +43,7 @@ def find_route(
     progress: Callable[[str], None] | None = None,
     cache: str | Path | None = None,
     jobs: int = 1,
+    time_limit: float | None = None,
     **options: Any,
 ) -> Answer:
     """Find the contact formations that lead from a problem's start to its goals, and a plan.
@@ -62,6 +64,8 @@ def find_route(
     jobs : int
         Most processes at the same time; others than this one are forked. What is found does not
         depend on it.
+    time_limit : float, optional, [s]
+        Longest time that the search may take; then the best route so far is returned.
     **options
         As `wholearm.solve` takes them.
 
@@ -71,12 +75,15 @@ def find_route(
         If the problem has no goals, or an option is out of its range.
     InfeasibleError
         If nothing leads to a goal; names what blocks the way.
+    SolverError
+        If the time is over before there is a plan; names what is missing.
     """
     if jobs < 1:
         raise InputError("", "jobs", f"{jobs} given; allowed is 1 or more")
     own = PlanOptions(objective=objective, **options)
     folder = None if cache is None else Path(cache)
-    return find_route_with(problem, own, alternatives, progress, folder, jobs=jobs)
+    given = problem, own, alternatives, progress, folder, jobs
+    return find_route_with(*given, time_limit=time_limit)
 
 
 @exclusive
@@ -87,11 +94,31 @@ def find_route_with(
     progress: Callable[[str], None] | None = None,
     cache: Path | None = None,
     jobs: int = 1,
+    *,
+    time_limit: float | None = None,
+    hurry: Callable[[], None] | None = None,
 ) -> Answer:
-    """Find a route with `options` given as one object; see `find_route`."""
+    """Find a route with `options` given as one object; see `find_route`.
+
+    With `hurry` an interrupt ends the search alone: the best route so far is returned, or planned,
+    which `hurry` is called before. Without it KeyboardInterrupt is raised.
+    """
+    with limited(time_limit):
+        return _find(problem, options, alternatives, Reporter(progress), cache, jobs, hurry)
+
+
+def _find(
+    problem: Problem,
+    options: PlanOptions,
+    alternatives: int,
+    report: Reporter,
+    cache: Path | None,
+    jobs: int,
+    hurry: Callable[[], None] | None,
+) -> Answer:
+    """Find a route from goal to goal."""
     if not problem.goals:
         raise InputError(problem.source, "goal", "is missing; allowed is flush or phi_deg, and x")
-    report = progress or (lambda _: None)
     if cache is not None:
         require_folder(cache)
     chart, before = get_chart(problem, options, cache), list[Route]()
@@ -104,7 +131,7 @@ def find_route_with(
         require_reach(problem.scene, goal, float(start[2]))
         search = Search(chart, place, goal)
         wanted = alternatives if index + 1 == len(problem.goals) else 0
-        answer = _choose(problem, before, search, options, wanted, report, jobs)
+        answer = _choose(problem, before, search, options, wanted, report, jobs, hurry)
         before = [*before, answer.route]
     if cache is not None:
         store_chart(cache, key_chart(problem, options), chart)
@@ -144,14 +171,26 @@ def _refuse(
     return InfeasibleError(text, changes=changes)
 
 
+def _describe_missing(chooser: Chooser, doing: str) -> str:
+    """What a search that is out of time has found, and what it was at."""
+    text = f"the time limit is over, and there is no plan yet: {chooser.search.settled} places"
+    text += " looked at"
+    if chooser.found:
+        best = min(chooser.found, key=chooser.estimate)
+        count = sum(len(link.steps) for link in best.links)
+        text += f", a route of {count} phases found, of about {chooser.estimate(best):.3g} s"
+    return f"{text}; what it was at: {doing}"
+
+
 def _choose(
     problem: Problem,
     before: list[Route],
     search: Search,
     options: PlanOptions,
     alternatives: int,
-    report: Callable[[str], None],
+    report: Reporter,
     jobs: int,
+    hurry: Callable[[], None] | None,
 ) -> Answer:
     """Plan routes to one goal, and say how good the best one is."""
     chooser, complete = Chooser(problem, before, search, options, jobs), True
@@ -159,11 +198,18 @@ def _choose(
         with yielding():
             report("looking for routes")
             chooser.run(1 + alternatives, report)
+    except OutOfTime:
+        if not chooser.made:
+            raise SolverError(_describe_missing(chooser, report.last)) from None
+        complete = False
     except KeyboardInterrupt:
-        if not (chooser.made or chooser.found):
+        if hurry is None or not (chooser.made or chooser.found):
             raise
         complete = False
-        chooser.plan(1, report)
+        if not chooser.made:
+            hurry()
+            chooser.hurried = True
+            chooser.plan(1, report)
     except np.linalg.LinAlgError:
         # Contacts depend on each other at a place that the search came to.
         complete = False
@@ -178,8 +224,10 @@ def _choose(
     if complete and not before:
         try:
             with yielding():
-                bound = chooser.bound(plan.duration)
-        except KeyboardInterrupt:
+                bound = chooser.bound(plan.duration, route.in_cells)
+        except KeyboardInterrupt as error:
+            if hurry is None and not isinstance(error, OutOfTime):
+                raise
             complete = False
     return Answer(
         plan,

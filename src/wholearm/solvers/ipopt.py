@@ -12,6 +12,7 @@ import numpy as np
 
 from ..common.arrays import Expression
 from ..common.interrupts import check
+from ..common.pulse import beat
 from .statistics import SolverStatistics, book
 
 STOPPED = "User_Requested_Stop"
@@ -119,8 +120,9 @@ class Solver:
         Raises
         ------
         KeyboardInterrupt
-            If a signal stopped the solver.
+            If a signal stopped the solver, or the time is over (`OutOfTime`).
         """
+        beat()
         # CasADi takes lists in three times as fast as arrays.
         given = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in arguments.items()}
         result: dict[str, Expression] = self.function(**given)
