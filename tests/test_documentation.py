@@ -100,7 +100,7 @@ def test_shell_lines_are_read(line: str, folder: Path, monkeypatch: pytest.Monke
         if len(words) == 2:
             words.append("--help")
         try:
-            build_parser().parse_args(name_study([protect(w) for w in name_simulator(words[1:])]))
+            build_parser().parse_args(name_study(protect(name_simulator(words[1:]))))
         except SystemExit as error:
             assert error.code == 0
     elif words[0] == "python":

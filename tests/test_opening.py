@@ -76,4 +76,4 @@ def test_what_is_advised_opens_the_way() -> None:
         Search(Chart(eased, 0.1), make_place(eased.scene, eased.start), goal).run()
     ).duration == pytest.approx(float(text.split()[-2]), rel=0.05)
     said = describe_block(own, [], text, lambda blocked: explain(rough, PlanOptions(), blocked))
-    assert "all blocked; v0-palm" in said and said.endswith(text) and " N short; " in said
+    assert "blocked; v0-palm" in said and said.endswith(text) and " N short; " in said

@@ -157,7 +157,8 @@ def test_sensitivities_are_those_of_the_simulator_that_is_told_contacts(
 
 def test_the_figure_shows_every_sample(study: Robustness) -> None:
     motion, ends = draw_robustness(study).axes
-    assert (motion.get_xlabel(), ends.get_xlabel()) == ("x [mm]", "distance from the goal [mm]")
+    assert motion.get_xlabel() == "x [mm]"
+    assert ends.get_xlabel().startswith("distance from the goal [mm]")
     _, labels = ends.get_legend_handles_labels()
     assert sum(int(label.rpartition(" ")[2]) for label in labels) == 5
 

@@ -202,7 +202,7 @@ def test_failures_that_no_limit_explains_are_the_solvers() -> None:
     text = str(failed)
     assert text.startswith("no plan for phases 1 and 2 (") and "Restoration_Failed" in text
     assert all(name in text for name in problem.phases[0].formation.names)
-    assert text.endswith("; try other time_intervals") and "\n" not in text
+    assert text.endswith("intervals per phase (--time-intervals)") and "\n" not in text
 
 
 def test_the_motion_that_is_short_of_least_is_described() -> None:

@@ -116,7 +116,8 @@ def test_a_rolling_contact_is_mended(kind: str, first: float, second: float) -> 
     (loss,) = (loss for loss in report.help.losses if loss.kind == kind)
     k = [force.contact for force in loss.forces].index(loss.contact)
     mu = problem.phases[loss.phase - 1].formation.friction[k]
-    assert abs(loss.forces[k].c_t) > mu * loss.forces[k].c_n
+    # It slips at the edge of its cone, or beyond.
+    assert abs(loss.forces[k].c_t) > mu * loss.forces[k].c_n * (1 - 1e-6)
     mend = loss.changes[0]
     assert not mend.but
     assert isinstance(report.replay, Simulation)

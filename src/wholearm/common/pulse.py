@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from .interrupts import check
-from .require import require_number
 
 _listeners: list[Callable[[], object]] = []
 _deadline: float | None = None
@@ -33,6 +32,9 @@ def limited(seconds: float | None) -> Iterator[None]:
     if seconds is None:
         yield
         return
+    # It needs NumPy, which bad input on a command line does not wait for.
+    from .require import require_number
+
     end = time.monotonic() + require_number(seconds, "time_limit", positive=True)
     outer, _deadline = _deadline, end if _deadline is None else min(end, _deadline)
     try:
