@@ -78,7 +78,7 @@ def test_the_motion_that_misses_least_is_there(along: InfeasibleError, tmp_path:
     assert 6.0 - at == pytest.approx(worst.amount, rel=1e-3)
     motion.save(tmp_path / "a.npz")
     figure = plots.force_margins(load_trajectory(tmp_path / "a.npz"))
-    texts = [text.get_text().replace("\n", " ") for text in figure.texts]
+    texts = [" ".join(text.get_text().split()) for text in figure.texts]
     assert any("misses limits least" in text for text in texts)
 
 
