@@ -36,7 +36,7 @@ from .origin import tell_origin
 from .overlay import overlay
 from .policy import add_policy
 from .predict import predict
-from .progress import announce, clear_progress, show_progress
+from .progress import announce, clear_progress, progress_log, show_progress
 from .robustness import add_robustness
 from .route import add_route, find, route
 from .tune import tune
@@ -69,7 +69,8 @@ def _run(given: Sequence[str]) -> int:
     try:
         named = name_study(protect(name_simulator(given)))
         options = build_parser().parse_args(named)
-        status: int = options.run(options)
+        with progress_log():
+            status: int = options.run(options)
         sys.stdout.flush()
         return status
     except WholearmError as error:

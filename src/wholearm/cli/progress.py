@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 from ..common.pulse import listen
 
@@ -17,7 +18,12 @@ class _Lines:
     """Lines for a log: what is being done, for how long already."""
 
     def __init__(self) -> None:
-        self._process, self._text = os.getpid(), "working"
+        listen(self.look)
+        self.begin(0)
+
+    def begin(self, process: int) -> None:
+        """Count from now on, for the work of a process."""
+        self._process, self._text = process, "working"
         self._begun = self._last = time.monotonic()
 
     def say(self, text: str) -> None:
@@ -37,12 +43,25 @@ class _Lines:
             pass  # nobody reads it
 
 
+_LINES = _Lines()
+"""Those of the command, which may show progress of several things."""
+
+
+@contextmanager
+def progress_log() -> Iterator[None]:
+    """Where stderr is no terminal, have a line logged every ten seconds of a command."""
+    if not sys.stderr.isatty():
+        _LINES.begin(os.getpid())
+    try:
+        yield
+    finally:
+        _LINES.begin(0)
+
+
 def show_progress() -> Callable[[str], None]:
     """What shows progress."""
     if not sys.stderr.isatty():
-        lines = _Lines()
-        listen(lines.look)
-        return lines.say
+        return _LINES.say
 
     def show(text: str) -> None:
         print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)

@@ -50,6 +50,8 @@ def find_differences(
 
 def _write(value: Any) -> str:
     text = "nothing" if value is None else repr(value)
+    if isinstance(value, float):
+        text = f"{value:.12g}"
     return text if len(text) <= 40 else f"{text[:37]}..."
 
 
