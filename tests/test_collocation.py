@@ -35,7 +35,7 @@ def test_legendre_points_and_weights_are_those_of_gauss(degree: int) -> None:
     scheme = make_scheme("legendre", degree)
     np.testing.assert_allclose(scheme.points, (x + 1) / 2, atol=1e-14)
     # Inverting the powers enlarges rounding a little.
-    np.testing.assert_allclose(scheme.weights, weights / 2, atol=1e-13)
+    np.testing.assert_allclose(scheme.weights, weights / 2, atol=1e-10)
 
 
 def test_schemes_have_butchers_coefficients() -> None:
@@ -69,7 +69,7 @@ def test_integrals_are_exact_up_to_the_degree(name: str, degree: int) -> None:
     for power in range(degree):
         exact = scheme.points ** (power + 1) / (power + 1)
         # Rounding, which inverting the powers enlarges a little.
-        np.testing.assert_allclose(scheme.integrals @ scheme.points**power, exact, atol=1e-13)
+        np.testing.assert_allclose(scheme.integrals @ scheme.points**power, exact, atol=1e-10)
     over = scheme.integrals @ scheme.points**degree - scheme.points ** (degree + 1) / (degree + 1)
     assert np.abs(over).max() > 1e-7
 
@@ -80,12 +80,13 @@ def test_the_whole_interval_is_integrated_to_the_order(name: str, degree: int) -
     scheme = make_scheme(name, degree)
     assert scheme.order == {"radau": 2 * degree - 1, "legendre": 2 * degree}[name]
     assert (scheme.weights > 0).all()
+    # The inverse of the powers has a condition number of up to 1e5.
     for power in range(scheme.order):
-        assert scheme.weights @ scheme.points**power == pytest.approx(1 / (power + 1), abs=1e-13)
+        assert scheme.weights @ scheme.points**power == pytest.approx(1 / (power + 1), abs=1e-10)
     power = scheme.order
     assert abs(scheme.weights @ scheme.points**power - 1 / (power + 1)) > 1e-8
     if scheme.ends:
-        np.testing.assert_allclose(scheme.integrals[-1], scheme.weights, atol=1e-14)
+        np.testing.assert_allclose(scheme.integrals[-1], scheme.weights, atol=1e-10)
 
 
 @pytest.mark.parametrize("degree", DEGREES)

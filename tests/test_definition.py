@@ -93,7 +93,7 @@ def test_defaults() -> None:
 
     problem = read_edited(edit)
     finger = problem.scene.fingers[0]
-    assert (problem.name, problem.scene.gravity) == ("unnamed", 9.81)
+    assert problem.name == "unnamed" and problem.scene.gravity == pytest.approx(9.81)
     assert (finger.viscous, finger.dry, finger.speed_limit) == (0.0, 0.0, math.inf)
     assert problem.scene.speed_limit.tolist() == [math.inf, math.inf]
 

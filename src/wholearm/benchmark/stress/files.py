@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import re
 import tempfile
 import traceback
 import warnings
@@ -17,6 +18,7 @@ from .plans import Finding
 
 STATUSES = (0, 1, 2)
 LONGEST = 2000
+_PROGRESS = re.compile(r"wholearm: \d+ s: ")
 """Longest line on stderr that still counts as clear."""
 
 
@@ -103,7 +105,7 @@ def look(
 ) -> list[Finding]:
     """What is wrong with how a command ended."""
     texts = []
-    lines = err.rstrip("\n").split("\n") if err.strip() else []
+    lines = [line for line in err.splitlines() if not _PROGRESS.match(line)]
     if status not in STATUSES:
         texts.append(f"exit status {status}")
     if status == 0 and lines:
