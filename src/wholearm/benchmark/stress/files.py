@@ -18,8 +18,9 @@ from .plans import Finding
 
 STATUSES = (0, 1, 2)
 LONGEST = 2000
-_PROGRESS = re.compile(r"wholearm: \d+ s: ")
 """Longest line on stderr that still counts as clear."""
+PROGRESS = re.compile(r"wholearm: \d+ s: ")
+"""Lines that tell how long work goes on already."""
 
 
 def run_file(task: tuple[int, int]) -> dict[str, Any]:
@@ -105,7 +106,7 @@ def look(
 ) -> list[Finding]:
     """What is wrong with how a command ended."""
     texts = []
-    lines = [line for line in err.splitlines() if not _PROGRESS.match(line)]
+    lines = [line for line in err.splitlines() if not PROGRESS.match(line)]
     if status not in STATUSES:
         texts.append(f"exit status {status}")
     if status == 0 and lines:
