@@ -345,6 +345,8 @@ def rolling_states(
             kinematics = formation.evaluate(z, z)
             v = 0.3 * np.linalg.svd(kinematics.P[0])[2][-1]
             slip = kinematics.A_t[0] @ v
+            if np.abs(np.delete(slip, formation.rolling_rows)).min() < 1e-9:
+                continue  # The other vertex of a flush edge does not slide either: it has no sign.
             yield formation, z[0], v, Directions(np.sign(slip), np.sign(v[3:]))
 
 
