@@ -38,7 +38,8 @@ def test_a_landing_comes_to_rest_where_it_is_pinned() -> None:
     problem = pin(landing(), 5, ("x", 0.0195))
     start = trace_phases(problem)[-1].end
     options = PlanOptions(time_intervals=5, mode_search=False)
-    plans = try_phases(problem, problem.phases[4:], start, options)
+    # Several guesses: what one solve comes to depends on the last bits.
+    plans = try_phases(problem, problem.phases[4:], start, options, further=4)
     assert plans is not None
     motion = plans[-1].motion
     end = motion.evaluate(np.array([motion.duration]))

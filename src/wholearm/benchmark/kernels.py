@@ -17,7 +17,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from itertools import groupby, product
 from pathlib import Path
@@ -112,19 +112,13 @@ def list_modes(plan: Plan) -> list[list[str]]:
     return found
 
 
-Answers = dict[str, dict[str, Any]]
-
-
-def answer_all(environment: Environment, paths: Sequence[str]) -> Iterator[tuple[str, Any]]:
-    """Answers of an environment by problem and objective, each when it is there."""
-    for path, objective in product(paths, OBJECTIVES):
-        given = ["--answer", path, objective, str(environment.seed)]
-        run = environment.run(["-m", "wholearm.benchmark.kernels", *given])
-        if run.returncode:
-            found: dict[str, Any] = {"value": None, "modes": [], "fault": run.stderr.strip()[-300:]}
-        else:
-            found = json.loads(run.stdout)
-        yield f"{Path(path).stem} {objective}", found
+def answer_in(environment: Environment, path: str, objective: str) -> dict[str, Any]:
+    """What `answer` returns in a process of an environment."""
+    given = ["--answer", path, objective, str(environment.seed)]
+    run = environment.run(["-m", "wholearm.benchmark.kernels", *given])
+    if run.returncode:
+        return {"value": None, "modes": [], "fault": run.stderr.strip()[-300:]}
+    return dict(json.loads(run.stdout))
 
 
 def compare(found: Mapping[str, Any], stored: Mapping[str, Any] | None) -> list[str]:
@@ -160,7 +154,7 @@ def run_kernels(
     update : bool
         Whether the answers of the first environment are stored.
     workers : int
-        Environments at the same time.
+        Answers at the same time.
 
     Returns
     -------
@@ -171,25 +165,19 @@ def run_kernels(
     """
     from ..common.files import read_json, write_text
 
+    results: dict[Environment, dict[str, dict[str, Any]]] = {own: {} for own in environments}
+    known = {} if update else read_json(stored, "--update writes it anew")
     with ThreadPoolExecutor(workers) as pool:
-
-        def collect(environment: Environment) -> Answers:
-            found: Answers = {}
-            for name, own in answer_all(environment, paths):
-                found[name] = own
-                if progress is not None:
-                    progress(f"{environment.kernel or 'own kernel'}: {name}")
-            return found
-
-        first = collect(environments[0]) if update else {}
-        if update:
-            write_text(stored, json.dumps(first, indent=1, sort_keys=True) + "\n")
-        known = first or read_json(stored, "--update writes it anew")
-        others = environments[1:] if update else environments
-        jobs = {pool.submit(collect, environment): environment for environment in others}
-        results = {jobs[job]: job.result() for job in as_completed(jobs)}
+        tasks = product(environments, paths, OBJECTIVES)
+        jobs = {pool.submit(answer_in, *task): task for task in tasks}
+        for count, job in enumerate(as_completed(jobs), start=1):
+            environment, path, objective = jobs[job]
+            results[environment][f"{Path(path).stem} {objective}"] = job.result()
+            if progress is not None:
+                progress(f"{count} of {len(jobs)} answers")
     if update:
-        results[environments[0]] = first
+        known = results[environments[0]]
+        write_text(stored, json.dumps(known, indent=1, sort_keys=True) + "\n")
     lines = ["| environment | answers | as stored | largest difference of a value |"]
     lines.append("|---|---|---|---|")
     faults = []

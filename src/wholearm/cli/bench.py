@@ -82,7 +82,7 @@ def add_bench(bench: argparse.ArgumentParser) -> None:
     kernels.add_argument("--answers", default="results/bench_kernels.json", help=words)
     words = "store the answers of the first environment"
     kernels.add_argument("--update", action="store_true", help=words)
-    kernels.add_argument("--jobs", type=JOBS, help="environments at a time (default: all cores)")
+    kernels.add_argument("--jobs", type=JOBS, help="answers at a time (default: all cores)")
     kernels.add_argument("-o", "--output", metavar="FILE", help="write the table (Markdown)")
     kernels.set_defaults(run=_compare_kernels)
 
