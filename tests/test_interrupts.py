@@ -180,7 +180,7 @@ def test_a_command_that_goes_on_is_ended(number: signal.Signals, tmp_path: Path)
     assert os.listdir(tmp_path) == []
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.15, 0.5])
+@pytest.mark.parametrize("delay", [0.05, 0.15, 0.5])
 def test_planning_is_interrupted(delay: float, tmp_path: Path) -> None:
     slow = ["solve", str(HEPTAGON), "--intervals", "800", "--objective", "margin"]
     both = ["-o", "plan.npz", "--torques", "plan.csv"]
