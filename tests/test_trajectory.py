@@ -320,6 +320,15 @@ def test_bad_names_of_rolling_contacts(trajectory: Trajectory, tmp_path: Path, g
     assert caught.value.key == "meta.rolling"
 
 
+@pytest.mark.parametrize("given", [3, [True], [[0.5]], [["a"]], [[{"start": 0.0, "stop": 1.0}]]])
+def test_bad_contact_modes(trajectory: Trajectory, tmp_path: Path, given: Any) -> None:
+    changed = replace(trajectory, meta={**trajectory.meta, "modes": given})
+    changed.save(tmp_path / "plan.npz")
+    with pytest.raises(InputError, match="not a list of spans") as caught:
+        load_trajectory(tmp_path / "plan.npz")
+    assert caught.value.key == "meta.modes"
+
+
 def test_nothing_rolls_unless_it_is_said(trajectory: Trajectory) -> None:
     assert trajectory.rolling.shape == trajectory.c_t.shape and not trajectory.rolling.any()
 

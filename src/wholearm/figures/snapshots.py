@@ -132,7 +132,9 @@ def choose_numbers(
         return found
 
     steps = (k * 10**n for n in range(4) for k in (1, 2, 5))
-    every = next(own for step in steps if len(put(own := range(0, count, step))) == len(own))
+    # None of them where even the first number would stand too low.
+    fitting = (own for step in steps if len(put(own := range(0, count, step))) == len(own))
+    every = next(fitting, range(0))
     return dict(sorted(put(dict.fromkeys([*first, *every])).items()))
 
 

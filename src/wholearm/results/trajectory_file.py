@@ -12,6 +12,7 @@ import numpy as np
 from ..common.archive import read_arrays
 from ..common.errors import InputError
 from ..common.files import require_ending, write_whole
+from .modes import ModeSpan
 from .sampled import sample_phases
 from .torque import MOST, TorqueProfile
 from .trajectory import Trajectory
@@ -63,6 +64,11 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     named = meta.get("rolling", [])
     if not isinstance(named, list) or not all(isinstance(names, list) for names in named):
         raise InputError(source, "meta.rolling", "is not a list of names for each phase")
+    try:
+        [ModeSpan.of(span) for spans in meta.get("modes", []) for span in spans]
+    except (AttributeError, KeyError, TypeError, ValueError):
+        text = "is not a list of spans with start, stop, contacts and joints for each phase"
+        raise InputError(source, "meta.modes", text) from None
     contacts = tuple(str(name) for name in arrays["contacts"])
     known = {name: arrays[name] for name in _ARRAYS}
     torque = TorqueProfile(arrays["torque_breaks"], arrays["torque_coefficients"])
