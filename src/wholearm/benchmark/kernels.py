@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from ..planning.result import Plan
 
 OBJECTIVES = ("time", "effort", "margin")
-KERNELS = ("Haswell", "Zen", "Sandybridge", "Nehalem", "Prescott", "SkylakeX")
 TOLERANCE = 1e-6
 """Largest relative difference of values: what Ipopt and the refinement of limits leave open."""
 BRIEF = 1e-3
