@@ -80,6 +80,10 @@ def refuse(
         say = "at its end, {}, no motion comes to rest in any contact mode"
     if blocked is None:
         _refuse_pushed(problem, phases[0], stages if alone else ())
+        if problem.scene.has_slow_motors:
+            _refuse_unheld(problem, phases[0], stages[0], 0)
+            if alone and (last.formation.n_constraints == 4 or phase.until.pins):
+                _refuse_unheld(problem, phases[0], last, -1)
         return
     where = describe_pose(to_si(stage, problem).guess.nodes[node, 0])
     text = f"phase {phase.number} is infeasible: {say.format(where)}"
@@ -119,6 +123,24 @@ def _refuse_pushed(problem: Problem, phase: Phase, stages: Sequence[Stage]) -> N
             f"phase {phase.number} is infeasible: {names} can only push the object one way, with "
             f"whatever friction, so that it does not come to rest at its end, {where}"
         )
+
+
+def _refuse_unheld(problem: Problem, phase: Phase, stage: Stage, node: int) -> None:
+    """Raise an error if torques that may not step cannot hold the object at rest at an end."""
+    from ...mechanics.wedging import find_static_torques
+
+    z, limit = to_si(stage, problem).guess.nodes[node, 0], problem.scene.torque_limit
+    held = find_static_torques([phase.formation], z)
+    if not held.is_empty(limit):
+        return
+    most = "however large" if held.is_empty(np.full(2, np.inf)) else "within their limits"
+    raise InfeasibleError(
+        f"phase {phase.number} is infeasible: torques may not step (torque_rate_limit, "
+        f"actuator_lag), so that they have to hold the object at rest at its "
+        f"{'end' if node else 'start'}, {describe_pose(z)}; {' '.join(phase.formation.names)} with "
+        f"their friction can be held there by no torques, {most}; end the phase where they can "
+        "(wholearm predict shows where), or leave out torque_rate_limit and actuator_lag"
+    )
 
 
 def explain(
