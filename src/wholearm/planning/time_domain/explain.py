@@ -26,7 +26,8 @@ from ..advice import (
     name_phases,
     rank_shortfalls,
 )
-from ..options import Objective
+from ..options import Objective, PlanOptions
+from ..splitting import runs_along_curves
 from .collocation import Scheme, blend
 from .motion import TimeMotion, make_motions
 from .own_units import to_si
@@ -170,6 +171,9 @@ def explain(
     if not short:
         names = " and ".join(" ".join(phase.formation.names) for phase in phases)
         text = f"no plan for {name_phases(numbers)} ({names}, until {phases[-1].until}): {status}"
+        usual = search.options.transcription == "time" and not problem.scene.control_period
+        if usual and runs_along_curves(phases, PlanOptions()):
+            return SolverError(f"{text}; leave out --transcription time, which plans along curves")
         return SolverError(f"{text}; try another number of intervals per phase (--time-intervals)")
 
     def sum_up(stages: list[Stage]) -> float:
