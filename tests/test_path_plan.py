@@ -21,6 +21,7 @@ from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import inverse
 from wholearm.planning.lower_bound.lower_bound import bound_least_time
 from wholearm.planning.options import Objective, PlanOptions
+from wholearm.planning.path_domain import plan as path_plan
 from wholearm.planning.path_domain import task
 from wholearm.planning.path_domain.impact_sequence import ImpactSequence, make_sequence
 from wholearm.planning.path_domain.motion import PathMotion, directions_of
@@ -345,3 +346,13 @@ def test_a_stuck_solver_does_not_blame_the_limits(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(task, "build_path_nlp", build)
     with pytest.raises(SolverError, match=r"Ipopt stopped with Max.* although limits can be kept"):
         Toy(constant(1.0, 0.0, 3.0)).plan(intervals=20)
+
+
+def test_a_stuck_solver_within_ranges_says_that_there_is_a_plan_without(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stuck = path_plan._Stuck([], "phase 1: Ipopt stopped", False)
+    monkeypatch.setattr(path_plan, "_plan_within", lambda _: (stuck, (object(),)))
+    monkeypatch.setattr(path_plan, "_explain", lambda *_: SolverError("unclear"))
+    with pytest.raises(SolverError, match=r"stopped within the ranges .* try --robust 0\.5, or"):
+        Toy(constant(1.0)).plan(robust=1.0)

@@ -85,6 +85,10 @@ def find(
 
 
 def _hurry() -> None:
+    from ..common.interrupts import check
+
+    # After SIGTERM nothing is planned any more.
+    check()
     clear_progress()
     print("wholearm: planning the best route; again to stop", file=sys.stderr, flush=True)
 
