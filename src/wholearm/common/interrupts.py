@@ -189,7 +189,10 @@ def _watcher() -> Iterator[None]:
             number = os.read(source, 1)[0]
             if _is_pardoned(number):
                 continue
-            if number in _WORDS and not over.wait(PATIENCE):
+            if number in _WORDS and not over.wait(PATIENCE / 2):
+                # Who waits for a child goes on; case: `bench skip`.
+                end_children()
+                over.wait(PATIENCE / 2)
                 with _ending:
                     if not over.is_set():
                         _end(number, errors)
