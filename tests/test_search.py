@@ -215,6 +215,10 @@ def test_a_route_whose_planning_is_interrupted_is_still_there(
     assert chooser.found == [route] and not chooser.made
 
 
+def fail(*_: object) -> None:
+    raise InputError("found", "", "cannot be written: No space left on device")
+
+
 def test_route_prints_phases_that_load(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = HEPTAGON.read_text(encoding="utf-8").split("[[phases]]")[0]
     path = tmp_path / "goal.toml"
@@ -227,6 +231,12 @@ def test_route_prints_phases_that_load(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(["solve", str(path), "-o", str(plan), "--cache", str(found)]) == 0
     assert phase["until"] == load_plan(plan).problem.table["phases"][0]["until"]
     assert f"wrote {plan}" in capsys.readouterr().out
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("wholearm.search.route.store_chart", fail)
+        assert main(["route", str(path), "--cache", str(found)]) == 0
+    said = capsys.readouterr()
+    assert tomllib.loads(said.out)["phases"] == [phase]
+    assert "wholearm: warning: found: cannot be written: No space left" in said.err
     assert main(["route", str(path), "--alternatives", "-1"]) == 2
     assert "--alternatives: -1 given" in capsys.readouterr().err
     assert main(["route", str(path), "--jobs", "0"]) == 2

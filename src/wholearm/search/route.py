@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
@@ -134,7 +135,11 @@ def _find(
         answer = _choose(problem, before, search, options, wanted, report, jobs, hurry)
         before = [*before, answer.route]
     if cache is not None:
-        store_chart(cache, key_chart(problem, options), chart)
+        try:
+            store_chart(cache, key_chart(problem, options), chart)
+        except InputError as error:
+            # What was found counts, with or without a copy for later searches.
+            warnings.warn(str(error), stacklevel=2)
     return answer
 
 
