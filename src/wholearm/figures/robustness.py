@@ -92,7 +92,7 @@ def _draw_ends(axes: Axes, study: Robustness) -> None:
     low = 0.8 * 10 ** np.floor(np.log10(around.min(axis=0)))
     high = 1.25 * 10 ** np.ceil(np.log10(around.max(axis=0)))
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    least = [f" (at least {_LEAST:g})" if at else "" for at in (around <= _LEAST).any(axis=0)]
+    least = [f" (at least {_LEAST:g})" if min(own) <= _LEAST else "" for own in around.T.tolist()]
     axes.set_xlabel(f"distance from the goal [mm]{least[0]}")
     axes.set_ylabel(f"angle from the goal [deg]{least[1]}")
     axes.axvline(goal[0], color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
