@@ -25,6 +25,7 @@ from wholearm.policy.motion_law import MotionLaw
 from wholearm.policy.pace import Pace
 from wholearm.policy.policy import Policy
 from wholearm.policy.regulator import RATE, Linear, follow, regulate
+from wholearm.policy.replan import SAME
 from wholearm.policy.retime import eliminate, retime
 from wholearm.policy.sensing import Sensing
 from wholearm.policy.squeeze import choose_squeeze
@@ -344,6 +345,8 @@ def test_a_landing_without_a_reserve_is_planned_anew() -> None:
     # The plan's torques are at their limit, the policy's leave some of it to feedback.
     assert np.abs(plan.tau).max() == pytest.approx(2.0, rel=1e-6)
     assert np.abs(law.tau).max() < 1.85
+    # It ends where the plan does: the new landing is pinned to the plan's.
+    assert law.theta[-1] == pytest.approx(plan.z[-1, 3:], abs=SAME)
     report = verify_policy(problem, plan, policy)
     assert report.ok, report.failures
 
