@@ -46,8 +46,8 @@ def edited(friction: dict[str, float] | None = None, **joints: float) -> Problem
 def test_extreme_scenes_are_planned(joints: dict[str, Any]) -> None:
     problem = edited(**joints)
     # Links a thousand times as heavy let other contact forces be possible than the planned ones.
-    plan = solve(problem, intervals=20, replay=False, least_minor=-5.0)
-    report = verify(problem, plan, least_minor=-5.0)
+    plan = solve(problem, intervals=20, replay=False, uniqueness_margin=-5.0)
+    report = verify(problem, plan, uniqueness_margin=-5.0)
     assert report.ok, report.failures
 
 

@@ -120,6 +120,17 @@ def test_controls_are_the_torques_less_dry_friction(root: Element) -> None:
         assert abs(off.mean()) < 1e-4 * largest
 
 
+def test_a_viewer_lists_the_motors_and_the_joints_of_the_scene_alone(root: Element) -> None:
+    # Groups 0 to 2 are those that MuJoCo's viewer shows by default.
+    shown = {
+        own.get("name")
+        for tag in ("actuator", "worldbody")
+        for own in root.find(tag).iter()  # type: ignore[union-attr]
+        if own.tag in ("joint", "motor", "general") and int(own.get("group", 0)) < 3
+    }
+    assert shown == {"motor1", "motor2", "x", "y", "phi", "theta1", "theta2"}
+
+
 def test_links_without_thickness_are_refused() -> None:
     with pytest.raises(InputError, match=r"fingers.2.radius: 0 given"):
         write_mjcf(problem_of(HEPTAGON).with_(radius2=0.0))

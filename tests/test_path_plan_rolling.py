@@ -24,7 +24,7 @@ from wholearm.scene.model import Friction, Scene
 EPSILON = 0.05
 LIMIT = float(box().scene.torque_limit.max())
 ANY = -1.0
-"""Least minor that cones are looked at with, unique or not."""
+"""Least uniqueness margin that cones are looked at with, unique or not."""
 OBJECTIVES = ["time", "effort", "margin"]
 
 
@@ -40,7 +40,7 @@ def tip_on(mu: float) -> Curve:
 
 @cache
 def plan(objective: str = "time", mu: float = 0.5, intervals: int = 40) -> PhasePlan[PathMotion]:
-    options = PlanOptions(objective=objective, intervals=intervals, least_minor=ANY)
+    options = PlanOptions(objective=objective, intervals=intervals, uniqueness_margin=ANY)
     return plan_path(tip_on(mu), EPSILON, options, 2, 0.4 if objective == "margin" else None)
 
 
@@ -123,7 +123,7 @@ def test_a_slippery_palm_is_named() -> None:
 
 def test_an_epsilon_that_cones_allow_is_advised() -> None:
     """Rolling contacts need c_n >= epsilon and a cone that is narrower by mu epsilon."""
-    options, mu, epsilon = PlanOptions(intervals=15, least_minor=ANY), 0.8, 0.7
+    options, mu, epsilon = PlanOptions(intervals=15, uniqueness_margin=ANY), 0.8, 0.7
     with pytest.raises(InfeasibleError) as caught:
         plan_path(tip_on(mu), epsilon, options, 2)
     _, found, advised = str(caught.value).rpartition("epsilon = ")

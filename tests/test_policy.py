@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -316,6 +318,32 @@ def test_no_policy_is_written_that_does_not_carry_out_its_plan(
     assert main(given) == 0
     assert "phase 2, and opens by" in capsys.readouterr().err
     assert any("opens by" in text for text in Policy.load(output).about["failures"])
+
+
+def test_contacts_of_a_policy_may_open_as_far_as_is_asked_for(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    plan: Plan,
+    policy: Policy,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    plan.save(tmp_path / "plan.npz")
+    gap = 0.004 * plan.problem.scene.scales.length
+
+    def report(*_: object, departure: float = 1e-3) -> SimpleNamespace:
+        ok = gap < departure * plan.problem.scene.scales.length
+        losses = () if ok else (SimpleNamespace(gap=gap),)
+        phases = [SimpleNamespace(losses=losses)]
+        return SimpleNamespace(ok=ok, failures=["opens"] * len(losses), phases=phases)
+
+    monkeypatch.setattr("wholearm.policy.make.make_policy", lambda *_, **__: policy)
+    monkeypatch.setattr("wholearm.verification.policy.verify_policy", report)
+    given = ["policy", str(tmp_path / "plan.npz"), "-o", str(tmp_path / "p.npz")]
+    assert main(given) == 1
+    said = capsys.readouterr().err
+    match = re.search(r"; --departure (\S+) allows that; ", said)
+    assert match and 0.004 < float(match[1]) < 0.005, said
+    assert main([*given, "--departure", match[1]]) == 0
 
 
 def test_an_end_without_a_gained_contact_is_held(problem: Problem) -> None:

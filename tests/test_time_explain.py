@@ -3,6 +3,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,12 +21,14 @@ from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.time_domain import explain as time_explain
+from wholearm.planning.time_domain.attempts import Attempts
 from wholearm.planning.time_domain.collocation import make_scheme
 from wholearm.planning.time_domain.explain import (
     change_limit,
     explain,
     is_met,
     list_shortfalls,
+    refuse,
     solve_elastic,
 )
 from wholearm.planning.time_domain.motion import TimeMotion
@@ -34,6 +37,7 @@ from wholearm.planning.time_domain.search import Search
 from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.staging import guess_stages
 from wholearm.problem.definition import Problem
+from wholearm.problem.read import read_problem
 
 SCHEME = make_scheme("radau", 3, 3)
 TORQUE = "fingers.1.torque_limit"
@@ -54,6 +58,49 @@ def why_not(plan: Callable[[], object]) -> str:
 
 def search(problem: Problem) -> Search:
     return Search.of(problem, COARSE)
+
+
+PENTAGON = """
+epsilon = 0.05
+object = { vertices = [[0, 0], [0.08, 0], [0.08, 0.03], [0.03, 0.09], [0, 0.09]], mass = 0.35 }
+friction = { palm = 0.02, finger1 = 0.02, finger2 = 0.02 }
+start = { flush = 0, x = 0.04 }
+[fingers]
+1 = { base = [0.09, -0.01], length = 0.17, radius = 0.006, inertia = 0.002, viscous = 0.01, dry = 0.01, torque_limit = 4.0 }
+2 = { base = [-0.09, -0.01], length = 0.17, radius = 0.006, inertia = 0.002, viscous = 0.01, dry = 0.01, torque_limit = 4.0 }
+[[phases]]
+contacts = ["v0-palm", "v1-palm", "v1-finger1", "v4-finger2"]
+until = "v2-finger1"
+[[phases]]
+contacts = ["v1-palm", "v1-finger1", "v2-finger1", "v4-finger2"]
+until = "v4-tip2"
+end = "smooth"
+[[phases]]
+contacts = ["v1-palm", "v1-finger1", "v2-finger1", "v4-tip2"]
+until = "e4-tip2"
+end = "smooth"
+[[phases]]
+contacts = ["v1-palm", "v1-finger1", "v2-finger1", "e4-tip2"]
+until = "v0-finger2"
+[[phases]]
+contacts = ["v1-palm", "v2-finger1", "v0-finger2"]
+until = { contact = "v3-finger1", x = 0.08804 }
+"""  # noqa: E501
+TURNED = np.array([0.10451807, 0.05929573, -1.03431931, 0.53647701, 0.53647701])
+"""Start of the last phase, at whose end no contact forces balance the weight."""
+
+
+@pytest.mark.parametrize("rate", [500.0, 1e4])
+def test_torques_that_may_not_step_have_to_hold_the_end(tmp_path: Path, rate: float) -> None:
+    (tmp_path / "pent.toml").write_text(PENTAGON)
+    problem = read_problem(str(tmp_path / "pent.toml"))
+    last = problem.phases[-1:]
+    stages = Attempts(problem, last, TURNED, search(problem), None, False).first.stages
+    refuse(search(problem), problem, last, stages, None)
+    slow = problem.with_(torque_rate_limit=rate)
+    message = why_not(lambda: refuse(search(slow), slow, slow.phases[-1:], stages, None))
+    assert "have to hold the object at rest at its end, x = 88.04 mm" in message
+    assert "can be held there by no torques, however large" in message
 
 
 def outline(problem: Problem, index: int = 0) -> Stage:
@@ -203,6 +250,9 @@ def test_failures_that_no_limit_explains_are_the_solvers() -> None:
     assert text.startswith("no plan for phases 1 and 2 (") and "Restoration_Failed" in text
     assert all(name in text for name in problem.phases[0].formation.names)
     assert text.endswith("intervals per phase (--time-intervals)") and "\n" not in text
+    slide, own = box(), replace(COARSE, transcription="time")
+    given = Search.of(slide, own), slide, slide.phases[:1], [], "Restoration_Failed", None
+    assert "leave out --transcription time" in str(explain(*given))
 
 
 def test_the_motion_that_is_short_of_least_is_described() -> None:

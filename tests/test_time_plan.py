@@ -40,7 +40,7 @@ from wholearm.verification.verify import verify
 SLACK = 1e-6
 """What a limit may be missed by between the places that the planner looks at [N or N m]."""
 ANY = -5.0
-"""Least minor of a palm so rough that a vertex rolls on it however it is heaved."""
+"""Least uniqueness margin of a palm so rough that a vertex rolls on it however it is heaved."""
 COARSE = 6
 """Intervals where only what a plan is for is looked at, not how good it is."""
 SCHEMES = [("radau", 2), ("radau", 5), ("legendre", 3)]
@@ -85,7 +85,7 @@ def thrown(
 ) -> tuple[Problem, Trajectory, float]:
     """A problem of one and two contacts, its plan, and the time that its second phase takes."""
     problem, expected = throw()
-    plan = solve(problem, objective, time_intervals=8, least_minor=ANY)
+    plan = solve(problem, objective, time_intervals=8, uniqueness_margin=ANY)
     return problem, plan.trajectory, expected
 
 
@@ -183,7 +183,7 @@ def test_what_moves_by_itself_takes_its_time(
 ) -> None:
     problem, plan, expected = thrown(throw)
     if name != "radau":
-        plan = solve(problem, time_intervals=8, scheme=name, least_minor=ANY).trajectory
+        plan = solve(problem, time_intervals=8, scheme=name, uniqueness_margin=ANY).trajectory
     # One or two contacts are left, and with them four or three freedoms.
     formation = problem.phases[1].formation
     assert formation.n_constraints == 2 - (throw is lift)
@@ -191,7 +191,7 @@ def test_what_moves_by_itself_takes_its_time(
     # acceleration is constant, not at all.
     accuracy = 1e-12 if throw is shove else 2e-8
     assert plan.meta["phase_durations"][1] == pytest.approx(expected, rel=accuracy)
-    report = verify(problem, plan, least_minor=ANY)
+    report = verify(problem, plan, uniqueness_margin=ANY)
     assert report.ok, report.to_text()
     motion = plan.motions[1]
     samples = motion.evaluate(np.linspace(0.0, motion.duration, 50))

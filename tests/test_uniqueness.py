@@ -88,20 +88,22 @@ def test_a_rod_on_the_palm_is_that_of_painleve() -> None:
 
 def test_an_ambiguous_scene_is_refused_by_name() -> None:
     rough = problem_of(BOX).with_(friction_palm=0.5)
-    with pytest.raises(AmbiguityError, match=r"phase 1: ambiguous: v0-palm with v0-finger2, minor"):
+    with pytest.raises(AmbiguityError, match=r"phase 1: ambiguous: v0-palm with v0-finger2, uniq"):
         plan_curves(trace_phases(rough)[:1], rough.epsilon, PlanOptions(), (1,), explained=False)
-    with pytest.raises(InputError, match=r"least_minor: 1 given; allowed are numbers below 1"):
-        solve(rough, least_minor=1.0)
+    with pytest.raises(
+        InputError, match=r"uniqueness_margin: 1 given; allowed are numbers below 1"
+    ):
+        solve(rough, uniqueness_margin=1.0)
 
 
-def test_replays_tell_the_least_minor_of_each_phase() -> None:
+def test_replays_tell_the_uniqueness_margin_of_each_phase() -> None:
     report = verify(box(), tipped())
-    minors = [phase.minor for phase in report.phases]
-    assert report.ok and all(minor is not None and 0.1 < minor.ratio < 1 for minor in minors)
-    planned = [own["ratio"] for own in tipped().meta["least_minors"]]
-    found = [minor.ratio for minor in minors if minor is not None]
+    minors = [phase.uniqueness_margin for phase in report.phases]
+    assert report.ok and all(minor is not None and 0.1 < minor.value < 1 for minor in minors)
+    planned = [own["value"] for own in tipped().meta["uniqueness_margins"]]
+    found = [minor.value for minor in minors if minor is not None]
     np.testing.assert_allclose(found, planned, atol=5e-3)
-    strict = verify(box(), tipped(), least_minor=0.9)
+    strict = verify(box(), tipped(), uniqueness_margin=0.9)
     assert not strict.ok and strict.failures[0].startswith("ambiguous: ")
 
 

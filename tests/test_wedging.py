@@ -25,6 +25,10 @@ def test_torques_that_friction_can_hold_are_those_of_the_linear_programme(path: 
         for own, beyond in zip(tau, static.measure(tau), strict=True):
             if abs(beyond) > 1e-4 * scene.scales.torque:
                 assert balances(scene, contacts, curve.start, own) == (beyond < 0)
+                if beyond < 0:
+                    assert not static.is_empty(np.abs(own))
+        if abs(beyond := static.measure(np.zeros((1, 2)))[0]) > 1e-4 * scene.scales.torque:
+            assert static.is_empty(np.zeros(2)) == (beyond > 0)
 
 
 def test_a_wedged_start_lasts_until_nothing_balances_the_torques() -> None:

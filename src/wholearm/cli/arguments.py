@@ -98,7 +98,7 @@ def add_solve(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--largest", action="store_true", help=text)
     text = "bound the least time along curves from below, and print the gap"
     parser.add_argument("--certify", action="store_true", help=text)
-    _add_least_minor(parser)
+    _add_uniqueness_margin(parser)
     add_cache(parser)
     add_jobs(parser)
     add_time_limit(parser)
@@ -140,7 +140,7 @@ def add_verify(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--departure", type=DEPARTURE, help=f"{text} (1e-3)")
     text = "speed that passes for rest, over the root of that radius times gravity"
     parser.add_argument("--rest-speed", type=DEPARTURE, help=f"{text} (2e-2)")
-    _add_least_minor(parser)
+    _add_uniqueness_margin(parser)
     text = "also list the paper's scalar equation of motion where a phase has four constraints"
     parser.add_argument("--reduced", action="store_true", help=text)
     text = "simulate without telling which contacts hold: whole, and a plan's phases one by one too"
@@ -156,9 +156,10 @@ def add_verify(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
 
 
-def _add_least_minor(parser: argparse.ArgumentParser) -> None:
-    text = "least principal minor of the contact problem, over that without friction (0.1)"
-    parser.add_argument("--least-minor", type=number(-1e3, 0.999), help=text)
+def _add_uniqueness_margin(parser: argparse.ArgumentParser) -> None:
+    text = "least uniqueness margin of contact forces: principal minors of the contact matrix "
+    text += "over those without friction, 1 without friction, 0 ambiguous (0.1)"
+    parser.add_argument("--uniqueness-margin", type=number(-1e3, 0.999), help=text)
 
 
 def add_plot(parser: argparse.ArgumentParser) -> None:
@@ -225,4 +226,4 @@ def add_map(parser: argparse.ArgumentParser) -> None:
     )
     text = "print the formations along a route of two or more poses [m, deg] as [[phases]]"
     parser.add_argument("--list", metavar="X,PHI", nargs="+", help=text)
-    _add_least_minor(parser)
+    _add_uniqueness_margin(parser)

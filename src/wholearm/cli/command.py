@@ -250,8 +250,8 @@ def _verify(options: argparse.Namespace) -> int:
         if getattr(options, key) is not None
     }
     _check_free(options)
-    if options.least_minor is not None:
-        given["least_minor"] = options.least_minor
+    if options.uniqueness_margin is not None:
+        given["uniqueness_margin"] = options.uniqueness_margin
     problem = read_problem(options.problem)
     torques = _read_torques(options.torques)
     policy, notes = _read_policy(options, torques), {}

@@ -48,7 +48,11 @@ def _draw_map(options: argparse.Namespace, phi: tuple[float, float] | None) -> i
     if plan is not None:
         tell_origin(problem, (options.plan, plan), silent=bool(options.list))
     window = choose_window(problem, phi)
-    limit = {} if options.least_minor is None else {"least_minor": options.least_minor}
+    limit = (
+        {}
+        if options.uniqueness_margin is None
+        else {"uniqueness_margin": options.uniqueness_margin}
+    )
     known = build_map(problem, window=window, progress=show_progress(), **limit)
     plots.save(draw_map(known, plan), output)
     clear_progress()

@@ -9,7 +9,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from ..common.errors import name_source
-from .arguments import number
+from .arguments import DEPARTURE, number
 from .progress import clear_progress, show_progress
 
 _QUICK = 2e-4
@@ -38,6 +38,10 @@ def add_policy(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--torque-limit", type=number(1e-12, 1e12), help=text)
     text = "also look for how many times as wide ranges a policy can keep contacts in"
     parser.add_argument("--largest", action="store_true", help=text)
+    text = (
+        "how far contacts may open in its simulation, over the object's radius of gyration (1e-3)"
+    )
+    parser.add_argument("--departure", type=DEPARTURE, help=text)
     text = "write the policy although its simulation does not hold, marked so in its file"
     parser.add_argument("--write-anyway", action="store_true", help=text)
     parser.add_argument("--json", action="store_true", help="print the summary as JSON")
@@ -61,6 +65,7 @@ def _policy(options: argparse.Namespace) -> int:
     plan = load_trajectory(options.plan)
     problem = read_own_problem(plan.meta, options.plan)
     given = {key: getattr(options, key) for key in ("reserve", "period", "delay", "torque_limit")}
+    allowed = {} if options.departure is None else {"departure": options.departure}
     say = show_progress()
 
     def plan_anew(own: Problem) -> Trajectory:
@@ -73,14 +78,14 @@ def _policy(options: argparse.Namespace) -> int:
             return f"a period below {options.period:g} s may do"
         own = make_policy(problem, plan, **quick, planner=plan_anew)
         words = f"--period {quick['period']:g} --delay 0"
-        held = verify_policy(problem, plan, own).ok
+        held = verify_policy(problem, plan, own, **allowed).ok
         return f"{words} would do" if held else f"{words} would not do either"
 
     with name_source(options.plan):
         say("making the policy")
         policy = make_policy(problem, plan, **given, planner=plan_anew)
         say("simulating the policy")
-        report = verify_policy(problem, plan, policy)
+        report = verify_policy(problem, plan, policy, **allowed)
         if options.largest:
             say("looking for the widest ranges")
             each = find_widest(problem, plan, options.delay)
@@ -93,9 +98,15 @@ def _policy(options: argparse.Namespace) -> int:
         text = f"{output}: written although in the free simulation, {failures}"
         print(f"wholearm: warning: {text}", file=sys.stderr)
     elif not report.ok:
+        opened = [loss.gap for own in report.phases for loss in own.losses]
+        enough = ""
+        if len(opened) == len(report.failures):
+            # Nothing but openings: rounded up to two digits.
+            share = f"{1.05 * max(opened) / problem.scene.scales.length:.2g}"
+            enough = f"--departure {share} allows that; "
         raise ReplayError(
             f"{options.plan}: no policy is written: in the free simulation, {failures}; "
-            f"{advise()}; --write-anyway writes it all the same"
+            f"{enough}{advise()}; --write-anyway writes it all the same"
         )
     policy.save(output)
     told = {key: value for key, value in policy.about.items() if key != "problem"}

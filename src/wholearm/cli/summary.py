@@ -95,11 +95,15 @@ def _describe_replay(replay: ReplayFigures | None, problem: Problem) -> str:
 
 def _describe_sureness(plan: Plan) -> list[str]:
     """Whether contact forces are the only ones, and for how long phases may stay wedged."""
-    known = [(own.minor, own.number) for own in plan.phases if own.minor is not None]
+    known = [
+        (own.uniqueness_margin, own.number)
+        for own in plan.phases
+        if own.uniqueness_margin is not None
+    ]
     if not known:
         return []
     least, number = min(known)
-    text = f"contact forces unique: margin {least.ratio:.2f} (1 without friction, 0 ambiguous)"
+    text = f"contact forces unique: margin {least.value:.2f} (1 without friction, 0 ambiguous)"
     text += f", least in phase {number}"
     wedged = [
         f"; phase {phase.number} may stay wedged for {1e3 * phase.wedged:.3g} ms"

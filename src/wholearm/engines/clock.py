@@ -5,7 +5,8 @@ moves it. For each finger a fixed tendon adds clock and joint angle. Springs on 
 which force limits let act from one row of the torque table to the next, make up the torque: a sum
 of ramps. The angle's weight in the tendon, `SHARE`, is so small that the springs see the clock
 alone, and they are that much stiffer. So the model plays the plan wherever it is opened. The
-controls ``motor1`` and ``motor2`` add to it. Keyframes at the starts of phases set the clock too.
+controls ``motor1`` and ``motor2`` add to it, and are the only ones that a viewer lists: the rest is
+in a group that it hides. Keyframes at the starts of phases set the clock too.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ BEND = 1e-3
 RISE = 1e-6
 """Least time from row to row, over the time step."""
 CLOCK = "clock"
+HIDDEN = {"group": 3}
+"""Group of joints and actuators for which MuJoCo's viewer has no sliders, unless asked for."""
 
 
 def list_ramps(scene: Scene, plan: Trajectory, step: float) -> tuple[Array, Array]:
@@ -55,9 +58,9 @@ def add_clock(root: Element, scene: Scene, plan: Trajectory, step: float) -> Non
     drive = DRIVE * (np.abs(rises).sum() + np.abs(tau[0]).sum() / share + scene.scales.force)
     body = add(_find(root, "worldbody"), "body", name=CLOCK)
     add(body, "inertial", pos=[0, 0, 0], mass=scene.scales.mass, diaginertia=[1, 1, 1])
-    add(body, "joint", name=CLOCK, type="slide", axis=[0, 0, 1], damping=drive)
+    add(body, "joint", name=CLOCK, type="slide", axis=[0, 0, 1], damping=drive, **HIDDEN)
     tendons, springs = add(root, "tendon"), _find(root, "actuator")
-    spring = {"gainprm": [0], "biastype": "affine"}
+    spring = {"gainprm": [0], "biastype": "affine", **HIDDEN}
     add(springs, "general", name=CLOCK, joint=CLOCK, biasprm=[drive, 0, 0], **spring)
     for k, name in enumerate(("torque1", "torque2")):
         tendon = add(tendons, "fixed", name=name)

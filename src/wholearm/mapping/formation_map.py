@@ -23,7 +23,7 @@ from ..contacts.closing import (
     evaluate_contacts,
 )
 from ..contacts.elemental import Contact
-from ..mechanics.uniqueness import LEAST_MINOR, require_minor
+from ..mechanics.uniqueness import UNIQUENESS_MARGIN, require_uniqueness_margin
 from ..problem.definition import Problem
 from ..scene.model import Scene
 from .borders import NOWHERE, Piece, Window, label_cells, list_tracks, name_contacts
@@ -159,7 +159,7 @@ def build_map(
     resolution: int = 200,
     window: Window | None = None,
     progress: Callable[[str], None] | None = None,
-    least_minor: float = LEAST_MINOR,
+    uniqueness_margin: float = UNIQUENESS_MARGIN,
 ) -> FormationMap:
     """Build the contact-formation map of a problem's scene.
 
@@ -174,9 +174,9 @@ def build_map(
         from the flush angle below the plan to that above it.
     progress : callable, optional
         Receives a line of text now and then.
-    least_minor : float
-        Where principal minors of the contact problem are less, over those without friction, motion
-        is ambiguous.
+    uniqueness_margin : float
+        Where the uniqueness margin of contact forces (`mechanics.uniqueness`) is less, motion is
+        ambiguous.
 
     Raises
     ------
@@ -185,7 +185,7 @@ def build_map(
     """
     if resolution < 10:
         raise InputError("", "resolution", f"{resolution!r} given; allowed is 10 or more")
-    limit = require_minor(least_minor)
+    limit = require_uniqueness_margin(uniqueness_margin)
     scene, report = problem.scene, progress or (lambda text: None)
     report("map: cells")
     window = window or choose_window(problem)

@@ -17,7 +17,7 @@ from ..contacts.formation import Formation, Kinematics
 from ..contacts.many import evaluate_each, group_alike
 from ..mechanics.dynamics import Directions, force_rows, inverse
 from ..mechanics.metric import metric_weights
-from ..mechanics.uniqueness import LEAST_MINOR, find_minors
+from ..mechanics.uniqueness import UNIQUENESS_MARGIN, find_minors
 from ..quasistatic.squeeze import Squeezing
 from ..scene.model import Scene
 
@@ -35,7 +35,7 @@ def check_border(
     label: Numbers,
     z: Array,
     coordinate: int | Numbers,
-    least_minor: float = LEAST_MINOR,
+    uniqueness_margin: float = UNIQUENESS_MARGIN,
 ) -> tuple[Flags, Flags, Flags]:
     """Whether a quasistatic motion along a border is possible, each way.
 
@@ -49,8 +49,8 @@ def check_border(
         Configurations on borders.
     coordinate : {0, 2} or ndarray of int, shape (n,)
         x or phi, whichever increases along the border.
-    least_minor : float
-        Limit on principal minors, as of `find_minors`.
+    uniqueness_margin : float
+        Least uniqueness margin, as of `find_minors`.
 
     Returns
     -------
@@ -73,12 +73,16 @@ def check_border(
         part = Kinematics(*(array[own] for array in kinematics))
         for row, sole, way in zip(held, unique, (z_s[own], -z_s[own]), strict=True):
             row[own] = _check_path(formation, part, epsilon, z[own], way)
-            sole[own[row[own]]] = _are_unique(formation, part, way, row[own], least_minor)
+            sole[own[row[own]]] = _are_unique(formation, part, way, row[own], uniqueness_margin)
     return held[0] & unique[0], held[1] & unique[1], np.any(held & ~unique, axis=0)
 
 
 def check_cell(
-    scene: Scene, epsilon: float, label: Numbers, z: Array, least_minor: float = LEAST_MINOR
+    scene: Scene,
+    epsilon: float,
+    label: Numbers,
+    z: Array,
+    uniqueness_margin: float = UNIQUENESS_MARGIN,
 ) -> tuple[Flags, Flags]:
     """Whether a quasistatic motion from inside a cell is possible towards each of `WAYS`.
 
@@ -90,7 +94,7 @@ def check_cell(
         The three contacts, as indices into `closing.contact_table`: palm, finger 1, finger 2.
     z : ndarray, shape (n, 5)
         Configurations in cells.
-    least_minor : float
+    uniqueness_margin : float
         As of `check_border`.
 
     Returns
@@ -113,7 +117,7 @@ def check_cell(
             right[:, 3:, 0] = way
             z_s = np.linalg.solve(matrix[regular], right)[..., 0]
             held[regular, k] = _check_balance(formation, part, epsilon, z_s)
-            own = _are_unique(formation, part, z_s, held[regular, k], least_minor)
+            own = _are_unique(formation, part, z_s, held[regular, k], uniqueness_margin)
             unique[held[:, k], k] = own
     return held & unique, np.any(held & ~unique, axis=1)
 
@@ -144,9 +148,9 @@ def _check_balance(
 
 
 def _are_unique(
-    formation: Formation, kinematics: Kinematics, z_s: Array, rows: Flags, least_minor: float
+    formation: Formation, kinematics: Kinematics, z_s: Array, rows: Flags, uniqueness_margin: float
 ) -> Flags:
     """Whether contact forces of travel along `z_s` are the only ones, at those of the `rows`."""
     part = Kinematics(*(array[rows] for array in kinematics))
     Xi = Directions.of(part, z_s[rows]).Xi
-    return np.asarray(find_minors(formation, part, Xi).ratios >= least_minor)
+    return np.asarray(find_minors(formation, part, Xi).ratios >= uniqueness_margin)

@@ -1,4 +1,4 @@
-"""Whether contact forces are the only ones: principal minors of K over those without friction.
+"""Uniqueness margin of contact forces: least principal minor of K over that without friction.
 
 Contacts only press, c_n >= 0, and only those that press keep their gaps closed. Which of them do is
 a complementarity problem with the matrix K = A M5^-1 (A - U Xi A_t)^T. It has exactly one solution,
@@ -32,8 +32,8 @@ from ..common.errors import InputError
 from ..common.require import require_number
 from ..contacts.formation import Formation, Kinematics
 
-LEAST_MINOR = 0.1
-"""Least ratio of a minor of a plan: coefficients of friction are not known to better than a
+UNIQUENESS_MARGIN = 0.1
+"""Least uniqueness margin of a plan: coefficients of friction are not known to better than a
 tenth."""
 _INDEPENDENT = 1e-12
 """Least Gram determinant of the rows of contacts, each of length one, at which they are
@@ -41,25 +41,25 @@ independent."""
 _SLIDES, _STICKS, _SLIPS = " ", " sticking", (" slipping +", " slipping -")
 
 
-def require_minor(value: float) -> float:
-    """A least ratio of minors that can be asked for: below 1, negative ones too.
+def require_uniqueness_margin(value: float) -> float:
+    """A least uniqueness margin that can be asked for: below 1, negative ones too.
 
     Raises
     ------
     InputError
         If it is not.
     """
-    given = require_number(value, "least_minor")
+    given = require_number(value, "uniqueness_margin")
     if given >= 1:
-        raise InputError("", "least_minor", f"{given:g} given; allowed are numbers below 1")
+        raise InputError("", "uniqueness_margin", f"{given:g} given; allowed are numbers below 1")
     return given
 
 
-def describe_minor(ratio: float, contacts: str, place: str, least: float) -> str:
-    """Say that a minor is too small."""
+def describe_uniqueness(ratio: float, contacts: str, place: str, least: float) -> str:
+    """Say that a uniqueness margin is too small."""
     return (
-        f"ambiguous: {contacts}, minor {ratio:.2f} at {place}, of that without friction; at least "
-        f"{least:g} is asked for, and other contact forces are possible at 0 and below"
+        f"ambiguous: {contacts}, uniqueness margin {ratio:.2f} at {place} (1 without friction); at "
+        f"least {least:g} is asked for, and other contact forces are possible at 0 and below"
     )
 
 

@@ -52,6 +52,15 @@ class StaticTorques(NamedTuple):
             return np.full(len(tau), -np.inf)
         return np.asarray((tau @ self.normals.T - self.bounds).max(axis=1))
 
+    def is_empty(self, limit: Array) -> bool:
+        """Whether no torques up to `limit`, shape (2,) [N m], maybe infinite, are inside."""
+        from scipy.optimize import linprog
+
+        if not np.isfinite(self.bounds).all():
+            return True
+        sides = [(-own, own) for own in limit]
+        return bool(linprog(np.zeros(2), self.normals, self.bounds, bounds=sides).status == 2)
+
 
 def find_static_torques(
     touching: Sequence[Formation], z: Array, least: float = 0.0

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..common.bounds import PLANNER
 from ..common.errors import InputError
-from ..mechanics.uniqueness import LEAST_MINOR, require_minor
+from ..mechanics.uniqueness import UNIQUENESS_MARGIN, require_uniqueness_margin
 from ..problem.uncertainty import PARAMETERS, read_widths
 
 
@@ -71,7 +71,7 @@ class PlanOptions:
     mode_search: bool = True
     certify: bool = False
     accuracy: float = DEFAULT_ACCURACY
-    least_minor: float = LEAST_MINOR
+    uniqueness_margin: float = UNIQUENESS_MARGIN
     robust: float = 0.0
     largest: bool = False
     ranges: Mapping[str, float] = field(default_factory=dict)
@@ -97,7 +97,9 @@ class PlanOptions:
         for key in ("replay", "mode_search", "certify", "largest"):
             if not isinstance(value := getattr(self, key), bool):
                 raise InputError("", key, f"{value!r} given; allowed are true and false")
-        object.__setattr__(self, "least_minor", require_minor(self.least_minor))
+        object.__setattr__(
+            self, "uniqueness_margin", require_uniqueness_margin(self.uniqueness_margin)
+        )
         if self.duration is not None and self.objective is not Objective.MARGIN:
             raise InputError("", "duration", "is for the objective margin only")
         if self.certify and self.objective in (Objective.EFFORT, Objective.MARGIN):

@@ -89,9 +89,9 @@ def solve(
         Whether to look for the largest such factor with which there is a plan.
     certify : bool, default False
         Whether to bound the least time along curves from below, for `time`.
-    least_minor : float, default 0.1, below 1
-        Least principal minor of the contact problem over that without friction: contact forces are
-        the only ones where all are positive, and at 0.1 still with a tenth more friction.
+    uniqueness_margin : float, default 0.1, below 1
+        Least uniqueness margin (`mechanics.uniqueness`): contact forces are the only ones where it
+        is positive, and at 0.1 still with a tenth more friction.
 
     Returns
     -------
@@ -167,7 +167,7 @@ def finish_plan(
     """
     problem, options = planning.problem, planning.options
     trajectory, figures = checked.trajectory if checked else assemble_plan(planning), None
-    sure = check_sureness(problem, trajectory, options.least_minor)
+    sure = check_sureness(problem, trajectory, options.uniqueness_margin)
     planned = time.perf_counter()
     if options.replay:
         from .self_check import replay_plan
@@ -176,7 +176,7 @@ def finish_plan(
         given = planning, trajectory, assemble_plan, report, checked
         planning, trajectory, figures = replay_plan(*given)
         if trajectory is not first:
-            sure = check_sureness(problem, trajectory, options.least_minor)
+            sure = check_sureness(problem, trajectory, options.uniqueness_margin)
     replayed = time.perf_counter()
     transitions = _assess(planning, report)
     assessed = time.perf_counter()

@@ -18,7 +18,7 @@ from ..results.certificate import Certificate
 from ..results.modes import ModeSpan
 from ..results.range_figures import RangeFigures
 from ..results.replay_figures import ReplayFigures
-from ..results.report import LeastMinor
+from ..results.report import UniquenessMargin
 from ..results.settling import Settling
 from ..results.trajectory import Samples, Trajectory
 from ..results.transition import Transition
@@ -72,8 +72,8 @@ class PlannedPhase(NamedTuple):
     statistics : SolverStatistics
         Everything that was solved for this phase, or for phases planned as one from this one on:
         for the plan itself and on the way to it, for its refinement and to assess its impacts.
-    minor : LeastMinor or None
-        The least principal minor over that without friction; None in files of earlier versions.
+    uniqueness_margin : UniquenessMargin or None
+        Of its contact forces; None in files of earlier versions.
     wedged : float or None, [s]
         For how long friction could hold everything at rest; None if it does not begin so.
     settling : Settling or None
@@ -92,7 +92,7 @@ class PlannedPhase(NamedTuple):
     attempt: str
     error: float
     statistics: SolverStatistics
-    minor: LeastMinor | None = None
+    uniqueness_margin: UniquenessMargin | None = None
     wedged: float | None = None
     settling: Settling | None = None
     unheld: float | None = None

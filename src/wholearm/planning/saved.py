@@ -14,7 +14,7 @@ from ..results.certificate import Certificate
 from ..results.modes import ModeSpan
 from ..results.range_figures import RangeFigures
 from ..results.replay_figures import ReplayFigures
-from ..results.report import LeastMinor
+from ..results.report import UniquenessMargin
 from ..results.settling import Settling
 from ..results.trajectory import Trajectory
 from ..results.trajectory_file import load_trajectory
@@ -25,7 +25,7 @@ from .result import Plan, PlannedPhase, Status, Timings
 
 _OPTIONS = (
     "intervals", "transcription", "time_weight", "duration", "time_intervals", "degree", "scheme",
-    "opening", "clearance", "samples", "mode_search", "certify", "accuracy", "least_minor",
+    "opening", "clearance", "samples", "mode_search", "certify", "accuracy", "uniqueness_margin",
     "robust", "largest",
 )  # fmt: skip
 """Options that stand in `meta` by themselves; `objective` and `replay` do in other ways."""
@@ -49,7 +49,10 @@ def write_meta(plan: Plan) -> dict[str, Any]:
         "complete": [phase.complete for phase in phases],
         "attempts": [phase.attempt for phase in phases],
         "phase_errors": [None if isnan(phase.error) else phase.error for phase in phases],
-        "least_minors": [None if own.minor is None else own.minor._asdict() for own in phases],
+        "uniqueness_margins": [
+            None if own.uniqueness_margin is None else own.uniqueness_margin._asdict()
+            for own in phases
+        ],
         "wedged": [phase.wedged for phase in phases],
         "settling": [own.settling and own.settling.to_dict() for own in phases],
         "unheld": [own.unheld for own in phases],
@@ -92,8 +95,8 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
         raise InputError(source, f"meta.{error.key}", error.problem) from None
 
 
-def _read_minor(given: Mapping[str, Any] | None) -> LeastMinor | None:
-    return None if given is None else LeastMinor(**given)
+def _read_uniqueness_margin(given: Mapping[str, Any] | None) -> UniquenessMargin | None:
+    return None if given is None else UniquenessMargin(**given)
 
 
 def _read_settling(given: Mapping[str, Any] | None) -> Settling | None:
@@ -139,7 +142,7 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
             str(column("attempts", "")[k]),
             _read_error(column("phase_errors", None)[k]),
             statistics[k],
-            _read_minor(column("least_minors", None)[k]),
+            _read_uniqueness_margin(column("uniqueness_margins", None)[k]),
             column("wedged", None)[k],
             _read_settling(column("settling", None)[k]),
             column("unheld", None)[k],

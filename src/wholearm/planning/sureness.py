@@ -8,20 +8,20 @@ import numpy as np
 
 from ..common.errors import AmbiguityError
 from ..geometry.curve import describe_pose
-from ..mechanics.uniqueness import describe_minor
+from ..mechanics.uniqueness import describe_uniqueness
 from ..problem.definition import Problem
-from ..results.report import LeastMinor
+from ..results.report import UniquenessMargin
 from ..results.trajectory import Trajectory
-from ..verification.sureness import find_least_minor, find_wedged
+from ..verification.sureness import find_uniqueness_margin, find_wedged
 
 _STILL = 1e-9
 """Speed of a plan that is rest but for rounding, relative to the scene's."""
 
 
 class Sureness(NamedTuple):
-    """The least minor of a phase, and for how long it may stay wedged; see `PlannedPhase`."""
+    """The uniqueness margin of a phase, and for how long it may stay wedged; see `PlannedPhase`."""
 
-    minor: LeastMinor | None
+    uniqueness_margin: UniquenessMargin | None
     wedged: float | None
 
 
@@ -33,7 +33,7 @@ def check_sureness(problem: Problem, trajectory: Trajectory, least: float) -> li
     problem : Problem
     trajectory : Trajectory
     least : float
-        Least ratio of a principal minor to that without friction.
+        Least uniqueness margin (`mechanics.uniqueness`).
 
     Raises
     ------
@@ -43,10 +43,10 @@ def check_sureness(problem: Problem, trajectory: Trajectory, least: float) -> li
     found = []
     for phase in problem.phases:
         rows = np.flatnonzero(trajectory.phase == phase.index)
-        minor = find_least_minor(phase, trajectory, rows)
-        if minor is not None and minor.ratio < least:
-            place = describe_pose(trajectory.z[np.searchsorted(trajectory.t, minor.time)])
-            text = describe_minor(minor.ratio, minor.contacts, place, least)
+        margin = find_uniqueness_margin(phase, trajectory, rows)
+        if margin is not None and margin.value < least:
+            place = describe_pose(trajectory.z[np.searchsorted(trajectory.t, margin.time)])
+            text = describe_uniqueness(margin.value, margin.contacts, place, least)
             raise AmbiguityError(f"phase {phase.number}: {text}")
-        found.append(Sureness(minor, find_wedged(problem, phase, trajectory, rows, _STILL)))
+        found.append(Sureness(margin, find_wedged(problem, phase, trajectory, rows, _STILL)))
     return found

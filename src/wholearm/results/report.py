@@ -32,20 +32,21 @@ class ContactMargin(NamedTuple):
     margin: float
 
 
-class LeastMinor(NamedTuple):
-    """The least principal minor of the contact problem in one phase (`mechanics.uniqueness`).
+class UniquenessMargin(NamedTuple):
+    """Least uniqueness margin of contact forces in one phase (`mechanics.uniqueness`).
 
     Attributes
     ----------
-    ratio : float
-        To that without friction; contact forces are the only ones where it is positive.
+    value : float
+        Principal minor of the contact matrix K over that without friction: 1 without friction,
+        and contact forces are the only ones where it is positive.
     contacts : str
         Whose minor it is, with the modes of those that do not slide.
     time : float, [s]
         When.
     """
 
-    ratio: float
+    value: float
     contacts: str
     time: float
 
@@ -133,7 +134,7 @@ class PhaseReport(NamedTuple):
         None if there was no impact; one that is planned for may have been a stop.
     end_deviation, deviation : Deviation or None
         From the plan, at the end of the phase and at worst; None without a plan.
-    minor : LeastMinor or None
+    uniqueness_margin : UniquenessMargin or None
         None if nothing was seen moving.
     wedged : float or None, [s]
         For how long friction could have held everything at rest; None if it did not begin so.
@@ -151,7 +152,7 @@ class PhaseReport(NamedTuple):
     impact: LeastImpulse | None
     end_deviation: Deviation | None
     deviation: Deviation | None
-    minor: LeastMinor | None = None
+    uniqueness_margin: UniquenessMargin | None = None
     wedged: float | None = None
 
 

@@ -106,9 +106,9 @@ def _sure_table(report: Report) -> list[str]:
     rows = [
         [
             str(p.number),
-            show(p.minor and p.minor.ratio, ".4f"),
-            p.minor.contacts if p.minor else "-",
-            show(p.minor and p.minor.time, ".5f"),
+            show(p.uniqueness_margin and p.uniqueness_margin.value, ".4f"),
+            p.uniqueness_margin.contacts if p.uniqueness_margin else "-",
+            show(p.uniqueness_margin and p.uniqueness_margin.time, ".5f"),
             show(None if p.wedged is None else 1e3 * p.wedged, ".1f"),
         ]
         for p in report.phases

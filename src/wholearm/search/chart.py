@@ -74,7 +74,7 @@ class Chart:
     ----------
     problem : Problem
         Whose scene and epsilon it is for.
-    least_minor : float
+    uniqueness_margin : float
         See `PlanOptions`.
 
     Attributes
@@ -91,9 +91,9 @@ class Chart:
         Links through cells that were planned for themselves, or why they have no plan.
     """
 
-    def __init__(self, problem: Problem, least_minor: float) -> None:
+    def __init__(self, problem: Problem, uniqueness_margin: float) -> None:
         self.scene, self.epsilon = problem.scene, problem.epsilon
-        self.terms = Terms(problem.epsilon, least_minor)
+        self.terms = Terms(problem.epsilon, uniqueness_margin)
         self.polished: set[Link] = set()
         self._borders: dict[tuple[Key, tuple[Contact, ...]], list[Border]] = {}
         self._curves: dict[frozenset[Contact], list[Curve]] = {}

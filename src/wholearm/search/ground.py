@@ -71,7 +71,7 @@ class Ground(NamedTuple):
         return self._replace(rows=rows, steps=self.steps / ratio)
 
 
-def survey(curve: Curve, epsilon: float, least_minor: float) -> Ground:
+def survey(curve: Curve, epsilon: float, uniqueness_margin: float) -> Ground:
     """Look at a border.
 
     Parameters
@@ -80,7 +80,7 @@ def survey(curve: Curve, epsilon: float, least_minor: float) -> Ground:
         By its arc length.
     epsilon : float, [N]
         Least normal force.
-    least_minor : float
+    uniqueness_margin : float
         See `PlanOptions`.
     """
     way = Way((curve,), epsilon)
@@ -96,7 +96,7 @@ def survey(curve: Curve, epsilon: float, least_minor: float) -> Ground:
     steps = np.diff(nodes)
     try:
         at = curve.evaluate(s)
-        closed, clear = _find_ambiguity(curve, s, at, owners, least_minor)
+        closed, clear = _find_ambiguity(curve, s, at, owners, uniqueness_margin)
         rows = limit_along(curve, epsilon, _pick(at, slice(count)), owners[:count])
     except np.linalg.LinAlgError:
         none = np.zeros((len(steps), 1))
@@ -190,7 +190,7 @@ def _find_ambiguity(
     if inertia[~lost].min() <= 0:
         return "friction jams it", clear
     ratio, names, row = minors.find_least()
-    return f"{names} ambiguous: minor {ratio:.2f} at {describe_pose(at.z[row])}", clear
+    return f"{names} ambiguous: uniqueness margin {ratio:.2f} at {describe_pose(at.z[row])}", clear
 
 
 def _describe_dependence(formation: Formation, z: Array) -> str:

@@ -36,7 +36,7 @@ class Terms(NamedTuple):
     """What motions have to keep: the least normal force [N], and the least ratio of minors."""
 
     epsilon: float
-    least_minor: float
+    uniqueness_margin: float
 
 
 class Step(NamedTuple):

@@ -84,7 +84,7 @@ def _look_beyond(
     if not sources:
         return None
     start = replace(search.start, scene=changed.scene)
-    beyond = Search(Chart(changed, options.least_minor), start, search.goal, sources=sources)
+    beyond = Search(Chart(changed, options.uniqueness_margin), start, search.goal, sources=sources)
     rough = replace(options, objective=Objective.TIME, duration=None, accuracy=ROUGH, robust=0.0)
     rough = replace(rough, mode_search=False, certify=False, replay=False)
     chooser = Chooser(changed, [], beyond, rough, hurried=True)

@@ -140,7 +140,7 @@ def _find(
 
 def key_chart(problem: Problem, options: PlanOptions) -> str:
     """What a chart depends on, in words."""
-    known = describe_scene(problem.scene) | {"": (problem.epsilon, options.least_minor)}
+    known = describe_scene(problem.scene) | {"": (problem.epsilon, options.uniqueness_margin)}
     return json.dumps(known, sort_keys=True)
 
 
@@ -150,7 +150,7 @@ def get_chart(problem: Problem, options: PlanOptions, cache: Path | None = None)
     chart = _charts.pop(key, None)
     if chart is None and cache is not None:
         chart = load_chart(cache, key)
-    chart = chart or Chart(problem, options.least_minor)
+    chart = chart or Chart(problem, options.uniqueness_margin)
     _charts[key] = chart
     while len(_charts) > CHARTS:
         _charts.popitem(last=False)

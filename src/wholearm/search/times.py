@@ -15,7 +15,7 @@ from ..mapping.formation_map import Border
 from ..mechanics.dynamics import Directions, inverse, reduced_inertia
 from ..mechanics.limits import make_limits
 from ..mechanics.metric import metric_weights
-from ..mechanics.uniqueness import LEAST_MINOR, find_minors
+from ..mechanics.uniqueness import UNIQUENESS_MARGIN, find_minors
 from ..planning.lower_bound.rows import Rows, limit
 from ..problem.definition import Problem
 from .sweep import find_durations
@@ -76,7 +76,7 @@ def _follow(problem: Problem, borders: Sequence[Border], places: Array) -> Rows:
             rows = limit(every, forces, turned[:, 3:])
             inertia = reduced_inertia(formation, part, directions)
             ratios = find_minors(formation, part, directions.Xi).ratios
-            closed = ~(inertia > 0) | (ratios < LEAST_MINOR)
+            closed = ~(inertia > 0) | (ratios < UNIQUENESS_MARGIN)
             rows.one[closed], rows.a[closed], rows.b[closed] = -1.0, 0.0, 0.0
             chosen = mine.reshape(-1, count)[:, 0]
             for k, values in enumerate(rows):

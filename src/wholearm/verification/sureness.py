@@ -11,22 +11,22 @@ from ..contacts.formation import Kinematics
 from ..mechanics.uniqueness import find_minors
 from ..mechanics.wedging import SURE, find_static_torques
 from ..problem.definition import Phase, Problem
-from ..results.report import LeastMinor
+from ..results.report import UniquenessMargin
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Trajectory
 from ..simulation.events import EventKind, Simulation
 from .verdict import measure_speed
 
 PLACES = 33
-"""Instants of a phase at which minors are looked at, and at which torques are."""
+"""Instants of a phase at which uniqueness margins are looked at, and at which torques are."""
 _LEANS = 1 - 1e-6
 """Share of U c_n from which on a tangential force is that of sliding."""
 
 
-def find_least_minor(
+def find_uniqueness_margin(
     phase: Phase, motion: Trajectory | Simulation, rows: NDArray[np.int64]
-) -> LeastMinor | None:
-    """The least principal minor over that without friction in a phase; None if nothing moved.
+) -> UniquenessMargin | None:
+    """The least uniqueness margin in a phase; None if nothing moved.
 
     Tangential forces tell which way a contact slides; one that leans on no side of its cone sticks.
 
@@ -53,7 +53,7 @@ def find_least_minor(
         part = Kinematics(*(array[own] for array in kinematics))
         sticking = tuple(np.flatnonzero(~pattern).tolist())
         ratio, names, row = find_minors(formation, part, Xi[own], sticking).find_least()
-        found.append(LeastMinor(ratio, names, float(motion.t[rows[own[row]]])))
+        found.append(UniquenessMargin(ratio, names, float(motion.t[rows[own[row]]])))
     return min(found)
 
 

@@ -15,7 +15,7 @@ from ..common.arrays import Array
 from ..common.require import require_number
 from ..contacts.links import FINGERS_TOUCH
 from ..geometry.curve import describe_pose
-from ..mechanics.uniqueness import LEAST_MINOR, describe_minor, require_minor
+from ..mechanics.uniqueness import UNIQUENESS_MARGIN, describe_uniqueness, require_uniqueness_margin
 from ..problem.definition import End, Problem
 from ..results.report import ContactMargin, Deviation, Failure, FingerGap, PhaseReport
 from ..scene.model import Scene
@@ -33,8 +33,8 @@ ROUNDING = 5e-7
 GOAL = 3e-4
 """Distance to the end of the last phase that counts as there, relative to the scene's length, and
 in rad."""
-ROUGH_MINOR = 1e-3
-"""By how much minors of a replay may be less than those of its plan."""
+ROUGH_UNIQUENESS = 1e-3
+"""By how much uniqueness margins of a replay may be less than those of its plan."""
 OVERLAP = 3e-5
 """Overlap of the links that passes for touching, relative to the scene's length."""
 
@@ -52,8 +52,8 @@ class Allowance:
         scene's length.
     stray : float
         How far normal forces of a plan may fall below epsilon, over epsilon.
-    least_minor : float
-        Least ratio of a principal minor of the contact problem to that without friction.
+    uniqueness_margin : float
+        Least uniqueness margin of contact forces (`mechanics.uniqueness`).
 
     Raises
     ------
@@ -64,13 +64,15 @@ class Allowance:
     departure: float = DEPARTURE
     rest_speed: float = REST_SPEED
     stray: float = STRAY
-    least_minor: float = LEAST_MINOR
+    uniqueness_margin: float = UNIQUENESS_MARGIN
 
     def __post_init__(self) -> None:
         for key in ("departure", "rest_speed", "stray"):
             value = require_number(getattr(self, key), key, positive=True)
             object.__setattr__(self, key, value)
-        object.__setattr__(self, "least_minor", require_minor(self.least_minor))
+        object.__setattr__(
+            self, "uniqueness_margin", require_uniqueness_margin(self.uniqueness_margin)
+        )
 
     def scale(self, share: float) -> Allowance:
         """A share of what is allowed from the plan; the speed that passes for rest stays."""
@@ -205,12 +207,12 @@ def describe_ambiguity(
     """Sentences on phases whose contact forces are not, or hardly, the only ones."""
     failures = []
     for phase in phases:
-        minor = phase.minor
-        if minor is None or minor.ratio >= allowance.least_minor - ROUGH_MINOR:
+        least = phase.uniqueness_margin
+        if least is None or least.value >= allowance.uniqueness_margin - ROUGH_UNIQUENESS:
             continue
-        place = describe_pose(simulation.z[np.searchsorted(simulation.t, minor.time)])
-        text = describe_minor(minor.ratio, minor.contacts, place, allowance.least_minor)
-        text = f"{text}, at t = {minor.time:.5g} s, phase {phase.number}"
+        place = describe_pose(simulation.z[np.searchsorted(simulation.t, least.time)])
+        text = describe_uniqueness(least.value, least.contacts, place, allowance.uniqueness_margin)
+        text = f"{text}, at t = {least.time:.5g} s, phase {phase.number}"
         failures.append(Failure(phase.number, text))
     return failures
 

@@ -11,7 +11,7 @@ import numpy as np
 from ..common.arrays import Array
 from ..common.errors import InputError
 from ..common.sharing import exclusive
-from ..mechanics.uniqueness import LEAST_MINOR
+from ..mechanics.uniqueness import UNIQUENESS_MARGIN
 from ..problem.definition import End, Phase, Problem
 from ..results.narrow import Torques, adopt_torques
 from ..results.report import (
@@ -38,7 +38,7 @@ from .margins import (
     list_slip_margins,
 )
 from .motors import describe_motors
-from .sureness import find_departure, find_least_minor, find_wedged
+from .sureness import find_departure, find_uniqueness_margin, find_wedged
 from .verdict import (
     DEPARTURE,
     REST_SPEED,
@@ -90,7 +90,7 @@ def verify(
     tolerance: float = 1e-9,
     departure: float = DEPARTURE,
     rest_speed: float = REST_SPEED,
-    least_minor: float = LEAST_MINOR,
+    uniqueness_margin: float = UNIQUENESS_MARGIN,
     reduced: bool = False,
 ) -> Report:
     """Replay the torques of a plan, or given ones, open loop and report what happens.
@@ -111,8 +111,8 @@ def verify(
     rest_speed : float
         Speed at the end of a phase that passes for rest, relative to the scene's speed (the root
         of length times gravity); angular speeds count times the scene's length.
-    least_minor : float
-        Least ratio of a principal minor of the contact problem to that without friction.
+    uniqueness_margin : float
+        Least uniqueness margin of contact forces (`mechanics.uniqueness`).
     reduced : bool
         Whether to list the paper's scalar equation of motion along phases with four constraints.
 
@@ -124,7 +124,7 @@ def verify(
         If the simulation cannot go on.
     """
     problem, torque, plan = adopt_torques(problem, what)
-    allowance = Allowance(departure, rest_speed, least_minor=least_minor)
+    allowance = Allowance(departure, rest_speed, uniqueness_margin=uniqueness_margin)
     names = {contact.name for contact in problem.contacts}
     if plan is not None and set(plan.contacts) != names:
         odd = ", ".join(sorted(set(plan.contacts) ^ names))
@@ -262,7 +262,7 @@ def _report_phase(
         impact=LeastImpulse(impacts[0].contact, impacts[0].value) if impacts else None,
         end_deviation=end,
         deviation=worst,
-        minor=find_least_minor(phase, simulation, rows) if sure else None,
+        uniqueness_margin=find_uniqueness_margin(phase, simulation, rows) if sure else None,
         wedged=find_wedged(problem, phase, simulation, rows, REST_SPEED, moves) if sure else None,
     )
 

@@ -42,6 +42,8 @@ _FINER = (1, 2, 4)
 """Elements to try, over those that are asked for."""
 _SPREADS = 3
 """Most plans within ranges, each with rows for the speed of the one before."""
+_NARROWER = (0.5, 0.2, 0.1)
+"""Shares of ranges that are tried where it is not known what leaves no plan within them."""
 _WASTED = 0.02
 """Share of the accuracy that limits may cost by being tightened more than they need."""
 _ROUGH = 1e-2
@@ -145,7 +147,10 @@ def plan_curves(
     if isinstance(found, _Stuck):
         if not explained:
             raise SolverError(found.reason)
-        raise _explain(task, found, replan)
+        error = _explain(task, found, replan)
+        # What guides is a plan without ranges.
+        unclear = guides and isinstance(error, SolverError)
+        raise _explain_ranges(task) if unclear else error
     if options.goal is Objective.MARGIN and found.plans[0].value < task.lost:
         least = SolverError(f"{task.name}: the margin found is below epsilon")
         raise _explain_duration(task) or least
@@ -187,6 +192,20 @@ def _explain(
         return explain_motors(task, found.parts, found.reason, plan_curves)
     late, slow = _explain_duration(task), guess_slowly(join(found.parts))
     return late or explain(found.parts, *slow, task.phases, found.reason, replan)
+
+
+def _explain_ranges(task: Task) -> SolverError:
+    """That there is no plan within the ranges, and with which narrower ones there is."""
+    given, options = task.options.robust, _roughen(task.options)
+    text = f"{task.name}: no plan was found that keeps the limits within the ranges of numbers"
+    for share in _NARROWER:
+        ranges = {name: share * half for name, half in options.ranges.items()}
+        narrow = replace(task, options=replace(options, ranges=ranges))
+        if isinstance(_plan_within(narrow)[0], _Solved):
+            return SolverError(
+                f"{text} (--robust {given:g}); with --robust {share * given:g} one is"
+            )
+    return SolverError(f"{text}, nor for a tenth of them; without --robust there is a plan")
 
 
 def _plan_within(task: Task) -> tuple[_Solved | _Stuck, tuple[Guide, ...]]:

@@ -85,7 +85,7 @@ class Task:
     def require_unique(self) -> None:
         """Require contact forces to be the only ones; see `unique.require_unique`."""
         for curve, phase in zip(self.curves, self.phases, strict=True):
-            require_unique(curve, self.options.least_minor, phase)
+            require_unique(curve, self.options.uniqueness_margin, phase)
 
     def lay_out(
         self, meshes: Sequence[Mesh], wanted: int

@@ -7,7 +7,7 @@ import numpy as np
 from ...common.errors import AmbiguityError
 from ...geometry.curve import Curve, describe_pose
 from ...mechanics.dynamics import Directions, reduced_inertia
-from ...mechanics.uniqueness import describe_minor, find_minors
+from ...mechanics.uniqueness import describe_uniqueness, find_minors
 
 LOOKS = 17
 """Places of a stretch without reversals at which contact forces are looked at."""
@@ -20,7 +20,7 @@ def require_unique(curve: Curve, least: float, phase: int) -> None:
     ----------
     curve : Curve
     least : float
-        Least ratio of a principal minor to that without friction.
+        Least uniqueness margin (`mechanics.uniqueness`).
     phase : int
         Its number, for messages.
 
@@ -42,5 +42,5 @@ def require_unique(curve: Curve, least: float, phase: int) -> None:
         return
     sigma = np.repeat([own.sigma for own in segments], LOOKS, axis=0)
     if reduced_inertia(formation, point.kinematics, Directions(Xi, sigma)).min() > 0:
-        text = describe_minor(ratio, names, describe_pose(point.z[row]), least)
+        text = describe_uniqueness(ratio, names, describe_pose(point.z[row]), least)
         raise AmbiguityError(f"phase {phase}: {text}")

@@ -26,7 +26,8 @@ from ..advice import (
     name_phases,
     rank_shortfalls,
 )
-from ..options import Objective
+from ..options import Objective, PlanOptions
+from ..splitting import runs_along_curves
 from .collocation import Scheme, blend
 from .motion import TimeMotion, make_motions
 from .own_units import to_si
@@ -80,6 +81,10 @@ def refuse(
         say = "at its end, {}, no motion comes to rest in any contact mode"
     if blocked is None:
         _refuse_pushed(problem, phases[0], stages if alone else ())
+        if problem.scene.has_slow_motors:
+            _refuse_unheld(problem, phases[0], stages[0], 0)
+            if alone and (last.formation.n_constraints == 4 or phase.until.pins):
+                _refuse_unheld(problem, phases[0], last, -1)
         return
     where = describe_pose(to_si(stage, problem).guess.nodes[node, 0])
     text = f"phase {phase.number} is infeasible: {say.format(where)}"
@@ -121,6 +126,24 @@ def _refuse_pushed(problem: Problem, phase: Phase, stages: Sequence[Stage]) -> N
         )
 
 
+def _refuse_unheld(problem: Problem, phase: Phase, stage: Stage, node: int) -> None:
+    """Raise an error if torques that may not step cannot hold the object at rest at an end."""
+    from ...mechanics.wedging import find_static_torques
+
+    z, limit = to_si(stage, problem).guess.nodes[node, 0], problem.scene.torque_limit
+    held = find_static_torques([phase.formation], z)
+    if not held.is_empty(limit):
+        return
+    most = "however large" if held.is_empty(np.full(2, np.inf)) else "within their limits"
+    raise InfeasibleError(
+        f"phase {phase.number} is infeasible: torques may not step (torque_rate_limit, "
+        f"actuator_lag), so that they have to hold the object at rest at its "
+        f"{'end' if node else 'start'}, {describe_pose(z)}; {' '.join(phase.formation.names)} with "
+        f"their friction can be held there by no torques, {most}; end the phase where they can "
+        "(wholearm predict shows where), or leave out torque_rate_limit and actuator_lag"
+    )
+
+
 def explain(
     search: Search,
     problem: Problem,
@@ -148,6 +171,9 @@ def explain(
     if not short:
         names = " and ".join(" ".join(phase.formation.names) for phase in phases)
         text = f"no plan for {name_phases(numbers)} ({names}, until {phases[-1].until}): {status}"
+        usual = search.options.transcription == "time" and not problem.scene.control_period
+        if usual and runs_along_curves(phases, PlanOptions()):
+            return SolverError(f"{text}; leave out --transcription time, which plans along curves")
         return SolverError(f"{text}; try another number of intervals per phase (--time-intervals)")
 
     def sum_up(stages: list[Stage]) -> float:

@@ -309,8 +309,8 @@ def _explain(
 
     tried = dict.fromkeys([NEAREST, *(own.name for own in outcomes)])
     reason = (
-        f"the solver did not converge from {len(tried)} initial guesses ({'; '.join(tried)}), nor "
-        "when limits may be missed"
+        "the solver found neither a plan nor a motion that misses limits least, from "
+        f"{len(tried)} guess{'es' * (len(tried) > 1)} of the motion"
     )
     short = [own.short for own in outcomes if own.short]
     if not short:
