@@ -107,7 +107,7 @@ def test_the_cone_is_what_holds_the_fastest_motion_back() -> None:
     samples = sample(plan(), 4000)
     near = margin(samples, 0.5) < 0.5 * EPSILON + 1e-3
     assert (near & (samples.c_t[:, 0] > 0)).any() and (near & (samples.c_t[:, 0] < 0)).any()
-    times = [plan("time", mu, 20).value for mu in (0.45, 0.5, 0.6, 0.8)]
+    times = [plan("time", mu, 20).value for mu in (0.45, 0.5, 0.8)]
     assert (np.diff(times) < -1e-3).all()
     assert (margin(sample(plan("time", 0.8, 20), 4000), 0.5) < 0).any()
 

@@ -335,7 +335,7 @@ def test_a_landing_without_a_reserve_is_planned_anew() -> None:
     problem = replace(whole, start=start, phases=phases)
 
     def planner(own: Problem) -> Trajectory:
-        return wholearm.solve(own, replay=False).trajectory
+        return wholearm.solve(own, replay=False, time_intervals=8).trajectory
 
     plan = planner(problem)
     policy = make_policy(problem, plan, planner=planner)

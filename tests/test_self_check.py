@@ -179,7 +179,7 @@ def test_a_block_is_refined_by_twice_its_intervals(
         asked.append((k, options.intervals))
         return planning.blocks[k].plans, planning.blocks[k].chain
 
-    monkeypatch.setattr(blocks, "_plan_block", plan_again)
+    monkeypatch.setattr(blocks, "plan_block", plan_again)
     once = refine_block(planning, 1, lambda _: None)
     twice = refine_block(once, 1, lambda _: None)
     assert [own.finer for own in twice.blocks] == [0, 2, 0] and asked == [(1, 20), (1, 40)]
