@@ -180,10 +180,13 @@ def test_a_function_in_another_thread_waits(tracked: type[Tracked]) -> None:
 
 
 def test_nothing_of_casadi_is_left_to_the_garbage_collector() -> None:
-    def run(**changes: Any) -> None:
-        problem = replace(wholearm.load(SQUARE), **changes)
+    def run(transcription: str = "auto", **changes: Any) -> None:
+        problem = wholearm.load(SQUARE)
+        problem = replace(problem, phases=problem.phases[:1], **changes)
+        options: dict[str, Any] = {"transcription": transcription, "replay": False}
         try:
-            wholearm.verify(problem, wholearm.solve(problem, intervals=10, time_intervals=4))
+            plan = wholearm.solve(problem, intervals=10, time_intervals=4, **options)
+            wholearm.verify(problem, plan)
         except wholearm.InfeasibleError:
             assert changes
 
@@ -192,6 +195,7 @@ def test_nothing_of_casadi_is_left_to_the_garbage_collector() -> None:
     gc.set_debug(gc.DEBUG_SAVEALL)
     try:
         run()
+        run("time")
         run(epsilon=3.0)
         gc.collect()
         kinds = {type(item).__module__.partition(".")[0] for item in gc.garbage}
