@@ -108,7 +108,8 @@ def tried(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> li
 )
 def test_a_plan_names_the_attempt_that_led_to_it(tried: list[str], order: list[str]) -> None:
     problem, _ = shove()
-    assert plan_phases(problem, problem.phases, problem.start, OPTIONS) == [order[-1]]
+    plans: list[Any] = plan_phases(problem, problem.phases, problem.start, OPTIONS)
+    assert plans == [order[-1]]
     assert tried == order
 
 
