@@ -163,8 +163,8 @@ def test_what_may_slide_or_roll_is_faster_than_what_has_to_roll() -> None:
     problem = tilting()
     (phase,) = problem.phases
     rolls = replace(phase, formation=roll(phase.formation, "v1-palm"))
-    bound = solve(replace(problem, phases=(rolls,)), intervals=40, replay=False).trajectory
-    plan = solve(problem, time_intervals=10, replay=False).trajectory
+    bound = solve(replace(problem, phases=(rolls,)), intervals=10, replay=False).trajectory
+    plan = solve(problem, time_intervals=6, replay=False).trajectory
     assert plan.duration < 0.95 * bound.duration
     report = verify(problem, plan)
     assert report.ok, report.to_text()

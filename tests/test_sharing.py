@@ -179,6 +179,7 @@ def test_a_function_in_another_thread_waits(tracked: type[Tracked]) -> None:
     assert done
 
 
+@pytest.mark.usefixtures("unadvised")
 def test_nothing_of_casadi_is_left_to_the_garbage_collector() -> None:
     def run(transcription: str = "auto", **changes: Any) -> None:
         problem = wholearm.load(SQUARE)
