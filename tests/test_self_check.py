@@ -225,6 +225,10 @@ def test_a_plan_that_is_allowed_is_kept_where_finer_ones_are_not(
     own.usual_before = 1
     planning, _, figures = own.run()
     assert planning is own.planning and (figures.simulations or 0) > 1
+    # One that is always allowed, and never strictly, is refined once.
+    own.usual_before = 100
+    planning, _, figures = own.run()
+    assert figures.simulations == 2 and [block.finer for block in planning.blocks] == [0, 1, 0]
 
 
 def test_meta_keeps_the_figures(heptagon: Problem, trajectory: Trajectory) -> None:
