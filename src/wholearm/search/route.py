@@ -171,13 +171,17 @@ def _refuse(
     failures: list[Failure],
     seconds: float,
     report: Reporter,
+    hurry: Callable[[], None] | None,
 ) -> InfeasibleError:
     """Why nothing leads to a goal, which took so many seconds to see, and what opens the way."""
     opening, changes, why = "", tuple[Change, ...](), partial(explain, problem, options)
     try:
-        opening, changes = find_opening(search, problem, options, seconds, report)
-        text = describe_block(search, failures, opening, why)
-    except OutOfTime:
+        with yielding():
+            opening, changes = find_opening(search, problem, options, seconds, report)
+            text = describe_block(search, failures, opening, why)
+    except KeyboardInterrupt as error:
+        if hurry is None and not isinstance(error, OutOfTime):
+            raise
         # That nothing leads there is known; what would help, and why, is not looked for any more.
         text = describe_block(search, failures, opening)
     return InfeasibleError(text, changes=changes)
@@ -230,9 +234,8 @@ def _choose(
             chooser.plan(1, report)
     made, margin = chooser.made, options.goal is Objective.MARGIN
     if not made:
-        raise _refuse(
-            problem, search, options, chooser.failures, time.process_time() - begun, report
-        )
+        spent = time.process_time() - begun
+        raise _refuse(problem, search, options, chooser.failures, spent, report, hurry)
     made.sort(key=lambda own: -own[0].value if margin else own[0].value)
     plan, route = made[0]
     bound = None
