@@ -1,27 +1,26 @@
 from __future__ import annotations
 
-from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from shipped import HEPTAGON, problem_of
 from thrown import shove
+from wholearm.common.errors import InfeasibleError, SolverError
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.plan import solve
+from wholearm.planning.time_domain import attempts as attempts_module
 from wholearm.planning.time_domain import plan as time_plan
-from wholearm.planning.time_domain.attempts import (
-    FALLS,
-    GRADUAL,
-    NEAREST,
-    Attempt,
-    Attempts,
-    solve_attempt,
-)
+from wholearm.planning.time_domain.attempts import GRADUAL, NEAREST, Attempt, Attempts
 from wholearm.planning.time_domain.plan import plan_phases
 from wholearm.planning.time_domain.search import Search, Solution
+from wholearm.planning.time_domain.stage import Stage
+from wholearm.planning.time_domain.staging import guess_stages
+from wholearm.planning.time_domain.way_guess import PacedWay
 from wholearm.problem.definition import Problem
 
 OPTIONS = PlanOptions(time_intervals=12, transcription="time")
+PACE = "{}, {} times as long as a fall over that height"
+AHEAD = [PACE.format("one to an end of the phases further on", falls) for falls in (2, 4, 1) * 2]
 
 
 def list_attempts(problem: Problem, count: int, patient: bool = True) -> Attempts:
@@ -29,39 +28,52 @@ def list_attempts(problem: Problem, count: int, patient: bool = True) -> Attempt
     return Attempts(problem, problem.phases[:count], problem.start, search, None, patient)
 
 
-def test_a_single_phase_is_tried_along_ways_and_at_several_paces() -> None:
+def along(margin: float, gradual: bool = False) -> str:
+    return f"a straight path that keeps limits with {margin:g} to spare{GRADUAL * gradual}"
+
+
+@pytest.mark.parametrize(
+    ("margins", "ways"),
+    [
+        # Paths that keep limits come first, those near that next, and what is far is left out.
+        ((0.4, -0.1, -0.5), [along(0.4), along(0.4, True), along(-0.1, True), along(-0.1)]),
+        # Of paths that are all far from it the best one shows what is short.
+        ((-0.5, -0.6), [along(-0.5)]),
+        ((), []),
+    ],
+)
+def test_a_single_phase_is_tried_along_paths_and_at_several_paces(
+    monkeypatch: pytest.MonkeyPatch, margins: tuple[float, ...], ways: list[str]
+) -> None:
+    guessed = list[tuple[int, float, bool, float | None]]()
+
+    def guess(*given: Any, way: PacedWay | None) -> list[Stage]:
+        guessed.append((*given[4:7], way and way.margin))
+        return guess_stages(*given)
+
+    paced = [PacedWay([], margin, None, None) for margin in margins]  # type: ignore[arg-type]
+    monkeypatch.setattr(attempts_module, "list_ways", lambda *_: paced)
+    monkeypatch.setattr(attempts_module, "guess_stages", guess)
     attempts = list_attempts(problem_of(HEPTAGON), 1)
     found = list(attempts)
-    names = [attempt.name for attempt in found]
-    assert len(set(names)) < len(names) and found.count(attempts.first) == 1
-    at = found.index(attempts.first)
-    # Modes are found before they are given, from the same guesses.
-    gradual = [attempt for attempt in found if attempt.gradual]
-    assert gradual[0].stages is attempts.first.stages and found[0] == gradual[0]
-    plain = [name for name, attempt in zip(names, found, strict=True) if not attempt.gradual]
-    plain = plain[: plain.index(NEAREST)]
-    assert all(name.startswith("a straight path that keeps limits ") for name in plain)
-    assert len(plain) <= len(attempts.ways)
-    sure = [way.margin for way in attempts.ways if way.margin > 0]
-    assert [attempt.gradual for attempt in found[1 : 1 + len(sure)]] == [False] * len(sure)
-    assert {attempt.name for attempt in gradual[1:]} <= {f"{name}{GRADUAL}" for name in plain}
-    # The same guess again on finer intervals counts as another, and the first one is not repeated.
-    paces = [name for name in names[at + 1 :] if name.startswith(f"{NEAREST}, ")]
-    assert len(paces) == len(names) - at - 1 == 2 * len(FALLS) - 1
-    for attempt in found:
-        halved = 12 / 2**attempt.halvings
-        assert all(stage.intervals <= halved + 1e-9 for stage in attempt.stages)
+    paces = [PACE.format(NEAREST, falls) for falls in (4, 1, 2, 4, 1)]
+    assert [own.name for own in found] == [NEAREST + GRADUAL, *ways, NEAREST, *paces]
+    assert [own.gradual for own in found] == [own.name.endswith(GRADUAL) for own in found]
+    # The first one is guessed once: its modes are found before they are given.
+    assert found[0].stages is attempts.first.stages
+    # Half the intervals, as 12 are more than a phase starts with; then the same on all of them.
+    near = [margin for margin in margins if along(margin) in ways]
+    assert guessed[:-5] == [(6, 2.0, False, own) for own in (None, *near)]
+    assert [own[:2] for own in guessed[-5:]] == [(6, 4), (6, 1), (12, 2), (12, 4), (12, 1)]
+    assert [own.halvings for own in found[-6:]] == [1, 1, 1, 0, 0, 0]
 
 
 def test_phases_in_motion_are_tried_ahead() -> None:
-    problem, _ = shove()
-    attempts = list_attempts(problem, 2)
+    attempts = list_attempts(shove()[0], 2)
     assert attempts.ways == [] and not attempts.are_far
-    names = [attempt.name for attempt in attempts]
-    assert names[:2] == [f"{NEAREST}{GRADUAL}", NEAREST]
-    assert all(name.startswith("one to an end of the phases further on, ") for name in names[2:])
+    assert [own.name for own in attempts] == [NEAREST + GRADUAL, NEAREST, *AHEAD]
     # Where the first one has led nowhere, it is not among those that are made after it.
-    assert [attempt.name for attempt in attempts.list_further(3)] == [names[0], names[2]]
+    assert [own.name for own in attempts.list_further(3)] == [NEAREST + GRADUAL, AHEAD[0]]
 
 
 def test_where_patience_is_not_asked_for_there_is_one_attempt() -> None:
@@ -69,23 +81,56 @@ def test_where_patience_is_not_asked_for_there_is_one_attempt() -> None:
     assert list(attempts) == [attempts.first]
 
 
-def test_a_plan_names_the_attempt_that_led_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the first one is lost, the next one that leads to a plan."""
+@pytest.fixture
+def tried(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> list[str]:
+    """Names of attempts in the order in which they are made; one leads to a plan."""
+    names, good = list[str](), request.param
+
+    def pretend(search: Search, attempt: Attempt) -> Solution:
+        names.append(attempt.name)
+        nlp, success = search.build(attempt.stages), attempt.name == good
+        return Solution(attempt.stages, 1.0, 0.0, "Ipopt stopped", success, nlp, {})
+
+    monkeypatch.setattr(time_plan, "solve_attempt", pretend)
+    monkeypatch.setattr(time_plan, "find_short", lambda *_: (None, []))
+    monkeypatch.setattr(time_plan, "list_plans", lambda *given: [given[-1]])
+    return names
+
+
+@pytest.mark.parametrize(
+    ("tried", "order"),
+    [
+        (NEAREST, [NEAREST]),
+        (NEAREST + GRADUAL, [NEAREST, NEAREST + GRADUAL]),
+        (AHEAD[1], [NEAREST, NEAREST + GRADUAL, *AHEAD[:2]]),
+    ],
+    indirect=["tried"],
+)
+def test_a_plan_names_the_attempt_that_led_to_it(tried: list[str], order: list[str]) -> None:
     problem, _ = shove()
-    plan = solve(problem, time_intervals=4, replay=False)
-    assert {phase.attempt for phase in plan.phases} == {NEAREST}
-    assert plan.meta["attempts"] == [NEAREST] * len(problem.phases)
-    tried: list[str] = []
-    run = solve_attempt
+    plans: list[Any] = plan_phases(problem, problem.phases, problem.start, OPTIONS)
+    assert plans == [order[-1]]
+    assert tried == order
 
-    def lose_first(search: Search, attempt: Attempt) -> Solution:
-        tried.append(attempt.name)
-        if len(tried) > 1 and not attempt.gradual:
-            return run(search, attempt)
-        nlp = search.build(attempt.stages)
-        return Solution(attempt.stages, 0.0, 0.0, "lost", False, nlp, {})
 
-    monkeypatch.setattr(time_plan, "solve_attempt", lose_first)
-    options = replace(OPTIONS, time_intervals=4)
-    (first, *_) = plan_phases(problem, problem.phases, problem.start, options)
-    assert tried[0] == NEAREST and first.attempt == tried[-1] != NEAREST
+@pytest.mark.parametrize("tried", ["none"], indirect=True)
+def test_attempts_end_where_motions_of_two_are_short_of_limits(
+    tried: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before that all are made; what is like what is short is first asked what it is short of."""
+    problem, _ = shove()
+    with pytest.raises(SolverError, match="did not converge from 5 initial guesses"):
+        plan_phases(problem, problem.phases, problem.start, OPTIONS, explained=False)
+    assert tried == [NEAREST, NEAREST + GRADUAL, *AHEAD]
+    asked = list[object]()
+
+    def find_short(*given: Any) -> tuple[list[Stage], list[Stage]]:
+        asked.append(given)
+        return given[2], given[2]
+
+    tried.clear()
+    monkeypatch.setattr(time_plan, "find_short", find_short)
+    monkeypatch.setattr(time_plan, "explain_lost", lambda *_: InfeasibleError("short"))
+    with pytest.raises(InfeasibleError, match="short"):
+        plan_phases(problem, problem.phases, problem.start, OPTIONS, explained=False)
+    assert tried == [NEAREST, NEAREST + GRADUAL] and len(asked) == time_plan.CONVINCING == 2

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -9,16 +12,15 @@ import wholearm.planning.time_domain.attempts as attempts
 import wholearm.planning.time_domain.mode_search as mode_search
 from plane import make_formation, measure_gaps, measure_slip
 from thrown import parting, raised
-from timed import instants, landing, plan_landing, total
+from timed import instants
 from tipping import roll, tilting
 from wholearm.contacts.formation import find_touching
-from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
 from wholearm.planning.time_domain.enforcing import MOST
 from wholearm.planning.time_domain.mode_search import improve
-from wholearm.planning.time_domain.modes import in_mode, link, mode_of, sign_sequence, split
+from wholearm.planning.time_domain.modes import Mode, in_mode, link, mode_of
 from wholearm.planning.time_domain.motion import TimeMotion
 from wholearm.planning.time_domain.moves import WORTH
 from wholearm.planning.time_domain.plan import plan_phases
@@ -48,16 +50,92 @@ def turn_joint(stages: list[Stage], joint: int) -> list[Stage]:
     return link(turned)
 
 
-def test_a_joint_that_is_guessed_the_wrong_way_is_corrected() -> None:
-    search, stages = outlined(raised())
-    right = improve(search, search.solve(stages))
-    wrong = search.solve(turn_joint(stages, 1))
-    assert right.success and wrong.success
-    corrected = improve(search, wrong)
-    assert corrected.cost < 0.9 * wrong.cost
-    # Whichever way was guessed, what is found is the same.
-    assert corrected.cost == pytest.approx(right.cost, rel=WORTH)
-    assert sign_sequence(corrected.stages) == sign_sequence(right.stages)
+@cache
+def alphabet() -> dict[str, Stage]:
+    """A stage in several modes, by name: sequences below are words of these; "r" rolls."""
+    (stage,) = outlined(raised(), 4)[1]
+    signs = {"a": (1, -1, -1), "b": (1, 1, -1), "c": (1, -1, 1), "d": (1, 1, 1), "r": (0, -1, -1)}
+    return {
+        name: in_mode(stage, Mode((float(palm), 1.0, 1.0, float(one), float(two))))
+        for name, (palm, one, two) in signs.items()
+    }
+
+
+def word_of(stages: list[Stage]) -> str:
+    names = {mode_of(stage): name for name, stage in alphabet().items()}
+    return "".join(names[mode_of(stage)] for stage in stages)
+
+
+class Priced(Search):
+    """A search whose solves cost what a table says, and fail for sequences that it leaves out."""
+
+    costs: Mapping[str, float]
+    asked: list[str]
+
+    def solve(self, stages: list[Stage], before: Solution | None = None, most: int = 0) -> Solution:
+        self.asked.append(word_of(stages))
+        return self.answer(stages, self.costs.get(self.asked[-1], math.inf))
+
+    def answer(self, stages: list[Stage], cost: float) -> Solution:
+        return Solution(stages, cost, 0.0, "", math.isfinite(cost), None, {})  # type: ignore[arg-type]
+
+
+LESS, MORE = 1 - 2 * WORTH, 1 + 2 * WORTH
+
+
+@pytest.mark.parametrize(
+    ("begin", "costs", "moves", "asked", "found"),
+    [
+        pytest.param(
+            "a", {"b": 0.9, "c": 0.8}, {"a": "b d", "b": "a c"}, "b c", "c", id="down, step by step"
+        ),
+        pytest.param("a", {"b": LESS}, {"a": "b"}, "b", "b", id="worth it"),
+        pytest.param("a", {"b": 1 - WORTH / 2}, {"a": "b"}, "b", "a", id="not worth it"),
+        pytest.param("ab", {"b": 1 + WORTH / 2}, {"ab": "b"}, "b", "b", id="one stage less"),
+        pytest.param("ab", {"b": MORE}, {"ab": "b"}, "b", "ab", id="one stage less, but dearer"),
+        # A stage of no length gains by the intervals beside it; then there is one stage less.
+        pytest.param(
+            "a", {"ba": 0.9, "a": 0.9}, {"a": "ba", "ba": "a"}, "ba a", "a", id="of no length"
+        ),
+        pytest.param("ab", {"c": 2.0}, {"ab": "c c"}, "c", "ab", id="the same one twice"),
+        pytest.param(
+            "a", {"r": 1.1, "b": 0.9}, {"a": "r", "r*": "b"}, "r b", "b", id="leans where it rolls"
+        ),
+        pytest.param("a", {"d": 0.5}, {"a": "b c bc d"}, "b c bc", "a", id="lost three times"),
+        pytest.param(
+            "a",
+            {"d": 0.5, "cd": 0.4},
+            {"a": "b c d", "d": "bc bd cd"},
+            "b c d bc bd cd",
+            "cd",
+            id="lost, and again after a gain",
+        ),
+    ],
+)
+def test_modes_change_for_as_long_as_that_gains(
+    monkeypatch: pytest.MonkeyPatch,
+    begin: str,
+    costs: dict[str, float],
+    moves: dict[str, str],
+    asked: str,
+    found: str,
+) -> None:
+    """Which sequences are solved for, in which order, and what is kept; the first one costs 1.
+
+    Moves from what rolls and is no better are those of contacts that lean, "r*".
+    """
+    own = Priced(**vars(outlined(raised(), 4)[0]))
+    own.costs, own.asked = costs, []
+
+    def list_moves(search: Search, solution: Solution, leaning: bool = False) -> list[list[Stage]]:
+        words = moves.get(word_of(solution.stages) + "*" * leaning, "").split()
+        return [[alphabet()[name] for name in word] for word in words]
+
+    monkeypatch.setattr(mode_search, "list_neighbours", list_moves)
+    best = improve(own, own.answer([alphabet()[name] for name in begin], 1.0))
+    assert own.asked == asked.split() and word_of(best.stages) == found
+    assert own.tried.sequences == 1 + len(own.asked)
+    assert own.tried.complete == ({*moves.get(found, "").split()} <= {begin, *own.asked})
 
 
 def test_plans_are_the_same_whichever_way_a_joint_is_guessed(
@@ -71,7 +149,6 @@ def test_plans_are_the_same_whichever_way_a_joint_is_guessed(
     (right,) = plan_phases(problem, problem.phases, problem.start, OPTIONS)
     monkeypatch.setattr(attempts, "guess_stages", guess_wrong)
     (plan,) = plan_phases(problem, problem.phases, problem.start, OPTIONS)
-    assert plan.sequences > 1
     assert plan.motion.duration == pytest.approx(right.motion.duration, rel=1e-3)
     for stage in plan.motion.stages:
         samples = stage.evaluate(instants(stage, 12))
@@ -81,71 +158,16 @@ def test_plans_are_the_same_whichever_way_a_joint_is_guessed(
         assert (joints * stage.directions.sigma).min() > -1e-4 * np.abs(joints).max()
 
 
-def test_rolling_for_a_while_is_found_where_it_is_the_best_of_all_sequences() -> None:
-    # The box turns over one vertex one way, so that only its own mode is in question.
-    search, (stage,) = outlined(tilting(), 16)
-    modes = [mode_of(stage).changed((0,), sign) for sign in (-1.0, 0.0)]
-    guesses = [[in_mode(stage, mode)] for mode in modes]
-    guesses.append(split(in_mode(stage, modes[1]), search.scheme, 8, 16, modes[0]))
-    slides, rolls, both = (search.solve(link(guess)) for guess in guesses)
-    # Sliding throughout and rolling throughout are possible; doing both in turn is quicker.
-    assert slides.success and rolls.success and both.success
-    assert both.cost < (1 - WORTH) * min(slides.cost, rolls.cost)
-    found = improve(search, slides)
-    palm = [mode_of(part).signs[0] for part in found.stages]
-    assert {*palm} == {0.0, -1.0}
-    assert found.cost < (1 - WORTH) * min(slides.cost, rolls.cost)
-    # It rolls for a while, and leans on its cone less epsilon at most.
-    rolling = found.stages[palm.index(0.0)]
-    assert rolling.guess.duration > 0.1 * found.cost
-    c_n, c_t = rolling.guess.forces[..., 0], rolling.guess.forces[..., -1]
-    mu = rolling.formation.friction[0]
-    assert (mu * (c_n - search.problem.epsilon) - np.abs(c_t)).min() > -1e-6
-
-
-def test_a_stage_of_no_length_that_gains_by_its_intervals_alone_is_dropped(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    search, stages = outlined(raised(), 4)
-    first = search.solve(stages)
-    (stage,) = first.stages
-    pieces = link(split(stage, search.scheme, 0, 1, mode_of(stage).changed((1,), 0.0)))
-    split_up = search.solve(pieces)
-    # Rolling shrinks to the shortest that is allowed, and all that follows is one stage less.
-    assert split_up.stages[0].guess.duration < 1e-4
-    assert split_up.cost < (1 - WORTH) * first.cost
-    list_all = mode_search.list_neighbours
-
-    def list_pieces(search: Search, solution: Solution, leaning: bool = False) -> list[list[Stage]]:
-        return [pieces] if solution is first else list_all(search, solution, leaning)
-
-    monkeypatch.setattr(mode_search, "list_neighbours", list_pieces)
-    found = improve(search, first)
-    assert sign_sequence(found.stages) == sign_sequence(first.stages)
-    assert found.cost == pytest.approx(split_up.cost, rel=WORTH)
-
-
-def test_stages_dropped_one_way_or_another_are_solved_for_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    search, stages = outlined(raised(), 4)
-    (stage,) = stages
-    solution = search.solve(link(split(stage, search.scheme, 0, 2, mode_of(stage))))
-    assert len(solution.stages) == 2
-    # The same single stage twice, the wrong way round: no better than the two.
-    moves = [turn_joint(stages, 1), turn_joint(stages, 1)]
-    monkeypatch.setattr(mode_search, "list_neighbours", lambda *given, **named: list(moves))
-    known = search.tried.sequences
-    assert improve(search, solution) is solution
-    assert search.tried.sequences == known + 1
-
-
-def test_rounding_of_masses_decides_nothing() -> None:
-    problem = landing()
-    noisy = problem.with_(mass=problem.scene.polygon.mass * (1 + 2.04e-10))
-    start = trace_phases(problem)[-1].end
-    plans = plan_phases(noisy, noisy.phases[4:], start, PlanOptions(time_intervals=6))
-    assert total(plans) == pytest.approx(total(plan_landing(time_intervals=6)), rel=1e-7)
+def test_what_may_slide_or_roll_is_faster_than_what_has_to_roll() -> None:
+    """Rolling throughout is one of its motions, with one freedom: the bound is along a curve."""
+    problem = tilting()
+    (phase,) = problem.phases
+    rolls = replace(phase, formation=roll(phase.formation, "v1-palm"))
+    bound = solve(replace(problem, phases=(rolls,)), intervals=10, replay=False).trajectory
+    plan = solve(problem, time_intervals=6, replay=False).trajectory
+    assert plan.duration < 0.95 * bound.duration
+    report = verify(problem, plan)
+    assert report.ok, report.to_text()
 
 
 def test_a_first_phase_lets_go_what_touches_at_the_start() -> None:

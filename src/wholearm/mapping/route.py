@@ -129,7 +129,7 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
         if note:
             notes.append(f"leg {leg + 1} goes through cells: {note}")
         for entry in walked:
-            _append(stretches, legs, leg, z, entry)
+            _append(stretches, legs, leg, z, entry, problem.scene.scales.length)
             z = entry[2]
         here = z[[0, 2]]
     # The end of a leg may be moved to a change of contacts, but not the start.
@@ -137,15 +137,17 @@ def list_formations(problem: Problem, *poses: Sequence[float]) -> Route:
     return Route(tuple(stretches), start, tuple(notes))
 
 
-def _append(stretches: list[Stretch], legs: list[int], leg: int, z: Array, entry: Walked) -> None:
-    """Add the stretch of a phase that starts at `z`."""
+def _append(
+    stretches: list[Stretch], legs: list[int], leg: int, z: Array, entry: Walked, length: float
+) -> None:
+    """Add the stretch of a phase that starts at `z`; `length` is the scene's, of poses."""
     _, (contacts, until), end = entry
     stretch = Stretch(contacts, until, z[[0, 2]], end[[0, 2]])
     before = stretches[-1] if stretches and legs[-1] != leg else None
     # On a border a leg may go on where the one before it stopped; a turn back is a phase.
     if before is not None and len(contacts) == 4 and set(before.contacts) == set(contacts):
-        onwards = (before.stop - before.start) * (stretch.stop - stretch.start)
-        if onwards.max() > 0 and before.until.contact is None:
+        onwards = (before.stop - before.start) * (stretch.stop - stretch.start) / [length**2, 1]
+        if onwards.sum() > 0 and before.until.contact is None:
             stretches.pop()
             stretch = replace(stretch, contacts=before.contacts, start=before.start)
     stretches.append(stretch)

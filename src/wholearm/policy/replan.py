@@ -2,7 +2,7 @@
 
 Along a curve a motion only has to be slower to leave normal forces and torques in reserve. With
 more freedoms it has to be another motion: the least time leaves nothing, at any speed. What follows
-is planned from the new end for as long as it takes to be where the plan is again.
+is planned from the new end until the plan is met again; the last phase ends at the plan's pose.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import WholearmError
-from ..problem.definition import Phase, Problem
+from ..problem.definition import ROWS, Phase, Problem
 from ..results.torque import TorqueProfile
 from ..results.trajectory import Motion, Trajectory, assemble
 from .regulator import ROOM
@@ -23,10 +23,8 @@ SHARES = (1.0, 0.5, 0.25)
 """Parts of the reserve that are tried, the largest first."""
 SLOWER = 1.5
 """Duration over the plan's from which on a motion costs more than its reserve is worth."""
-FAR = 0.02
-"""How far from the plan's the last end may be, over the scene's length and in rad."""
 SAME = 1e-5
-"""How far ends may be from the plan's to count as the same, likewise."""
+"""How far ends may be from the plan's to count as the same, over the scene's length and in rad."""
 
 Planner = Callable[[Problem], Trajectory]
 """Makes a plan of a problem."""
@@ -80,6 +78,7 @@ def _detour(
     """Motions with a part of the reserve until the plan is met again, and of how many blocks."""
     starts, found = plan.phase_starts, list[Motion]()
     z = plan.z[np.flatnonzero(plan.phase == blocks[0][0].index)[0]]
+    blocks = [*blocks[:-1], (*blocks[-1][:-1], _pin(blocks[-1][-1], plan.z[-1]))]
     for count, (own, curve) in enumerate(zip(blocks, curves, strict=True), start=1):
         part = _solve(planner, problem, own, z, 0.0 if curve else share)
         lasts = starts[own[-1].index + 1] - starts[own[0].index]
@@ -89,7 +88,7 @@ def _detour(
         z = part.z[-1]
         away = np.abs(z - plan.z[np.flatnonzero(plan.phase == own[-1].index)[-1]])
         away[:2] /= problem.scene.scales.length
-        if away.max() < (SAME if count < len(blocks) else FAR):
+        if away.max() < SAME:
             return found, count
     return None
 
@@ -111,3 +110,14 @@ def _solve(
         return planner(own)
     except WholearmError:
         return None
+
+
+def _pin(phase: Phase, z: Array) -> Phase:
+    """The phase with the pose of z, shape (5,), pinned where its end leaves it open."""
+    until = phase.until
+    given = {row for row, _ in until.poses}
+    gained = until.contact is not None
+    freedoms = len(z) - len(phase.formation.contacts) - gained - len(given)
+    names = [name for name in ("x", "phi") if ROWS[name] not in given][: max(freedoms, 0)]
+    pins = tuple((name, float(z[ROWS[name]])) for name in names)
+    return replace(phase, until=replace(until, pins=until.pins + pins))
