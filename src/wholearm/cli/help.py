@@ -39,7 +39,7 @@ TOPICS = {
 def add_help(parser: argparse.ArgumentParser) -> None:
     """Add what `help` takes."""
     text = "what the page is about (left out: list the topics)"
-    parser.add_argument("topic", nargs="?", choices=TOPICS, metavar="TOPIC", help=text)
+    parser.add_argument("topic", nargs="?", choices=tuple(TOPICS), metavar="TOPIC", help=text)
     parser.set_defaults(run=_show)
 
 
