@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 import wholearm
+from once import once
 from shipped import FOLDER, HEPTAGON, LANDING, chart, problem_of, solved
 from wholearm.cli.arguments import name_simulator
 from wholearm.cli.bench import name_study
@@ -75,9 +76,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@once
+def policy() -> wholearm.Policy:
+    return wholearm.make_policy(problem_of(HEPTAGON), solved(HEPTAGON), reserve=0.0)
+
+
 def test_python_blocks_run(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = solved(HEPTAGON)
-    wholearm.make_policy(problem_of(HEPTAGON), plan, reserve=0.0).save("policy.npz")
+    policy().save("policy.npz")
     solve, known = wholearm.solve, {"heptagon, landing on edge 1": solved(LANDING)}
 
     def look_up(problem: Problem, **options: Any) -> Plan:
@@ -153,7 +158,7 @@ def test_results_are_one_line_and_motions_a_picture() -> None:
         plan.trajectory,
         wholearm.simulate(problem, plan),
         wholearm.verify(problem, plan),
-        wholearm.make_policy(problem, plan, reserve=0.0),
+        policy(),
         chart(),
         problem,
     ]
