@@ -14,7 +14,7 @@ import pytest
 
 from shipped import HEPTAGON
 from wholearm.benchmark.interrupts import STARTED, interrupt
-from wholearm.cli.route import _hurry
+from wholearm.cli.route import hasten
 from wholearm.common import interrupts
 from wholearm.common.files import together, write_whole
 from wholearm.common.interrupts import check, guard, held
@@ -83,7 +83,7 @@ def test_a_search_says_that_it_plans_unless_it_is_terminated(
             with interrupts.yielding():
                 signal.raise_signal(number)
         except KeyboardInterrupt:
-            _hurry()
+            hasten()
         return 0
 
     assert guard(search) == (0 if number is signal.SIGINT else 128 + number)

@@ -350,8 +350,8 @@ def test_a_stuck_solver_does_not_blame_the_limits(monkeypatch: pytest.MonkeyPatc
 def test_a_stuck_solver_within_ranges_says_that_there_is_a_plan_without(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    stuck = path_plan._Stuck([], "phase 1: Ipopt stopped", False)
-    monkeypatch.setattr(path_plan, "_plan_within", lambda _: (stuck, (object(),)))
-    monkeypatch.setattr(path_plan, "_explain", lambda *_: SolverError("unclear"))
+    stuck = path_plan.Stuck([], "phase 1: Ipopt stopped", False)
+    monkeypatch.setattr(path_plan, "plan_within", lambda _: (stuck, (object(),)))
+    monkeypatch.setattr(path_plan, "explain_stuck", lambda *_: SolverError("unclear"))
     with pytest.raises(SolverError, match=r"stopped within the ranges .* try --robust 0\.5, or"):
         Toy(constant(1.0)).plan(robust=1.0)

@@ -82,7 +82,7 @@ def find(
         with warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = _warn
-            return find_route_with(problem, *given, time_limit=time_limit, hurry=_hurry)
+            return find_route_with(problem, *given, time_limit=time_limit, hurry=hasten)
     except WholearmError:
         clear_progress()
         raise
@@ -93,7 +93,7 @@ def _warn(message: Warning | str, *_: object, **__: object) -> None:
     print(f"wholearm: warning: {message}", file=sys.stderr, flush=True)
 
 
-def _hurry() -> None:
+def hasten() -> None:
     from ..common.interrupts import check
 
     # After SIGTERM nothing is planned any more.
