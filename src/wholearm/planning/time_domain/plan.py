@@ -12,7 +12,7 @@ it is a better guess, or says why there is no plan.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple
@@ -99,9 +99,10 @@ def plan_phases(
     known = _go_on(search, attempts, begun[0]) if begun else None
     if known is not None:
         return list_plans(problem, search, phases, known, begun[0].attempt)
-    first, name = _begin(search, attempts.first, fastest, pinned)
-    if first.success:
-        return list_plans(problem, search, phases, first, name)
+    for attempt in attempts.begin():
+        first, name = _begin(search, attempt, fastest, pinned)
+        if first.success:
+            return list_plans(problem, search, phases, first, name)
     moved = approach(search, problem, phases, z)
     if moved.solution is not None:
         return list_plans(problem, search, phases, moved.solution, MOVED)
@@ -134,13 +135,10 @@ def try_phases(
     own = replace(options, mode_search=False)
     search = Search.of(problem, own, None, None, math.inf, True)
     attempts = Attempts(problem, phases, z, search, None, further > 0)
-    straight = None if goal is None else attempts.towards(goal)
-    begin = [straight] if straight else []
-    first = (attempts.first for _ in range(straight is None or further > 0))
-    guesses: Iterable[Attempt] = chain(begin, first, attempts.list_further(further))
+    begin = attempts.begin(goal)[: None if further else 1]
     if hurried:
-        guesses = [own._replace(most=FEW) for own in (begin if goal is not None else first)]
-    for attempt in guesses:
+        begin = [own._replace(most=FEW) for own in begin]
+    for attempt in chain(begin, attempts.list_further(further)):
         solution = solve_attempt(search, attempt)
         if solution.success:
             return _list_begun(problem, search, phases, solution, attempt.name, options)
