@@ -141,10 +141,10 @@ def _list_across(
     """Runs of one thing that meet where stages of a phase do, without other runs beside them."""
     known = {(k, run.row, run.sign, _sign(stages[k], run)): run for run, k in runs}
     found = []
-    for (k, *key), run in known.items():
+    for (k, row, sign, way), run in known.items():
         chain = [(run, k)]
         while (own := chain[-1])[0].stop == stages[own[1]].intervals:
-            after = known.get((own[1] + 1, *key))
+            after = known.get((own[1] + 1, row, sign, way))
             if after is None or after.begin or stages[own[1] + 1].phase != stages[k].phase:
                 break
             chain.append((after, own[1] + 1))
