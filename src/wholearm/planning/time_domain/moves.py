@@ -88,11 +88,7 @@ def list_moves(
         ]
         yield from _apply(stages, scheme, own, runs)
         return
-    for index, stage in enumerate(stages):
-        if stage.guess.duration < _GONE * stage.intervals:
-            left = drop(stages, index)
-            if left is not None:
-                yield link(merge(left))
+    yield from list_dropped(stages)
     for index in range(len(stages)):
         left = release_earlier(stages, index)
         if left is not None:
@@ -106,6 +102,15 @@ def list_moves(
             leaning_too = _find_leaning(stage, scheme, own[index], epsilon)
             runs += [(run, index) for run in [*held, *leaning_too]]
         yield from _apply(stages, scheme, own, runs)
+
+
+def list_dropped(stages: Sequence[Stage]) -> Iterator[list[Stage]]:
+    """The stages without one that has shrunk to nothing, for each of these."""
+    for index, stage in enumerate(stages):
+        if stage.guess.duration < _GONE * stage.intervals:
+            left = drop(stages, index)
+            if left is not None:
+                yield link(merge(left))
 
 
 def _apply(

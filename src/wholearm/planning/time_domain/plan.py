@@ -99,13 +99,18 @@ def plan_phases(
     known = _go_on(search, attempts, begun[0]) if begun else None
     if known is not None:
         return list_plans(problem, search, phases, known, begun[0].attempt)
-    for attempt in attempts.begin():
+    begin = attempts.begin()
+    for attempt in begin:
         first, name = _begin(search, attempt, fastest, pinned)
         if first.success:
-            return list_plans(problem, search, phases, first, name)
-    moved = approach(search, problem, phases, z)
-    if moved.solution is not None:
-        return list_plans(problem, search, phases, moved.solution, MOVED)
+            break
+    # Straight to a pinned end modes may be found that are not the best: phase 3 of query 33.
+    enough = first.success and (len(begin) == 1 or bool(fastest))
+    moved = Approach() if enough else approach(search, problem, phases, z)
+    found = [(own, how) for own, how in ((first, name), (moved.solution, MOVED)) if own]
+    if any(own.success for own, _ in found):
+        best = min((own for own in found if own[0].success), key=lambda own: own[0].cost)
+        return list_plans(problem, search, phases, *best)
     return _look_further(search, attempts, problem, phases, first, moved, explained)
 
 
