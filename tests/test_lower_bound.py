@@ -222,7 +222,7 @@ def test_a_place_that_motions_hardly_pass_is_found_on_any_first_grid(
     curves, epsilon = trace_octagon()
     least = []
     for intervals in (50, 100):
-        monkeypatch.setattr(lower_bound, "MOST_INTERVALS", intervals)
+        monkeypatch.setattr(lower_bound, "GRID_INTERVALS", intervals)
         found = bound_least_time(curves, epsilon)
         assert found is not None
         least.append(found.value)

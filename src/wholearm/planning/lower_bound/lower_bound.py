@@ -22,7 +22,7 @@ from .way import Grid, Way
 
 _TOLERANCE = 3e-8
 """What the bound may lose, and its error, relative to the time."""
-MOST_INTERVALS = 100
+GRID_INTERVALS = 100
 """Of the first grid."""
 _ROUNDS = 16
 """Most grids: where motions hardly pass a place losses fall by 64 from one to the next."""
@@ -74,7 +74,7 @@ def bound_least_time(curves: Sequence[Curve], epsilon: float) -> LowerBound | No
         Least normal force.
     """
     way = Way(curves, epsilon)
-    grid, near, found, tries = way.make_grid(MOST_INTERVALS), None, None, 0
+    grid, near, found, tries = way.make_grid(GRID_INTERVALS), None, None, 0
     for _ in range(_ROUNDS):
         try:
             found = _bound(way, grid, near)
