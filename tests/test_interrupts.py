@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from shipped import HEPTAGON
-from wholearm.benchmark.interrupts import STARTED, interrupt
+from signalled import STARTED, interrupt
 from wholearm.common import interrupts
 from wholearm.common.files import together, write_whole
 from wholearm.common.interrupts import check, guard, held

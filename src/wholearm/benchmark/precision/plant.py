@@ -113,14 +113,3 @@ def sample_slow_motion(instance: Instance, counts: list[int]) -> list[tuple[Arra
 def count_intervals(stretches: list[Stretch], intervals: int, least: int = 4) -> list[int]:
     """About so many intervals, shared among the stretches of a phase."""
     return [max(least, round(intervals * stretch.share)) for stretch in stretches]
-
-
-def join_pieces(status: str, durations: list[float], torques: list[Array]) -> PeerPlan:
-    """The plan with torques that are linear between even nodes of each stretch, (n, 2) each."""
-    marks = np.append(0.0, np.cumsum(durations))
-    if not np.isfinite(marks).all() or min(durations) <= 0:
-        return NO_PLAN._replace(status=status)
-    spans = zip(marks, marks[1:], torques, strict=False)
-    times = np.concatenate([np.linspace(start, stop, len(tau)) for start, stop, tau in spans])
-    torque = TorqueProfile.join_rows(times, np.concatenate(torques))
-    return PeerPlan(status, float(marks[-1]), torque, tuple(marks[1:-1]))

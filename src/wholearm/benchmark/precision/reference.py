@@ -1,7 +1,7 @@
 """An independent reference for simulators: extrapolation in extended precision.
 
 Gragg's modified midpoint rule with 2, 4, ... steps, extrapolated in the square of the step, on the
-Newton-Euler equations of `baseline_simulation` in NumPy's `longdouble` (64 bits of mantissa on
+Newton-Euler equations of `newton` in NumPy's `longdouble` (64 bits of mantissa on
 x86). Directions reverse where the sliding velocity vanishes, which a secant finds.
 """
 
@@ -16,7 +16,7 @@ from ...common.arrays import Array
 from ...geometry.curve import Curve
 from ...problem.definition import Problem
 from ...results.torque import TorqueProfile
-from ..baseline_simulation import evaluate_piece, find_piece, find_sliding, solve_motion
+from .newton import evaluate_piece, find_piece, find_sliding, solve_motion
 
 COLUMNS = 9
 """Columns of the extrapolation."""

@@ -10,7 +10,6 @@ import numpy as np
 
 from ...results.torque import TorqueProfile
 from .instances import Instance
-from .opti import TUNED
 from .plant import (
     NO_PLAN,
     OPTIMUM,
@@ -21,6 +20,14 @@ from .plant import (
     sample_slow_motion,
 )
 
+IPOPT = {
+    "print_level": 0,
+    "sb": "yes",
+    "tol": 1e-8,
+    "bound_relax_factor": 0.0,
+    "max_iter": 1000,
+    "mu_strategy": "adaptive",
+}
 POINTS = 2
 """Collocation points of a segment."""
 
@@ -64,7 +71,7 @@ def build_yapss(instance: Instance, setting: str) -> Callable[[], PeerPlan]:
     ocp.bounds.discrete.lower[:] = ocp.bounds.discrete.upper[:] = 0.0
     ocp.derivatives.method, ocp.derivatives.order = "auto", "second"
     ocp.spectral_method = "lg"
-    for name, value in TUNED.items():
+    for name, value in IPOPT.items():
         setattr(ocp.ipopt_options, name, value)
 
     def run() -> PeerPlan:

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from .mutation import Mutant, base_files, draw_mutant
-from .plans import Finding
 
 STATUSES = (0, 1, 2)
 LONGEST = 2000
@@ -23,21 +22,19 @@ PROGRESS = re.compile(r"wholearm: \d+ s: ")
 """Lines that tell how long work goes on already."""
 
 
-def run_file(task: tuple[int, int]) -> dict[str, Any]:
-    """Run one mutated file, given as (seed, number), and return what came of it as plain data."""
-    seed, number = task
+def run_file(seed: int, number: int) -> dict[str, Any]:
+    """Run one damaged file, and return what came of it as plain data."""
     mutant = draw_mutant(seed, number)
     rng = np.random.default_rng([seed, number, 2])
     with tempfile.TemporaryDirectory() as folder:
         command = write_case(mutant, folder, rng)
         status, findings = run_command(command, folder)
     return {
-        "file": number,
         "kind": mutant.kind,
         "what": mutant.what,
         "command": " ".join([command[0], *map(os.path.basename, command[1:])]),
         "status": status,
-        "findings": [list(finding) for finding in findings],
+        "findings": findings,
     }
 
 
@@ -77,7 +74,7 @@ def _write(path: str, content: bytes) -> None:
         stream.write(content)
 
 
-def run_command(command: list[str], folder: str) -> tuple[int | None, list[Finding]]:
+def run_command(command: list[str], folder: str) -> tuple[int | None, list[tuple[str, str]]]:
     """Run the command line in this process, warnings being errors, and look at what it leaves."""
     from ...__main__ import start
 
@@ -96,14 +93,14 @@ def run_command(command: list[str], folder: str) -> tuple[int | None, list[Findi
         status = error.code if isinstance(error.code, int) else None
     except Exception as error:
         kind = "warning" if isinstance(error, Warning) else "traceback"
-        return None, [Finding(kind, "".join(traceback.format_exception(error)[-4:]).strip())]
+        return None, [(kind, "".join(traceback.format_exception(error)[-4:]).strip())]
     written = set(os.listdir(folder)) - before
     return status, look(command, status, out.getvalue(), err.getvalue(), written)
 
 
 def look(
     command: list[str], status: int | None, out: str, err: str, written: set[str]
-) -> list[Finding]:
+) -> list[tuple[str, str]]:
     """What is wrong with how a command ended."""
     texts = []
     lines = [line for line in err.splitlines() if not PROGRESS.match(line)]
@@ -125,4 +122,4 @@ def look(
     partial = sorted(name for name in written if name.endswith(".part"))
     if partial or (status in (1, 2) and written):
         texts.append(f"exit status {status} and {', '.join(sorted(written))} left behind")
-    return [Finding("unclear end", text) for text in texts]
+    return [("unclear end", text) for text in texts]

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from ..common.arrays import Array
-from ..contacts.elemental import Contact
-from ..results.torque import TorqueProfile
-from ..scene.model import Scene
+from ...common.arrays import Array
+from ...contacts.elemental import Contact
+from ...results.torque import TorqueProfile
+from ...scene.model import Scene
 
 
 def find_piece(torque: TorqueProfile, t: float) -> int:
@@ -39,13 +39,11 @@ def solve_motion(
     tau: Array,
     Xi: Array,
     sigma: Array,
-    pull: float = 0.0,
 ) -> tuple[Array, Array]:
     """Accelerations z'', shape (5,), and c_n, shape (n_c,) [N], from one linear system.
 
     The unknowns are those of Eqs. (1) and (2) with the friction of Eq. (3) put in, together with
-    the contact conditions differentiated twice. With a `pull` p [1/s] gaps come back to zero as
-    Baumgarte has it, C'' + 2 p C' + p^2 C = 0. Extended precision is kept.
+    the contact conditions differentiated twice. Extended precision is kept.
     """
     count = len(contacts)
     matrix = np.zeros((5 + count, 5 + count), dtype=z.dtype)
@@ -56,7 +54,7 @@ def solve_motion(
         friction = finger.viscous * z_dot[3 + i] + finger.dry * sigma[i]
         right[3 + i] = tau[i] - friction
     for k, contact in enumerate(contacts):
-        point, normal, bend, gap = _touch(scene, contact, z, z_dot)
+        point, normal, bend = _touch(scene, contact, z, z_dot)
         tangent = np.array([normal[1], -normal[0]])
         coefficient = scene.friction.of(contact.finger)
         row = _lever(scene, contact, z, point, normal)
@@ -64,8 +62,6 @@ def solve_motion(
         matrix[:5, 5 + k] = -force
         matrix[5 + k, :5] = row
         right[5 + k] = -bend
-        if pull:
-            right[5 + k] -= pull * (2 * row @ z_dot + pull * gap)
     solution = solve_linear(matrix, right)
     return np.asarray(solution[:5]), np.asarray(solution[5:])
 
@@ -87,14 +83,9 @@ def solve_linear(matrix: Array, right: Array) -> Array:
 
 def find_sliding(scene: Scene, contact: Contact, z: Array, z_dot: Array) -> Any:
     """Sliding velocity of a contact [m/s]."""
-    point, normal, _, _ = _touch(scene, contact, z, z_dot)
+    point, normal, _ = _touch(scene, contact, z, z_dot)
     tangent = np.array([normal[1], -normal[0]])
     return _lever(scene, contact, z, point, tangent) @ z_dot
-
-
-def find_gaps(scene: Scene, contacts: tuple[Contact, ...], z: Array) -> Array:
-    """Gaps of contacts, shape (n_c,) [m]."""
-    return np.array([_touch(scene, contact, z, np.zeros(5))[3] for contact in contacts])
 
 
 def _lever(scene: Scene, contact: Contact, z: Array, point: Array, force: Array) -> Array:
@@ -108,10 +99,8 @@ def _lever(scene: Scene, contact: Contact, z: Array, point: Array, force: Array)
     return row
 
 
-def _touch(
-    scene: Scene, contact: Contact, z: Array, z_dot: Array
-) -> tuple[Array, Array, float, float]:
-    """Contact point, normal into the object, the gap's second derivative less A z'', the gap."""
+def _touch(scene: Scene, contact: Contact, z: Array, z_dot: Array) -> tuple[Array, Array, float]:
+    """Contact point, normal into the object, and the gap's second derivative less A z''."""
     c, s = np.cos(z[2]), np.sin(z[2])
     turn = np.array([[c, -s], [s, c]])
     spin = z_dot[2]
@@ -119,7 +108,7 @@ def _touch(
     vertex = z[:2] + arm
     velocity = z_dot[:2] + spin * np.array([-arm[1], arm[0]])
     if contact.finger is None:
-        return vertex, np.array([0.0, 1.0]), -(spin**2) * arm[1], vertex[1]
+        return vertex, np.array([0.0, 1.0]), -(spin**2) * arm[1]
     finger = scene.fingers[contact.finger]
     angle, rate = z[3 + contact.finger], z_dot[3 + contact.finger]
     axis = np.array([np.cos(angle), np.sin(angle)])
@@ -130,7 +119,7 @@ def _touch(
         swing = -side * rate * axis
         reach = vertex - np.asarray(finger.base)
         bend = 2 * swing @ velocity - rate**2 * normal @ reach - spin**2 * normal @ arm
-        return vertex, normal, bend, normal @ reach - finger.radius
+        return vertex, normal, bend
     if contact.feature != "e":
         raise ValueError(f"{contact.name}: the baseline knows no contacts with a tip's arc")
     following = scene.polygon.vertices[(contact.index + 1) % scene.polygon.n_vertices]
@@ -145,5 +134,4 @@ def _touch(
         - spin**2 * outward @ (tip - vertex)
         + outward @ (spin**2 * arm - rate**2 * finger.length * axis)
     )
-    gap = outward @ (tip - vertex) - finger.radius
-    return tip - finger.radius * outward, -outward, bend, gap
+    return tip - finger.radius * outward, -outward, bend
