@@ -9,14 +9,15 @@ import pytest
 
 from shipped import HEPTAGON, SQUARE, problem_of
 from wholearm.benchmark.kernels import (
+    LARGEST,
     STUDY,
     Environment,
     answer,
     compare,
     find_kernel,
+    perturb_scenes,
 )
 from wholearm.benchmark.pool import Answer
-from wholearm.benchmark.rounding import LARGEST, perturb_scenes
 from wholearm.benchmark.study import Case
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError

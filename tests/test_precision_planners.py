@@ -11,7 +11,7 @@ import pytest
 from timed import landing
 from tipping import box
 from wholearm.benchmark.precision.check import check_plan
-from wholearm.benchmark.precision.instances import Instance, keep_curves, list_instances
+from wholearm.benchmark.precision.phases import Instance, keep_curves, list_instances
 from wholearm.benchmark.precision.planners import (
     LEAST_TIME,
     NO_DRAG,

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from wholearm.benchmark.precision.instances import Instance, list_instances
+from wholearm.benchmark.precision.phases import Instance, list_instances
 from wholearm.benchmark.precision.reference import Course, measure_error
 from wholearm.benchmark.precision.simulators import FEW, SIMULATORS, make_course
 

@@ -11,12 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wholearm.benchmark.stress.cases import draw_case
-from wholearm.benchmark.stress.files import look, run_file
-from wholearm.benchmark.stress.mutation import BASE, draw_mutant
+from wholearm.benchmark.stress.damage import BASE, change_tree, draw_mutant, look, run_file, to_toml
+from wholearm.benchmark.stress.scenes import draw_case
 from wholearm.benchmark.stress.study import STUDY, compare_values
-from wholearm.benchmark.stress.toml import to_toml
-from wholearm.benchmark.stress.trees import change_tree
 from wholearm.cli.command import main
 
 

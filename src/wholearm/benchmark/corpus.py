@@ -63,8 +63,8 @@ class Corpus(Study):
         return 300.0 if case[0] == "tune" else 120.0
 
     def run(self, case: Case) -> Row:
-        """Ask, and keep nine digits."""
-        return {"answer": _shorten(answer(case, self.problems))}
+        """Ask."""
+        return {"answer": answer(case, self.problems)}
 
     def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
         """How many answers of each family are the same, and which differ; or they are stored."""
@@ -164,15 +164,6 @@ def _flatten(value: Any) -> list[float] | None:
 def _show(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) < 100 else f"{text[:60]} ... {text[-30:]}"
-
-
-def _shorten(value: Any) -> Any:
-    """Numbers with nine digits."""
-    if isinstance(value, Mapping):
-        return {key: _shorten(own) for key, own in value.items()}
-    if isinstance(value, list):
-        return [_shorten(own) for own in value]
-    return float(f"{value:.9g}") if isinstance(value, float) else value
 
 
 def _read(path: str) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 import re
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
@@ -22,12 +23,10 @@ import numpy as np
 import wholearm
 from wholearm import Plan, Problem
 
-from ..results.report import plain
 from .kernels import list_modes
 from .queries import draw_leg, draw_query
-from .stress.cases import draw_case
-from .stress.mutation import BASE
-from .stress.toml import to_toml
+from .stress.damage import BASE, to_toml
+from .stress.scenes import draw_case
 from .study import Case, Row
 
 PROBLEMS = (
@@ -116,8 +115,19 @@ def list_cases() -> Iterator[Case]:
 def answer(case: Case, folder: Path) -> Row:
     """What the package says to a case; `folder` has the shipped problems."""
     family, *given = case
-    row: Row = plain(FAMILIES[family](folder, *given))
+    row: Row = _shorten(FAMILIES[family](folder, *given))
     return row
+
+
+def _shorten(value: Any) -> Any:
+    """Plain values for JSON: numbers with nine digits, None for NaN and infinity."""
+    if isinstance(value, dict):
+        return {key: _shorten(own) for key, own in value.items()}
+    if isinstance(value, list | tuple):
+        return [_shorten(own) for own in value]
+    if isinstance(value, float):
+        return float(f"{value:.9g}") if math.isfinite(value) else None
+    return value
 
 
 def _load(folder: Path, name: str) -> Problem:
@@ -380,7 +390,7 @@ def _compare(folder: Path, name: str) -> Row:
 
 
 def _report(folder: Path, name: str) -> Row:
-    """The first table of a report: what it says of a plan and of torques."""
+    """Numbers in the tables of a report of a plan and of torques, but for how long it took."""
     from ..__main__ import start
 
     with tempfile.TemporaryDirectory() as place:
@@ -389,10 +399,10 @@ def _report(folder: Path, name: str) -> Row:
         torques = str(folder / "torques" / TUNED[name][0])
         status = start(["report", str(folder / f"{name}.toml"), path, torques, "-o", str(page)])
         text = page.read_text(encoding="utf-8")
-    rows = [re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr>.*?</tr>", text)]
-    cells = [cell for row in rows for cell in row]
+    tables = [own for own in re.findall(r"<table>.*?</table>", text) if "planning took" not in own]
+    cells = re.findall(r"<td[^>]*>(.*?)</td>", "".join(tables))
     numbers = [float(cell) for cell in cells if re.fullmatch(r"[-+]?\d+\.\d+", cell)]
-    return {"exit": status, "rows": len(rows), "numbers": numbers}
+    return {"exit": status, "cells": len(cells), "numbers": numbers}
 
 
 def _draw_map(folder: Path, name: str) -> Row:

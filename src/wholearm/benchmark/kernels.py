@@ -2,7 +2,7 @@
 
 OpenBLAS has kernels for each processor, which differ in the last bits; ``OPENBLAS_CORETYPE`` makes
 one machine stand in for another. Further Pythons bring other versions of the libraries. Seeds
-change the numbers of the scenes themselves in the last bits, see `rounding`.
+change the numbers of the scenes themselves in the last bits.
 
 Each problem is planned and verified for every objective, in a process for each environment. Its
 answer is the value of the objective and the sequence of contact modes of each phase. Answers are
@@ -14,17 +14,84 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import random
 import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields
+from functools import cache
 from itertools import groupby, product
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
+from ..common.arrays import Array
 from ..common.bounds import Bounds
 from ..common.files import read_json, write_text
+from ..scene.model import Finger, Friction, Scene
+from ..scene.polygon import Polygon
 from .study import Case, Row, Study
+
+LARGEST = 4
+"""Largest change of a number, in units of 2^-52 of it."""
+
+
+def perturb_scenes(seed: int) -> None:
+    """Multiply every number of each scene that is made from now on by 1 + k 2^-52, |k| <= 4.
+
+    k follows from the seed, the name of the number and its first 14 digits, to which the number
+    is rounded first. So a scene that is made again from its own numbers keeps them.
+    """
+    for kind in (Polygon, Finger, Friction, Scene):
+        _perturb(kind, seed)
+
+
+def _perturb(kind: Any, seed: int) -> None:
+    check = getattr(kind.__post_init__, "exact", kind.__post_init__)
+    names = [field.name for field in fields(kind) if field.init and field.name != "name"]
+
+    def check_and_perturb(self: Any) -> None:
+        # First as they were given: messages about bad numbers quote them.
+        given = [name for name in names if getattr(self, name) is not None]
+        left_out = set(names) - set(given)
+        check(self)
+        for name in left_out:
+            object.__setattr__(self, name, None)
+        for name in given:
+            label = f"{seed} {kind.__name__}.{getattr(self, 'name', '')}.{name}"
+            object.__setattr__(self, name, _change(getattr(self, name), label))
+        check(self)
+
+    check_and_perturb.exact = check  # type: ignore[attr-defined]
+    kind.__post_init__ = check_and_perturb
+
+
+def _change(value: Any, label: str) -> Any:
+    if isinstance(value, np.ndarray):
+        return _change_array(value, label)
+    if isinstance(value, Real) and not isinstance(value, bool):
+        return _change_number(float(value), label)
+    return value
+
+
+def _change_array(values: Array, label: str) -> Array:
+    places = np.ndenumerate(values)
+    return np.array([_change_number(float(v), f"{label}{i}") for i, v in places]).reshape(
+        values.shape
+    )
+
+
+@cache
+def _change_number(value: float, label: str) -> float:
+    if value == 0.0 or not np.isfinite(value):
+        return value
+    rounded = float(f"{value:.13e}")
+    k = random.Random(f"{label} {rounded!r}").randint(-LARGEST, LARGEST)
+    return rounded * (1 + k * 2.0**-52)
+
 
 if TYPE_CHECKING:
     from ..planning.result import Plan
@@ -206,8 +273,6 @@ def _answer() -> None:
     parser.add_argument("--answer", nargs=3, required=True)
     path, objective, seed = parser.parse_args().answer
     if int(seed):
-        from .rounding import perturb_scenes
-
         perturb_scenes(int(seed))
     print(json.dumps(answer(path, objective)))
 

@@ -20,11 +20,9 @@ from ...planning.path_domain.terms import LimitShape
 from ...planning.phase_plan import PhasePlan
 from ...planning.time_domain.plan import plan_phases
 from .check import check_plan
-from .instances import Instance, list_instances, pick
-from .plant import OPTIMUM, PeerPlan, list_stretches
+from .peers import build_toppra, build_yapss
+from .phases import OPTIMUM, Instance, PeerPlan, list_instances, list_stretches, pick
 from .runs import Median, measure
-from .toppra_peer import build_toppra
-from .yapss_peer import build_yapss
 
 LEAST_TIME, NO_DRAG = "least time", "least time without viscous friction"
 """Studies: all phases, and the same without viscous friction."""

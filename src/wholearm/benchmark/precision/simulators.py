@@ -24,9 +24,8 @@ from ...planning.path_domain.motion import PathMotion
 from ...planning.path_domain.plan import plan_path
 from ...results.torque import TorqueProfile
 from ...simulation.simulate import simulate
-from .instances import Instance, list_instances, pick
-from .newton import evaluate_piece, solve_motion
-from .reference import Course, Span, find_course, measure_error
+from .phases import Instance, list_instances, pick
+from .reference import Course, Span, evaluate_piece, find_course, measure_error, solve_motion
 from .runs import SOLVED, Median, measure
 
 FEW, MANY = "simulation, few pieces", "simulation, many pieces"

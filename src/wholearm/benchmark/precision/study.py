@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from ...common.bounds import Bounds
 from ...common.errors import InputError
 from ..study import Case, Row, Study
-from .instances import find_files, list_instances
+from .phases import find_files, list_instances
 from .planners import LEAST_TIME, NO_DRAG, PLANNERS, is_installed, run_planner
 from .simulators import FEW, MANY, SIMULATORS, TOLERANCES, run_simulator
 from .tables import draw_medians, format_report, read_medians

@@ -27,12 +27,11 @@ from ...problem.read import build_problem, read_problem
 from ...results.trajectory import Trajectory
 from ...verification.verify import verify
 from ..study import Case, Row, Study
-from .cases import Case as Scene
-from .cases import draw_case
-from .files import run_file
+from .damage import run_file, to_toml
 from .plan_check import check_plan
 from .refusals import judge
-from .toml import to_toml
+from .scenes import Case as Scene
+from .scenes import draw_case
 
 OBJECTIVES = ("time", "effort", "margin")
 LIMITS = {"scene": 30.0, "file": 20.0, "problem": 60.0}
