@@ -70,6 +70,8 @@ class Study:
         Whether warnings are errors.
     columns : tuple of str
         Entries of rows that are written as CSV; none for no such file.
+    packages : tuple of str
+        Further ones whose versions are stated.
     """
 
     name = ""
@@ -81,6 +83,7 @@ class Study:
     alone = False
     strict = False
     columns: tuple[str, ...] = ()
+    packages: tuple[str, ...] = ()
 
     def add_options(self, parser: argparse.ArgumentParser) -> None:
         """Add what the command line takes beside the options that every study has."""
@@ -182,16 +185,16 @@ def _report(
         *(f"{name_case(row)}: {row['failed']}" for row in rows if "failed" in row),
         *findings,
     ]
-    parts = [f"# {study.title}", describe_machine(), table.strip()]
+    parts = [f"# {study.title}", describe_machine(study.packages), table.strip()]
     if findings:
         parts.append("\n".join(["## Findings", "", *(f"* {text}" for text in findings)]))
     return "\n\n".join(parts) + "\n", findings
 
 
-def describe_machine() -> str:
+def describe_machine(packages: Sequence[str] = ()) -> str:
     """Versions, processor and cores, in a line."""
     parts = [f"wholearm {__version__}", f"Python {platform.python_version()}"]
-    for name in PACKAGES:
+    for name in (*PACKAGES, *packages):
         try:
             parts.append(f"{name} {version(name)}")
         except PackageNotFoundError:

@@ -27,6 +27,7 @@ class Precision(Study):
 
     name, title, timed = "precision", "Run time against error, with peers", True
     columns = ("study", "phase", "method", "setting", "build", "solve", "errors", "outcome")
+    packages = ("toppra", "yapss")
     allowed = 60.0
 
     def add_options(self, parser: argparse.ArgumentParser) -> None:
