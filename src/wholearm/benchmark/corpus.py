@@ -29,10 +29,11 @@ USUAL = 1e-4
 LOCAL = ("plan over time", "goal", "scene", "leg")
 """Families whose optimum need not be the only one: values agree within `USUAL`."""
 SAMPLES = 1
-"""Samples that may end otherwise, of those at the edge of what a plan bears."""
+"""How many samples may end otherwise, of those at the edge of what a plan bears."""
 WORDS = ("words", "text", "advice", "help", "reason")
 """Entries that do not count as an answer: words, and advice, which ends by processor time."""
-SEVERAL = ("goals", "kept")
+COUNTED = ("goals", "kept")
+"""Entries that count samples."""
 
 
 class Corpus(Study):
@@ -57,6 +58,10 @@ class Corpus(Study):
         for case in list_cases():
             if any(fnmatch(" ".join(map(str, case)), own) for own in options.only):
                 yield case
+
+    def list_inputs(self, options: argparse.Namespace) -> list[Path]:
+        """The problem files."""
+        return sorted(Path(options.problems).glob("*.toml"))
 
     def limit(self, case: Case) -> float:
         """Tuning takes a thousand simulations."""
@@ -132,14 +137,9 @@ def _differ(family: str, key: str, found: Any, stored: Any) -> Iterator[tuple[bo
         return
     numbers, others = _flatten(found), _flatten(stored)
     if numbers is not None and others is not None and len(numbers) == len(others):
-        if key in SEVERAL and all(isinstance(own, int) for own in numbers):
-            off = max((abs(a - b) for a, b in zip(numbers, others, strict=True)), default=0)
-            same = off <= SAMPLES
-        else:
-            scale = max(map(abs, [*numbers, *others]), default=0.0)
-            off = max((abs(a - b) for a, b in zip(numbers, others, strict=True)), default=0.0)
-            same = off <= _allowed(family, key) * scale
-        if not same:
+        off = max(abs(a - b) for a, b in zip(numbers, others, strict=True))
+        scale = max(map(abs, [*numbers, *others]))
+        if off > (SAMPLES if key in COUNTED else _allowed(family, key) * scale):
             yield key in WORDS, f"{_show(found)}, stored {_show(stored)}, off by {off:.2g}"
     elif isinstance(found, list) and isinstance(stored, list) and len(found) == len(stored):
         for one, other in zip(found, stored, strict=True):

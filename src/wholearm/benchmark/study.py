@@ -96,6 +96,10 @@ class Study:
         """All cases."""
         raise NotImplementedError
 
+    def list_inputs(self, options: argparse.Namespace) -> Iterable[Path]:
+        """Files that records count for alone, beside the source code."""
+        return ()
+
     def run(self, case: Case) -> Row:
         """Run one case, in another process."""
         raise NotImplementedError
@@ -151,7 +155,7 @@ def run_study(
     stamp = {"study": study.name, "version": __version__, **study.stamp(options)}
     fresh = options.fresh
     if study.of_code:
-        stamp["source"] = digest_source()
+        stamp["source"] = digest_source(study.list_inputs(options))
         fresh = fresh or not _continues(f"{stem}.jsonl", stamp["source"])
     with Journal(f"{stem}.jsonl", stamp, fresh, options.again) as journal:
         done = journal.done("case", _key)
@@ -209,12 +213,14 @@ def finish_axes(axes: Axes, **legend: Any) -> None:
     axes.legend(frameon=False, **legend)
 
 
-def digest_source() -> str:
-    """A digest of the source code of the package, of the machine and of what it plans with."""
+def digest_source(inputs: Iterable[Path] = ()) -> str:
+    """A digest of the source code of the package, the machine, its packages and further files."""
     folder = Path(__file__).parents[1]
     found = hashlib.sha256(describe_machine().encode())
     for path in sorted(folder.rglob("*.py")):
         found.update(str(path.relative_to(folder)).encode() + path.read_bytes())
+    for path in inputs:
+        found.update(path.name.encode() + path.read_bytes())
     return found.hexdigest()[:16]
 
 
