@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from wholearm.benchmark.baseline_simulation import evaluate_piece, find_piece, solve_motion
+from wholearm.benchmark.precision.reference import evaluate_piece, find_piece, solve_motion
 from wholearm.common.arrays import Array
 from wholearm.mechanics.dynamics import Directions
 from wholearm.problem.definition import Problem

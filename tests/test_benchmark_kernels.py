@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +9,16 @@ import pytest
 
 from shipped import HEPTAGON, SQUARE, problem_of
 from wholearm.benchmark.kernels import (
+    LARGEST,
+    STUDY,
     Environment,
     answer,
-    answer_in,
     compare,
     find_kernel,
-    run_kernels,
+    perturb_scenes,
 )
-from wholearm.benchmark.rounding import LARGEST, perturb_scenes
+from wholearm.benchmark.pool import Answer
+from wholearm.benchmark.study import Case
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.problem.read import read_problem
@@ -58,17 +59,20 @@ def test_a_problem_without_a_plan_is_a_fault() -> None:
 
 
 def test_answers_come_from_the_environment() -> None:
-    found = answer_in(Environment(seed=3), str(SQUARE), "time")
+    found = STUDY.run((*Environment(seed=3), str(SQUARE), "time"))
     assert found["fault"] == ""
     assert found["value"] == pytest.approx(answer(str(SQUARE), "time")["value"], rel=1e-6)
-    absent = answer_in(Environment(), "absent.toml", "time")
+    absent = STUDY.run((*Environment(), "absent.toml", "time"))
     assert absent["value"] is None and "absent.toml: cannot be read" in absent["fault"]
 
 
 def test_the_command_stores_answers_and_fails_where_they_differ(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("wholearm.benchmark.kernels.answer_in", lambda *_: dict(GOOD))
+    def answer_all(_: object, cases: list[Case], *__: object) -> list[Answer]:
+        return [Answer(case, "done", dict(GOOD), "", 0.0, 0.0, 0.0) for case in cases]
+
+    monkeypatch.setattr("wholearm.benchmark.study.run_tasks", answer_all)
     stored, table = tmp_path / "answers.json", tmp_path / "table.md"
     command = ["bench", "kernels", "a.toml", "--answers", str(stored), "--jobs", "1"]
     assert main(command) == 2
@@ -82,7 +86,6 @@ def test_the_command_stores_answers_and_fails_where_they_differ(
     capsys.readouterr()
     assert main(command) == 1
     assert "a time: value 2 is off 1 by +1.0e+00" in capsys.readouterr().out
-    assert run_kernels(["a.toml"], [Environment(sys.executable)], str(stored), False, 1)[1] == 1
 
 
 def test_numbers_change_in_the_last_bits_and_stay_so(monkeypatch: pytest.MonkeyPatch) -> None:

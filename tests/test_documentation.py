@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
 import ast
-import importlib
 import inspect
 import re
 import shlex
-import sys
 import tomllib
 from functools import cache
 from pathlib import Path
@@ -20,7 +17,6 @@ import wholearm
 from once import once
 from shipped import FOLDER, HEPTAGON, LANDING, chart, problem_of, solved
 from wholearm.cli.arguments import name_simulator
-from wholearm.cli.bench import name_study
 from wholearm.cli.command import build_parser, main
 from wholearm.cli.help import TOPICS, read_page
 from wholearm.cli.map import protect
@@ -105,31 +101,16 @@ def test_python_calls_fit_their_functions(text: str) -> None:
     inspect.signature(function).bind(*call.args, **{str(key.arg): 0 for key in call.keywords})
 
 
-class ParsedError(Exception):
-    pass
-
-
 @pytest.mark.parametrize("line", LINES)
-def test_shell_lines_are_read(line: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shell_lines_are_read(line: str, folder: Path) -> None:
     words = shlex.split(line, comments=True)
     if words[0] == "wholearm" and "COMMAND" not in words:
         if len(words) == 2:
             words.append("--help")
         try:
-            make_parser().parse_args(name_study(protect(name_simulator(words[1:]))))
+            make_parser().parse_args(protect(name_simulator(words[1:])))
         except SystemExit as error:
             assert error.code == 0
-    elif words[0] == "python":
-
-        def stop(self: argparse.ArgumentParser, *args: Any, **kwargs: Any) -> None:
-            parse(self, *args, **kwargs)
-            raise ParsedError
-
-        parse = argparse.ArgumentParser.parse_args
-        monkeypatch.setattr(argparse.ArgumentParser, "parse_args", stop)
-        monkeypatch.setattr(sys, "argv", words[2:])
-        with pytest.raises(ParsedError):
-            importlib.import_module(words[2]).main()
 
 
 @pytest.mark.parametrize("pages", [PAGES, [FOLDER / "README.md"]], ids=["package", "problems"])

@@ -13,8 +13,8 @@ import pytest
 
 from plane import finger_gap, make_scene
 from planned import change, plan
+from random_runs import draw_run, judge_run, run_draw
 from shipped import HEPTAGON, HEXAGON
-from wholearm.benchmark.free_runs import draw_run, judge_run, run_draw
 from wholearm.cli.command import main
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, SimulationError

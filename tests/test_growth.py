@@ -1,33 +1,26 @@
 from __future__ import annotations
 
-from pathlib import Path
+import argparse
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from shipped import HEPTAGON
-from wholearm.benchmark import growth
-from wholearm.benchmark.alone import Cost
-from wholearm.benchmark.growth import (
-    SIZES,
-    WORK,
-    Point,
-    draw_growth,
-    fit_exponent,
-    format_growth,
-    list_work,
-    run_growth,
-    run_work,
-)
+from wholearm.benchmark.growth import SIZES, STUDY, WORK, fit_exponent, run_work
+from wholearm.benchmark.study import Row
 from wholearm.problem.read import read_problem
 from wholearm.solvers.ipopt import record_runs
 
+KEYS = ("grows", "work", "size")
 
-def make_points() -> list[Point]:
+
+def make_rows() -> list[Row]:
     """Times that grow with the square of sizes, and memory in proportion to them."""
     return [
-        Point(grows, work, size, 1e-3 * size**2, 0.1 * size) for grows, work, size in list_work()
+        {"grows": grows, "work": work, "size": k, "seconds": 1e-3 * k**2, "memory": 0.1 * k}
+        for grows, sizes in SIZES.items()
+        for work in WORK[grows]
+        for k in sizes
     ]
 
 
@@ -45,7 +38,7 @@ def test_sizes_reach_what_is_asked() -> None:
 
 
 def test_the_table_has_every_measurement_and_exponent() -> None:
-    text = format_growth(make_points())
+    text = STUDY.report(make_rows(), argparse.Namespace())[0]
     rows = iter(line for line in text.splitlines() if " [s] | " in line)
     for grows, sizes in SIZES.items():
         assert f"## {grows.capitalize()}" in text
@@ -57,7 +50,7 @@ def test_the_table_has_every_measurement_and_exponent() -> None:
 
 
 def test_axes_are_logarithmic_with_names_and_units() -> None:
-    figure = draw_growth(make_points())
+    figure = STUDY.draw(make_rows())
     assert len(figure.axes) == 2 * len(SIZES)
     for axes, grows in zip(figure.axes, [*SIZES, *SIZES], strict=True):
         assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
@@ -79,20 +72,8 @@ def test_work_is_as_large_as_is_asked() -> None:
         run_work(table, "vertices", "reading", size)
 
 
-def test_everything_is_measured_and_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    given: list[tuple[object, ...]] = []
-
-    def measure(_: object, table: object, *what: object) -> Cost:
-        given.append(what)
-        return Cost(None, 1.0, 2.0)
-
-    monkeypatch.setattr(growth, "measure_alone", measure)
-    monkeypatch.setattr(growth, "draw_growth", lambda _: Figure())
-    paths = run_growth(str(HEPTAGON), str(tmp_path))
-    assert given == [(point.grows, point.work, point.size) for point in make_points()]
-    assert [Path(path).suffix for path in paths] == [".md", ".csv", ".png"]
-    lines = Path(paths[1]).read_text(encoding="utf-8").splitlines()
-    assert lines[:2] == ["grows,work,size,seconds,memory", "intervals,least time,50,1.0,2.0"]
-    assert len(lines) == len(given) + 1
+def test_what_is_drawn_and_listed_is_what_is_run() -> None:
+    options = argparse.Namespace(problem=str(HEPTAGON))
+    cases = list(STUDY.list_cases(options))
+    assert [case[1:] for case in cases] == [tuple(map(row.get, KEYS)) for row in make_rows()]
+    assert STUDY.alone and STUDY.columns == (*KEYS, "seconds", "memory")

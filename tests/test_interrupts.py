@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from shipped import HEPTAGON
-from wholearm.benchmark.interrupts import STARTED, interrupt
+from signalled import STARTED, interrupt
 from wholearm.cli.route import hasten
 from wholearm.common import interrupts
 from wholearm.common.files import together, write_whole

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wholearm.benchmark.stress.overlap import clearances, separate
+from wholearm.benchmark.stress.newton import clearances, separate
 from wholearm.problem.definition import Problem
 from wholearm.results.trajectory import Trajectory
 

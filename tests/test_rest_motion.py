@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from timed import landing
-from wholearm.benchmark.stress.rest_motion import list_others, rest_margin
+from wholearm.benchmark.stress.slow_motion import list_others, rest_margin
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.time_domain.own_units import in_own_units, scale_state

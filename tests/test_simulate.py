@@ -12,7 +12,7 @@ from crossing import hexagon, measure_fingers, shorten, slid
 from integrated import integrate_phase
 from planned import CosineMotion, change, plan
 from pushed import forward
-from wholearm.benchmark.baseline_simulation import solve_motion
+from wholearm.benchmark.precision.reference import solve_motion
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError, JammingError, SimulationError
 from wholearm.contacts.elemental import parse_contact

@@ -1,14 +1,12 @@
 from __future__ import annotations
 
-from pathlib import Path
+import argparse
 
-import numpy as np
 import pytest
 
 from shipped import FOLDER
-from wholearm.benchmark import skip
-from wholearm.benchmark.alone import Cost, measure_alone
-from wholearm.benchmark.skip import Expense, Pair, format_pair, list_pairs, run_skip, spend
+from wholearm.benchmark.skip import STUDY, Pair, list_pairs, spend
+from wholearm.benchmark.study import Row
 
 INTERVALS, TIME_INTERVALS, POINTS, CONTACTS = 12, 4, 3, 4
 ABSENT = ("friction of joints", "speed limits that never bind")
@@ -23,17 +21,17 @@ def pairs() -> dict[str, Pair]:
     return {pair.part: pair for pair in every}
 
 
-def assert_bare(cost: Expense, contacts: int, rolling: int) -> None:
+def assert_bare(cost: Row, contacts: int, rolling: int) -> None:
     """Along a curve from rest to rest nothing but what each node needs.
 
     Unknowns are speed, acceleration and squeeze, but for the speed at both ends, where it is 0.
     Rows are how the speed goes on, and at each node contact forces, both sides of the cones of
     rolling contacts, and torques.
     """
-    nodes, rest = divmod(cost.unknowns + 2, 3)
+    nodes, rest = divmod(cost["unknowns"] + 2, 3)
     # Five nodes for each element of four intervals, of which switches may ask for more.
     assert rest == nodes % 5 == 0 and nodes >= 5 * INTERVALS // 4
-    assert cost.rows == nodes - 1 + (contacts + 2 * rolling + 2) * nodes
+    assert cost["rows"] == nodes - 1 + (contacts + 2 * rolling + 2) * nodes
 
 
 @pytest.mark.parametrize("part", ["friction of contacts", *ABSENT])
@@ -49,9 +47,9 @@ def test_over_time_friction_adds_a_sense_for_each_contact_and_point(pairs: dict[
         spend(case) for case in (own[0].having, own[0].without, own[1].without, own[2].having)
     )
     # What else there is, are coefficients and bounds.
-    assert full[:2] == free[:2] == limited[:2]
-    assert full.unknowns == smooth.unknowns
-    intervals, rest = divmod(full.rows - smooth.rows, CONTACTS * POINTS)
+    assert {own["unknowns"] for own in (full, free, limited)} == {smooth["unknowns"]}
+    assert {own["rows"] for own in (full, free, limited)} == {full["rows"]}
+    intervals, rest = divmod(full["rows"] - smooth["rows"], CONTACTS * POINTS)
     # Where a direction turns, a stage ends and an interval is divided.
     assert TIME_INTERVALS <= intervals < 2 * TIME_INTERVALS and rest == 0
 
@@ -71,30 +69,18 @@ def test_phases_that_stop_are_problems_of_their_own(pairs: dict[str, Pair]) -> N
     stopping, going = (spend(case) for case in (pair.without, pair.having))
     for cost in (stopping, going):
         assert_bare(cost, CONTACTS, 0)
-    assert going.unknowns > stopping.unknowns
+    assert going["unknowns"] > stopping["unknowns"]
 
 
-def test_the_table_has_a_row_for_each_part(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pairs: dict[str, Pair]
-) -> None:
-    chosen = pairs["a figure"]
-    monkeypatch.setattr(skip, "list_pairs", lambda _: [chosen])
-    monkeypatch.setattr(skip, "REPEATS", 1)
-    monkeypatch.setattr(skip, "measure_alone", lambda work, case: Cost(work(case), 0.0, 0.0))
-    path = run_skip("anywhere", str(tmp_path))
-    *_, row = Path(path).read_text(encoding="utf-8").splitlines()
+def test_the_table_has_a_row_for_each_part(pairs: dict[str, Pair]) -> None:
+    pair = pairs["a figure"]
+    rows = [
+        {"case": ["anywhere", pair.part, having, 0], **spend(plan)}
+        for having, plan in ((False, pair.without), (True, pair.having))
+    ]
+    *_, row = STUDY.report(rows, argparse.Namespace())[0].splitlines()
     name, *cells = [cell.strip() for cell in row.strip("|").split("|")]
     assert name == "a figure" and len(cells) == 8
     assert cells[0] == cells[1] and cells[2] == cells[3]
     # Drawing costs, and nothing of it is run where no figure is wanted.
     assert int(cells[5]) > int(cells[4])
-    assert format_pair("a", Expense(1, 2, 0.1, 0.2), Expense(3, 4, 0.3, 0.4)) == (
-        "| a | 1 | 3 | 2 | 4 | 100 | 300 | 200 | 400 |"
-    )
-
-
-def test_what_work_takes_is_that_of_its_own_process() -> None:
-    cost = measure_alone(np.ones, 6_000_000)
-    assert len(cost.answer) == 6_000_000 and cost.seconds > 0
-    # Eight bytes each [MB].
-    assert 40 < cost.memory < 100

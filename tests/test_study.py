@@ -1,35 +1,108 @@
+"""What every study has: processes, records that it goes on with, a table, a command."""
+
 from __future__ import annotations
 
 import json
-import os
 import re
-import tomllib
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 
-from misbehaving import misbehave
-from wholearm.benchmark.stress.cases import draw_case
-from wholearm.benchmark.stress.files import look, run_file
-from wholearm.benchmark.stress.mutation import BASE, draw_mutant
-from wholearm.benchmark.stress.plans import Finding
-from wholearm.benchmark.stress.problems import compare_values
-from wholearm.benchmark.stress.report import format_summary
-from wholearm.benchmark.stress.study import StressOptions, run_stress
-from wholearm.benchmark.stress.toml import to_toml
-from wholearm.benchmark.stress.trees import change_tree
-from wholearm.benchmark.stress.workers import run_tasks
-from wholearm.cli.bench import name_study
+from misbehaving import allow, misbehave
+from wholearm.benchmark import STUDIES
+from wholearm.benchmark.pool import run_tasks
+from wholearm.benchmark.study import Study, digest_source
+from wholearm.cli.bench import load_study
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
 from wholearm.common.journal import Journal
 
 
+@pytest.fixture
+def steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tiny study is one of those that there are."""
+    monkeypatch.setitem(STUDIES, "steps", ("tiny_study", "count steps to one"))
+
+
+@pytest.mark.usefixtures("steps")
+def test_a_study_is_a_command_with_records_and_a_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "out"
+    command = ["bench", "steps", "-o", str(folder), "--jobs", "2"]
+    assert main([*command, "--most", "4"]) == 1
+    text = capsys.readouterr().out
+    assert text.startswith("# Steps to one\n\nwholearm ") and "| 3 | 7 |" in text
+    assert "* no natural one" in text and f"wrote {folder / 'bench_steps.md'}" in text
+    records = (folder / "bench_steps.jsonl").read_text(encoding="utf-8")
+    assert len(records.splitlines()) == 1 + 4
+    # It goes on with what there is; a case that raises is a finding with its reason.
+    assert main([*command, "--most", "6"]) == 1
+    after = (folder / "bench_steps.jsonl").read_text(encoding="utf-8")
+    assert after.startswith(records) and len(after.splitlines()) == 1 + 6
+    text = (folder / "bench_steps.md").read_text(encoding="utf-8")
+    assert "| 4 | 2 |" in text and "* 5: traceback after " in text and "ValueError: five" in text
+    table = (folder / "bench_steps.csv").read_text(encoding="utf-8").splitlines()
+    assert table[:3] == ["number,steps", "0,0", "1,0"]
+    # What had findings is run again, and everything where that is asked for.
+    assert main([*command, "--most", "5", "--again"]) == 1
+    lines = (folder / "bench_steps.jsonl").read_text(encoding="utf-8").splitlines()
+    assert [json.loads(line)["case"] for line in lines[1:]][-1] == [0]
+    main([*command, "--most", "1", "--fresh"])
+    assert len((folder / "bench_steps.jsonl").read_text(encoding="utf-8").splitlines()) == 2
+
+
+@pytest.mark.usefixtures("steps")
+def test_records_of_other_code_do_not_count_where_that_matters(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = load_study("steps")
+    monkeypatch.setattr(study, "of_code", True, raising=False)
+    command = ["bench", "steps", "-o", str(tmp_path), "--jobs", "1", "--most", "2"]
+    path = tmp_path / "bench_steps.jsonl"
+    main(command)
+    head, *rows = path.read_text(encoding="utf-8").splitlines()
+    assert json.loads(head)["source"] == digest_source()
+    path.write_text("\n".join([head, *rows[:1], ""]), encoding="utf-8")
+    main(command)
+    assert path.read_text(encoding="utf-8").splitlines()[:2] == [head, rows[0]]
+    path.write_text(
+        head.replace(digest_source(), "other") + "\n" + rows[0] + "\n", encoding="utf-8"
+    )
+    main(command)
+    assert path.read_text(encoding="utf-8").splitlines()[0] == head
+
+
+def test_every_study_is_listed_and_has_its_options(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench"]) == 0
+    text = capsys.readouterr().out
+    for name, (_, about) in STUDIES.items():
+        assert re.search(rf"^{name} +{re.escape(about)}$", text, re.M)
+        study = load_study(name)
+        assert isinstance(study, Study) and study.name == name and study.title
+        with pytest.raises(SystemExit):
+            main(["bench", name, "--help"])
+        assert ("--output DIR" in capsys.readouterr().out) is study.keeps
+
+
+@pytest.mark.parametrize("option", ["--scenes", "--files", "--seed", "--jobs", "--only"])
+def test_numbers_out_of_range_are_refused(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "stress", option, "-1"]) == 2
+    assert capsys.readouterr().err.startswith(f"wholearm: {option}: -1 given")
+
+
+@pytest.mark.usefixtures("steps")
+def test_a_folder_that_cannot_be_made_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    assert main(["bench", "steps", "-o", str(tmp_path / "file" / "folder")]) == 2
+    assert "cannot be made" in capsys.readouterr().err
+
+
 def test_a_worker_that_hangs_or_dies_is_replaced() -> None:
     tasks = ["fine", "hang", "die", "raise", "warn", "print", "well"]
-    answers = {answer.task: answer for answer in run_tasks(misbehave, tasks, 1, 1.0)}
+    answers = {answer.task: answer for answer in run_tasks(misbehave, tasks, 1, allow)}
     assert {task: answer.ended for task, answer in answers.items()} == {
         "fine": "done",
         "hang": "late",
@@ -48,53 +121,16 @@ def test_a_worker_that_hangs_or_dies_is_replaced() -> None:
 def test_tasks_of_one_kind_come_after_another_in_one_worker() -> None:
     """A worker keeps what it has drawn for a scene until another one comes."""
     tasks = ["a1", "b1", "a2", "b2", "c1", "a3"]
-    answers = run_tasks(misbehave, tasks, 1, 20.0, lambda task: task[0])
+    answers = run_tasks(misbehave, tasks, 1, allow, lambda task: task[0])
     assert [answer.task for answer in answers] == ["a1", "a2", "a3", "b1", "b2", "c1"]
 
 
-def test_a_scene_is_drawn_alike_again_and_is_the_same_as_a_file() -> None:
-    case, again = draw_case(0, 2), draw_case(0, 2)
-    assert case == again
-    assert case.table["phases"]
-    assert tomllib.loads(to_toml(case.table)) == case.table
-
-
-def test_mutants_are_reproducible_and_differ_from_what_they_come_from() -> None:
-    for number in range(40):
-        mutant = draw_mutant(1, number)
-        assert mutant == draw_mutant(1, number)
-        assert mutant.what
-    table = json.loads(json.dumps(BASE))
-    change_tree(np.random.default_rng(0), table)
-    assert table != BASE
-
-
-@pytest.mark.parametrize("number", range(12))
-def test_damaged_files_end_clearly(number: int) -> None:
-    record = run_file((6, number))
-    assert record["findings"] == [] and record["status"] in (0, 1, 2)
-
-
-@pytest.mark.parametrize(
-    ("status", "out", "err", "written", "count"),
-    [
-        (2, "", "wholearm: mutant.toml: x\n", set(), 0),
-        (2, "", "wholearm: x\n", set(), 1),
-        (2, "", "wholearm: mutant.toml: x\nmore\n", set(), 1),
-        (2, "", "", set(), 2),
-        (2, "half a table", "wholearm: mutant.toml: x\n", set(), 1),
-        (2, "", "wholearm: mutant.toml: x\n", {"out.npz"}, 1),
-        (0, "fine", "", {"out.npz"}, 0),
-        (0, "fine", "a warning\n", set(), 1),
-        (3, "", "", set(), 1),
-        (1, "a report", "", set(), 0),
-        (1, "", "", set(), 1),
-    ],
-)
-def test_what_counts_as_an_unclear_end(
-    status: int, out: str, err: str, written: set[str], count: int
-) -> None:
-    assert len(look(["verify"], status, out, err, written)) == count
+def test_what_a_task_takes_is_its_own() -> None:
+    answers = {
+        own.task: own for own in run_tasks(misbehave, ["fine", "large"], 1, allow, alone=True)
+    }
+    assert 40 < answers["large"].memory < 100 and answers["fine"].memory < 10
+    assert 0 < answers["large"].seconds < answers["large"].elapsed + 1
 
 
 def test_a_journal_goes_on_after_half_a_line(tmp_path: Path) -> None:
@@ -143,61 +179,3 @@ def test_two_runs_do_not_write_to_one_file(tmp_path: Path) -> None:
             Journal(path, stamp, fresh=True)
     with Journal(path, stamp) as journal:
         assert journal.records == [{"scene": 0}]
-
-
-def test_values_that_noise_changes_are_found() -> None:
-    def record(value: float | None, number: int, what: str = "noise") -> dict[str, Any]:
-        return {"problem": ["a.toml", "time", what, number], "value": value, "findings": []}
-
-    close = [record(1.0, 0), record(1.0 + 5e-7, 1), record(2.0, 0, "change"), record(None, 2)]
-    assert compare_values(close) == []
-    (finding,) = compare_values([*close, record(1.0 + 5e-6, 3)])
-    assert "a.toml, time" in finding.text
-
-
-def test_the_summary_counts_every_finding() -> None:
-    scene = {"scene": [4, "time"], "kind": "any", "outcome": "planned", "verdict": "", "seconds": 1}
-    records: list[dict[str, Any]] = [
-        {**scene, "findings": [["hang", "after 9 s"], ["warning", "a | b"]]},
-        {"file": 2, "kind": "torque", "status": None, "findings": [["traceback", "ValueError"]]},
-        {"problem": ["p.toml", "time", "noise", 0], "value": 1.0, "findings": []},
-    ]
-    noise = [Finding("optimum that differs under noise", "p.toml")]
-    text, count = format_summary(records, noise, {"seed": 0})
-    assert count == 4
-    assert "| hang | 1 |" in text and "| traceback | 1 |" in text and "a \\| b" in text
-    assert "| optimum that differs under noise | 1 |" in text
-
-
-def test_a_study_goes_on_where_it_was_stopped(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = str(tmp_path / "out")
-    arguments = ["bench", "stress", "--scenes", "0", "--seed", "2", "-o", folder, "--jobs", "1"]
-    assert main([*arguments, "--files", "3"]) == 0
-    with open(f"{folder}/bench_stress.jsonl", encoding="utf-8") as stream:
-        before = stream.read()
-    text, path, count = run_stress(StressOptions(scenes=0, files=3, seed=2), folder)
-    assert count == 0 and "Damaged files" in text and os.path.isfile(path)
-    with open(f"{folder}/bench_stress.jsonl", encoding="utf-8") as stream:
-        assert stream.read() == before
-    assert "Stress study" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("option", ["--scenes", "--files", "--seed", "--jobs", "--only"])
-def test_numbers_out_of_range_are_refused(option: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "stress", option, "-1"]) == 2
-    assert capsys.readouterr().err.startswith(f"wholearm: {option}: -1 given")
-
-
-def test_the_name_of_the_study_may_be_left_out() -> None:
-    assert name_study(["bench", "a.toml"]) == ["bench", "problem", "a.toml"]
-    assert name_study(["bench", "-o", "x", "a.toml"]) == ["bench", "problem", "-o", "x", "a.toml"]
-    for same in (["bench", "stress"], ["bench"], ["bench", "--help"], ["solve", "stress"]):
-        assert name_study(same) == same
-
-
-def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("", encoding="utf-8")
-    with pytest.raises(InputError, match="cannot be made"):
-        run_stress(StressOptions(scenes=0), str(tmp_path / "file" / "folder"))

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from wholearm.benchmark.torque_rates import LinePoint
 from wholearm.common.arrays import Array
 from wholearm.geometry.curve import Curve, Segment
 from wholearm.mechanics.dynamics import Directions, PathForces
@@ -28,6 +27,23 @@ from wholearm.planning.path_domain.motion import PathMotion
 from wholearm.planning.path_domain.plan import plan_path
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.scene.model import Scales
+
+
+class LinePoint(tuple[Array, Array, Array]):
+    """Points of a straight line in place of those of a curve: z, z' and z''."""
+
+    kinematics = None
+
+    @property
+    def z(self) -> Array:
+        """Configurations, shape (n, 5)."""
+        return self[0]
+
+    @property
+    def z_s(self) -> Array:
+        """Their derivatives along the line, shape (n, 5)."""
+        return self[1]
+
 
 Law = Callable[[Array, NDArray[np.bool_]], tuple[Array, ...]]
 """Coefficients (Ta, Tl, Tv), each (n, 2), at n arc lengths, before or after the break."""

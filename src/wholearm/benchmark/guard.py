@@ -8,8 +8,9 @@ NumPy 2.1 to 2.5, iterations differ by 1 %, evaluations by 0.5 %, and panels by 
 
 from __future__ import annotations
 
+import argparse
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from ..common.errors import InputError
@@ -21,6 +22,7 @@ from ..problem.definition import Problem
 from ..simulation.runge_kutta import NODES
 from ..simulation.simulate import simulate
 from ..solvers.ipopt import Run, record_runs
+from .study import Case, Row, Study
 
 BANDS = {"iterations": 1.25, "evaluations of the replay": 1.1, "panels of curves": 1.25}
 """Largest ratio to the stored counts of those in which rounding has a part; others may not grow."""
@@ -28,17 +30,48 @@ BANDS = {"iterations": 1.25, "evaluations of the replay": 1.1, "panels of curves
 Counts = dict[str, int]
 
 
-def count_all(
-    paths: Sequence[str], progress: Callable[[str], None] | None = None
-) -> dict[str, Counts]:
-    """Counts of every problem, by the names of its file."""
-    found = {}
-    for path in paths:
-        problem, name = load(path), Path(path).stem
-        if progress is not None:
-            progress(f"{name}: planning")
-        found[name] = count(problem)
-    return found
+class Guard(Study):
+    """Counts of today against stored ones."""
+
+    name, title, keeps = "guard", "Counts against stored ones", False
+
+    def add_options(self, parser: argparse.ArgumentParser) -> None:
+        """Which problems, and where the counts are."""
+        parser.add_argument("problems", nargs="+", metavar="FILE", help="problem files (TOML)")
+        text = "file of stored counts (results/bench_guard.json)"
+        parser.add_argument("--counts", default="results/bench_guard.json", help=text)
+        parser.add_argument("--update", action="store_true", help="store the counts anew")
+
+    def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
+        """The problems."""
+        if not options.update:
+            read_stored(options.counts)
+        require_writable(options.counts)
+        for path in options.problems:
+            load(path)
+            yield (path,)
+
+    def run(self, case: Case) -> Row:
+        """Count one."""
+        return {"counts": count(load(case[0]))}
+
+    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
+        """What has grown."""
+        found: dict[str, Counts] = {Path(row["case"][0]).stem: row["counts"] for row in rows}
+        known = read_stored(options.counts) if Path(options.counts).exists() else {}
+        if options.update:
+            known |= found
+            write_text(options.counts, json.dumps(known, indent=2, sort_keys=True) + "\n")
+        grown = []
+        for name, counts in found.items():
+            if name in known:
+                grown += compare(name, counts, known[name])
+            else:
+                grown.append(f"{name}: no counts are stored; --update stores them")
+        return "" if grown else f"{len(rows)} problems: no count has grown", grown
+
+
+STUDY = Guard()
 
 
 def count(problem: Problem) -> Counts:
@@ -101,30 +134,3 @@ def read_stored(path: str) -> dict[str, Counts]:
     if not all(type(number) is int for number in numbers):
         raise InputError(path, "", "holds other things than whole numbers by problem and count")
     return dict(table)
-
-
-def run_guard(
-    paths: Sequence[str], stored: str, update: bool, progress: Callable[[str], None] | None = None
-) -> list[str]:
-    """Count, and store the counts or hold them against those that are stored.
-
-    Returns
-    -------
-    list of str
-        What has grown; nothing if the counts are stored.
-    """
-    known = {} if update and not Path(stored).exists() else read_stored(stored)
-    require_writable(stored)
-    found = count_all(paths, progress)
-    if update:
-        write_text(stored, json.dumps(known | found, indent=2, sort_keys=True) + "\n")
-        return []
-    return [
-        text
-        for name, counts in found.items()
-        for text in (
-            compare(name, counts, known[name])
-            if name in known
-            else [f"{name}: no counts are stored; --update stores them"]
-        )
-    ]

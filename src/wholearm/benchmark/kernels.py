@@ -2,7 +2,7 @@
 
 OpenBLAS has kernels for each processor, which differ in the last bits; ``OPENBLAS_CORETYPE`` makes
 one machine stand in for another. Further Pythons bring other versions of the libraries. Seeds
-change the numbers of the scenes themselves in the last bits, see `rounding`.
+change the numbers of the scenes themselves in the last bits.
 
 Each problem is planned and verified for every objective, in a process for each environment. Its
 answer is the value of the objective and the sequence of contact modes of each phase. Answers are
@@ -14,14 +14,84 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import random
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields
+from functools import cache
 from itertools import groupby, product
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from ..common.arrays import Array
+from ..common.bounds import Bounds
+from ..common.files import read_json, write_text
+from ..scene.model import Finger, Friction, Scene
+from ..scene.polygon import Polygon
+from .study import Case, Row, Study
+
+LARGEST = 4
+"""Largest change of a number, in units of 2^-52 of it."""
+
+
+def perturb_scenes(seed: int) -> None:
+    """Multiply every number of each scene that is made from now on by 1 + k 2^-52, |k| <= 4.
+
+    k follows from the seed, the name of the number and its first 14 digits, to which the number
+    is rounded first. So a scene that is made again from its own numbers keeps them.
+    """
+    for kind in (Polygon, Finger, Friction, Scene):
+        _perturb(kind, seed)
+
+
+def _perturb(kind: Any, seed: int) -> None:
+    check = getattr(kind.__post_init__, "exact", kind.__post_init__)
+    names = [field.name for field in fields(kind) if field.init and field.name != "name"]
+
+    def check_and_perturb(self: Any) -> None:
+        # First as they were given: messages about bad numbers quote them.
+        given = [name for name in names if getattr(self, name) is not None]
+        left_out = set(names) - set(given)
+        check(self)
+        for name in left_out:
+            object.__setattr__(self, name, None)
+        for name in given:
+            label = f"{seed} {kind.__name__}.{getattr(self, 'name', '')}.{name}"
+            object.__setattr__(self, name, _change(getattr(self, name), label))
+        check(self)
+
+    check_and_perturb.exact = check  # type: ignore[attr-defined]
+    kind.__post_init__ = check_and_perturb
+
+
+def _change(value: Any, label: str) -> Any:
+    if isinstance(value, np.ndarray):
+        return _change_array(value, label)
+    if isinstance(value, Real) and not isinstance(value, bool):
+        return _change_number(float(value), label)
+    return value
+
+
+def _change_array(values: Array, label: str) -> Array:
+    places = np.ndenumerate(values)
+    return np.array([_change_number(float(v), f"{label}{i}") for i, v in places]).reshape(
+        values.shape
+    )
+
+
+@cache
+def _change_number(value: float, label: str) -> float:
+    if value == 0.0 or not np.isfinite(value):
+        return value
+    rounded = float(f"{value:.13e}")
+    k = random.Random(f"{label} {rounded!r}").randint(-LARGEST, LARGEST)
+    return rounded * (1 + k * 2.0**-52)
+
 
 if TYPE_CHECKING:
     from ..planning.result import Plan
@@ -31,6 +101,7 @@ TOLERANCE = 1e-6
 """Largest relative difference of values: what Ipopt and the refinement of limits leave open."""
 BRIEF = 1e-3
 """Duration below which a stretch with other contact modes does not count, over the phase's."""
+ANSWER = ("value", "modes", "fault")
 SUPPORTED = re.compile(r"^Core: (\w+)", re.M)
 
 
@@ -111,13 +182,75 @@ def list_modes(plan: Plan) -> list[list[str]]:
     return found
 
 
-def answer_in(environment: Environment, path: str, objective: str) -> dict[str, Any]:
-    """What `answer` returns in a process of an environment."""
-    given = ["--answer", path, objective, str(environment.seed)]
-    run = environment.run(["-m", "wholearm.benchmark.kernels", *given])
-    if run.returncode:
-        return {"value": None, "modes": [], "fault": run.stderr.strip()[-300:]}
-    return dict(json.loads(run.stdout))
+class Kernels(Study):
+    """Answers in several environments against stored ones."""
+
+    name, title, keeps = "kernels", "Answers by environment", False
+
+    def add_options(self, parser: argparse.ArgumentParser) -> None:
+        """Which problems and environments, and where the answers are."""
+        parser.add_argument("problems", nargs="+", metavar="FILE", help="problem files (TOML)")
+        text = "kernels of OpenBLAS, as for OPENBLAS_CORETYPE (default: the processor's own)"
+        parser.add_argument("--kernels", nargs="+", default=[""], metavar="NAME", help=text)
+        text = "seeds of changes to all numbers in the last bits; 0 for none (0)"
+        read = Bounds(0, 2**63).read
+        parser.add_argument("--seeds", nargs="+", type=read, default=[0], metavar="K", help=text)
+        text = "interpreters that have the package (default: this one)"
+        parser.add_argument("--pythons", nargs="+", default=[sys.executable], help=text)
+        text = "file of stored answers (results/bench_kernels.json)"
+        parser.add_argument("--answers", default="results/bench_kernels.json", help=text)
+        text = "store the answers of the first environment"
+        parser.add_argument("--update", action="store_true", help=text)
+        parser.add_argument("-o", "--output", metavar="FILE", help="write the table (Markdown)")
+
+    def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
+        """Every problem and objective in each environment."""
+        if not options.update:
+            read_json(options.answers, "--update writes it anew")
+        given = options.pythons, options.kernels, options.seeds, options.problems, OBJECTIVES
+        return product(*given)
+
+    def run(self, case: Case) -> Row:
+        """What `answer` returns in a process of an environment."""
+        *given, path, objective = case
+        environment = Environment(*given)
+        asked = ["--answer", path, objective, str(environment.seed)]
+        run = environment.run(["-m", "wholearm.benchmark.kernels", *asked])
+        if run.returncode:
+            return {"value": None, "modes": [], "fault": run.stderr.strip()[-300:]}
+        return dict(json.loads(run.stdout))
+
+    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
+        """A row for each environment, and what differs."""
+        found: dict[Environment, dict[str, Row]] = {}
+        for row in rows:
+            *given, path, objective = row["case"]
+            answers = found.setdefault(Environment(*given), {})
+            answers[f"{Path(path).stem} {objective}"] = {k: row[k] for k in ANSWER}
+        if options.update:
+            first = next(iter(found.values()))
+            write_text(options.answers, json.dumps(first, indent=1, sort_keys=True) + "\n")
+        known = read_json(options.answers, "--update writes it anew")
+        lines = ["| environment | answers | as stored | largest difference of a value |"]
+        lines.append("|---|---|---|---|")
+        findings = []
+        for environment, answers in found.items():
+            label = environment.describe()
+            texts = {name: compare(own, known.get(name)) for name, own in answers.items()}
+            findings += [f"{label}: {name}: {'; '.join(own)}" for name, own in texts.items() if own]
+            offs = [
+                abs(own["value"] / known[name]["value"] - 1)
+                for name, own in answers.items()
+                if own["value"] and known.get(name, {}).get("value")
+            ]
+            same = sum(not own for own in texts.values())
+            lines.append(f"| {label} | {len(answers)} | {same} | {max(offs, default=0.0):.1e} |")
+        if options.output:
+            write_text(options.output, "\n".join([f"# {self.title}", "", *lines]) + "\n")
+        return "\n".join(lines), findings
+
+
+STUDY = Kernels()
 
 
 def compare(found: Mapping[str, Any], stored: Mapping[str, Any] | None) -> list[str]:
@@ -134,74 +267,12 @@ def compare(found: Mapping[str, Any], stored: Mapping[str, Any] | None) -> list[
     return texts
 
 
-def run_kernels(
-    paths: Sequence[str],
-    environments: Sequence[Environment],
-    stored: str,
-    update: bool,
-    workers: int,
-    progress: Callable[[str], None] | None = None,
-) -> tuple[str, int]:
-    """Hold the answers of all environments against those that are stored.
-
-    Parameters
-    ----------
-    paths : sequence of str
-        Problem files.
-    stored : str
-        File of answers (JSON).
-    update : bool
-        Whether the answers of the first environment are stored.
-    workers : int
-        Answers at the same time.
-
-    Returns
-    -------
-    table : str
-        A row for each environment (Markdown), then what differs.
-    count : int
-        Number of differences.
-    """
-    from ..common.files import read_json, write_text
-
-    results: dict[Environment, dict[str, dict[str, Any]]] = {own: {} for own in environments}
-    known = {} if update else read_json(stored, "--update writes it anew")
-    with ThreadPoolExecutor(workers) as pool:
-        tasks = product(environments, paths, OBJECTIVES)
-        jobs = {pool.submit(answer_in, *task): task for task in tasks}
-        for count, job in enumerate(as_completed(jobs), start=1):
-            environment, path, objective = jobs[job]
-            results[environment][f"{Path(path).stem} {objective}"] = job.result()
-            if progress is not None:
-                progress(f"{count} of {len(jobs)} answers")
-    if update:
-        known = results[environments[0]]
-        write_text(stored, json.dumps(known, indent=1, sort_keys=True) + "\n")
-    lines = ["| environment | answers | as stored | largest difference of a value |"]
-    lines.append("|---|---|---|---|")
-    faults = []
-    for environment in environments:
-        found, label = results[environment], environment.describe()
-        texts = {name: compare(own, known.get(name)) for name, own in found.items()}
-        faults += [f"{label}: {name}: {'; '.join(own)}" for name, own in texts.items() if own]
-        offs = [
-            abs(own["value"] / known[name]["value"] - 1)
-            for name, own in found.items()
-            if own["value"] and known.get(name, {}).get("value")
-        ]
-        same = sum(not own for own in texts.values())
-        lines.append(f"| {label} | {len(found)} | {same} | {max(offs, default=0.0):.1e} |")
-    return "\n".join([*lines, "", *faults]).rstrip() + "\n", len(faults)
-
-
 def _answer() -> None:
     """Print the answer that the parent process asks for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--answer", nargs=3, required=True)
     path, objective, seed = parser.parse_args().answer
     if int(seed):
-        from .rounding import perturb_scenes
-
         perturb_scenes(int(seed))
     print(json.dumps(answer(path, objective)))
 

@@ -5,24 +5,24 @@ A part that a scene does not have adds no unknowns and no rows, and its code is 
 
 from __future__ import annotations
 
+import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..common.files import make_folder, require_writable, write_text
 from ..geometry.path_guess import load
 from ..geometry.tracing import trace_phases
 from ..planning.plan import solve
 from ..problem.definition import End, Problem, Until
 from ..problem.read import build_problem
 from ..solvers.ipopt import record_runs
-from .alone import measure_alone
-from .report import stamp
+from .study import Case, Row, Study
 
 REPEATS = 3
 """Runs of which the medians are taken."""
@@ -30,21 +30,55 @@ PUSHED = 0.03
 """Place that the object is pushed to by one finger or by both [m]."""
 AWAY = np.array([0.0, 0.0, 0.0, 0.0, 0.6])
 """Change of the start that turns an idle finger away [m, rad]."""
-HEAD = (
-    "# What each part costs",
-    "",
-    stamp(),
-    "",
-    "The same phases without a part of the model and with it. Sizes are those of the first NLP,",
-    "times those of the processor, as medians of fresh processes; building is all but the solver.",
-    "",
-    "| part | unknowns without | with | rows without | with | building without [ms] | with "
-    "| solving without [ms] | with |",
-    "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
-)
+COLUMNS = ("unknowns", "rows", "building", "solving")
 
 
-class Case(NamedTuple):
+class Skip(Study):
+    """Plans without a part of the model and with it."""
+
+    name, title, timed = "skip", "What each part costs", True
+    alone = True
+
+    def add_options(self, parser: argparse.ArgumentParser) -> None:
+        """Where the problems are."""
+        text = "folder of problem files (problems)"
+        parser.add_argument("--problems", default="problems", metavar="DIR", help=text)
+
+    def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
+        """Each part, without and with it, several times."""
+        parts = [pair.part for pair in list_pairs(options.problems)]
+        return product([options.problems], parts, (False, True), range(REPEATS))
+
+    def run(self, case: Case) -> Row:
+        """Plan once."""
+        folder, part, having, _ = case
+        (pair,) = (own for own in list_pairs(folder) if own.part == part)
+        return spend(pair.having if having else pair.without)
+
+    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
+        """Sizes, and medians of times."""
+        lines = [
+            "The same phases without a part of the model and with it. Sizes are those of the first",
+            "NLP, times those of the processor, as medians of fresh processes; building is all but",
+            "the solver.",
+            "",
+            "| part | unknowns without | with | rows without | with | building without [ms] | with "
+            "| solving without [ms] | with |",
+            "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
+        ]
+        for part in dict.fromkeys(row["case"][1] for row in rows):
+            cells = [part]
+            for column, having in product(COLUMNS, (False, True)):
+                own = [row for row in rows if row["case"][1:3] == [part, having]]
+                cells.append(f"{median(row[column] for row in own):.0f}")
+            lines.append(f"| {' | '.join(cells)} |")
+        return "\n".join(lines), []
+
+
+STUDY = Skip()
+
+
+class Plan(NamedTuple):
     """A problem to plan, and how.
 
     Attributes
@@ -66,23 +100,8 @@ class Pair:
     """A part of the model, and the same phases without it and with it."""
 
     part: str
-    without: Case
-    having: Case
-
-
-class Expense(NamedTuple):
-    """What a plan takes: sizes of its first NLP, and processor time outside and inside the solver.
-
-    Attributes
-    ----------
-    unknowns, rows : int
-    building, solving : float, [s]
-    """
-
-    unknowns: int
-    rows: int
-    building: float
-    solving: float
+    without: Plan
+    having: Plan
 
 
 def list_pairs(folder: str, **options: Any) -> list[Pair]:
@@ -95,7 +114,7 @@ def list_pairs(folder: str, **options: Any) -> list[Pair]:
     tip = _pick(box, 1, 2)
     path, over_time = options, options | {"transcription": "time"}
     pairs = [
-        Pair(f"{part}, {where}", Case(slide.with_(absent), own), Case(slide.with_(present), own))
+        Pair(f"{part}, {where}", Plan(slide.with_(absent), own), Plan(slide.with_(present), own))
         for where, own in (("along curves", path), ("over time", over_time))
         for part, absent, present in (
             ("friction of contacts", {"friction": 0.0}, {}),
@@ -115,11 +134,11 @@ def list_pairs(folder: str, **options: Any) -> list[Pair]:
     stop = replace(run, phases=(replace(run.phases[0], end=End.REST), *run.phases[1:]))
     return [
         *pairs,
-        Pair("a rolling contact, over time", Case(slipping, over_time), Case(tip, over_time)),
-        Pair("a second freedom", Case(tip, path), Case(slipping, path)),
-        Pair("a transition at speed", Case(stop, path), Case(run, path)),
-        Pair("an idle finger, over time", Case(both, over_time), Case(idle, over_time)),
-        Pair("a figure", Case(slide, path), Case(slide, path, draw=True)),
+        Pair("a rolling contact, over time", Plan(slipping, over_time), Plan(tip, over_time)),
+        Pair("a second freedom", Plan(tip, path), Plan(slipping, path)),
+        Pair("a transition at speed", Plan(stop, path), Plan(run, path)),
+        Pair("an idle finger, over time", Plan(both, over_time), Plan(idle, over_time)),
+        Pair("a figure", Plan(slide, path), Plan(slide, path, draw=True)),
     ]
 
 
@@ -131,41 +150,15 @@ def _pick(problem: Problem, first: int, stop: int) -> Problem:
     return replace(problem, start=start, phases=tuple(phases))
 
 
-def spend(case: Case) -> Expense:
-    """Plan a case and say what that takes."""
+def spend(plan: Plan) -> Row:
+    """Sizes of the first NLP of a plan, and processor time outside and inside the solver [ms]."""
     started = time.process_time()
     with record_runs() as runs:
-        plan = solve(case.problem, replay=False, **case.options)
-    if case.draw:
+        found = solve(plan.problem, replay=False, **plan.options)
+    if plan.draw:
         from ..figures.plots import force_margins
 
-        force_margins(plan).canvas.draw()
+        force_margins(found).canvas.draw()
     whole, solving = time.process_time() - started, sum(run.seconds for run in runs)
-    return Expense(runs[0].unknowns, runs[0].rows, whole - solving, solving)
-
-
-def run_skip(folder: str, output: str, progress: Callable[[str], None] | None = None) -> str:
-    """Measure every part in fresh processes and write a table; returns the path of its file."""
-    make_folder(output)
-    path = str(Path(output) / "bench_skip.md")
-    require_writable(path)
-    lines = [*HEAD]
-    for pair in list_pairs(folder):
-        if progress is not None:
-            progress(pair.part)
-        cells = []
-        for case in (pair.without, pair.having):
-            runs = [measure_alone(spend, case).answer for _ in range(REPEATS)]
-            cells.append(Expense(*(median(column) for column in zip(*runs, strict=True))))
-        lines.append(format_pair(pair.part, *cells))
-    write_text(path, "\n".join(lines) + "\n")
-    return path
-
-
-def format_pair(part: str, without: Expense, having: Expense) -> str:
-    """One row of the table."""
-    sizes = zip(without[:2], having[:2], strict=True)
-    times = zip(without[2:], having[2:], strict=True)
-    cells = [f"{one:.0f} | {other:.0f}" for one, other in sizes]
-    cells += [f"{1e3 * one:.0f} | {1e3 * other:.0f}" for one, other in times]
-    return f"| {part} | {' | '.join(cells)} |"
+    sizes = runs[0].unknowns, runs[0].rows
+    return dict(zip(COLUMNS, (*sizes, 1e3 * (whole - solving), 1e3 * solving), strict=True))

@@ -4,28 +4,27 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
+from typing import NoReturn
 
 from ..common.bounds import PLANNER, Bounds
+from ..common.errors import InputError
 
 SIMULATORS = ("told", "free")
 """What `plot --simulate` takes; the first one if it is left out."""
 
 
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are ours."""
+
+    def error(self, message: str) -> NoReturn:
+        """Refuse the command line."""
+        text = message.removeprefix("argument ")
+        raise InputError("", "", f"{text}; see {self.prog} --help")
+
+
 def number(low: float, high: float) -> Callable[[str], float]:
     """What reads an option that is a number from `low` to `high`, a whole one if `low` is."""
-    bounds = Bounds(low, high)
-
-    def read(text: str) -> float:
-        value: float | str
-        try:
-            value = int(text) if bounds.whole else float(text)
-        except ValueError:
-            value = text
-        if wrong := bounds.describe(value):
-            raise argparse.ArgumentTypeError(wrong)
-        return value  # type: ignore[return-value]
-
-    return read
+    return Bounds(low, high).read
 
 
 JOBS = number(1, 256)

@@ -12,11 +12,12 @@ import json
 import os
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 from ..common.errors import InputError, WholearmError, name_source
 from ..common.interrupts import guard
 from .arguments import (
+    Parser,
     add_compare,
     add_map,
     add_plot,
@@ -26,7 +27,7 @@ from .arguments import (
     add_verify,
     name_simulator,
 )
-from .bench import add_bench, name_study
+from .bench import add_bench
 from .compare import compare
 from .completion import add_completion
 from .engines import add_export, add_replay
@@ -54,12 +55,6 @@ if TYPE_CHECKING:
     from ..verification.free_report import FreeReport
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        text = message.removeprefix("argument ")
-        raise InputError("", "", f"{text}; see {self.prog} --help")
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit status."""
     given = sys.argv[1:] if arguments is None else arguments
@@ -68,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(given: Sequence[str]) -> int:
     try:
-        named = name_study(protect(name_simulator(given)))
+        named = protect(name_simulator(given))
         options = build_parser().parse_args(named)
         with progress_log():
             status: int = options.run(options)
@@ -104,7 +99,7 @@ def _silence_output() -> None:
 
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of all commands."""
-    parser = _Parser(prog="wholearm", description="Plan and verify whole-arm manipulation.")
+    parser = Parser(prog="wholearm", description="Plan and verify whole-arm manipulation.")
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     for name, add, run, text in (
@@ -132,7 +127,12 @@ def build_parser() -> argparse.ArgumentParser:
         ("gallery", add_gallery, None, "plan problems and show them all on one page"),
         ("help", add_help, None, "print a page of the documentation, or list its topics"),
         ("completion", add_completion, None, "print what makes a shell complete all this"),
-        ("bench", add_bench, None, "measure run time against error, or run the stress study"),
+        (
+            "bench",
+            add_bench,
+            None,
+            "run studies: measure, compare with stored answers, look for what must not be",
+        ),
     ):
         own = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
         if run is not None:

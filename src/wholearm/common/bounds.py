@@ -28,6 +28,19 @@ class Bounds(NamedTuple):
         kind = "whole numbers from " if self.whole else ""
         return f"{given!r} given; allowed are {kind}{low} to {high}"
 
+    def read(self, text: str) -> float:
+        """The value of an option on the command line."""
+        value: float | str
+        try:
+            value = int(text) if self.whole else float(text)
+        except ValueError:
+            value = text
+        if wrong := self.describe(value):
+            from argparse import ArgumentTypeError
+
+            raise ArgumentTypeError(wrong)
+        return value  # type: ignore[return-value]
+
     def check(self, key: str, given: object) -> None:
         """Raise an `InputError` that names `key` if a value is out of its range."""
         if text := self.describe(given):

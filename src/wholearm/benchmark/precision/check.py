@@ -13,8 +13,7 @@ import casadi as ca
 import numpy as np
 
 from ...common.arrays import Array, Expression
-from .instances import Instance
-from .plant import OPTIMUM, PeerPlan
+from .phases import OPTIMUM, Instance, PeerPlan
 from .reference import Course, Span, measure_error
 from .runs import SOLVED
 from .simulators import pack_span, write_rates

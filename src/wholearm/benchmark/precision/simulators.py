@@ -1,4 +1,4 @@
-"""Simulators that are compared: ours, SciPy's, CasADi's, and full coordinates after Baumgarte.
+"""Simulators that are compared: ours, SciPy's and CasADi's; and the courses that they run.
 
 All but ours are told when directions reverse, from the reference, and start anew there and where
 the torques step.
@@ -7,21 +7,39 @@ the torques step.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from ...common.arrays import Array, Expression
+from ...geometry.curve import Curve
 from ...mechanics.dynamics import build_forward
+from ...planning.options import PlanOptions
+from ...planning.path_domain.data import prepare
+from ...planning.path_domain.first_guess import guess
+from ...planning.path_domain.mesh import Mesh
+from ...planning.path_domain.motion import PathMotion
+from ...planning.path_domain.plan import plan_path
+from ...results.torque import TorqueProfile
 from ...simulation.simulate import simulate
-from ..baseline_simulation import evaluate_piece, solve_motion
-from .plant import build_plant
-from .reference import Course, Span
+from .phases import Instance, list_instances, pick
+from .reference import Course, Span, evaluate_piece, find_course, measure_error, solve_motion
+from .runs import SOLVED, Median, measure
 
-PULL = 20.0
-"""Rate at which Baumgarte's gaps close [1/s]."""
+FEW, MANY = "simulation, few pieces", "simulation, many pieces"
+"""Studies: torques in a few long pieces, and planned torques in eighty."""
+TOLERANCES = {FEW: tuple(10.0**-k for k in (4, *range(6, 14))), MANY: (1e-6, 1e-9, 1e-12)}
+"""Tolerances of each study."""
+DEGREES = {FEW: 14, MANY: 6}
+"""Degrees of the torques' polynomials."""
+SLOW = 0.3
+"""Square of the speed of the motion with few pieces, over that of a first guess of a plan."""
+LOOKS = 201
+"""Instants at which contact forces of a motion are looked at."""
+STOP = 0.95
+"""Share of the last stretch between reversals that is run: just before a stop all is ill-posed."""
 
 Rates = Callable[[float, Array], Array]
 Runner = Callable[[], Array]
@@ -54,13 +72,8 @@ def build_own(course: Course, tolerance: float) -> Runner:
     return run
 
 
-def build_scipy(
-    course: Course, tolerance: float, method: str, callback: Callable[..., Any]
-) -> Runner:
-    """SciPy's `solve_ivp` on some kind of callbacks, with the same relative and absolute tolerance.
-
-    Radau and LSODA get the Jacobian from callbacks that have one.
-    """
+def build_scipy(course: Course, tolerance: float, callback: Callable[..., Any]) -> Runner:
+    """SciPy's DOP853 on some kind of callbacks, with the same relative and absolute tolerance."""
     from scipy.integrate import solve_ivp
 
     choose = callback(course)
@@ -68,17 +81,8 @@ def build_scipy(
     def run() -> Array:
         state = np.append(course.problem.start, np.zeros(5))
         for span in course.spans:
-            rates, jacobian = choose(span)
-            given = {"jac": jacobian} if jacobian and method != "DOP853" else {}
-            found = solve_ivp(
-                rates,
-                (span.start, span.stop),
-                state,
-                method=method,
-                rtol=tolerance,
-                atol=tolerance,
-                **given,
-            )
+            given = {"method": "DOP853", "rtol": tolerance, "atol": tolerance}
+            found = solve_ivp(choose(span), (span.start, span.stop), state, **given)
             if found.status:
                 raise RuntimeError(found.message)
             state = found.y[:, -1]
@@ -87,33 +91,30 @@ def build_scipy(
     return run
 
 
-def call_numpy(course: Course, pull: float = 0.0) -> Callable[[Span], tuple[Rates, None]]:
+def call_numpy(course: Course) -> Callable[[Span], Rates]:
     """Plain NumPy: one linear system in every call."""
     scene, torque = course.problem.scene, course.torque
     contacts = course.problem.phases[0].formation.contacts
 
-    def choose(span: Span) -> tuple[Rates, None]:
+    def choose(span: Span) -> Rates:
         def rates(t: float, y: Array) -> Array:
             tau = evaluate_piece(torque, span.piece, t)
-            found = solve_motion(scene, contacts, y[:5], y[5:], tau, span.Xi, span.sigma, pull)
+            found = solve_motion(scene, contacts, y[:5], y[5:], tau, span.Xi, span.sigma)
             return np.concatenate([y[5:], found[0]])
 
-        return rates, None
+        return rates
 
     return choose
 
 
-def call_casadi(course: Course) -> Callable[[Span], tuple[Rates, Rates]]:
-    """CasADi functions of the same equations and their Jacobian, with buffers that stay."""
+def call_casadi(course: Course) -> Callable[[Span], Rates]:
+    """A CasADi function of the same equations, with buffers that stay."""
     t, y, p, ode, _ = write_rates(course)
-    plain = ca.Function("rates", [t, y, p], [ode])
-    bent = ca.Function("jacobian", [t, y, p], [ca.densify(ca.jacobian(ode, y))])
-    given = _Buffered(plain), _Buffered(bent)
+    function = _Buffered(ca.Function("rates", [t, y, p], [ode]))
 
-    def choose(span: Span) -> tuple[Rates, Rates]:
-        for function in given:
-            function.p[:] = pack_span(course, span)
-        return given[0], given[1]
+    def choose(span: Span) -> Rates:
+        function.p[:] = pack_span(course, span)
+        return function
 
     return choose
 
@@ -124,16 +125,15 @@ class _Buffered:
     def __init__(self, function: Expression) -> None:
         self.buffer, self.call = function.buffer()
         self.t, self.y = np.zeros(1), np.zeros(10)
-        self.p, self.out = np.zeros(function.numel_in(2)), np.zeros(function.size_out(0), order="F")
+        self.p, self.out = np.zeros(function.numel_in(2)), np.zeros(10)
         for index, array in enumerate((self.t, self.y, self.p)):
             self.buffer.set_arg(index, array.data)
-        self.buffer.set_res(0, self.out.reshape(-1, order="F").data)
-        self.column = function.size2_out(0) == 1
+        self.buffer.set_res(0, self.out.data)
 
     def __call__(self, t: float, y: Array) -> Array:
         self.t[0], self.y[:] = t, y
         self.call()
-        return self.out[:, 0].copy() if self.column else self.out.copy()
+        return self.out.copy()
 
 
 def write_rates(course: Course) -> tuple[Any, ...]:
@@ -162,81 +162,95 @@ def pack_span(course: Course, span: Span) -> Array:
     return np.concatenate([span.Xi, span.sigma, coefficients.ravel("F"), ends])
 
 
-def build_sundials(course: Course, tolerance: float, name: str, **options: Any) -> Runner:
-    """CasADi's interface to cvodes, or to idas with the contact forces as algebraic unknowns.
-
-    All stretches are one call, by `mapaccum`.
-    """
+def build_cvodes(course: Course, tolerance: float) -> Runner:
+    """CasADi's interface to cvodes; all stretches are one call, by `mapaccum`."""
     t, y, p, ode, _ = write_rates(course)
     ends, x = ca.SX.sym("ends", 2), ca.SX.sym("x")
     half, now = (ends[1] - ends[0]) / 2, (ends[0] + ends[1] + x * (ends[1] - ends[0])) / 2
-    system = {"x": y, "t": x, "p": ca.vertcat(p, ends)}
-    if name == "idas":
-        system["z"] = c_n = ca.SX.sym("c_n", course.problem.phases[0].formation.n_contacts)
-        acceleration, missed = _write_dae(course, y, p, t, c_n)
-        system["alg"] = ca.substitute(missed, t, now)
-        ode = ca.vertcat(y[5:], acceleration)
-    system["ode"] = half * ca.substitute(ode, t, now)
-    given = {"abstol": tolerance, "reltol": tolerance, "max_num_steps": 100000, **options}
-    step = ca.integrator("step", name, system, -1.0, 1.0, given)
-    count = len(course.spans)
-    chain = step.mapaccum(count)
+    system = {"x": y, "t": x, "p": ca.vertcat(p, ends), "ode": half * ca.substitute(ode, t, now)}
+    given = {
+        "abstol": tolerance,
+        "reltol": tolerance,
+        "max_num_steps": 100000,
+        "linear_multistep_method": "adams",
+        "nonlinear_solver_iteration": "functional",
+    }
+    step = ca.integrator("step", "cvodes", system, -1.0, 1.0, given)
+    chain = step.mapaccum(len(course.spans))
     columns = [[*pack_span(course, span), span.start, span.stop] for span in course.spans]
     parameters = ca.DM(np.array(columns).T)
     start = ca.DM(np.append(course.problem.start, np.zeros(5)))
-    guess = {"z0": ca.DM.ones(system["z"].shape[0], count)} if "z" in system else {}
 
     def run() -> Array:
-        found = chain(x0=start, p=parameters, **guess)["xf"]
+        found = chain(x0=start, p=parameters)["xf"]
         return np.asarray(found[:, -1].full()[:, 0])
 
     return run
 
 
-def _write_dae(course: Course, y: Expression, p: Expression, t: Expression, c_n: Expression) -> Any:
-    """Accelerations, and what A z'' + A' z' misses, with the contact forces as unknowns."""
-    formation = course.problem.phases[0].formation
-    sizes = np.cumsum([0, formation.n_contacts, 2, 2 * course.torque.coefficients.shape[2], 2])
-    Xi, sigma, flat, piece = ca.vertsplit(p, sizes.tolist())
-    return build_plant(formation)(y[:5], y[5:], _write_torque(t, flat, piece), c_n, Xi, sigma)
-
-
-def _scipy(method: str, callback: Callable[..., Any]) -> Callable[[Course, float], Runner]:
-    return partial(build_scipy, method=method, callback=callback)
-
-
 _SAME = "rtol = atol = tolerance"
-_TUNED = f"{_SAME}; CasADi function with buffers that stay"
 SIMULATORS = {
     "wholearm": Simulator("events, contact forces and energies included", build_own),
-    **{
-        f"{method}, NumPy": Simulator(_SAME, _scipy(method, call_numpy))
-        for method in ("DOP853", "Radau", "LSODA")
-    },
-    **{
-        f"{method}, CasADi": Simulator(
-            _TUNED + (", analytic Jacobian" if method != "DOP853" else ""),
-            _scipy(method, call_casadi),
-        )
-        for method in ("DOP853", "Radau", "LSODA")
-    },
+    "DOP853, NumPy": Simulator(_SAME, partial(build_scipy, callback=call_numpy)),
+    "DOP853, CasADi": Simulator(
+        f"{_SAME}; CasADi function with buffers that stay",
+        partial(build_scipy, callback=call_casadi),
+    ),
     "cvodes": Simulator(
         "abstol = reltol = tolerance; Adams, functional iteration; all stretches in one call",
-        partial(
-            build_sundials,
-            name="cvodes",
-            linear_multistep_method="adams",
-            nonlinear_solver_iteration="functional",
-        ),
-    ),
-    "idas": Simulator(
-        "abstol = reltol = tolerance; contact forces algebraic and without error test; "
-        "all stretches in one call",
-        partial(build_sundials, name="idas", suppress_algebraic=True),
-    ),
-    "Baumgarte": Simulator(
-        f"DOP853, NumPy, {_SAME}; C'' + 2 p C' + p^2 C = 0, p = {PULL:g}/s",
-        _scipy("DOP853", partial(call_numpy, pull=PULL)),
+        build_cvodes,
     ),
 }
 """Simulators by name."""
+
+
+def run_simulator(
+    study: str, name: str, method: str, setting: str, files: tuple[str, ...]
+) -> Median | None:
+    """Run one setting of one simulator on one phase; None if the phase has no course."""
+    course = _get_course(name, study, files)
+    if course is None:
+        return None
+    # No timing is to include its import.
+    import scipy.integrate  # noqa: F401
+
+    def judge(state: Array) -> tuple[tuple[float, ...], str]:
+        error = measure_error(course.problem, state, course.end)
+        return (error,), SOLVED if np.isfinite(error) else "no finite state"
+
+    return measure(partial(SIMULATORS[method].build, course, float(setting)), judge)
+
+
+@lru_cache(maxsize=4)
+def _get_course(name: str, study: str, files: tuple[str, ...]) -> Course | None:
+    return make_course(pick(list_instances(files), name), study)
+
+
+def make_course(instance: Instance, study: str) -> Course | None:
+    """The course of a phase, until just before it comes to rest.
+
+    None if the slow motion would lose a contact.
+    """
+    problem, curve = instance.problem, instance.curve
+    if study == FEW:
+        motion = make_slow_motion(curve, problem.epsilon)
+    else:
+        motion = plan_path(curve, problem.epsilon, PlanOptions(), 1).motion
+    looks = np.linspace(0.0, motion.duration, LOOKS)
+    if motion.evaluate(looks).c_n.min() <= 0:
+        return None
+    last = np.flatnonzero(np.diff(motion.grid.segment, append=-1))
+    marks = np.append(0.0, motion.times[last])
+    stop = marks[-2] + STOP * (marks[-1] - marks[-2])
+    breaks = motion.times[np.append(motion.grid.steps > 0, True)]
+    breaks = np.append(breaks[breaks < stop], stop)
+    torque = TorqueProfile.fit(breaks, lambda t: motion.evaluate(t).tau, DEGREES[study])
+    return find_course(problem, torque, curve, marks[1:-1])
+
+
+def make_slow_motion(curve: Curve, epsilon: float) -> PathMotion:
+    """A slow smooth motion with its squeeze amid the range that limits allow."""
+    data = prepare(curve, epsilon, Mesh().make_grid(curve, 2 + len(curve.segments)), 0)
+    profile, _ = guess(data)
+    calm = profile._replace(a=SLOW * profile.a, b=SLOW * profile.b)
+    return PathMotion(curve, data.grid, calm)

@@ -17,10 +17,8 @@ from numpy.typing import NDArray
 from ...common.arrays import Array
 from ...problem.definition import Phase, Until
 from ...scene.model import Scene
-from .newton import locate
-from .overlap import clearances
-from .rest_motion import rest_margin
-from .slow_motion import fast_margin
+from .newton import clearances, locate
+from .slow_motion import fast_margin, rest_margin
 from .tracing import weights
 
 PLACES = 40

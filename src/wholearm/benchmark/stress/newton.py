@@ -1,8 +1,8 @@
-"""Contacts and equations of motion written out for single bodies, to check plans with.
+"""Contacts, equations of motion and distances written out for single bodies, to check plans with.
 
 Nothing here uses the C-functions, Jacobians or dynamics of the planner: a contact is a point with a
-normal, bodies move rigidly, and Newton's and Euler's laws hold for each of them. The names are
-those of `scene.model`.
+normal, bodies move rigidly, and Newton's and Euler's laws hold for each of them. Distances are by
+separating axes. The names are those of `scene.model`.
 """
 
 from __future__ import annotations
@@ -134,3 +134,58 @@ def balance(
 
 def _dot(a: Array, b: Array) -> Array:
     return np.asarray((a * b).sum(axis=-1))
+
+
+def clearances(scene: Scene, z: Array) -> dict[str, Array]:
+    """Signed distances [m] of every solid pair at n configurations, each of shape (n,).
+
+    Exact where a pair overlaps by a little or faces flat to vertex; elsewhere a lower bound of the
+    distance, with the right sign. The palm does not stop a link.
+    """
+    corners = place_object(scene, z)
+    bones = [link_bone(scene, z, finger) for finger in (0, 1)]
+    apart = {"object and palm": corners[..., 1].min(axis=1)}
+    for finger, link in enumerate(scene.fingers):
+        gap = separate(corners, bones[finger]) - link.radius
+        apart[f"object and finger {finger + 1}"] = gap
+    if getattr(scene, "fingers_collide", True):
+        thick = sum(link.radius for link in scene.fingers)
+        apart["finger 1 and finger 2"] = separate(bones[0], bones[1]) - thick
+    return apart
+
+
+def link_bone(scene: Scene, z: Array, finger: int) -> Array:
+    """The segment from joint to tip centre, shape (n, 2, 2) [m]."""
+    link = scene.fingers[finger]
+    base = np.broadcast_to(np.asarray(link.base), (len(z), 2))
+    return np.stack([base, base + link.length * link_axis(scene, z, finger)], axis=1)
+
+
+def separate(first: Array, second: Array) -> Array:
+    """Signed distance of convex polygons or segments, shape (n, k, 2) and (n, m, 2), as (n,).
+
+    Positive: the distance. Negative: minus the depth of the overlap.
+    """
+    depth = np.maximum(_reach(first, second), _reach(second, first))
+    distance = np.minimum(_nearest(first, second), _nearest(second, first))
+    return np.where(depth > 0, distance, depth)
+
+
+def _reach(first: Array, second: Array) -> Array:
+    """Largest gap along the normals of the first body's edges, both ways for a segment."""
+    along = np.roll(first, -1, axis=1) - first
+    along = along / np.maximum(np.hypot(along[..., 0], along[..., 1]), 1e-300)[..., None]
+    outward = np.stack([along[..., 1], -along[..., 0]], axis=-1)
+    own = (outward * first).sum(axis=-1)
+    other = np.einsum("nkd,nmd->nkm", outward, second).min(axis=2)
+    return np.asarray((other - own).max(axis=1))
+
+
+def _nearest(points: Array, body: Array) -> Array:
+    """Least distance of the points of one body to the edges of another, shape (n,)."""
+    start, along = body, np.roll(body, -1, axis=1) - body
+    square = np.maximum((along**2).sum(axis=-1), 1e-300)
+    apart = points[:, :, None] - start[:, None]
+    share = np.clip((apart * along[:, None]).sum(axis=-1) / square[:, None], 0.0, 1.0)
+    away = apart - share[..., None] * along[:, None]
+    return np.asarray(np.hypot(away[..., 0], away[..., 1]).min(axis=(1, 2)))

@@ -8,8 +8,7 @@ from ...common.arrays import Array
 from ...problem.definition import End, Phase, Problem
 from ...results.trajectory import Samples, Trajectory
 from ...scene.model import Scene
-from .newton import Touch, balance, locate
-from .overlap import clearances
+from .newton import Touch, balance, clearances, locate
 
 INSTANTS = 401
 """Instants of a phase that are looked at, besides some in short pieces of its torques."""

@@ -14,8 +14,7 @@ from ...planning.plan import solve
 from ...problem.definition import End, Phase, Problem
 from ...scene.model import Scene
 from .cell_curves import best_end, find_best, list_ends
-from .rest_motion import rest_margin
-from .slow_motion import fast_margin, inertia_ratio, slow_margin
+from .slow_motion import fast_margin, inertia_ratio, rest_margin, slow_margin
 from .tracing import Trace, follow, resample, weights
 
 PLACES = 60

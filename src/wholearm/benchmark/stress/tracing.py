@@ -14,8 +14,7 @@ import numpy as np
 from ...common.arrays import Array
 from ...problem.definition import Phase, Until
 from ...scene.model import Scene
-from .newton import locate
-from .overlap import clearances
+from .newton import clearances, locate
 
 STEP = 0.02
 """Length of a step over the radius of gyration."""

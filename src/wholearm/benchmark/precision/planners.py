@@ -1,11 +1,10 @@
-"""Planners that are compared: both domains of ours, plain transcriptions and public tools."""
+"""Planners that are compared: both domains of ours, and public tools."""
 
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
@@ -21,24 +20,16 @@ from ...planning.path_domain.terms import LimitShape
 from ...planning.phase_plan import PhasePlan
 from ...planning.time_domain.plan import plan_phases
 from .check import check_plan
-from .implicit import STARTS, build_implicit
-from .instances import Instance, list_instances, pick
-from .opti import build_opti
-from .plant import OPTIMUM, PeerPlan, list_stretches
-from .rockit_peer import build_rockit
-from .runs import Key, Run, repeat
-from .toppra_peer import build_toppra
-from .yapss_peer import build_yapss
+from .peers import build_toppra, build_yapss
+from .phases import OPTIMUM, Instance, PeerPlan, list_instances, list_stretches, pick
+from .runs import Median, measure
 
 LEAST_TIME, NO_DRAG = "least time", "least time without viscous friction"
-IMPLICIT = "least time, contacts not given"
-"""Studies: all phases, the same without viscous friction, and one phase from random starts."""
+"""Studies: all phases, and the same without viscous friction."""
 FINE = 1e-7
 """Accuracy of a plan along a curve whose duration is the reference where there is no bound."""
 NEAR = 1e-7
 """Distance over the duration in which a step of the torques is that of a reversal."""
-IMPLICIT_PHASE = "heptagon 4"
-"""Phase of the random starts."""
 
 
 class Planner(NamedTuple):
@@ -64,47 +55,25 @@ class Planner(NamedTuple):
     studies: tuple[str, ...] = (LEAST_TIME,)
 
 
-class PlanTask(NamedTuple):
-    """One setting of one planner on one phase.
+def run_planner(study: str, name: str, method: str, setting: str, files: tuple[str, ...]) -> Median:
+    """Run one setting of one planner on one phase, and check its plans."""
+    instance = pick(list_instances(files, study != NO_DRAG), name)
+    if module := PLANNERS[method].module:
+        # No timing is to include the import.
+        __import__(module)
+    least = _find_least_time(name, study, files)
 
-    Attributes
-    ----------
-    study, instance, method, setting : str
-    files : tuple of str
-        Problem files that the instance is from.
-    least : float, [s]
-        Least time, of `find_least_time`.
-    """
+    def judge(plan: PeerPlan) -> tuple[tuple[float, ...], str]:
+        end, violation, outcome = check_plan(instance, plan)
+        error = plan.duration / least - 1 if plan.status == OPTIMUM else math.nan
+        return (error, end, violation), outcome
 
-    study: str
-    instance: str
-    method: str
-    setting: str
-    files: tuple[str, ...]
-    least: float = math.nan
-
-    @property
-    def key(self) -> Key:
-        """Of its runs."""
-        return self[:4]
+    return measure(partial(PLANNERS[method].build, instance, setting), judge)
 
 
-def run_planner(task: PlanTask) -> list[Run]:
-    """Run one task as often as its time allows, and check every plan."""
-    instance = pick(list_instances(task.files, task.study != NO_DRAG), task.instance)
-    build = partial(PLANNERS[task.method].build, instance, task.setting)
-    runs = []
-    with warnings.catch_warnings():
-        # Other people's libraries warn of their own affairs.
-        warnings.simplefilter("ignore")
-        if module := PLANNERS[task.method].module:
-            # No timing is to include the import.
-            __import__(module)
-        for index, (built, took, plan) in enumerate(repeat(build)):
-            end, violation, outcome = check_plan(instance, plan)
-            error = plan.duration / task.least - 1 if plan.status == OPTIMUM else math.nan
-            runs.append(Run(*task.key, index, built, took, error, end, violation, outcome))
-    return runs
+@lru_cache(maxsize=4)
+def _find_least_time(name: str, study: str, files: tuple[str, ...]) -> float:
+    return find_least_time(pick(list_instances(files, study != NO_DRAG), name))
 
 
 def find_least_time(instance: Instance) -> float:
@@ -117,17 +86,6 @@ def find_least_time(instance: Instance) -> float:
     if bound is not None:
         return bound.value
     return plan_path(curve, epsilon, PlanOptions(accuracy=FINE), 1).motion.duration
-
-
-def list_plan_tasks(study: str, instance: Instance, files: tuple[str, ...]) -> list[PlanTask]:
-    """Every installed planner and setting on a phase."""
-    return [
-        PlanTask(study, instance.name, method, setting, files)
-        for method, planner in PLANNERS.items()
-        if study in planner.studies and is_installed(method)
-        if study != IMPLICIT or instance.name == IMPLICIT_PHASE
-        for setting in planner.choices
-    ]
 
 
 def is_installed(method: str) -> bool:
@@ -178,7 +136,6 @@ def _convert(instance: Instance, plan: PhasePlan[Any]) -> PeerPlan:
 
 _CURVE = ("1e-2", "1e-3", "1e-4", "1e-5", "1e-6")
 _TIME = ("8 x 3", "16 x 3", "32 x 3", "16 x 2", "16 x 4")
-_NODES = ("20", "40", "80")
 PLANNERS = {
     "wholearm, curve": Planner(
         "accuracy; limits tightened between nodes included",
@@ -188,22 +145,6 @@ PLANNERS = {
     ),
     "wholearm, time": Planner(
         "Radau, intervals x degree; linear torques, refinement included", _build_over_time, _TIME
-    ),
-    "Opti": Planner("trapezoidal rule; Ipopt as it comes, straight line", build_opti, _NODES[:2]),
-    "Opti, expanded": Planner(
-        "the same with `expand`", partial(build_opti, expand=True), _NODES[:2]
-    ),
-    "Opti, tuned": Planner(
-        "`expand`, adaptive barrier, first guess a slow motion that keeps the limits",
-        partial(build_opti, expand=True, tuned=True),
-        _NODES,
-    ),
-    "rockit": Planner(
-        "Radau of degree 3, linear torques, algebraic contact forces; `expand`, adaptive barrier, "
-        "the slow motion",
-        build_rockit,
-        ("10", "20"),
-        "rockit",
     ),
     "yapss": Planner(
         "two Legendre-Gauss points a segment, automatic second derivatives; adaptive barrier, the "
@@ -218,13 +159,6 @@ PLANNERS = {
         ("50", "100", "200", "400", "800", "1600", "3200"),
         "toppra",
         (NO_DRAG,),
-    ),
-    "contact-implicit": Planner(
-        "16 implicit Euler steps, products below 1, 0.1, ... 1e-4 in the scene's units, `expand`, "
-        f"adaptive barrier; {STARTS} random starts on {IMPLICIT_PHASE}",
-        build_implicit,
-        tuple(map(str, range(STARTS))),
-        studies=(IMPLICIT,),
     ),
 }
 """Planners by name."""

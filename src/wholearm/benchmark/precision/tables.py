@@ -1,33 +1,29 @@
-"""Tables of a study of run time against error."""
+"""Tables and figure of run time against error."""
 
 from __future__ import annotations
 
 import math
-import platform
-from collections.abc import Sequence
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
-from typing import NamedTuple
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
-from ..report import stamp
-from .planning import IMPLICIT, LEAST_TIME, NO_DRAG, PLANNERS
-from .runs import (
-    BUDGET,
-    LIMIT,
-    REPEATS,
-    SHIFT,
-    SHORT,
-    SOLVED,
-    Key,
-    Median,
-    Run,
-    find_mean,
-    find_medians,
-)
-from .simulation import DRIFT, FEW, MANY
-from .simulators import SIMULATORS
+from ...figures.style import PALETTE
+from ..study import Row, finish_axes
+from .planners import LEAST_TIME, NO_DRAG, PLANNERS
+from .runs import BUDGET, REPEATS, SHIFT, SHORT, SOLVED, Median, find_mean
+from .simulators import FEW, MANY, SIMULATORS
+
+Key = tuple[str, str, str, str]
+"""Study, instance, method and setting: what one median is of."""
+Medians = dict[Key, Median]
+MARKERS = "osD^vP*Xdh<>"
+"""Markers of the methods of a panel."""
+SMALLEST = 1e-16
+"""Error that is drawn for none at all."""
 
 
 class Comparison(NamedTuple):
@@ -56,32 +52,30 @@ class Comparison(NamedTuple):
 
 _TIMES, _ALL = "by the error of the phase time", "by all three errors"
 COMPARISONS = (
-    Comparison(FEW, FEW, "wholearm", (1e-6, 1e-9, 1e-11), False, None),
-    Comparison(MANY, MANY, "wholearm", (1e-6, 1e-9, 1e-11), False, None),
-    Comparison(
-        LEAST_TIME, f"{LEAST_TIME}, {_TIMES}", "wholearm, curve", (1e-2, 1e-3, 1e-4), True, 1
+    *(Comparison(own, own, "wholearm", (1e-6, 1e-9, 1e-11), False, None) for own in (FEW, MANY)),
+    *(
+        Comparison(own, f"{own}, {which}", "wholearm, curve", (1e-2, 1e-3, 1e-4), True, count)
+        for own in (LEAST_TIME, NO_DRAG)
+        for count, which in ((1, "by the error of the phase time"), (None, "by all three errors"))
     ),
-    Comparison(
-        LEAST_TIME, f"{LEAST_TIME}, {_ALL}", "wholearm, curve", (1e-2, 1e-3, 1e-4), True, None
-    ),
-    Comparison(NO_DRAG, f"{NO_DRAG}, {_TIMES}", "wholearm, curve", (1e-2, 1e-3, 1e-4), True, 1),
-    Comparison(NO_DRAG, f"{NO_DRAG}, {_ALL}", "wholearm, curve", (1e-2, 1e-3, 1e-4), True, None),
 )
 """Tables of times at equal error."""
-DISTRIBUTIONS = {"scipy": "", "rockit-meco": "rockit", "toppra": "toppra", "yapss": "yapss"}
-"""Distributions whose versions are stated, and the methods that need them."""
-INSTALL = "pip install 'wholearm[bench]'"
-"""What installs them."""
-
-Medians = dict[Key, Median]
 
 
-def format_report(runs: Sequence[Run], limit: float = LIMIT) -> str:
+def read_medians(rows: Iterable[Row]) -> Medians:
+    """The medians of a study's rows."""
+    return {
+        (row["study"], row["phase"], row["method"], row["setting"]): Median(
+            row["build"], row["solve"], tuple(row["errors"]), row["outcome"]
+        )
+        for row in rows
+        if "errors" in row
+    }
+
+
+def format_report(medians: Medians, limit: float) -> str:
     """All tables as Markdown."""
-    medians = find_medians(runs)
-    lines = ["# Run time against error, with peers", "", stamp(), ""]
-    lines += [f"{_name_processor()}; {'; '.join(_list_versions())}.", ""]
-    lines += [
+    lines = [
         f"Times are medians of processor time over up to {REPEATS} runs (one where that takes over "
         f"{BUDGET:g} s) in one thread; what takes less than {SHORT:g} s is averaged over that "
         f"time. Means are geometric ones, shifted by {1e3 * SHIFT:g} ms, over the phases of all "
@@ -102,8 +96,6 @@ def format_report(runs: Sequence[Run], limit: float = LIMIT) -> str:
         lines += _format_targets(medians, comparison, limit)
     for study in (LEAST_TIME, NO_DRAG):
         lines += _format_settings(medians, study)
-    lines += _format_starts(medians)
-    lines += _format_drift(medians)
     lines += ["## Settings", "", "| method | settings |", "|---|---|"]
     lines += [f"| {name} | {own.settings} |" for name, own in (SIMULATORS | PLANNERS).items()]
     return "\n".join([*lines, ""])
@@ -187,52 +179,43 @@ def _format_settings(medians: Medians, study: str) -> list[str]:
     return [*lines, ""]
 
 
-def _format_starts(medians: Medians) -> list[str]:
-    """What came of the random starts."""
-    own = [median for key, median in medians.items() if key[0] == IMPLICIT]
-    if not own:
-        return []
-    found = [median for median in own if len(median.errors) == 3]
-    solved = [median for median in own if median.outcome == SOLVED]
-    errors = sorted(median.errors[0] for median in found)
-    seconds = [median.build + median.solve for median in own if math.isfinite(median.build)]
-    text = f"{len(own)} random starts: Ipopt found a solution from {len(found)}, and of these "
-    text += f"{len(solved)} hold in their replay. All starts took {sum(seconds):.0f} s."
-    if errors:
-        text += f" Errors of the phase time range from {errors[0]:.1e} to {errors[-1]:.1e}; "
-        text += f"those of the replayed end from {min(m.errors[1] for m in found):.1e} on."
-    return [f"## {IMPLICIT[0].upper()}{IMPLICIT[1:]}", "", text, ""]
+def draw_medians(medians: Medians) -> Figure:
+    """Mean run time over the error that half of the phases keep, one line for each method."""
+    figure = Figure(figsize=(11.0, 9.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    studies = (LEAST_TIME, NO_DRAG, FEW, MANY)
+    for axes, study in zip(figure.subplots(2, 2).flat, studies, strict=True):
+        _draw_study(axes, medians, study)
+    return figure
 
 
-def _format_drift(medians: Medians) -> list[str]:
-    """The long swing: time, error of the state, drift of gaps and energy."""
-    own = {key: median for key, median in medians.items() if key[0] == DRIFT}
-    if not own:
-        return []
-    lines = [f"## {DRIFT[0].upper()}{DRIFT[1:]}", ""]
-    lines += ["| method | tolerance | seconds | error of the state | gaps | energy | outcome |"]
-    lines += ["|---|---:|---:|---:|---:|---:|---|"]
-    for (_, _, method, setting), median in own.items():
-        errors = " | ".join(f"{value:.1e}" for value in (*median.errors, *3 * (math.nan,))[:3])
-        cells = f"{method} | {setting} | {median.solve:.4f} | {errors} | {median.outcome}"
-        lines.append(f"| {cells} |")
-    return [*lines, ""]
-
-
-def _name_processor() -> str:
-    """Name of the processor."""
-    path = Path("/proc/cpuinfo")
-    lines = path.read_text().splitlines() if path.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
-
-
-def _list_versions() -> list[str]:
-    """Versions of the peers that are installed, and what installs the others."""
-    found = []
-    for name, method in DISTRIBUTIONS.items():
-        try:
-            found.append(f"{name} {version(name)}")
-        except PackageNotFoundError:
-            found.append(f"{method or name} is skipped: {INSTALL}")
-    return found
+def _draw_study(axes: Axes, medians: Medians, study: str) -> None:
+    """One panel; hollow markers are settings with which some phases are not solved."""
+    planning = study in (LEAST_TIME, NO_DRAG)
+    for index, method in enumerate(list_methods(medians, study)):
+        points, full = [], []
+        for group in group_settings(medians, study, method).values():
+            found = [own for own in group if np.isfinite(own.errors[0])]
+            if 2 * len(found) < len(group):
+                continue
+            error = float(np.median([abs(own.errors[0]) for own in found]))
+            seconds = find_mean([own.solve + planning * own.build for own in found])
+            points.append((max(error, SMALLEST), seconds))
+            full.append(all(own.outcome == SOLVED for own in group))
+        if not points:
+            continue
+        look: Any = {"color": PALETTE[index % len(PALETTE)], "marker": MARKERS[index]}
+        look |= {"linestyle": "-" if index < len(PALETTE) else "--", "markersize": 5}
+        axes.plot(*zip(*points, strict=True), label=method, **look)
+        hollow = [point for point, whole in zip(points, full, strict=True) if not whole]
+        if hollow:
+            look |= {"markerfacecolor": "white", "linestyle": "", "zorder": 3}
+            axes.plot(*zip(*hollow, strict=True), **look)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_title(study[0].upper() + study[1:])
+    what = "relative error of the phase time" if planning else "error of z and z' in scene units"
+    axes.set_xlabel(f"{what}, median over phases [-]")
+    axes.set_ylabel(f"{'build and solve' if planning else 'run'} time, mean over phases [s]")
+    if axes.lines:
+        finish_axes(axes, fontsize=8, ncols=2)

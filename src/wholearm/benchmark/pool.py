@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import sys
@@ -11,9 +12,10 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
+from pathlib import Path
 from typing import Any, NamedTuple
 
-from ...common.workers import Spawning
+from ..common.workers import Spawning
 
 MEMORY = 6 * 2**30
 """Address space that a worker may take [byte]: a claim beyond it fails instead of swapping."""
@@ -22,6 +24,9 @@ PATIENCE = 20.0
 """Wall-clock time that a task may take over its bound of processor time: others may run too."""
 _CPU = getattr(signal, "SIGPROF", 27)
 """Signal that ends a process whose processor time is used up."""
+
+Limit = Callable[[Any], float]
+"""Processor time that a task may take [s]."""
 
 
 class Answer(NamedTuple):
@@ -36,23 +41,27 @@ class Answer(NamedTuple):
         What was returned, or the traceback, or the signal or status that the process ended with.
     printed : str
         What it wrote to stdout and stderr, libraries included.
-    seconds : float
-        By the wall clock.
+    elapsed, seconds : float
+        By the wall clock, and processor time of the worker.
+    memory : float, [MB]
+        By which the task has raised the worker's peak of memory.
     """
 
     task: Any
     ended: str
     result: Any
     printed: str
-    seconds: float
+    elapsed: float
+    seconds: float = math.nan
+    memory: float = math.nan
 
 
 class _Worker:
     """A process that runs tasks one after the other."""
 
-    def __init__(self, context: Any, run: Callable[[Any], Any], bound: float) -> None:
+    def __init__(self, context: Any, run: Callable[[Any], Any], limit: Limit, strict: bool) -> None:
         self.pipe, far = context.Pipe()
-        self.process = context.Process(target=_serve, args=(far, run, bound), daemon=True)
+        self.process = context.Process(target=_serve, args=(far, run, limit, strict), daemon=True)
         self.process.start()
         far.close()
         self.task: Any = None
@@ -97,39 +106,46 @@ def run_tasks(
     run: Callable[[Any], Any],
     tasks: Sequence[Any],
     jobs: int,
-    bound: float,
+    limit: Limit,
     kind: Callable[[Any], Any] = lambda task: task,
+    strict: bool = True,
+    alone: bool = False,
 ) -> Iterator[Answer]:
     """Run tasks in worker processes and give their answers as they come.
 
     Parameters
     ----------
     run : callable
-        A function of a module: workers import it by name. Warnings are errors in there.
+        A function of a module: workers import it by name.
     tasks : sequence
         What `run` is called with; has to be picklable.
     jobs : int
         Number of workers.
-    bound : float, [s]
-        Processor time that a task may take. By the wall clock it may take `PATIENCE` times that.
+    limit : callable
+        Processor time that a task may take [s]. By the wall clock it may take `PATIENCE` times
+        that.
     kind : callable, optional
         Of a task: one worker runs those of one kind, as far as others have something else to do.
+    strict : bool
+        Whether warnings are errors in there.
+    alone : bool
+        Whether each task has a process of its own, where nothing is kept from others.
     """
     context = Spawning()
     waiting = _Queue(tasks, kind)
     workers: list[_Worker] = []
     try:
         for _ in range(min(jobs, len(tasks))):
-            workers.append(_Worker(context, run, bound))
+            workers.append(_Worker(context, run, limit, strict))
             workers[-1].give(waiting.take())
         while any(worker.busy for worker in workers):
             for k, worker in enumerate(workers):
-                answer = _look(worker, bound) if worker.busy else None
+                answer = _look(worker, limit(worker.task)) if worker.busy else None
                 if answer is None:
                     continue
-                if answer.ended in ("late", "died"):
+                if alone or answer.ended in ("late", "died"):
                     worker.stop()
-                    workers[k] = worker = _Worker(context, run, bound)
+                    workers[k] = worker = _Worker(context, run, limit, strict)
                 worker.busy = False
                 if waiting:
                     worker.give(waiting.take(answer.task))
@@ -145,8 +161,8 @@ def _look(worker: _Worker, bound: float) -> Answer | None:
     seconds = time.monotonic() - worker.started
     try:
         if worker.pipe.poll():
-            ended, result, printed = worker.pipe.recv()
-            return Answer(worker.task, ended, result, printed, seconds)
+            ended, result, printed, *spent = worker.pipe.recv()
+            return Answer(worker.task, ended, result, printed, seconds, *spent)
     except (EOFError, OSError):
         worker.process.join()
         code = worker.process.exitcode
@@ -156,23 +172,26 @@ def _look(worker: _Worker, bound: float) -> Answer | None:
     return None
 
 
-def _serve(pipe: Connection, run: Callable[[Any], Any], bound: float) -> None:
+def _serve(pipe: Connection, run: Callable[[Any], Any], limit: Limit, strict: bool) -> None:
     """Run what comes through the pipe until it closes."""
     _limit_memory()
     with tempfile.TemporaryFile() as printed:
         for stream in (1, 2):
             os.dup2(printed.fileno(), stream)
-        warnings.simplefilter("error")
+        if strict:
+            warnings.simplefilter("error")
         while True:
             try:
                 task = pipe.recv()
             except (EOFError, OSError):
                 return
-            _limit_time(bound)
+            _limit_time(limit(task))
+            before, begun = find_peak(), time.process_time()
             try:
                 outcome = "done", run(task)
             except Exception:
                 outcome = "raised", traceback.format_exc()
+            spent = time.process_time() - begun, find_peak() - before
             sys.stdout.flush()
             sys.stderr.flush()
             printed.seek(0)
@@ -180,9 +199,23 @@ def _serve(pipe: Connection, run: Callable[[Any], Any], bound: float) -> None:
             printed.seek(0)
             printed.truncate()
             try:
-                pipe.send((*outcome, text))
+                pipe.send((*outcome, text, *spent))
             except (BrokenPipeError, OSError):
                 return
+
+
+def find_peak() -> float:
+    """Peak of the memory that this process has had in use [MB]."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        import resource
+
+        unit = 1 if sys.platform == "darwin" else 1024
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+    # Where there is `/proc`, the other figure starts from that of the parent.
+    (peak,) = (line.split()[1] for line in lines if line.startswith("VmHWM:"))
+    return int(peak) * 1024 / 1e6
 
 
 def _limit_time(bound: float) -> None:

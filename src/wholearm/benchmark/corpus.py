@@ -1,0 +1,175 @@
+"""Everything that the package answers, against answers that are stored.
+
+Two answers agree if kinds, verdicts and contact modes are the same and numbers are within
+`TOLERANCES`. A better value of the objective is no difference, whatever else it changes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+from ..common.files import read_json, write_text
+from .corpus_cases import answer, list_cases
+from .study import Case, Row, Study, name_case
+
+TOLERANCES = {"value": 1e-6, "amount": 1e-2, "advice": 5e-2, "numbers": 1e-3, "least": 1e-3}
+"""Relative to the largest number of an entry: what Ipopt and the refinement of limits leave open.
+
+An amount is the shortfall of a motion that solves another problem, advice a bisection. Numbers of a
+report have four digits, and a least force is one at an instant.
+"""
+USUAL = 1e-4
+"""For all others: the accuracy that plans are made with."""
+LOCAL = ("plan over time", "goal", "scene", "leg")
+"""Families whose optimum need not be the only one: values agree within `USUAL`."""
+SAMPLES = 1
+"""How many samples may end otherwise, of those at the edge of what a plan bears."""
+WORDS = ("words", "text", "advice", "help", "reason")
+"""Entries that do not count as an answer: words, and advice, which ends by processor time."""
+COUNTED = ("goals", "kept")
+"""Entries that count samples."""
+
+
+class Corpus(Study):
+    """Answers of today against stored ones."""
+
+    name, title = "corpus", "Answers against stored ones"
+    of_code, folder = True, "build"
+    problems = Path("problems")
+
+    def add_options(self, parser: argparse.ArgumentParser) -> None:
+        """Which cases, and where the answers are."""
+        text = "cases whose names match, such as 'plan heptagon *' (all)"
+        parser.add_argument("--only", nargs="+", default=["*"], metavar="PATTERN", help=text)
+        parser.add_argument("--problems", default="problems", metavar="DIR", help="shipped ones")
+        text = "file of stored answers (results/corpus.json)"
+        parser.add_argument("--answers", default="results/corpus.json", metavar="FILE", help=text)
+        parser.add_argument("--update", action="store_true", help="store the answers of now")
+
+    def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
+        """Those that are asked for."""
+        self.problems = Path(options.problems)
+        for case in list_cases():
+            if any(fnmatch(" ".join(map(str, case)), own) for own in options.only):
+                yield case
+
+    def list_inputs(self, options: argparse.Namespace) -> list[Path]:
+        """The problem files."""
+        return sorted(Path(options.problems).glob("*.toml"))
+
+    def limit(self, case: Case) -> float:
+        """Tuning takes a thousand simulations."""
+        return 300.0 if case[0] == "tune" else 120.0
+
+    def run(self, case: Case) -> Row:
+        """Ask."""
+        return {"answer": answer(case, self.problems)}
+
+    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
+        """How many answers of each family are the same, and which differ; or they are stored."""
+        found = {name_case(row): row["answer"] for row in rows}
+        if options.update:
+            known = _read(options.answers) if Path(options.answers).exists() else {}
+            names = {" ".join(map(str, case)) for case in list_cases()}
+            _write(options.answers, {k: v for k, v in (known | found).items() if k in names})
+        stored = _read(options.answers)
+        verdicts = {
+            name_case(row): compare(row["case"][0], row["answer"], stored.get(name_case(row)))
+            for row in rows
+        }
+        kinds = ("same", "better", "other words", "differs")
+        lines = [f"| family | cases | {' | '.join(kinds)} | processor time [s] |"]
+        lines.append("|---|" + "---:|" * (len(kinds) + 2))
+        for family in [*dict.fromkeys(row["case"][0] for row in rows), "all"]:
+            mine = [row for row in rows if family in ("all", row["case"][0])]
+            count = Counter(verdicts[name_case(row)][0] for row in mine)
+            cells = [family, len(mine), *(count[kind] for kind in kinds)]
+            lines.append(
+                f"| {' | '.join(map(str, cells))} | {sum(r['seconds'] for r in mine):.0f} |"
+            )
+        lines.append("")
+        for name, (kind, texts) in verdicts.items():
+            if kind in kinds[1:3]:
+                lines.append(f"* {kind}: {name}: {texts[0]}")
+        wrong = {name: texts for name, (kind, texts) in verdicts.items() if kind == "differs"}
+        return "\n".join(lines), [
+            f"{name}: {own}" for name, texts in wrong.items() for own in texts[:3]
+        ]
+
+
+STUDY = Corpus()
+
+
+def compare(family: str, found: Any, stored: Any) -> tuple[str, list[str]]:
+    """Whether an answer is as stored: same, better, other words, or differs; and where."""
+    if stored is None:
+        return "differs", ["no answer is stored; --update stores it"]
+    if "value" in found and found["objective"] == stored.get("objective"):
+        gain = found["value"] / stored["value"] - 1
+        gain = gain if stored["objective"] == "margin" else -gain
+        holds = found["replay"]["ok"] >= stored["replay"]["ok"]
+        if gain > _allowed(family, "value") and holds:
+            return "better", [f"value {found['value']:.9g} instead of {stored['value']:.9g}"]
+    texts = list(_differ(family, "", found, stored))
+    if not texts:
+        return "same", []
+    strong = [text for weak, text in texts if not weak]
+    return ("differs", strong) if strong else ("other words", [text for _, text in texts])
+
+
+def _allowed(family: str, key: str) -> float:
+    return USUAL if key == "value" and family in LOCAL else TOLERANCES.get(key, USUAL)
+
+
+def _differ(family: str, key: str, found: Any, stored: Any) -> Iterator[tuple[bool, str]]:
+    """Whether a difference is one of words, and what it is, for each entry."""
+    if isinstance(found, Mapping) and isinstance(stored, Mapping):
+        for name in dict.fromkeys([*stored, *found]):
+            own = key if key in WORDS else name
+            for weak, text in _differ(family, own, found.get(name), stored.get(name)):
+                yield weak, f"{name}: {text}"
+        return
+    numbers, others = _flatten(found), _flatten(stored)
+    if numbers is not None and others is not None and len(numbers) == len(others):
+        off = max(abs(a - b) for a, b in zip(numbers, others, strict=True))
+        scale = max(map(abs, [*numbers, *others]))
+        if off > (SAMPLES if key in COUNTED else _allowed(family, key) * scale):
+            yield key in WORDS, f"{_show(found)}, stored {_show(stored)}, off by {off:.2g}"
+    elif isinstance(found, list) and isinstance(stored, list) and len(found) == len(stored):
+        for one, other in zip(found, stored, strict=True):
+            yield from _differ(family, key, one, other)
+    elif found != stored:
+        yield key in WORDS, f"{_show(found)}, stored {_show(stored)}"
+
+
+def _flatten(value: Any) -> list[float] | None:
+    """A number, or numbers in lists, as a list; None for anything else."""
+    if isinstance(value, bool) or value is None:
+        return None
+    if isinstance(value, int | float):
+        return [value]
+    if not isinstance(value, list) or not value:
+        return None
+    parts = [_flatten(own) for own in value]
+    known = [part for part in parts if part is not None]
+    return [own for part in known for own in part] if len(known) == len(parts) else None
+
+
+def _show(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) < 100 else f"{text[:60]} ... {text[-30:]}"
+
+
+def _read(path: str) -> dict[str, Any]:
+    return dict(read_json(path, "--update writes it anew"))
+
+
+def _write(path: str, answers: Mapping[str, Any]) -> None:
+    lines = [f"{json.dumps(name)}: {json.dumps(own)}" for name, own in sorted(answers.items())]
+    write_text(path, "{\n" + ",\n".join(lines) + "\n}\n")

@@ -1,0 +1,594 @@
+"""What the corpus asks of the package, and the answers as plain values.
+
+A case names a family and what that is asked with. Families call the public functions alone.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import re
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+
+import wholearm
+from wholearm import Plan, Problem
+
+from .kernels import list_modes
+from .queries import draw_leg, draw_query
+from .stress.damage import BASE, to_toml
+from .stress.scenes import draw_case
+from .study import Case, Row
+
+PROBLEMS = (
+    "box_rolling", "heptagon", "heptagon_four_contacts", "heptagon_impact", "heptagon_twice",
+    "hexagon", "square", "triangle",
+)  # fmt: skip
+OBJECTIVES = ("time", "effort", "margin")
+RANGES = {"mass": 0.1, "inertia": 0.1, "friction": 0.2, "start_x": 5e-4, "geometry": 0.0}
+"""Half widths of uncertain numbers."""
+VARIANTS: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
+    "dwell": ("heptagon_four_contacts", {"settle": "10 %"}, {}),
+    "dwell, landing": ("heptagon", {"settle": "10 %"}, {}),
+    "dwell, effort": ("triangle", {"settle": 0.02}, {"objective": "effort"}),
+    "dwell, impacts": ("heptagon_impact", {"settle": "10 %"}, {}),
+    "dwell, rate": ("heptagon_four_contacts", {"settle": 0.02, "torque_rate_limit": 500.0}, {}),
+    "rate": ("heptagon_four_contacts", {"torque_rate_limit": 500.0}, {}),
+    "rate, landing": ("heptagon", {"torque_rate_limit": 500.0}, {}),
+    "rate, box": ("box_rolling", {"torque_rate_limit": 500.0}, {}),
+    "lag": ("heptagon_four_contacts", {"actuator_lag": 0.002}, {}),
+    "rate and lag": (
+        "heptagon_four_contacts", {"torque_rate_limit": 1000.0, "actuator_lag": 0.001}, {},
+    ),
+    "period": ("heptagon_four_contacts", {"control_period": 0.005}, {}),
+    "period, landing": ("heptagon", {"control_period": 0.005}, {}),
+    "period, linear": (
+        "heptagon_four_contacts", {"control_period": 0.005, "control_hold": "linear"}, {},
+    ),
+    "ranges": ("heptagon_four_contacts", {"uncertainty": RANGES}, {"robust": 1.0}),
+    "ranges, widest": (
+        "heptagon_four_contacts", {"uncertainty": RANGES}, {"robust": 1.0, "largest": True},
+    ),
+    "ranges, landing": ("heptagon", {"uncertainty": RANGES}, {"robust": 1.0}),
+    "ranges, none": ("box_rolling", {"uncertainty": RANGES}, {"robust": 1.0}),
+    "speed": ("heptagon_four_contacts", {"speed_limit": 3.0}, {}),
+    "certified": ("heptagon_four_contacts", {}, {"certify": True}),
+    "certified, landing": ("heptagon", {}, {"certify": True}),
+    "certified, impacts": ("heptagon_impact", {}, {"certify": True}),
+    "accurate": ("heptagon_four_contacts", {}, {"accuracy": 1e-6}),
+    "weak": ("heptagon_four_contacts", {"torque_limit": 0.7}, {}),
+    "weak, rate": ("heptagon_four_contacts", {"torque_rate_limit": 5.0}, {}),
+    "rough": ("heptagon_four_contacts", {"friction": 0.5}, {}),
+    "pressed": ("heptagon_four_contacts", {"epsilon": 1.5}, {}),
+    "weak, over time": ("square", {"torque_limit": 0.25}, {}),
+    "rough, over time": ("triangle", {"friction": 0.5}, {}),
+}  # fmt: skip
+"""A problem, changes of it, and options of the planner."""
+TUNED = {
+    "heptagon_four_contacts": ("heptagon_tuned.csv", 0),
+    "heptagon": ("heptagon_landing_tuned.csv", 0),
+    "hexagon": ("hexagon_tuned.csv", 1),
+}
+"""Problems with torques that `tune` found, and how often it may stop on the way."""
+GOALS, SCENES, LEGS, LISTS = 60, 60, 60, 20
+PINNED = 40
+"""Goals of the queries study as they are, with x; others are an edge, or now and then an angle."""
+SEED = 0
+ROUTE = ((0.045, -2.0), (-0.0637, -2.0), (-0.0505, -23.4), (0.0078, -50.0))
+"""Of `list_formations`: x [m] and phi [degrees]."""
+MOMENT = 1e-3
+"""Time before the end of a phase in which contacts may bounce [s]."""
+NUMBER = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
+
+
+def list_cases() -> Iterator[Case]:
+    """All cases: first those that take long, so that processes end together."""
+    yield from (("tune", name) for name in reversed(TUNED))
+    yield from (("plan over time", *own) for own in product(PROBLEMS, OBJECTIVES))
+    yield from (("policy", name) for name in PROBLEMS)
+    yield from (("plan", *own) for own in product(PROBLEMS, OBJECTIVES))
+    yield from (("variant", name) for name in VARIANTS)
+    yield from (("goal", k) for k in range(GOALS))
+    yield from (("robustness", name) for name in ("heptagon_four_contacts",))
+    yield from (("scene", k, OBJECTIVES[k % 3]) for k in range(SCENES))
+    yield from (("leg", k, OBJECTIVES[k % 3]) for k in range(LEGS))
+    yield from (("free", name) for name in PROBLEMS)
+    yield from (("torques", name, share) for name in TUNED for share in (1.0, 1.05, 0.9))
+    yield from (("compare", "heptagon_four_contacts"), ("report", "heptagon_four_contacts"))
+    yield from (("predict", name) for name in PROBLEMS)
+    yield from (("map", name) for name in PROBLEMS)
+    yield from (("list", k) for k in range(LISTS))
+    yield from (("input", *own) for own in _list_inputs())
+    yield from (("option", name) for name in OPTIONS)
+    yield from (("torque file", name) for name in TORQUES)
+
+
+def answer(case: Case, folder: Path) -> Row:
+    """What the package says to a case; `folder` has the shipped problems."""
+    family, *given = case
+    row: Row = _shorten(FAMILIES[family](folder, *given))
+    return row
+
+
+def _shorten(value: Any) -> Any:
+    """Plain values for JSON: numbers with nine digits, None for NaN and infinity."""
+    if isinstance(value, dict):
+        return {key: _shorten(own) for key, own in value.items()}
+    if isinstance(value, list | tuple):
+        return [_shorten(own) for own in value]
+    if isinstance(value, float):
+        return float(f"{value:.9g}") if math.isfinite(value) else None
+    return value
+
+
+def _load(folder: Path, name: str) -> Problem:
+    return wholearm.load(str(folder / f"{name}.toml"))
+
+
+def mask(text: str) -> str:
+    """A message without its numbers, which differ as those of an answer may."""
+    return NUMBER.sub("#", text)
+
+
+def _refuse(error: Exception) -> Row:
+    """Why there is no answer."""
+    row: Row = {"refused": type(error).__name__, "words": mask(str(error)), "text": str(error)}
+    short = getattr(error, "shortfalls", ())
+    if short:
+        row["short"] = [own.part for own in short[:1]] + [short[0].kind, short[0].place.phase]
+        row["amount"] = short[0].amount
+    changes = getattr(error, "changes", ())
+    row["advice"] = {own.parameter.key: own.value for own in changes}
+    return row
+
+
+def _describe_plan(plan: Plan) -> Row:
+    row: Row = {
+        "status": plan.status.value,
+        "objective": plan.options.goal.value,
+        "value": plan.value,
+        "durations": [own.duration for own in plan.phases],
+        "modes": list_modes(plan),
+        "impacts": len(plan.transitions),
+    }
+    if any(own.settling for own in plan.phases):
+        row["dwells"] = [own.settling.duration if own.settling else 0.0 for own in plan.phases]
+    if plan.certificate is not None:
+        row["gaps"] = sorted(plan.certificate.gaps)
+        row["bound"] = None if plan.certificate.total is None else plan.certificate.total.bound
+    if plan.ranges is not None:
+        row |= {"without ranges": plan.ranges.nominal, "widest": plan.ranges.largest}
+    return row
+
+
+def _verify(problem: Problem, what: Any) -> Row:
+    """The verdict about a plan or torques, and what the replay shows."""
+    report = wholearm.verify(problem, what)
+    known = [
+        min((own for own in phase.contacts if own.least == own.least), key=lambda own: own.least)
+        for phase in report.phases
+        if any(own.least == own.least for own in phase.contacts)
+    ]
+    energy = report.energy
+    return {
+        "ok": report.ok,
+        "reached": report.reached,
+        "failed phase": report.failed_phase,
+        "failures": [mask(text) for text in report.failures],
+        "arrivals": [own.arrival for own in report.phases],
+        "least": [own.least for own in known],
+        "events": [own.time for own in report.changes],
+        "kinds": [f"{own.phase} {own.what} {own.kind}" for own in report.changes],
+        "energy": [energy.work, energy.kinetic, energy.potential, energy.dry, energy.contact],
+        "help": mask(json.dumps(report.to_dict().get("help"))) if not report.ok else "",
+    }
+
+
+def _solve(problem: Problem, **options: Any) -> Row:
+    """A plan with its replay, or why there is none."""
+    try:
+        plan = wholearm.solve(problem, **options)
+        return _describe_plan(plan) | {"replay": _verify(problem, plan)}
+    except wholearm.WholearmError as error:
+        return _refuse(error)
+
+
+def _plan(folder: Path, name: str, objective: str, **options: Any) -> Row:
+    return _solve(_load(folder, name), objective=objective, **options)
+
+
+def _vary(folder: Path, variant: str) -> Row:
+    name, changes, options = VARIANTS[variant]
+    return _solve(_load(folder, name).with_(changes), **options)
+
+
+def _reach(folder: Path, number: int) -> Row:
+    """A goal of the queries study, with the blocked borders where nothing leads there."""
+    problem = draw_query(SEED, number, folder)
+    goal = problem.table["goal"]
+    if number >= PINNED:
+        flush, polygon = goal["flush"], problem.scene.polygon
+        if flush == problem.table["start"]["flush"]:
+            flush = (flush + 1) % polygon.n_vertices
+        edge = polygon.flush_angle(flush)
+        free = {"flush": flush} if number % 4 else {"phi_deg": np.degrees(edge) + 10.0}
+        problem = problem.with_({"goal": free})
+    try:
+        found = wholearm.find_route(problem)
+    except wholearm.WholearmError as error:
+        return _refuse(error)
+    phases = [f"{' '.join(own['contacts'])} {own.get('end', '')}" for own in _phases(found.problem)]
+    row = _describe_plan(found.plan) | {"route": phases, "in cells": found.route.in_cells}
+    row["bound"] = None if found.bound is None else found.bound.value
+    return row | {"replay": _verify(found.problem, found.plan)}
+
+
+def _phases(problem: Problem) -> list[Any]:
+    return list(problem.table["phases"])
+
+
+def _scene(folder: Path, number: int, objective: str) -> Row:
+    try:
+        problem = _read_table(draw_case(SEED, number).table)
+    except wholearm.WholearmError as error:
+        return _refuse(error)
+    return _solve(problem, objective=objective)
+
+
+def _read_table(table: Any) -> Problem:
+    """A problem by way of its file, whose messages do not name the folder."""
+    with tempfile.TemporaryDirectory() as place:
+        path = Path(place, "problem.toml")
+        path.write_text(to_toml(table), encoding="utf-8")
+        try:
+            return wholearm.load(str(path))
+        except wholearm.InputError as error:
+            raise wholearm.InputError("F", error.key, error.problem) from None
+
+
+def _leg(folder: Path, number: int, objective: str) -> Row:
+    leg = draw_leg(SEED, number, folder)
+    return {"refused": "no route"} if leg is None else _solve(leg.problem, objective=objective)
+
+
+def _simulate_free(folder: Path, name: str) -> Row:
+    """Phases of a plan, each from its planned start, without telling which contacts hold.
+
+    The whole by the clock is not looked at: what rounding does to it grows from phase to phase.
+    """
+    problem = _load(folder, name)
+    report = wholearm.verify_free(problem, wholearm.solve(problem))
+    return {
+        "ok": report.ok,
+        "failures": [mask(text) for text in report.failures],
+        "phases": [own.number for own in report.alone if own.reached],
+        "stops": [own.stop for own in report.alone],
+        "lost": [f"{own.number} {loss.contact}" for own in report.alone for loss in own.losses],
+    }
+
+
+def _follow(folder: Path, name: str, share: float) -> Row:
+    """Torques of a file, times a share: up to their first loss of a contact, and simulated free."""
+    problem = _load(folder, name)
+    with open(folder / "torques" / TUNED[name][0], encoding="utf-8") as stream:
+        rows = [line for line in stream if line.strip() and line[0] != "#"]
+    with tempfile.TemporaryDirectory() as place:
+        path = Path(place, "torques.csv")
+        scaled = [[float(v) for v in line.split(",")] for line in rows[1:]]
+        text = "".join(f"{t!r},{share * a!r},{share * b!r}\n" for t, a, b in scaled)
+        path.write_text(rows[0] + text, encoding="utf-8")
+        torque = wholearm.read_torque_csv(str(path))
+    report = wholearm.verify_free(problem, torque)
+    lost = [(own.number, loss) for own in report.phases for loss in own.losses]
+    # Once contacts bounce, and beyond the first loss, what rounding does grows from event to event.
+    end = min([report.phases[0].stop, *(loss.time for _, loss in lost)]) - MOMENT
+    events = [own for own in report.whole.events if own.time < end]
+    free = {
+        "ok": report.ok,
+        "lost": [f"{number} {loss.contact}" for number, loss in lost[:1]],
+        "times": [loss.time for _, loss in lost[:1]],
+        "stops": [own.stop for own in report.phases if not lost or own.number < lost[0][0]],
+        "events": [own.time for own in events],
+        "kinds": [f"{own.kind.value} {own.contact}" for own in events],
+    }
+    try:
+        told = _verify(problem, torque)
+    except wholearm.WholearmError as error:
+        told = _refuse(error)
+    return {"free": free, "told": told}
+
+
+def _tune(folder: Path, name: str) -> Row:
+    found = wholearm.tune(_load(folder, name), brake=True, stops=TUNED[name][1])
+    return {
+        "ok": found.ok,
+        "reason": mask(found.reason),
+        "raised": [[own.raised, own.braked, own.supported] for own in found.phases],
+        "acting": [own.acting for own in found.phases],
+        "durations": [own.duration for own in found.phases],
+        "least": [own.least for own in found.phases],
+        "simulations": found.simulations,
+    }
+
+
+def _predict(folder: Path, name: str) -> Row:
+    phases = []
+    for own in wholearm.predict(_load(folder, name)).phases:
+        phases.append(
+            {
+                "path": own.path,
+                "length": own.length,
+                "kept": own.is_kept,
+                "first": "" if own.slow is None else own.slow.name,
+                "least": None if own.slow is None else own.slow.force,
+                "speeds": [one.speed for one in own.survivals],
+                "breaks": [f"{one.motion}: {one.first.name}" for one in own.survivals],
+            }
+        )
+    return {"phases": phases}
+
+
+def _control(folder: Path, name: str) -> Row:
+    """The policy of a least-time plan, and what becomes of its phases."""
+    problem = _load(folder, name)
+    plan = wholearm.solve(problem)
+    try:
+        policy = wholearm.make_policy(problem, plan)
+        report = wholearm.verify_policy(problem, plan, policy)
+    except wholearm.WholearmError as error:
+        return _refuse(error)
+    return {
+        "duration": policy.duration,
+        "durations": [own["duration"] for own in policy.about["phases"]],
+        "shares": [own["share"] for own in policy.about["phases"]],
+        "ok": report.ok,
+        "reached": [own.number for own in report.phases if own.reached],
+        "stops": [own.stop for own in report.phases],
+        "lost": [f"{own.number} {loss.contact}" for own in report.phases for loss in own.losses],
+    }
+
+
+def _assess(folder: Path, name: str) -> Row:
+    problem = _load(folder, name)
+    plan = wholearm.solve(problem, "margin")
+    start = partial(ThreadPoolExecutor, 1)
+    study = wholearm.assess_robustness(problem, plan, samples=40, phase=3, start=start)
+    return {
+        "samples": len(study.records),
+        "goals": study.reached.hits,
+        "kept": study.kept.hits,
+        "first": sorted(study.first_lost),
+    }
+
+
+def _compare(folder: Path, name: str) -> Row:
+    problem = _load(folder, name)
+    with tempfile.TemporaryDirectory() as place:
+        path = str(Path(place, "plan.npz"))
+        wholearm.solve(problem).save(path)
+        found = wholearm.compare(problem, [path, str(folder / "torques" / TUNED[name][0])])
+    own = found.contenders
+    return {
+        "ok": [one.ok for one in own],
+        "contacts": [f"{one.contact} in phase {one.phase}" for one in own],
+        "durations": [one.duration for one in own],
+        "efforts": [one.effort for one in own],
+        "margins": [one.margin for one in own],
+        "losses": [one.lost for one in own],
+        "peaks": [list(one.peaks) for one in own],
+        "simulations": [one.simulations for one in own],
+    }
+
+
+def _report(folder: Path, name: str) -> Row:
+    """Numbers in the tables of a report of a plan and of torques, but for how long it took."""
+    from ..__main__ import start
+
+    with tempfile.TemporaryDirectory() as place:
+        path, page = str(Path(place, "plan.npz")), Path(place, "page.html")
+        wholearm.solve(_load(folder, name)).save(path)
+        torques = str(folder / "torques" / TUNED[name][0])
+        status = start(["report", str(folder / f"{name}.toml"), path, torques, "-o", str(page)])
+        text = page.read_text(encoding="utf-8")
+    tables = [own for own in re.findall(r"<table>.*?</table>", text) if "planning took" not in own]
+    cells = re.findall(r"<td[^>]*>(.*?)</td>", "".join(tables))
+    numbers = [float(cell) for cell in cells if re.fullmatch(r"[-+]?\d+\.\d+", cell)]
+    return {"exit": status, "cells": len(cells), "numbers": numbers}
+
+
+def _draw_map(folder: Path, name: str) -> Row:
+    chart = wholearm.build_map(_load(folder, name))
+    points = np.array([own.point for own in chart.crossings])
+    return {
+        "formations": _count(chart.formations),
+        "borders": _count(own.contacts for own in chart.borders),
+        "crossings": _count(own.contacts for own in chart.crossings),
+        "x": np.sort(points[:, 0]).tolist(),
+        "phi": np.sort(points[:, 1]).tolist(),
+        "forth": sum(int(own.forth.sum()) for own in chart.borders),
+        "back": sum(int(own.back.sum()) for own in chart.borders),
+        "possible": chart.possible.sum(axis=0).tolist(),
+    }
+
+
+def _count(formations: Iterable[Iterable[object]]) -> list[Any]:
+    """How many formations there are, and a digest of their names."""
+    names = sorted(" ".join(map(str, own)) for own in formations)
+    return [len(names), f"{crc32(' '.join(names).encode()):08x}"]
+
+
+def _list(folder: Path, number: int) -> Row:
+    """Formations along a route: that of the documentation first, then those of legs."""
+    if number == 0:
+        problem = _load(folder, "heptagon_four_contacts")
+        poses = [(x, np.radians(phi)) for x, phi in ROUTE]
+        route = wholearm.list_formations(problem, *poses)
+        return {
+            "route": [" ".join(map(str, own.contacts)) for own in route],
+            "places": [own.stop.tolist() for own in route],
+        }
+    leg = draw_leg(SEED + 1, number, folder)
+    if leg is None:
+        return {"refused": "no route"}
+    return {
+        "route": [" ".join(own["contacts"]) for own in _phases(leg.problem)],
+        "places": [list(own) for own in leg.stops],
+    }
+
+
+BAD: tuple[Any, ...] = ("text", -1.0, 1e12, [1.0], True, float("nan"))
+"""What takes the place of entries of a problem file."""
+EDITS: tuple[tuple[str, Any], ...] = (
+    ("gravty", 9.81),
+    ("fingers.3", {}),
+    ("fingers.1.mass", 1.0),
+    ("object.vertices", [[0, 0], [0.05, 0.0]]),
+    ("object.vertices", [[0, 0], [0.05, 0.0], [0.1, 0.0]]),
+    ("object.vertices", [[0, 0], [0.0, 0.05], [0.05, 0.0]]),
+    ("object.vertices", [[0, 0], [0.05, 0.0], [0.02, 0.01], [0.0, 0.05]]),
+    ("fingers.1.base", [0.08]),
+    ("fingers.1.base", [0.0, 0.02]),
+    ("start.flush", 4),
+    ("start.x", 0.5),
+    ("start", {"flush": 0}),
+    ("phases", []),
+    ("phases.0.contacts", ["v0-palm"]),
+    ("phases.0.contacts", ["v0-palm", "v1-palm", "v2-finger1"]),
+    ("phases.0.contacts", ["v0-palm", "v0-palm", "v2-finger1", "v3-finger2"]),
+    ("phases.0.contacts", ["v0-palm", "v1-palm", "v3-finger1", "v2-finger2"]),
+    ("phases.0.contacts", ["v0-palm", "v1-palm", "v9-finger1", "v3-finger2"]),
+    ("phases.0.contacts", ["v0-palm", "v1-palm", "e2-finger1", "v3-finger2"]),
+    ("phases.0.contacts", ["v0-palm", "v1-palm", "v2-finger1", "v3-finger2 rolling"]),
+    ("phases.0.until", "v0-palm"),
+    ("phases.0.until", "v2-palm"),
+    ("phases.0.until", "nothing"),
+    ("phases.0.until", {"y": 0.0}),
+    ("phases.0.until", {"x": 0.02}),
+    ("phases.0.until", {"x": 0.005, "phi_deg": 10.0}),
+    ("phases.0.until", {}),
+    ("phases.0.end", "slowly"),
+    ("phases.0.end", "impact"),
+    ("phases.1.end", "smooth"),
+    ("phases.0.settle", "200 %"),
+    ("uncertainty", {"weight": 0.1}),
+    ("uncertainty", {"mass": 2.0}),
+    ("control_period", 0.005),
+    ("control_hold", "cubic"),
+    ("goal", {"flush": 0}),
+)
+"""Further entries, each in a problem that is right otherwise."""
+OPTIONS: dict[str, dict[str, Any]] = {
+    "objective": {"objective": "speed"},
+    "intervals": {"intervals": 0},
+    "intervals, text": {"intervals": "many"},
+    "accuracy": {"accuracy": 1.0},
+    "duration": {"duration": 1.0},
+    "short duration": {"objective": "margin", "duration": 0.01},
+    "degree": {"degree": 9},
+    "scheme": {"scheme": "euler"},
+    "transcription": {"transcription": "space"},
+    "certify": {"objective": "margin", "certify": True},
+    "certified ranges": {"certify": True, "robust": 1.0},
+    "widest": {"largest": True},
+    "robust": {"robust": 30.0},
+    "time limit": {"time_limit": -1.0},
+    "unknown": {"speed": 1.0},
+}
+TORQUES = {
+    "empty": "",
+    "header": "time,a,b\n0,0,0\n1,0,0\n",
+    "one row": "t,tau1,tau2\n0,0,0\n",
+    "text": "t,tau1,tau2\n0,0,0\n1,x,0\n",
+    "short": "t,tau1,tau2\n0,0,0\n1,0\n",
+    "back": "t,tau1,tau2\n0,0,0\n1,0,0\n0.5,0,0\n",
+    "thrice": "t,tau1,tau2\n0,0,0\n1,0,0\n1,0,0\n1,0,0\n2,0,0\n",
+    "nan": "t,tau1,tau2\n0,0,0\n1,nan,0\n",
+    "large": "t,tau1,tau2\n0,0,0\n1,1e9,0\n",
+}
+
+
+def _list_inputs() -> Iterator[tuple[str, str]]:
+    """Entries of a problem file, and what takes their place (JSON)."""
+    leaves = list(_list_leaves(BASE, ""))
+    # Every entry with some of the bad values, all of which come as often.
+    for k, (path, value) in enumerate(product(leaves, BAD)):
+        if k % 11 == 0 or (k % 2 == 0 and k % 3 == (k // len(BAD)) % 3):
+            yield path, json.dumps(value)
+    yield from ((path, json.dumps(value)) for path, value in EDITS)
+
+
+def _list_leaves(table: Any, prefix: str) -> Iterator[str]:
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from _list_leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}"
+
+
+def _read(folder: Path, path: str, value: str) -> Row:
+    """A problem file with another entry; the message does not name the folder."""
+    table: Any = copy.deepcopy(BASE)
+    keys = path.split(".")
+    *way, last = [int(key) if key.isdigit() and keys[0] == "phases" else key for key in keys]
+    own = table
+    for part in way:
+        own = own[part]
+    own[last] = json.loads(value)
+    try:
+        _read_table(table)
+    except wholearm.WholearmError as error:
+        return {"refused": type(error).__name__, "message": str(error)}
+    return {"refused": ""}
+
+
+def _ask(folder: Path, name: str) -> Row:
+    try:
+        wholearm.solve(_load(folder, "heptagon_four_contacts"), **OPTIONS[name])
+    except (wholearm.WholearmError, TypeError) as error:
+        text = str(error).replace(str(folder), "F")
+        return {"refused": type(error).__name__, "message": mask(text)}
+    return {"refused": ""}
+
+
+def _read_torques(folder: Path, name: str) -> Row:
+    with tempfile.TemporaryDirectory() as place:
+        path = Path(place, "bad.csv")
+        path.write_text(TORQUES[name], encoding="utf-8")
+        try:
+            torque = wholearm.read_torque_csv(str(path))
+            wholearm.verify(_load(folder, "square"), torque)
+        except wholearm.WholearmError as error:
+            return {"refused": type(error).__name__, "message": str(error).replace(str(path), "F")}
+    return {"refused": ""}
+
+
+FAMILIES: dict[str, Callable[..., Row]] = {
+    "plan": _plan,
+    "plan over time": partial(_plan, transcription="time"),
+    "variant": _vary,
+    "goal": _reach,
+    "scene": _scene,
+    "leg": _leg,
+    "free": _simulate_free,
+    "torques": _follow,
+    "tune": _tune,
+    "predict": _predict,
+    "policy": _control,
+    "robustness": _assess,
+    "compare": _compare,
+    "report": _report,
+    "map": _draw_map,
+    "list": _list,
+    "input": _read,
+    "option": _ask,
+    "torque file": _read_torques,
+}

@@ -1,0 +1,455 @@
+"""Damaged problem, torque and trajectory files through the command line.
+
+Files have something wrong in them, drawn by a seeded generator. Whatever it is, a command ends with
+an exit status of its own, one clear line, and nothing left behind.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import io
+import json
+import os
+import re
+import tempfile
+import traceback
+import warnings
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...planning.plan import solve
+from ...problem.read import build_problem
+
+BASE: dict[str, Any] = {
+    "name": "square",
+    "epsilon": 0.05,
+    "gravity": 9.81,
+    "fingers_collide": True,
+    "object": {
+        "vertices": [[-0.035, -0.035], [0.035, -0.035], [0.035, 0.035], [-0.035, 0.035]],
+        "mass": 0.2,
+    },
+    "fingers": {
+        key: {
+            "base": [side * 0.08, -0.01],
+            "length": 0.11,
+            "radius": 0.005,
+            "inertia": 0.005,
+            "viscous": 0.01,
+            "dry": 0.01,
+            "torque_limit": 2.0,
+            "speed_limit": 30.0,
+        }
+        for key, side in (("1", 1.0), ("2", -1.0))
+    },
+    "friction": {"palm": 0.1, "finger1": 0.1, "finger2": 0.1},
+    "start": {"flush": 0, "x": 0.02},
+    "phases": [
+        {"contacts": ["v0-palm", "v1-palm", "v2-finger1", "v3-finger2"], "until": {"x": x}}
+        for x in (0.005, -0.01)
+    ],
+}
+"""A problem that is planned quickly: a square that slides to the left in two phases."""
+STRANGE: tuple[Any, ...] = (
+    float("nan"), float("inf"), float("-inf"), 0, -0.0, -1, 2**63, 10**400, 1e308, 5e-324, 1e-30,
+    True, "", "text", "v99-palm", "e1-tip1", "v0-palm rolling", "smooth", "impact",
+    "\u4e2d\U0001f600", "a\\u0000b", [], [[]], [1, 2, 3], ["v0-palm"], [["a", "b"]],
+    [float("nan")], {}, {"x": "y"}, {"a": {"b": {}}}, {"phi_deg": 1e9}, {"x": 0.0, "phi_deg": 1.0},
+)  # fmt: skip
+"""Values that take the place of others."""
+CELLS = (
+    "nan", "-inf", "1e308", "1e-320", "-1", "", "text", "1,5", "0x10", "1_0", "\u0661", " 1 ",
+    '"1"', "1e999", "--1", "True", "\x00", "1" * 5000, "1" * 200_000,
+)  # fmt: skip
+"""What takes the place of a number in a table of torques."""
+METAS = (
+    "", "null", "[]", "{}", "1", '"text"', "{" * 5000, "[" * 100_000, '{"problem": {}}',
+    '{"rolling": [[]]}', "NaN", '{"epsilon": NaN}',
+)  # fmt: skip
+"""What takes the place of a trajectory's `meta`."""
+
+
+class Mutant(NamedTuple):
+    """A file with something wrong in it.
+
+    Attributes
+    ----------
+    kind : {"problem", "torque", "trajectory"}
+    what : str
+        What was done.
+    ending : str
+        Of the file's name.
+    content : bytes or None
+        None stands for a folder.
+    """
+
+    kind: str
+    what: str
+    ending: str
+    content: bytes | None
+
+
+@lru_cache(maxsize=1)
+def base_files() -> tuple[bytes, bytes, bytes]:
+    """A valid problem file, torque file and trajectory file of the same plan."""
+    plan = solve(build_problem(BASE), intervals=20, samples=21)
+    with tempfile.TemporaryDirectory() as folder:
+        npz, table = os.path.join(folder, "a.npz"), os.path.join(folder, "a.csv")
+        plan.save(npz)
+        plan.save_torques(table)
+        with np.load(npz) as data:
+            arrays = {name: data[name] for name in data.files}
+        with open(table, "rb") as stream:
+            torques = stream.read()
+    # Timings and dates would make every run's files different.
+    meta = json.loads(str(arrays["meta"]))
+    none = [0.0] * len(meta["solves"])
+    told = {"timings": {}, "build_times": none, "solve_times": none}
+    arrays["meta"] = np.array(json.dumps(meta | told))
+    return to_toml(BASE).encode(), torques, _pack(arrays)
+
+
+def draw_mutant(seed: int, number: int) -> Mutant:
+    """Draw file `number` of a seed."""
+    rng = np.random.default_rng([seed, number, 1])
+    k = (0, 0, 1, 2, 2)[number % 5]
+    kind, ending = ("problem", "torque", "trajectory")[k], (".toml", ".csv", ".npz")[k]
+    base = base_files()[k]
+    own: Callable[[np.random.Generator, bytes], tuple[str, bytes | None]]
+    own = (_damage_problem, _damage_torques, _damage_archive)[k]
+    what, content = (_damage_bytes if rng.uniform() < 0.25 else own)(rng, base)
+    if rng.uniform() < 0.01:
+        ending = pick(rng, [".TOML", ".txt", "", ".npy", ".CSV", ".npz.csv"])
+    return Mutant(kind, what, ending, content)
+
+
+def pick(rng: np.random.Generator, options: Sequence[Any]) -> Any:
+    """One of some options."""
+    return options[int(rng.integers(len(options)))]
+
+
+def _damage_bytes(rng: np.random.Generator, base: bytes) -> tuple[str, bytes | None]:
+    """Damage that knows nothing of the format."""
+    at, length = int(rng.integers(len(base))), int(10.0 ** rng.uniform(0, 3))
+    noise = rng.integers(0, 256, size=length).astype(np.uint8).tobytes()
+    changed: dict[str, bytes | None] = {
+        "truncated": base[:at],
+        "overwritten": base[:at] + noise + base[at + length :],
+        "inserted": base[:at] + noise + base[at:],
+        "cut out": base[:at] + base[at + length :],
+        "repeated": base[: at + length] + base[at:],
+        "empty": b"",
+        "folder": None,
+        "noise": noise,
+        "utf-16": base.decode("latin-1").encode("utf-16"),
+        "latin-1": base[:at] + "\u00e9\u00fc\u00df".encode("latin-1") + base[at:],
+        "bom": b"\xef\xbb\xbf" + base,
+        "crlf": base.replace(b"\n", b"\r\n"),
+        "zeros": bytes(length),
+        "reversed": base[::-1],
+        "twice": base + base,
+    }
+    what = pick(rng, list(changed))
+    return what, changed[what]
+
+
+def change_tree(rng: np.random.Generator, table: Any) -> str:
+    """Change one value or key of nested tables and lists in place; says what."""
+    path = pick(rng, _list_places(table))
+    parent, key = table, path[-1]
+    for step in path[:-1]:
+        parent = parent[step]
+    value, name = parent[key], ".".join(map(str, path))
+    what = pick(rng, ["delete", "rename", "replace", "replace", "replace", "scale", "double"])
+    if what == "delete":
+        del parent[key]
+    elif what == "rename" and isinstance(parent, dict):
+        new = pick(rng, [f"{key}s", str(key).upper(), "", "x y", "\u00e9", "mass"])
+        parent[new] = parent.pop(key)
+    elif what == "scale" and isinstance(value, int | float) and not isinstance(value, bool):
+        parent[key] = value * pick(rng, [-1.0, 0.5, 1e3, 1e-3, 1e6, 1e-6, 1e12, 1e-12])
+    elif what == "double" and isinstance(parent, list):
+        parent.insert(int(rng.integers(len(parent) + 1)), copy.deepcopy(value))
+    else:
+        parent[key] = new = copy.deepcopy(pick(rng, STRANGE))
+        return f"{name} becomes {str(new)[:40]}"
+    return f"{what} {name}"
+
+
+def _list_places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Every path into nested tables and lists."""
+    items: Any = value.items() if isinstance(value, dict) else ()
+    items = enumerate(value) if isinstance(value, list) else items
+    return [at for key, part in items for at in ((*path, key), *_list_places(part, (*path, key)))]
+
+
+def _damage_problem(rng: np.random.Generator, base: bytes) -> tuple[str, bytes]:
+    if rng.uniform() < 0.7:
+        table = copy.deepcopy(BASE)
+        done = [change_tree(rng, table) for _ in range(int(rng.integers(1, 3)))]
+        return "; ".join(done), to_toml(table).encode("utf-8", "surrogatepass")
+    lines = base.decode().split("\n")
+    at, deep = int(rng.integers(len(lines))), int(10.0 ** rng.uniform(1, 5))
+    texts = [
+        lines[at], lines[at] + " [ { \" '", "a = " + "[" * deep, "a = " + "[" * deep + "]" * deep,
+        "[" + ".".join(["a"] * deep) + "]", "a = " + "9" * deep, 'name = "' + "x" * deep + '"',
+        "phases = [" + "{}," * deep + "]", "a = 2020-01-01", "\x00", "name = '''", "\ufeff",
+        "object.vertices = 1", "[object]\n[object]", "[[object]]", "epsilon = 1_0.0_1",
+        "start = { flush = 0, x = 1979-05-27T07:32:00Z }", "",
+    ]  # fmt: skip
+    text = pick(rng, texts)
+    lines[pick(rng, [0, at, -1])] = text
+    return f"line {at} is {text[:30]!r} of {len(text)}", "\n".join(lines).encode()
+
+
+def _damage_torques(rng: np.random.Generator, base: bytes) -> tuple[str, bytes]:
+    rows = [line.split(",") for line in base.decode().strip().split("\n")]
+    rows = rows[:1] + rows[1 :: max(1, len(rows) // 40)]
+    at, other = (int(row) for row in rng.integers(len(rows), size=2))
+    column, many = int(rng.integers(3)), int(10.0 ** rng.uniform(0, 3))
+    factor = pick(rng, [1e-320, 1e-100, 1e-6, 0.1, 10.0, 1e3, 1e6, 1e100, 1e300, -1.0])
+    heads = [["t", "tau1"], ["T", "tau1", "tau2"], ["t", "t", "t"], ["tau2", "tau1", "t"], []]
+    row, cell = rows[at], pick(rng, CELLS)
+    changed = {
+        "cell": [*rows[:at], [*row[:column], cell, *row[column + 1 :]], *rows[at + 1 :]],
+        "header": [pick(rng, heads), *rows[1:]],
+        "delete": rows[:at] + rows[at + 1 :],
+        "repeat": [*rows[:at], row, *rows[at:]],
+        "thrice": [*rows[:at], row, row, *rows[at:]],
+        "move": [*rows[:at], rows[other], *rows[at:]],
+        "short": [*rows[:at], row[:column], *rows[at + 1 :]],
+        "long": [*rows[:at], row * many, *rows[at + 1 :]],
+        "column": [own[:column] + own[column + 1 :] for own in rows],
+        "scale": [
+            rows[0],
+            *(
+                [*own[:column], repr(float(own[column]) * factor), *own[column + 1 :]]
+                for own in rows[1:]
+            ),
+        ],
+        "few": rows[: int(rng.integers(1, 4))],
+        "blank": [*rows[:at], *[[""]] * many, *rows[at:]],
+    }
+    what = pick(rng, ["cell"] * 4 + list(changed))
+    separator = ";" if rng.uniform() < 0.05 else ","
+    text = "\n".join(separator.join(own) for own in changed[what]) + "\n"
+    return f"{what} in row {at}, column {column}", text.encode("utf-8", "surrogatepass")
+
+
+def _damage_archive(rng: np.random.Generator, base: bytes) -> tuple[str, bytes]:
+    """A trajectory file with one array, its `meta` or the archive itself changed."""
+    with np.load(io.BytesIO(base)) as data:
+        arrays: dict[str, Any] = {name: data[name] for name in data.files}
+    name = pick(rng, list(arrays))
+    how = pick(rng, ["array", "array", "array", "meta", "meta", "header", "member", "rename"])
+    if how == "meta":
+        meta = json.loads(str(arrays["meta"]))
+        what, text = change_tree(rng, meta), pick(rng, METAS)
+        if rng.uniform() < 0.8:
+            text = json.dumps(meta)
+        arrays["meta"] = np.array(text)
+        return f"meta: {what} or {text[:20]!r}", _pack(arrays)
+    if how == "array":
+        what, arrays[name] = _change_array(rng, arrays[name])
+        return f"{what} {name}", _pack(arrays)
+    if how == "rename":
+        new = pick(rng, ["x", "T", "tau", ""])
+        arrays[new] = arrays.pop(name)
+        return f"{name} is called {new!r}", _pack(arrays)
+    if how == "header":
+        shape = pick(rng, [(10**12,), (10**6, 10**6), (2**62, 4), (-1,), (10**9, 3), (3, 2**40)])
+        kind = pick(rng, ["<f8", "<i8", "<U1000000", "|O", "<f4", ">f8", "|V1000000000", "<M8[s]"])
+        header = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}".encode()
+        raw = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + b"\0" * 64
+        del arrays[name]
+        return f"{name} claims {shape} of {kind}", _pack(arrays, name, raw)
+    member = pick(rng, ["a/b/t", "t", "t/", "../t", "x"])
+    return f"archive with {member}", _pack(arrays, member, b"abc")
+
+
+def _change_array(rng: np.random.Generator, array: Any) -> tuple[str, Any]:
+    if array.dtype.kind in "iuf" and array.size and rng.uniform() < 0.5:
+        new = pick(rng, [np.nan, np.inf, -np.inf, 1e308, -1e308, 0.0, -1.0, 1e30, 1e-30, 7.0])
+        changed, count = (
+            array.astype(float),
+            pick(rng, [1, 1, max(1, array.size // 10), array.size]),
+        )
+        changed.flat[rng.integers(array.size, size=count)] = new
+        return f"{new} in", changed
+    makers: list[Callable[[], Any]] = [
+        lambda: array.astype(str), lambda: array.astype(object), lambda: array.astype("S8"),
+        lambda: np.zeros(array.shape, complex), lambda: np.zeros(array.shape, bool),
+        lambda: np.zeros(array.shape, "M8[s]"), lambda: np.zeros(array.shape, "f2"),
+        lambda: np.zeros(array.shape, [("a", "f8")]), lambda: np.zeros(array.shape, ">f8"),
+        lambda: np.array({"a": 1}, dtype=object), lambda: np.array("text"),
+        lambda: np.array([array, array]), lambda: array[None], lambda: array[..., None],
+        lambda: array.T, lambda: array.ravel()[::-1], lambda: array.ravel()[:1],
+        lambda: array.ravel()[:0], lambda: array.ravel()[:-1], lambda: np.zeros((0, 0)),
+    ]  # fmt: skip
+    made = pick(rng, makers)()
+    return f"{made.dtype.str} of shape {made.shape} for", made
+
+
+def _pack(arrays: Mapping[str, Any], extra: str = "", raw: bytes = b"") -> bytes:
+    """The arrays as an archive, and one more member with bytes of its own."""
+    stream = io.BytesIO()
+    with warnings.catch_warnings(), zipfile.ZipFile(stream, "w") as archive:
+        warnings.simplefilter("ignore")
+        for name, array in arrays.items():
+            member = io.BytesIO()
+            np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=True)
+            archive.writestr(
+                zipfile.ZipInfo(f"{name}.npy"), member.getvalue(), zipfile.ZIP_DEFLATED
+            )
+        if extra:
+            full = extra if extra.endswith("/") else f"{extra}.npy"
+            archive.writestr(zipfile.ZipInfo(full), b"" if full == extra else raw)
+    return stream.getvalue()
+
+
+def to_toml(table: Mapping[str, Any], prefix: str = "") -> str:
+    """The text of a TOML file, whatever is in the table: values, then tables and lists of them."""
+    lines, below = [], []
+    for key, value in table.items():
+        name = f"{prefix}{_key(key)}"
+        if isinstance(value, Mapping) and key != "until":
+            below += ["", f"[{name}]", to_toml(value, f"{name}.")]
+        elif isinstance(value, list) and value and all(isinstance(v, Mapping) for v in value):
+            below += [text for v in value for text in ("", f"[[{name}]]", to_toml(v, f"{name}."))]
+        else:
+            lines.append(f"{_key(key)} = {_value(value)}")
+    return "\n".join([*lines, *below, ""])
+
+
+def _key(key: str) -> str:
+    plain = key.isascii() and key.replace("_", "").replace("-", "").isalnum()
+    return key if plain else json.dumps(key)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return repr(float(value))
+    if isinstance(value, str):
+        return json.dumps(value)
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_value, value)) + "]"
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items()) + " }"
+    return str(value)
+
+
+STATUSES = (0, 1, 2)
+LONGEST = 2000
+"""Longest line on stderr that still counts as clear."""
+PROGRESS = re.compile(r"wholearm: \d+ s: ")
+"""Lines that tell how long work goes on already."""
+
+
+def run_file(seed: int, number: int) -> dict[str, Any]:
+    """Run one damaged file, and return what came of it as plain data."""
+    mutant = draw_mutant(seed, number)
+    rng = np.random.default_rng([seed, number, 2])
+    with tempfile.TemporaryDirectory() as folder:
+        command = write_case(mutant, folder, rng)
+        status, findings = run_command(command, folder)
+    return {
+        "kind": mutant.kind,
+        "what": mutant.what,
+        "command": " ".join([command[0], *map(os.path.basename, command[1:])]),
+        "status": status,
+        "findings": findings,
+    }
+
+
+def write_case(mutant: Mutant, folder: str, rng: np.random.Generator) -> list[str]:
+    """Write a mutant and what its command needs into a folder; return the command's arguments."""
+    path = os.path.join(folder, f"mutant{mutant.ending}")
+    if mutant.content is None:
+        os.mkdir(path)
+    else:
+        _write(path, mutant.content)
+    problem, torques, _ = base_files()
+    own = os.path.join(folder, "problem.toml")
+    _write(own, problem)
+    share, out = float(rng.uniform()), os.path.join(folder, "out")
+    if mutant.kind == "problem":
+        if share < 0.6:
+            extra = ["--torques", f"{out}.csv"] if share < 0.2 else []
+            return ["solve", path, "-o", f"{out}.npz", "--intervals", "20", *extra]
+        if share < 0.8:
+            table = os.path.join(folder, "torques.csv")
+            _write(table, torques)
+            return ["verify", path, table]
+        if share < 0.97:
+            return ["map", path, "--list", "0.02,0", "-0.01,0"]
+        return ["map", path, "-o", f"{out}.png", "--phi=-10,10"]
+    if mutant.kind == "torque" or share < 0.75:
+        return ["verify", own, path, *(["--json"] if share < 0.1 else [])]
+    if share < 0.9:
+        return ["plot", path, "-o", f"{out}.png", "--simulate"]
+    if share < 0.97:
+        return ["plot", path, "-o", f"{out}.svg"]
+    return ["map", own, "--plan", path, "-o", f"{out}.png", "--phi=-10,10"]
+
+
+def _write(path: str, content: bytes) -> None:
+    with open(path, "wb") as stream:
+        stream.write(content)
+
+
+def run_command(command: list[str], folder: str) -> tuple[int | None, list[tuple[str, str]]]:
+    """Run the command line in this process, warnings being errors, and look at what it leaves."""
+    from ...__main__ import start
+
+    before = set(os.listdir(folder))
+    out, err = io.StringIO(), io.StringIO()
+    status: int | None = None
+    try:
+        with (
+            warnings.catch_warnings(),
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+        ):
+            warnings.simplefilter("error")
+            status = start(command)
+    except SystemExit as error:
+        status = error.code if isinstance(error.code, int) else None
+    except Exception as error:
+        kind = "warning" if isinstance(error, Warning) else "traceback"
+        return None, [(kind, "".join(traceback.format_exception(error)[-4:]).strip())]
+    written = set(os.listdir(folder)) - before
+    return status, look(command, status, out.getvalue(), err.getvalue(), written)
+
+
+def look(
+    command: list[str], status: int | None, out: str, err: str, written: set[str]
+) -> list[tuple[str, str]]:
+    """What is wrong with how a command ended."""
+    texts = []
+    lines = [line for line in err.splitlines() if not PROGRESS.match(line)]
+    if status not in STATUSES:
+        texts.append(f"exit status {status}")
+    if status == 0 and lines:
+        texts.append(f"exit status 0 with {lines[0][:80]!r} on stderr")
+    # A report on torques that fail goes to stdout; everything else fails with one line.
+    reported = command[0] == "verify" and status == 1 and bool(out.strip())
+    if status in (1, 2) and not reported:
+        if len(lines) != 1 or not lines[0].startswith("wholearm: "):
+            texts.append(f"{len(lines)} lines on stderr, beginning {err[:80]!r}")
+        elif len(lines[0]) > LONGEST:
+            texts.append(f"a line of {len(lines[0])} characters on stderr")
+        if out.strip():
+            texts.append(f"exit status {status} with output {out[:80]!r}")
+    if status == 2 and not any("mutant" in line for line in lines):
+        texts.append(f"the file is not named in {err[:120]!r}")
+    partial = sorted(name for name in written if name.endswith(".part"))
+    if partial or (status in (1, 2) and written):
+        texts.append(f"exit status {status} and {', '.join(sorted(written))} left behind")
+    return [("unclear end", text) for text in texts]

@@ -1,0 +1,305 @@
+"""A study: cases, what comes of each, and a table of all.
+
+`run_study` runs the cases in processes, each within its processor time, keeps what comes of them
+as they end, goes on where it was stopped, and writes the table with versions and machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import hashlib
+import io
+import os
+import platform
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from .. import __version__
+from ..common.bounds import Bounds
+from ..common.files import make_folder, together, write_text
+from ..common.journal import Journal
+from .pool import Answer, run_tasks
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Case = tuple[Any, ...]
+"""Plain values that say what is run: the name of its record, too."""
+Row = dict[str, Any]
+"""What came of a case, as plain values; `findings` is what must not be.
+
+Added are `case`, the `seconds` of processor time, and `memory`, by which it has raised the peak of
+its process [MB].
+"""
+PACKAGES = ("casadi", "numpy", "scipy")
+FAILED = {"raised": "traceback", "late": "time limit", "died": "crash"}
+
+
+class Report(NamedTuple):
+    """What a study has found: its text, what must not be, and the files it has written."""
+
+    text: str
+    findings: list[str]
+    written: list[str]
+
+
+class Study:
+    """Cases, a run of one of them, and a table.
+
+    Attributes
+    ----------
+    name : str
+        Of its files: ``bench_NAME.jsonl``, ``.md`` and ``.csv``.
+    title : str
+        Of the table.
+    keeps : bool
+        Whether records are kept, and the table is written.
+    folder : str
+        Where, if the command line does not say.
+    of_code : bool
+        Whether records count for the source code and the machine alone that they were made with.
+    timed, alone : bool
+        Whether cases are run one at a time, and each in a process of its own.
+    strict : bool
+        Whether warnings are errors.
+    columns : tuple of str
+        Entries of rows that are written as CSV; none for no such file.
+    packages : tuple of str
+        Further ones whose versions are stated.
+    """
+
+    name = ""
+    title = ""
+    keeps = True
+    folder = "results"
+    of_code = False
+    timed = False
+    alone = False
+    strict = False
+    columns: tuple[str, ...] = ()
+    packages: tuple[str, ...] = ()
+
+    def add_options(self, parser: argparse.ArgumentParser) -> None:
+        """Add what the command line takes beside the options that every study has."""
+
+    def stamp(self, options: argparse.Namespace) -> dict[str, Any]:
+        """What records belong to, beside study and version: a seed, for example."""
+        return {}
+
+    def list_cases(self, options: argparse.Namespace) -> Iterable[Case]:
+        """All cases."""
+        raise NotImplementedError
+
+    def list_inputs(self, options: argparse.Namespace) -> Iterable[Path]:
+        """Files that records count for alone, beside the source code."""
+        return ()
+
+    def run(self, case: Case) -> Row:
+        """Run one case, in another process."""
+        raise NotImplementedError
+
+    def report(self, rows: Sequence[Row], options: argparse.Namespace) -> tuple[str, list[str]]:
+        """The table in Markdown, and what must not be; cases that have failed are not in `rows`."""
+        raise NotImplementedError
+
+    def draw(self, rows: Sequence[Row]) -> Figure | None:
+        """The figure, if there is one."""
+        return None
+
+    def limit(self, case: Case) -> float:
+        """Processor time that a case may take [s]."""
+        return 60.0
+
+    def group(self, case: Case) -> Any:
+        """Cases for which this is equal are run by one process, one after the other."""
+        return case
+
+
+def name_case(row: Row) -> str:
+    """A case in words."""
+    return " ".join(map(str, row["case"]))
+
+
+def add_common(parser: argparse.ArgumentParser, study: Study) -> None:
+    """Add the options that every study has."""
+    if not study.timed:
+        cores = os.cpu_count() or 1
+        text = f"processes ({cores}, as many as cores)"
+        parser.add_argument("--jobs", type=Bounds(1, 256).read, default=cores, help=text)
+    if study.keeps:
+        text = "run all cases anew instead of going on with the records in the folder"
+        parser.add_argument("--fresh", action="store_true", help=text)
+        text = "run again the cases that had findings"
+        parser.add_argument("--again", action="store_true", help=text)
+        text = f"folder for records and tables ({study.folder})"
+        parser.add_argument("-o", "--output", metavar="DIR", default=study.folder, help=text)
+
+
+def run_study(
+    study: Study, options: argparse.Namespace, progress: Callable[[str], None] = lambda text: None
+) -> Report:
+    """Run a study, or what is left of it, and write its table."""
+    cases = list(dict.fromkeys(study.list_cases(options)))
+    if not study.keeps:
+        known = {_key(row["case"]): row for row in _run(study, cases, cases, options, progress)}
+        text, findings = _report(study, [known[case] for case in cases], options)
+        return Report(text, findings, [])
+    make_folder(options.output)
+    stem = os.path.join(options.output, f"bench_{study.name}")
+    stamp = {"study": study.name, "version": __version__, **study.stamp(options)}
+    fresh = options.fresh
+    if study.of_code:
+        stamp["source"] = digest_source(study.list_inputs(options))
+        fresh = fresh or not _continues(f"{stem}.jsonl", stamp["source"])
+    with Journal(f"{stem}.jsonl", stamp, fresh, options.again) as journal:
+        done = journal.done("case", _key)
+        left = [case for case in cases if case not in done]
+        for row in _run(study, cases, left, options, progress):
+            journal.add(row)
+        known = {_key(row["case"]): row for row in journal.records}
+    rows = [known[case] for case in cases]
+    text, findings = _report(study, rows, options)
+    written = [f"{stem}.md"]
+    with together():
+        write_text(written[0], text)
+        if study.columns:
+            written.append(f"{stem}.csv")
+            write_text(written[-1], _write_csv(rows, study.columns))
+        figure = study.draw([row for row in rows if "failed" not in row])
+        if figure is not None:
+            from ..figures.plots import save
+
+            written.append(f"{stem}.png")
+            save(figure, written[-1])
+    return Report(text, findings, written)
+
+
+def _report(
+    study: Study, rows: Sequence[Row], options: argparse.Namespace
+) -> tuple[str, list[str]]:
+    """The text of a study, and its findings: cases that have failed among them."""
+    table, findings = study.report([row for row in rows if "failed" not in row], options)
+    findings = [
+        *(f"{name_case(row)}: {row['failed']}" for row in rows if "failed" in row),
+        *findings,
+    ]
+    parts = [f"# {study.title}", describe_machine(study.packages), table.strip()]
+    if findings:
+        parts.append("\n".join(["## Findings", "", *(f"* {text}" for text in findings)]))
+    return "\n\n".join(parts) + "\n", findings
+
+
+def describe_machine(packages: Sequence[str] = ()) -> str:
+    """Versions, processor and cores, in a line."""
+    parts = [f"wholearm {__version__}", f"Python {platform.python_version()}"]
+    for name in (*PACKAGES, *packages):
+        try:
+            parts.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            continue
+    return ", ".join([*parts, _name_processor(), f"{os.cpu_count()} cores"])
+
+
+def finish_axes(axes: Axes, **legend: Any) -> None:
+    """Give axes a grid, no frame and a legend."""
+    axes.grid(True, which="major", color="#c4c9d0", linewidth=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, **legend)
+
+
+def digest_source(inputs: Iterable[Path] = ()) -> str:
+    """A digest of the source code of the package, the machine, its packages and further files."""
+    folder = Path(__file__).parents[1]
+    found = hashlib.sha256(describe_machine().encode())
+    for path in sorted(folder.rglob("*.py")):
+        found.update(str(path.relative_to(folder)).encode() + path.read_bytes())
+    for path in inputs:
+        found.update(path.name.encode() + path.read_bytes())
+    return found.hexdigest()[:16]
+
+
+def _continues(path: str, source: str) -> bool:
+    """Whether a file of records was begun with this source code."""
+    try:
+        with open(path, encoding="utf-8") as stream:
+            return source in stream.readline()
+    except (OSError, UnicodeDecodeError):
+        return True
+
+
+def _run(
+    study: Study,
+    cases: Sequence[Case],
+    left: Sequence[Case],
+    options: argparse.Namespace,
+    report: Callable[[str], None],
+) -> Iterator[Row]:
+    """Rows of the cases that are left, as they come."""
+    begun, found = time.monotonic(), 0
+    jobs = 1 if study.timed else options.jobs
+    with _one_thread():
+        answers = run_tasks(
+            study.run, left, jobs, study.limit, study.group, study.strict, study.alone
+        )
+        for count, answer in enumerate(answers, start=1):
+            row = _record(answer)
+            found += bool(row.get("findings"))
+            yield row
+            ahead = (time.monotonic() - begun) / count * (len(left) - count) / 60
+            text = f"{study.name}: {len(cases) - len(left) + count} of {len(cases)} cases"
+            report(f"{text}, {found} with findings, {ahead:.0f} min left")
+
+
+def _record(answer: Answer) -> Row:
+    own = dict(answer.result) if answer.ended == "done" else {}
+    if answer.ended != "done":
+        text = str(answer.result or "").strip()[-1500:]
+        own = {"failed": f"{FAILED[answer.ended]} after {answer.elapsed:.0f} s: {text}"}
+        own["findings"] = [own["failed"]]
+    if answer.printed.strip():
+        own["printed"] = answer.printed.strip()[:500]
+    taken = {"seconds": round(answer.seconds, 4), "memory": round(answer.memory, 2)}
+    return {"case": list(answer.task), **own, **taken}
+
+
+def _key(case: Any) -> Any:
+    """A case as it was before it was written."""
+    return tuple(map(_key, case)) if isinstance(case, list | tuple) else case
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Processes that are started have one thread of OpenBLAS each."""
+    name = "OPENBLAS_NUM_THREADS"
+    before = os.environ.get(name)
+    os.environ.setdefault(name, "1")
+    try:
+        yield
+    finally:
+        if before is None:
+            os.environ.pop(name, None)
+
+
+def _write_csv(rows: Iterable[Row], columns: Sequence[str]) -> str:
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, columns, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return stream.getvalue()
+
+
+def _name_processor() -> str:
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as stream:
+            for line in stream:
+                if line.startswith("model name"):
+                    return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
