@@ -76,7 +76,6 @@ def _export(options: argparse.Namespace) -> int:
 
 def _replay(options: argparse.Namespace) -> int:
     from ..engines.replay import ENGINES, replay_in, require_engine
-    from ..engines.report_text import to_dict, write
     from ..problem.read import read_problem
 
     require_engine(options.engine)
@@ -102,7 +101,7 @@ def _replay(options: argparse.Namespace) -> int:
             progress=show_progress(),
         )
     clear_progress()
-    print(json.dumps(to_dict(report) | notes, indent=2) if options.json else write(report))
+    print(json.dumps(report.to_dict() | notes, indent=2) if options.json else report.to_text())
     return report.exit_status
 
 

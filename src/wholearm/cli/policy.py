@@ -118,16 +118,15 @@ def _policy(options: argparse.Namespace) -> int:
 
 def _describe(policy: Policy) -> str:
     """How long the phases take, what reserve they keep, and within which ranges."""
-    from ..results.report_text import align
+    from ..common.document import Table
 
     rows = []
     for own in policy.about["phases"]:
-        times = [f"{own[name]:.6f}" for name in ("plan", "duration")]
         kept = [f"{level:.2f} {name}" for name, level in own.get("reserves", {}).items()]
-        share = f"{own['share']:.2f}" if kept else ""
-        rows.append([str(own["number"]), *times, share, ", ".join(kept)])
-    header = ["phase", "plan [s]", "policy [s]", "reserve", "least of each contact"]
-    lines = list(align(header, rows, {4}))
+        share = own["share"] if kept else ""
+        rows.append([own["number"], own["plan"], own["duration"], share, ", ".join(kept)])
+    heads = ["phase:d", "plan [s]:.6f", "policy [s]:.6f", "reserve:.2f", "least of each contact"]
+    lines = [Table(heads, rows).to_text()]
     parts = {own["number"]: own["share"] for own in policy.about["phases"] if "reserves" in own}
     if "ranges" in policy.about and parts:
         short = [f"{part:.2f} of them in phase {k}" for k, part in parts.items() if part < 1]

@@ -74,7 +74,6 @@ def _robustness(options: argparse.Namespace) -> int:
     from ..policy.policy import Policy
     from ..problem.read import adopt_phases, read_problem
     from ..results.trajectory_file import load_trajectory
-    from ..robustness.report import to_dict, to_text
     from ..robustness.study import assess_robustness
 
     output = options.output or _name_output(options)
@@ -113,7 +112,7 @@ def _robustness(options: argparse.Namespace) -> int:
         from ..figures.robustness import draw_robustness
 
         plots.save(draw_robustness(study), options.figure)
-    print(json.dumps(to_dict(study) | notes, indent=2) if options.json else to_text(study))
+    print(json.dumps(study.to_dict() | notes, indent=2) if options.json else study.to_text())
     if not options.json:
         print("wrote " + ", ".join(filter(None, (output, options.figure))))
     return 0

@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from ..common.document import fixed
 from ..planning.phase_plan import combine
 from ..problem.uncertainty import PARAMETERS
-from ..results.report_text import fixed
 
 if TYPE_CHECKING:
     from ..planning.result import Plan

@@ -12,9 +12,8 @@ LONGEST = 100
 
 
 def write_brief(result: Any) -> str:
-    """The `repr` of a result: its class and its `headline`, or the first line of its text."""
-    text = getattr(result, "headline", None) or result.to_text().partition("\n")[0]
-    line = f"{type(result).__name__}({text})"
+    """The `repr` of a result: its class and its `headline`."""
+    line = f"{type(result).__name__}({result.headline})"
     return line if len(line) <= LONGEST else f"{line[: LONGEST - 4]}...)"
 
 

@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..common.brief import write_brief
+from ..common.document import Document, Result, Table, plain
 from ..common.errors import InputError
 from ..policy.closed_loop import ROOM, ClosedLoop
 from ..policy.policy import Policy
 from ..problem.definition import Problem
 from ..results.narrow import Moved, adopt_motion
-from ..results.report_text import align
 from ..results.trajectory import Trajectory
 from .between import find_between
 from .departure import find_pairs
 from .replay import ENGINES, require_engine
-from .report_text import name_phases
-from .stretch import Run, Setting, Stretch, list_stretches
+from .stretch import Run, Setting, Stretch, list_stretches, name_phases
 
 ALLOWED = 1e-2
 """How far from the plan's a motion may end, over the scene's length and in rad: in soft contacts
@@ -55,7 +54,8 @@ class Arrival(NamedTuple):
     gap: float
 
 
-class PolicyReport(NamedTuple):
+@dataclass(frozen=True, eq=False, repr=False)
+class PolicyReport(Result):
     """What a policy does in an engine; `allowed` is over the scene's length and in rad."""
 
     problem: Problem
@@ -68,11 +68,6 @@ class PolicyReport(NamedTuple):
         """Whether every stretch ends, and where it is to end."""
         return all(self.find_failure(own) is None for own in self.arrivals)
 
-    @property
-    def exit_status(self) -> int:
-        """Exit status of the command line."""
-        return 0 if self.ok else 1
-
     def find_failure(self, own: Arrival) -> str | None:
         """What is wrong with a stretch."""
         far = max(own.position / self.problem.scene.scales.length, own.angle)
@@ -83,41 +78,38 @@ class PolicyReport(NamedTuple):
             return f"phase {name_phases(own.stretch)} does not end within {own.duration:.4g} s"
         return None
 
-    def __repr__(self) -> str:
-        return write_brief(self)
-
-    def to_text(self) -> str:
-        """The report as lines of text; lengths in mm and angles in degrees."""
-        failures = [self.find_failure(own) for own in self.arrivals]
+    @property
+    def document(self) -> Document:
+        """Durations beside those of the plan, and where stretches end."""
         rows = [
-            [
+            (
                 name_phases(own.stretch),
-                f"{own.stretch.stop - own.stretch.start:.6f}",
-                f"{own.duration:.6f}",
-                f"{own.position * 1e3:.4f}",
-                f"{math.degrees(own.angle):.4f}",
-                f"{own.gap * 1e3:.4f} {own.contact}",
-            ]
+                own.stretch.stop - own.stretch.start,
+                own.duration,
+                own.position,
+                own.angle,
+                own.gap,
+                own.contact,
+            )
             for own in self.arrivals
         ]
-        header = ["phase", "plan [s]", "policy [s]", "end off [mm]", "[deg]", "largest gap [mm]"]
-        lines = [
-            f"{self.problem.name} in {self.title}, by the policy: {'ok' if self.ok else 'FAILS'}",
-            *(failure for failure in failures if failure is not None),
-            "",
-            *align(header, rows, {5}),
-        ]
-        return "\n".join(lines)
+        heads = ["phase:d", "plan [s]:.6f", "policy [s]:.6f", "end off [mm]:.4f", "[deg]:.4f"]
+        return Document(
+            f"{self.problem.name} in {self.title}, by the policy",
+            "ok" if self.ok else "FAILS",
+            parts=[
+                *(self.find_failure(own) or "" for own in self.arrivals),
+                Table([*heads, "largest gap [mm]:.4f", ""], rows),
+            ],
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The report for machines, in m, rad and s."""
-        stretches = [
-            {
-                "phases": [index + 1 for index in own.stretch.phases],
-                **{key: value for key, value in own._asdict().items() if key != "stretch"},
-            }
-            for own in self.arrivals
-        ]
+        stretches = []
+        for own in self.arrivals:
+            values = {"phases": [index + 1 for index in own.stretch.phases], **own._asdict()}
+            del values["stretch"]
+            stretches.append(plain(values))
         return {
             "problem": self.problem.name,
             "engine": self.title,

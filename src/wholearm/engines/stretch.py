@@ -149,3 +149,9 @@ def _average(torque: TorqueProfile, start: float, h: float, count: int) -> Array
     places = (np.arange(count * _LOOKS) + 0.5) * (h / _LOOKS) - h / 2
     places = start + np.maximum(places, _LEAST * h)
     return np.asarray(torque.at(places).reshape(count, _LOOKS, 2).mean(axis=1))
+
+
+def name_phases(stretch: Stretch) -> str:
+    """Numbers of the phases, first to last."""
+    ends = dict.fromkeys((stretch.phases[0] + 1, stretch.phases[-1] + 1))
+    return "-".join(map(str, ends))

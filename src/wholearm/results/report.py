@@ -1,12 +1,13 @@
-"""The report of a replay: numbers, text and plain values."""
+"""What a replay of torques showed, phase by phase, as numbers and as tables."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
-from ..common.brief import write_brief
+from ..common.document import Document, Result, Table, fixed
 from .narrow import Moved
 from .trajectory import Trajectory
 from .tuning import TuningHelp
@@ -243,8 +244,8 @@ class EnergyBalance(NamedTuple):
     relative: float
 
 
-@dataclass(frozen=True)
-class Report:
+@dataclass(frozen=True, repr=False)
+class Report(Result):
     """What a replay of torques showed.
 
     Attributes
@@ -300,7 +301,7 @@ class Report:
     help: TuningHelp = field(default_factory=TuningHelp)
     replay: Moved | None = field(default=None, repr=False, compare=False)
 
-    __repr__ = write_brief
+    derived = ("ok", "exit_status", "reason")
 
     @property
     def headline(self) -> str:
@@ -324,32 +325,100 @@ class Report:
         return self.failures[0] if self.failures else self.outcome
 
     @property
-    def exit_status(self) -> int:
-        """Exit status of the command line: 0 or 1."""
-        return 0 if self.ok else 1
+    def document(self) -> Document:
+        """The verdict with its reason, then everything else as tables."""
+        lines = [f"failure: {text}" for text in self.failures[1:]]
+        if self.outcome not in (*self.failures, self.reason):
+            lines.append(f"end of the replay: {self.outcome}")
+        lines += [f"warning: {text}" for text in self.warnings]
+        help, gap = self.help, self.finger_gap
+        lines += [f"help: {own.to_text()}" for own in (*help.losses, help.approach) if own]
+        if gap is not None:
+            lines.append(f"least gap of the fingers: {gap.least:.5g} m at t = {gap.time:.5g} s")
+        # Epsilon with three digits, or a thousandth of the largest.
+        least = [own.least for phase in self.phases for own in phase.contacts]
+        largest = max((force for force in least if not math.isnan(force)), default=0.0)
+        force = fixed(self.epsilon or 1e-3 * largest)
+        return Document(
+            self.name,
+            "ok" if self.ok else "FAILED",
+            self.reason,
+            [
+                *lines,
+                self._list_losses(force),
+                Table(
+                    ["phase:d", "contact", f"least c_n [N]:{force}", f"margin [N]:+{force}",
+                     "at t [s]:.5f"],
+                    [(p.number, c.contact, c.least, c.margin, c.time)
+                     for p in self.phases for c in p.contacts],
+                ),
+                Table(
+                    ["phase:d", "rolling", f"least mu c_n - |c_t| [N]:+{force}", "at t [s]:.5f"],
+                    [(p.number, *own) for p in self.phases for own in p.rolling],
+                ),
+                self._list_phases(),
+                Table(
+                    ["phase:d", "uniqueness of forces:.4f", "least of", "at t [s]:.5f",
+                     "wedged [ms]:.1f"],
+                    [(p.number, *(p.uniqueness_margin or (None, "-", None)), p.wedged)
+                     for p in self.phases],
+                ),
+                Table(
+                    ["phase:d", "mode of", "", "at t [s]:.5f"],
+                    [(own.phase, own.what, own.kind, own.time) for own in self.changes],
+                ),
+                Table(
+                    ["phase:d", "at t [s]:.5f", "Phi_1 [kg m^2]:.6g", "Phi_2 [N m s]:.6g",
+                     "Phi_3 [N m]:.6g", "theta_1' [rad/s]:.6g", "theta_1'' [rad/s^2]:.6g",
+                     "residual [N m]:.1e"],
+                    [(own.phase, own.time, *own[2:], own.residual) for own in self.reduced],
+                ),
+                Table(
+                    ["energy", "[J]: .6e"],
+                    [
+                        ("work of the torques", self.energy.work),
+                        ("change of kinetic energy", self.energy.kinetic),
+                        ("change of potential energy", self.energy.potential),
+                        ("viscous joint friction", self.energy.viscous),
+                        ("dry joint friction", self.energy.dry),
+                        ("sliding friction", self.energy.contact),
+                        ("contacts gained", self.energy.impact),
+                        ("residual", self.energy.residual),
+                    ],
+                ),
+            ],
+        )  # fmt: skip
 
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain values for JSON, with None where there is no number."""
-        values = plain(asdict(replace(self, replay=None)))
-        del values["replay"]
-        verdict = {"ok": self.ok, "exit_status": self.exit_status, "reason": self.reason}
-        return {**verdict, **values}
+    def _list_losses(self, force: str) -> Table:
+        """Forces where contacts are lost or slip, and what torques change of them."""
+        rows: list[Sequence[object]] = []
+        for loss in self.help.losses:
+            if loss.kind == "thin":
+                continue
+            for own in loss.forces:
+                rows.append((loss.time, f"c_n of {own.contact}", own.c_n, own.c_t, *own.per_tau))
+            if loss.closing:
+                value, *per_tau = loss.closing
+                until = self.phases[loss.phase - 1].until
+                rows.append((loss.time, f"acceleration to {until}", f"{value:+.3f}", "", *per_tau))
+        columns = ["at t [s]:.5f", "where lost", f"c_n [N]:+{force}", f"c_t [N]:+{force}"]
+        return Table([*columns, "per N m of tau_1:+.3f", "of tau_2:+.3f"], rows)
 
-    def to_text(self) -> str:
-        """The verdict with its reason, then everything else as aligned tables."""
-        from .report_text import write
-
-        return write(self)
-
-
-def plain(value: Any) -> Any:
-    """`value` with None for NaN and infinity and plain containers."""
-    if hasattr(value, "_asdict"):
-        value = value._asdict()
-    if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    return value
+    def _list_phases(self) -> Table:
+        """How phases end, and how far from the plan."""
+        columns = ["phase:d", "until", "end", "arrival [s]:.5f", "rate [m/s, rad/s]:.1e"]
+        columns.append("left [m/s]:.1e")
+        planned = any(p.deviation is not None for p in self.phases)
+        impacts = any(p.end == "impact" for p in self.phases)
+        columns += ["least impulse [N s]:.4g", "on"] if impacts else []
+        if planned:
+            columns += ["end dev. [m]:.1e", "[rad]:.1e", "largest dev. [m]:.1e", "[rad]:.1e"]
+        rows = []
+        for p in self.phases:
+            row = [p.number, p.until, p.end, p.arrival, p.arrival_rate, p.end_speed]
+            if impacts:
+                row += [p.impact.impulse, p.impact.contact] if p.impact else [None, "-"]
+            for own in (p.end_deviation, p.deviation) if planned else ():
+                row += own[:2] if own else [None, None]
+            rows.append(row)
+        return Table(columns, rows)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import platform
 from collections.abc import Callable, Sequence
 
+from ..common.document import fixed
 from ..comparison.compare import compare
 from ..comparison.side_by_side import Comparison, Contender
 from ..mapping.formation_map import FormationMap, build_map, choose_window
 from ..problem.definition import Problem
-from ..results.report_text import fixed
 from . import page
 from .chart import describe_map
 from .motion import describe_motion

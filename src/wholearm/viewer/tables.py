@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from ..common.document import fixed
 from ..problem.definition import Problem
-from ..results.report_text import fixed
 from ..results.trajectory import Trajectory
 
 PHASE_HEADS = ("phase", "contacts", "until", "end", "duration [s]", "least c_n [N]", "of")
