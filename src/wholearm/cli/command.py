@@ -33,6 +33,7 @@ from .engines import add_export, add_replay
 from .map import draw, protect
 from .new import add_new, add_schema
 from .origin import tell_origin
+from .output import name_files, print_result
 from .overlay import overlay
 from .policy import add_policy
 from .predict import predict
@@ -271,13 +272,11 @@ def _verify(options: argparse.Namespace) -> int:
     else:
         announce(f"replaying {len(problem.phases)} phases")
         report = verify(problem, torques, reduced=options.reduced, **given)
-    clear_progress()
     if options.output is not None:
         report.trajectory.save(options.output)
-    print(json.dumps(report.to_dict() | notes, indent=2) if options.json else report.to_text())
-    if options.output is not None and not options.json:
-        print(f"wrote {options.output}")
-    return report.exit_status
+    status = print_result(options, report, notes)
+    name_files(options, options.output)
+    return status
 
 
 def _read_policy(options: argparse.Namespace, torques: Trajectory | TorqueProfile) -> Policy | None:
@@ -351,8 +350,7 @@ def _plot(options: argparse.Namespace) -> int:
             trajectory, simulation=simulation, width=width, motion=options.motion
         )
     plots.save(figure, options.output)
-    clear_progress()
-    print(f"wrote {options.output}")
+    name_files(options, options.output)
     return 0
 
 
