@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import fields, is_dataclass
-from enum import Enum
+from collections.abc import Sequence
 from html import escape
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .brief import write_brief
+from .plain import plain
 
 SCALES = {"mm": 1e3, "mm/s": 1e3, "ms": 1e3, "deg": 180 / math.pi, "%": 1e2}
 """What numbers in SI units are multiplied by in a column of that unit."""
@@ -205,23 +204,3 @@ def fixed(size: float, digits: int = 3) -> str:
     """The format that gives a value of this size so many significant digits; no zero is minus."""
     places = digits - 1 - math.floor(math.log10(size)) if size > 0 else digits
     return f"z.{min(max(places, 0), 15)}f"
-
-
-def plain(value: Any) -> Any:
-    """`value` in plain containers for JSON, with None for NaN and infinity.
-
-    Of named tuples and dataclasses the properties that they name as `derived`, and all fields but
-    those that a `repr` leaves out.
-    """
-    names = [own.name for own in fields(value) if own.repr] if is_dataclass(value) else ()
-    if names := [*getattr(value, "derived", ()), *(names or getattr(value, "_fields", ()))]:
-        value = {name: getattr(value, name) for name in names}
-    elif isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    elif isinstance(value, Enum):
-        value = value.value
-    if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..common.document import Document, Result, Table, plain
+from ..common.document import Document, Result, Table
 from ..common.errors import InputError
+from ..common.plain import plain
 from ..policy.closed_loop import ROOM, ClosedLoop
 from ..policy.policy import Policy
 from ..problem.definition import Problem

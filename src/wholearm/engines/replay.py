@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..common.document import Document, Result, Table, plain
+from ..common.document import Document, Result, Table
 from ..common.errors import InputError
+from ..common.plain import plain
 from ..problem.definition import Problem
 from ..results.narrow import Moved, adopt_motion, require_same_phases
 from ..results.trajectory import Trajectory

@@ -22,8 +22,9 @@ from .. import __version__
 from ..common.arrays import Array
 from ..common.bounds import Bounds
 from ..common.crowd import DiedError, run_all
-from ..common.document import Document, Result, Table, plain
+from ..common.document import Document, Result, Table
 from ..common.journal import Journal
+from ..common.plain import plain
 from ..common.workers import Spawning
 from ..policy.policy import Policy
 from ..problem.definition import Problem

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from ..common.document import Document, Result, Table, fixed, plain
+from ..common.document import Document, Result, Table, fixed
+from ..common.plain import plain
 from ..free_simulation.result import FreeSimulation
 from ..results.report import Deviation
 from ..results.trajectory import Trajectory
