@@ -155,8 +155,8 @@ def _solve(options: argparse.Namespace) -> int:
     from ..geometry.path_guess import load
     from ..planning.options import PlanOptions
     from ..planning.plan import solve_with
+    from ..planning.plan_report import describe_plan
     from ..scene.ranges import find_unit_hint
-    from .summary import summarise
 
     output = options.output or _stem(options.problem) + ".npz"
     given = {
@@ -201,9 +201,9 @@ def _solve(options: argparse.Namespace) -> int:
     figures = None if table is None else {"file": options.torques, **table.figures}
     if options.json:
         extra = {} if figures is None else {"torques": figures}
-        print(json.dumps({**plan.meta, **extra}, indent=2))
+        print(json.dumps(plan.to_dict() | extra, indent=2))
     else:
-        print(found + summarise(plan, output, figures))
+        print(found + describe_plan(plan, output, figures).to_text())
     return 0
 
 

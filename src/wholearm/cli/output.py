@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ..common.document import Result
 from .progress import clear_progress
+
+if TYPE_CHECKING:
+    from ..common.document import Result
 
 
 def print_result(

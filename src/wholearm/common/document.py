@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any, NamedTuple
 
@@ -35,6 +35,15 @@ class Table(NamedTuple):
     rows: Sequence[Sequence[Any]]
     title: str = ""
     most: int | None = None
+
+    @staticmethod
+    def of(items: Iterable[Any], columns: Mapping[str, str], title: str = "") -> Table:
+        """A row for each item, with the attributes that columns are given by, such as ``a.b``.
+
+        Where there is no a there is no value.
+        """
+        rows = [[_find(item, name) for name in columns] for item in items]
+        return Table(list(columns.values()), rows, title)
 
     @property
     def heads(self) -> list[str]:
@@ -173,6 +182,10 @@ class Result:
         """What it is, in a line."""
         return self.document.head
 
+    def judge(self, name: str, reason: str, parts: Sequence[str | Table]) -> Document:
+        """The document of a result that holds or does not."""
+        return Document(name, "ok" if self.ok else "FAILED", reason, parts)
+
     def to_text(self) -> str:
         """Lines of text and aligned tables."""
         return self.document.to_text()
@@ -187,6 +200,12 @@ class Result:
 
     def __repr__(self) -> str:
         return write_brief(self)
+
+
+def _find(item: Any, name: str) -> Any:
+    for part in name.split("."):
+        item = None if item is None else getattr(item, part)
+    return item
 
 
 def show(value: Any, form: str, scale: float = 1.0) -> str:

@@ -67,6 +67,11 @@ class Contender:
         """Whether it holds, in a word."""
         return "ok" if self.ok else "FAILED"
 
+    @property
+    def place(self) -> str:
+        """The contact with the least margin, and its phase."""
+        return f"{self.contact}, phase {self.phase}" if self.contact else "-"
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison(Result):
@@ -97,23 +102,13 @@ class Comparison(Result):
     @property
     def summary(self) -> Table:
         """What each comes to."""
-        heads = ["", "verdict", "duration [s]:.5f", "effort [(N m)^2 s]:.5f"]
-        heads += ["least margin [N]:+z.5f", "of", "peak torques [N m]:.4f", "energy lost [J]:.5f"]
-        rows = [
-            (
-                own.name,
-                own.verdict,
-                own.duration,
-                own.effort,
-                own.margin,
-                f"{own.contact}, phase {own.phase}" if own.contact else "-",
-                own.peaks,
-                own.lost,
-                own.simulations,
-            )
-            for own in self.contenders
-        ]
-        return Table([*heads, "simulations:d"], rows)
+        columns = {
+            "name": "", "verdict": "verdict", "duration": "duration [s]:.5f",
+            "effort": "effort [(N m)^2 s]:.5f", "margin": "least margin [N]:+z.5f", "place": "of",
+            "peaks": "peak torques [N m]:.4f", "lost": "energy lost [J]:.5f",
+            "simulations": "simulations:d",
+        }  # fmt: skip
+        return Table.of(self.contenders, columns)
 
     @property
     def document(self) -> Document:

@@ -12,6 +12,34 @@ from .narrow import Moved
 from .trajectory import Trajectory
 from .tuning import TuningHelp
 
+_UNIQUENESS = {
+    "number": "phase:d", "uniqueness_margin.value": "uniqueness of forces:.4f",
+    "uniqueness_margin.contacts": "least of", "uniqueness_margin.time": "at t [s]:.5f",
+    "wedged": "wedged [ms]:.1f",
+}  # fmt: skip
+_CHANGES = {"phase": "phase:d", "what": "mode of", "kind": "", "time": "at t [s]:.5f"}
+_REDUCED = {
+    "phase": "phase:d", "time": "at t [s]:.5f", "Phi_1": "Phi_1 [kg m^2]:.6g",
+    "Phi_2": "Phi_2 [N m s]:.6g", "Phi_3": "Phi_3 [N m]:.6g",
+    "theta_1_dot": "theta_1' [rad/s]:.6g", "theta_1_ddot": "theta_1'' [rad/s^2]:.6g",
+    "residual": "residual [N m]:.1e",
+}  # fmt: skip
+_ENDS = {
+    "number": "phase:d", "until": "until", "end": "end", "arrival": "arrival [s]:.5f",
+    "arrival_rate": "rate [m/s, rad/s]:.1e", "end_speed": "left [m/s]:.1e",
+}  # fmt: skip
+_IMPACTS = {"impact.impulse": "least impulse [N s]:.4g", "impact.contact": "on"}
+_DEVIATIONS = {
+    "end_deviation.position": "end dev. [m]:.1e", "end_deviation.angle": "[rad]:.1e",
+    "deviation.position": "largest dev. [m]:.1e", "deviation.angle": "[rad]:.1e",
+}  # fmt: skip
+_ENERGIES = (
+    "work of the torques", "change of kinetic energy", "change of potential energy",
+    "viscous joint friction", "dry joint friction", "sliding friction", "contacts gained",
+    "residual",
+)  # fmt: skip
+"""Tables of a replay: columns by attributes, and what parts of the energy are called."""
+
 
 class ContactMargin(NamedTuple):
     """The least normal force of one contact in one phase.
@@ -339,55 +367,29 @@ class Report(Result):
         least = [own.least for phase in self.phases for own in phase.contacts]
         largest = max((force for force in least if not math.isnan(force)), default=0.0)
         force = fixed(self.epsilon or 1e-3 * largest)
-        return Document(
-            self.name,
-            "ok" if self.ok else "FAILED",
-            self.reason,
-            [
-                *lines,
-                self._list_losses(force),
-                Table(
-                    ["phase:d", "contact", f"least c_n [N]:{force}", f"margin [N]:+{force}",
-                     "at t [s]:.5f"],
-                    [(p.number, c.contact, c.least, c.margin, c.time)
-                     for p in self.phases for c in p.contacts],
-                ),
-                Table(
-                    ["phase:d", "rolling", f"least mu c_n - |c_t| [N]:+{force}", "at t [s]:.5f"],
-                    [(p.number, *own) for p in self.phases for own in p.rolling],
-                ),
-                self._list_phases(),
-                Table(
-                    ["phase:d", "uniqueness of forces:.4f", "least of", "at t [s]:.5f",
-                     "wedged [ms]:.1f"],
-                    [(p.number, *(p.uniqueness_margin or (None, "-", None)), p.wedged)
-                     for p in self.phases],
-                ),
-                Table(
-                    ["phase:d", "mode of", "", "at t [s]:.5f"],
-                    [(own.phase, own.what, own.kind, own.time) for own in self.changes],
-                ),
-                Table(
-                    ["phase:d", "at t [s]:.5f", "Phi_1 [kg m^2]:.6g", "Phi_2 [N m s]:.6g",
-                     "Phi_3 [N m]:.6g", "theta_1' [rad/s]:.6g", "theta_1'' [rad/s^2]:.6g",
-                     "residual [N m]:.1e"],
-                    [(own.phase, own.time, *own[2:], own.residual) for own in self.reduced],
-                ),
-                Table(
-                    ["energy", "[J]: .6e"],
-                    [
-                        ("work of the torques", self.energy.work),
-                        ("change of kinetic energy", self.energy.kinetic),
-                        ("change of potential energy", self.energy.potential),
-                        ("viscous joint friction", self.energy.viscous),
-                        ("dry joint friction", self.energy.dry),
-                        ("sliding friction", self.energy.contact),
-                        ("contacts gained", self.energy.impact),
-                        ("residual", self.energy.residual),
-                    ],
-                ),
-            ],
-        )  # fmt: skip
+        forces = [
+            (p.number, c.contact, c.least, c.margin, c.time)
+            for p in self.phases
+            for c in p.contacts
+        ]
+        slips = [(p.number, *own) for p in self.phases for own in p.rolling]
+        impacts = any(p.end == "impact" for p in self.phases)
+        planned = any(p.deviation is not None for p in self.phases)
+        ends = _ENDS | (_IMPACTS if impacts else {}) | (_DEVIATIONS if planned else {})
+        heads = ["phase:d", "contact", f"least c_n [N]:{force}", f"margin [N]:+{force}"]
+        slip = f"least mu c_n - |c_t| [N]:+{force}"
+        parts = [
+            *lines,
+            self._list_losses(force),
+            Table([*heads, "at t [s]:.5f"], forces),
+            Table(["phase:d", "rolling", slip, "at t [s]:.5f"], slips),
+            Table.of(self.phases, ends),
+            Table.of(self.phases, _UNIQUENESS),
+            Table.of(self.changes, _CHANGES),
+            Table.of(self.reduced, _REDUCED),
+            Table(["energy", "[J]: .6e"], list(zip(_ENERGIES, self.energy, strict=False))),
+        ]
+        return self.judge(self.name, self.reason, parts)
 
     def _list_losses(self, force: str) -> Table:
         """Forces where contacts are lost or slip, and what torques change of them."""
@@ -403,22 +405,3 @@ class Report(Result):
                 rows.append((loss.time, f"acceleration to {until}", f"{value:+.3f}", "", *per_tau))
         columns = ["at t [s]:.5f", "where lost", f"c_n [N]:+{force}", f"c_t [N]:+{force}"]
         return Table([*columns, "per N m of tau_1:+.3f", "of tau_2:+.3f"], rows)
-
-    def _list_phases(self) -> Table:
-        """How phases end, and how far from the plan."""
-        columns = ["phase:d", "until", "end", "arrival [s]:.5f", "rate [m/s, rad/s]:.1e"]
-        columns.append("left [m/s]:.1e")
-        planned = any(p.deviation is not None for p in self.phases)
-        impacts = any(p.end == "impact" for p in self.phases)
-        columns += ["least impulse [N s]:.4g", "on"] if impacts else []
-        if planned:
-            columns += ["end dev. [m]:.1e", "[rad]:.1e", "largest dev. [m]:.1e", "[rad]:.1e"]
-        rows = []
-        for p in self.phases:
-            row = [p.number, p.until, p.end, p.arrival, p.arrival_rate, p.end_speed]
-            if impacts:
-                row += [p.impact.impulse, p.impact.contact] if p.impact else [None, "-"]
-            for own in (p.end_deviation, p.deviation) if planned else ():
-                row += own[:2] if own else [None, None]
-            rows.append(row)
-        return Table(columns, rows)

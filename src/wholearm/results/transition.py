@@ -40,3 +40,8 @@ class Transition(NamedTuple):
     least_impulse_contact: str
     speed: float
     saves: float
+
+    @property
+    def stop(self) -> str:
+        """Why the motion stops there; empty if it does not."""
+        return "" if self.possible else f"stops: {self.reason}"

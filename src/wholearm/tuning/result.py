@@ -67,6 +67,16 @@ class PhaseTuning:
         """Its numbers, for people."""
         return name_numbers(self.number, self.last)
 
+    @property
+    def finger(self) -> str:
+        """The finger behind the motion, for people."""
+        return f"finger {self.acting}"
+
+    @property
+    def support(self) -> int | None:
+        """How many times the supporting torque is raised while braking; None if it is not."""
+        return self.supported or None
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tuning(Result):
@@ -137,30 +147,12 @@ class Tuning(Result):
     @property
     def document(self) -> Document:
         """The verdict with its reason, and a table of the phases."""
-        rows = [
-            (
-                phase.title,
-                phase.until,
-                f"finger {phase.acting}",
-                phase.quasistatic,
-                phase.raised,
-                phase.braked,
-                phase.supported or None,
-                phase.duration,
-                phase.rate,
-                phase.least,
-                phase.weakest or "-",
-                phase.simulations,
-            )
-            for phase in self.phases
-            if phase.acting
-        ]
-        heads = ["phase:d", "until", "acts", "from [N m]:.4f", "drive:+d", "brake:+d"]
-        heads += ["support:+d", "lasts [s]:.5f", "closing at:.2g", "least c_n [N]:.4f", "of"]
+        columns = {
+            "title": "phase:d", "until": "until", "finger": "acts",
+            "quasistatic": "from [N m]:.4f", "raised": "drive:+d", "braked": "brake:+d",
+            "support": "support:+d", "duration": "lasts [s]:.5f", "rate": "closing at:.2g",
+            "least": "least c_n [N]:.4f", "weakest": "of", "simulations": "simulations:d",
+        }  # fmt: skip
+        tuned = Table.of((phase for phase in self.phases if phase.acting), columns)
         last = "" if self.duration is None else f", {self.duration:.5f} s"
-        return Document(
-            self.name,
-            "ok" if self.ok else "FAILED",
-            self.reason,
-            [Table([*heads, "simulations:d"], rows), f"{self.simulations} simulations{last}"],
-        )
+        return self.judge(self.name, self.reason, [tuned, f"{self.simulations} simulations{last}"])

@@ -129,22 +129,21 @@ class FreeReport(Result):
         """The verdict with its reason, then what happened."""
         whole, lines = self.whole, [f"failure: {text}" for text in self.failures[1:]]
         form = fixed(1e-3 * max((s.least for s in whole.stretches if s.least > 0), default=0.0))
-        contacts = [(s.contact, s.start, s.stop, s.least, s.time) for s in whole.stretches]
         events = [
             (e.time, e.phase + 1, e.text.rpartition(" at t =")[0] or e.text) for e in whole.events
         ]
-        heads = ["contact", "presses from [s]:.6f", "to [s]:.6f", f"least c_n [N]:{form}"]
+        columns = {"contact": "contact", "start": "presses from [s]:.6f", "stop": "to [s]:.6f"}
+        columns |= {"least": f"least c_n [N]:{form}", "time": "at [s]:.6f"}
         told = "the whole from the start, by the clock" if self.alone else ""
-        return Document(
+        return self.judge(
             self.name,
-            "ok" if self.ok else "FAILED",
             self.reason,
             [
                 *lines,
                 *(f"warning: {text}" for text in self.warnings),
                 _list_phases(self.alone, "each phase from its planned start"),
                 _list_phases(self.phases, told),
-                Table([*heads, "at [s]:.6f"], contacts, most=MOST),
+                Table.of(whole.stretches, columns)._replace(most=MOST),
                 Table(["at t [s]:.6f", "phase:d", "event"], events, most=MOST),
                 f"residual of the contact problems {whole.residual:.1e}, of the energy "
                 f"{abs(whole.energies.residual).max():.1e} J; {whole.outcome.text}",
