@@ -45,7 +45,7 @@ from .viewer import add_animate, add_gallery, add_report
 
 if TYPE_CHECKING:
     from ..planning.result import Plan
-    from ..planning.table_check import Table
+    from ..planning.table_check import TorqueTable
     from ..policy.policy import Policy
     from ..problem.definition import Problem
     from ..results.report import Report
@@ -220,7 +220,7 @@ def _check_sampling(options: argparse.Namespace) -> None:
     require_sampling(options.sample_rate, options.interpolation or "linear")
 
 
-def _make_table(options: argparse.Namespace, plan: Plan) -> Table:
+def _make_table(options: argparse.Namespace, plan: Plan) -> TorqueTable:
     """The torque table that is asked for, replayed."""
     from ..planning.table_check import make_table, sample_table
 

@@ -97,7 +97,8 @@ class Table(NamedTuple):
     def to_markdown(self) -> str:
         """The table as Markdown."""
         rule = ["---:" if form else "---" for form in self.forms]
-        return "\n".join(f"| {' | '.join(line)} |" for line in (self.heads, rule, *self.cells))
+        lines = (" | ".join(map(_escape_bar, line)) for line in (self.heads, rule, *self.cells))
+        return "\n".join(f"| {line} |" for line in lines)
 
 
 class Document(NamedTuple):
@@ -200,6 +201,10 @@ class Result:
 
     def __repr__(self) -> str:
         return write_brief(self)
+
+
+def _escape_bar(text: str) -> str:
+    return text.replace("|", "\\|")
 
 
 def _find(item: Any, name: str) -> Any:
