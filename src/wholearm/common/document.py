@@ -169,6 +169,11 @@ class Result:
         raise NotImplementedError
 
     @property
+    def values(self) -> Any:
+        """What `to_dict` makes plain."""
+        return self
+
+    @property
     def ok(self) -> bool:
         """Whether everything holds that was looked at."""
         return True
@@ -193,8 +198,8 @@ class Result:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON, with None where there is no number."""
-        values: dict[str, Any] = plain(self)
-        return values
+        found: dict[str, Any] = plain(self.values)
+        return found
 
     def _repr_html_(self) -> str:
         return self.document.to_html()

@@ -12,7 +12,6 @@ import numpy as np
 
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError
-from ..common.plain import plain
 from ..policy.closed_loop import ROOM, ClosedLoop
 from ..policy.policy import Policy
 from ..problem.definition import Problem
@@ -21,7 +20,7 @@ from ..results.trajectory import Trajectory
 from .between import find_between
 from .departure import find_pairs
 from .replay import ENGINES, require_engine
-from .stretch import Run, Setting, Stretch, list_stretches, name_phases
+from .stretch import Run, Setting, Stretch, list_stretches
 
 ALLOWED = 1e-2
 """How far from the plan's a motion may end, over the scene's length and in rad: in soft contacts
@@ -74,50 +73,32 @@ class PolicyReport(Result):
         far = max(own.position / self.problem.scene.scales.length, own.angle)
         if not far <= self.allowed:
             text = f"{own.position * 1e3:.3g} mm and {math.degrees(own.angle):.3g} degrees"
-            return f"phase {name_phases(own.stretch)} ends {text} away from the plan"
+            return f"phase {own.stretch.name} ends {text} away from the plan"
         if not own.over:
-            return f"phase {name_phases(own.stretch)} does not end within {own.duration:.4g} s"
+            return f"phase {own.stretch.name} does not end within {own.duration:.4g} s"
         return None
 
     @property
     def document(self) -> Document:
         """Durations beside those of the plan, and where stretches end."""
-        rows = [
-            (
-                name_phases(own.stretch),
-                own.stretch.stop - own.stretch.start,
-                own.duration,
-                own.position,
-                own.angle,
-                own.gap,
-                own.contact,
-            )
-            for own in self.arrivals
-        ]
-        heads = ["phase:d", "plan [s]:.6f", "policy [s]:.6f", "end off [mm]:.4f", "[deg]:.4f"]
-        return Document(
-            f"{self.problem.name} in {self.title}, by the policy",
-            "ok" if self.ok else "FAILS",
-            parts=[
-                *(self.find_failure(own) or "" for own in self.arrivals),
-                Table([*heads, "largest gap [mm]:.4f", ""], rows),
-            ],
-        )
+        columns = {
+            "stretch.name": "phase:d", "stretch.duration": "plan [s]:.6f",
+            "duration": "policy [s]:.6f", "position": "end off [mm]:.4f", "angle": "[deg]:.4f",
+            "gap": "largest gap [mm]:.4f", "contact": "",
+        }  # fmt: skip
+        failures = [self.find_failure(own) or "" for own in self.arrivals]
+        title = f"{self.problem.name} in {self.title}, by the policy"
+        verdict, table = "ok" if self.ok else "FAILS", Table.of(self.arrivals, columns)
+        return Document(title, verdict, parts=[*failures, table])
 
-    def to_dict(self) -> dict[str, Any]:
+    @property
+    def values(self) -> dict[str, Any]:
         """The report for machines, in m, rad and s."""
-        stretches = []
-        for own in self.arrivals:
-            values = {"phases": [index + 1 for index in own.stretch.phases], **own._asdict()}
-            del values["stretch"]
-            stretches.append(plain(values))
-        return {
-            "problem": self.problem.name,
-            "engine": self.title,
-            "ok": self.ok,
-            "allowed": self.allowed,
-            "stretches": stretches,
-        }
+        stretches = [{"phases": own.stretch.numbers, **own._asdict()} for own in self.arrivals]
+        for own in stretches:
+            del own["stretch"]
+        values = {"problem": self.problem.name, "engine": self.title, "ok": self.ok}
+        return {**values, "allowed": self.allowed, "stretches": stretches}
 
 
 def play_policy(
@@ -161,7 +142,7 @@ def play_policy(
     arrivals = []
     for stretch in _join(list_stretches(find_between(plan), False), policy, whole):
         if progress is not None:
-            progress(f"phase {name_phases(stretch)} in {known.title}")
+            progress(f"phase {stretch.name} in {known.title}")
         last = stretch.phases[-1] + 1
         loop = ClosedLoop(policy.cut(last), stretch.phases[0] + 1)
         until = stretch.start + (1 + ROOM) * loop.find_duration(last)

@@ -14,14 +14,13 @@ import numpy as np
 
 from ..common.document import Document, Result, Table
 from ..common.errors import InputError
-from ..common.plain import plain
 from ..problem.definition import Problem
 from ..results.narrow import Moved, adopt_motion, require_same_phases
 from ..results.trajectory import Trajectory
 from .applied import apply_friction
 from .between import find_between
 from .departure import PRESS, Departure, compare
-from .stretch import Engine, Setting, Stretch, list_stretches, name_phases
+from .stretch import Engine, Setting, Stretch, list_stretches
 
 PARTS = 5
 """Equal parts of a stretch at whose ends the error is listed."""
@@ -108,7 +107,7 @@ class EngineReport(Result):
             at = np.linspace(stretch.start, stretch.stop, PARTS + 1)[1:]
             largest = np.max(found.position), np.max(found.angle)
             over = np.interp(at, found.t, found.position)
-            errors.append([name_phases(stretch), stretch.stop - stretch.start, *largest, *over])
+            errors.append([stretch.name, stretch.duration, *largest, *over])
             for force in found.forces:
                 off = force.off if force.planned > PRESS * scales.force else None
                 forces.append((force.phase, force.contact, force.planned, force.found, off))
@@ -116,68 +115,61 @@ class EngineReport(Result):
             farthest = [np.max(found.position) for found in level.departures]
             levels.append([level.setting.step * scales.time, level.setting.softness, *farthest])
         shares = [f"{k / PARTS:.0%} [mm]:.4f" for k in range(1, PARTS + 1)]
-        names = [f"{name_phases(stretch)} [mm]:.4f" for stretch in self.stretches]
-        heads = ["phase:d", "contact", "planned mean c_n [N]:.4f", "found [N]:.4f", "off [%]:+.2f"]
+        names = [f"{stretch.name} [mm]:.4f" for stretch in self.stretches]
+        heads = ["phase:d", "duration [s]:.6f", "largest [mm]:.4f", "[deg]:.4f", *shares]
+        other = ["phase:d", "contact", "planned mean c_n [N]:.4f", "found [N]:.4f", "off [%]:+.2f"]
+        lost = [
+            f"phase {stretch.name} {says} at t = {found.time:.5g} s: {found.reason}"
+            for stretch, found in pairs
+            if found.time is not None
+        ]
+        settings = f"steps of up to {setting.step * scales.time:.3g} s, softness "
+        settings += f"{setting.softness:g}; torques contain the dry friction of the joints, with "
+        tables = Table(heads, errors), Table(other, forces)
         return Document(
             f"{self.problem.name} in {self.title}",
             "ok" if self.ok else "DEPARTS" if self.converged else "NOT CONVERGED",
             f"within {worst:.4f} mm and {turned:.4f} degrees of the plan "
             f"(allowed {millimetres:.4g} mm, {degrees:.3g} degrees)",
             [
-                *(
-                    f"phase {name_phases(stretch)} {says} at t = {found.time:.5g} s: {found.reason}"
-                    for stretch, found in pairs
-                    if found.time is not None
-                ),
-                f"steps of up to {setting.step * scales.time:.3g} s, softness "
-                f"{setting.softness:g}; torques contain the dry friction of the joints, with its "
-                "planned signs",
-                Table(
-                    ["phase:d", "duration [s]:.6f", "largest [mm]:.4f", "[deg]:.4f", *shares],
-                    errors,
-                ),
-                Table(heads, forces),
+                *lost,
+                f"{settings}its planned signs",
+                *tables,
                 Table(["step [s]:.3g", "softness:g", *names], levels),
             ],
         )
 
-    def to_dict(self) -> dict[str, Any]:
+    @property
+    def values(self) -> dict[str, Any]:
         """The report for machines, in m, rad, s and N; null where an engine fails."""
         scales = self.problem.scene.scales
-        levels = [
-            {
-                "step": level.setting.step * scales.time,
-                "softness": level.setting.softness,
-                "stretches": [
-                    {
-                        "phases": [index + 1 for index in stretch.phases],
-                        "start": stretch.start,
-                        "stop": stretch.stop,
-                        "largest": {"position": found.position.max(), "angle": found.angle.max()},
-                        "departs": None
-                        if found.time is None
-                        else {"time": found.time, "reason": found.reason},
-                        "forces": found.forces,
-                        "t": found.t,
-                        "position": found.position,
-                        "angle": found.angle,
-                    }
-                    for stretch, found in zip(self.stretches, level.departures, strict=True)
-                ],
-            }
-            for level in self.levels
-        ]
-        values: dict[str, Any] = plain(
-            {
-                "problem": self.problem.name,
-                "engine": self.title,
-                "ok": self.ok,
-                "converged": self.converged,
-                "allowed": {"position": self.allowed * scales.length, "angle": self.allowed},
-                "levels": levels,
-            }
-        )
-        return values
+        return {
+            "problem": self.problem.name,
+            "engine": self.title,
+            "ok": self.ok,
+            "converged": self.converged,
+            "allowed": {"position": self.allowed * scales.length, "angle": self.allowed},
+            "levels": [
+                {
+                    "step": level.setting.step * scales.time,
+                    "softness": level.setting.softness,
+                    "stretches": list(map(_describe, self.stretches, level.departures)),
+                }
+                for level in self.levels
+            ],
+        }
+
+
+def _describe(stretch: Stretch, found: Departure) -> dict[str, Any]:
+    departs = {"time": found.time, "reason": found.reason}
+    return {
+        "phases": stretch.numbers,
+        "start": stretch.start,
+        "stop": stretch.stop,
+        "largest": {"position": found.position.max(), "angle": found.angle.max()},
+        "departs": None if found.time is None else departs,
+        **{name: getattr(found, name) for name in ("forces", "t", "position", "angle")},
+    }
 
 
 def require_engine(name: str) -> Engine:
@@ -244,7 +236,7 @@ def replay_in(
         found = []
         for stretch in stretches:
             if progress is not None:
-                progress(f"phase {name_phases(stretch)} in {known.title}, step {own.step:.3g}")
+                progress(f"phase {stretch.name} in {known.title}, step {own.step:.3g}")
             run = play(problem, stretch, torque, own)
             found.append(compare(problem, plan, stretch, run, allowed))
         levels.append(Level(own, tuple(found)))

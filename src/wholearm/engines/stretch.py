@@ -45,6 +45,21 @@ class Stretch(NamedTuple):
     z_ddot: Array
     c_n: Mapping[str, float]
 
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of its phases, from 1."""
+        return [index + 1 for index in self.phases]
+
+    @property
+    def name(self) -> str:
+        """Numbers of the phases, first to last."""
+        return "-".join(map(str, dict.fromkeys((self.numbers[0], self.numbers[-1]))))
+
+    @property
+    def duration(self) -> float:
+        """How long it is planned to last [s]."""
+        return self.stop - self.start
+
 
 class Setting(NamedTuple):
     """How finely an engine computes.
@@ -149,9 +164,3 @@ def _average(torque: TorqueProfile, start: float, h: float, count: int) -> Array
     places = (np.arange(count * _LOOKS) + 0.5) * (h / _LOOKS) - h / 2
     places = start + np.maximum(places, _LEAST * h)
     return np.asarray(torque.at(places).reshape(count, _LOOKS, 2).mean(axis=1))
-
-
-def name_phases(stretch: Stretch) -> str:
-    """Numbers of the phases, first to last."""
-    ends = dict.fromkeys((stretch.phases[0] + 1, stretch.phases[-1] + 1))
-    return "-".join(map(str, ends))

@@ -200,15 +200,16 @@ class Plan(Result):
         return self.trajectory.meta
 
     @property
+    def values(self) -> Mapping[str, Any]:
+        """The same, for JSON."""
+        return self.meta
+
+    @property
     def document(self) -> Document:
         """Phases, what the replay has shown and what is known of the value."""
         from .plan_report import describe_plan
 
         return describe_plan(self)
-
-    def to_dict(self) -> dict[str, Any]:
-        """The plan in plain values, as its file has them."""
-        return dict(self.meta)
 
     def at(self, t: ArrayLike) -> Samples:
         """The motion at some times [s]; see `Trajectory.at`."""

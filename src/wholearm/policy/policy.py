@@ -134,7 +134,8 @@ class Policy(Result):
             lines.append(f"{text}plan's (by phase: {factors})")
         return Document("", parts=[Table([*heads, "least of each contact"], rows), *lines])
 
-    def to_dict(self) -> dict[str, Any]:
+    @property
+    def values(self) -> dict[str, Any]:
         """What the policy is of, but for the problem, as plain values."""
         return {key: value for key, value in self.about.items() if key != "problem"}
 

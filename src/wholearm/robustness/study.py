@@ -24,7 +24,6 @@ from ..common.bounds import Bounds
 from ..common.crowd import DiedError, run_all
 from ..common.document import Document, Result, Table
 from ..common.journal import Journal
-from ..common.plain import plain
 from ..common.workers import Spawning
 from ..policy.policy import Policy
 from ..problem.definition import Problem
@@ -120,53 +119,43 @@ class Robustness(Result):
         for own in least.of:
             width = f"{own.width:g} {own.unit}" if own.unit else f"{100 * own.width:g} %"
             slope = f"{own.slope:.5g} N{'/' + own.unit if own.unit else ''}"
-            known = own.slope == own.slope
-            rows.append(
-                (own.name, width, slope if known else "a contact is lost at once", own.over_range)
-            )
+            slope = slope if own.slope == own.slope else "a contact is lost at once"
+            rows.append((own.name, width, slope, own.over_range))
         heads = ["parameter", "range (+-)", "d(least c_n)/d:.5g", "over the range [N]:.4g"]
+        missed = "" if self.nominal["reached"] else _name_miss(self.nominal)
+        place_of = f" on {least.contact} at t = {least.time:.4g} s"
         return Document(
             f"{trial.problem.name}, {place}",
             reason=f"{many} samples, seed {self.seed}",
             parts=[
                 Table(["", "share of the samples"], shares),
-                ""
-                if self.nominal["reached"]
-                else f"without anything off the goal is missed too: by {_name_miss(self.nominal)}",
+                f"without anything off the goal is missed too: by {missed}" if missed else "",
                 Table(["contact lost first", "share of the samples"], lost[:_ROWS] + others),
                 *(f"{count} ended early: {text}" for text, count in ended.most_common(3)),
-                f"least c_n: {least.c_n:.4g} N on {least.contact} at t = {least.time:.4g} s"
-                if least.contact
-                else "",
+                f"least c_n: {least.c_n:.4g} N{place_of}" if least.contact else "",
                 Table(heads, rows),
             ],
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, with None where there is no number."""
+    @property
+    def values(self) -> dict[str, Any]:
+        """Counts, shares and sensitivities, as JSON has them."""
         trial, least = self.trial, self.sensitivities
-        first = {name: _list_share(share) for name, share in self.first_lost.items()}
-        of = [
-            {"parameter": own.name, "unit": own.unit, "range": own.width, "slope": own.slope}
-            for own in least.of
-        ]
-        values: dict[str, Any] = plain(
-            {
-                "problem": trial.problem.name,
-                "phases": [window.phase for window in trial.windows],
-                "samples": len(self.records),
-                "seed": self.seed,
-                "ranges": trial.uncertainty.widths,
-                "sample_rate": trial.uncertainty.sample_rate,
-                "reached": _list_share(self.reached),
-                "kept": _list_share(self.kept),
-                "first_lost": first,
-                "least_c_n": {"contact": least.contact, "time": least.time, "c_n": least.c_n},
-                "sensitivities": of,
-                "nominal": {key: own for key, own in self.nominal.items() if key != "path"},
-            }
-        )
-        return values
+        keys = ("parameter", "unit", "range", "slope")
+        return {
+            "problem": trial.problem.name,
+            "phases": [window.phase for window in trial.windows],
+            "samples": len(self.records),
+            "seed": self.seed,
+            "ranges": trial.uncertainty.widths,
+            "sample_rate": trial.uncertainty.sample_rate,
+            "reached": _list_share(self.reached),
+            "kept": _list_share(self.kept),
+            "first_lost": {name: _list_share(share) for name, share in self.first_lost.items()},
+            "least_c_n": {"contact": least.contact, "time": least.time, "c_n": least.c_n},
+            "sensitivities": [dict(zip(keys, own, strict=True)) for own in least.of],
+            "nominal": {key: own for key, own in self.nominal.items() if key != "path"},
+        }
 
 
 def _name_miss(record: dict[str, Any]) -> str:

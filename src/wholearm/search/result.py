@@ -62,8 +62,9 @@ class Alternative(Result):
         """What is known of it, in lines."""
         return [f"{self.plan.value:.6f} {self.plan.unit}, {self.plan.duration:.6f} s"]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain values."""
+    @property
+    def values(self) -> dict[str, Any]:
+        """Everything that JSON has."""
         phases = list(self.problem.table.get("phases", []))
         return {"value": self.plan.value, "duration": self.plan.duration, "phases": phases}
 
@@ -148,16 +149,17 @@ class Answer(Alternative):
         lines.append(f"{tried}, {len(self.failures)} routes without a plan")
         return [*lines, NOT_CONSIDERED]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain values."""
+    @property
+    def values(self) -> dict[str, Any]:
+        """Everything that JSON has."""
         return {
-            **super().to_dict(),
+            **super().values,
             "unit": self.plan.unit,
             "bound": None if self.bound is None else self.bound.value,
             "gap": self.gap,
             "complete": self.complete,
             "in_cells": self.route.in_cells,
-            "alternatives": [other.to_dict() for other in self.alternatives],
+            "alternatives": [other.values for other in self.alternatives],
             "failures": [failure.reason for failure in self.failures],
             "blocked": [_describe_blocked(own) for own in self.blocked],
             "not_considered": NOT_CONSIDERED,

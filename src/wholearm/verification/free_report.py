@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from ..common.document import Document, Result, Table, fixed
-from ..common.plain import plain
 from ..free_simulation.result import FreeSimulation
 from ..results.report import Deviation
 from ..results.trajectory import Trajectory
@@ -99,30 +98,24 @@ class FreeReport(Result):
             f"{position:.1e} m and {angle:.1e} rad of the plan"
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain values for JSON, with None where there is no number."""
+    @property
+    def values(self) -> dict[str, Any]:
+        """Everything that JSON has."""
         whole = self.whole
-        energies = {name: float(values[-1]) for name, values in whole.energies._asdict().items()}
-        events = [{**e._asdict(), "kind": e.kind.value, "phase": e.phase + 1} for e in whole.events]
-        values: dict[str, Any] = plain(
-            {
-                "ok": self.ok,
-                "exit_status": self.exit_status,
-                "reason": self.reason,
-                "name": self.name,
-                "failures": self.failures,
-                "warnings": self.warnings,
-                "phases_alone": self.alone,
-                "phases": self.phases,
-                "outcome": whole.outcome.text,
-                "events": events,
-                "contacts": whole.stretches,
-                "energy": {**energies, "residual": float(whole.energies.residual[-1])},
-                "residual": whole.residual,
-                "steps": whole.steps,
-            }
-        )
-        return values
+        energies = {name: values[-1] for name, values in whole.energies._asdict().items()}
+        return {
+            **{key: getattr(self, key) for key in ("ok", "exit_status", "reason", "name")},
+            "failures": self.failures,
+            "warnings": self.warnings,
+            "phases_alone": self.alone,
+            "phases": self.phases,
+            "outcome": whole.outcome.text,
+            "events": [{**e._asdict(), "phase": e.phase + 1} for e in whole.events],
+            "contacts": whole.stretches,
+            "energy": {**energies, "residual": whole.energies.residual[-1]},
+            "residual": whole.residual,
+            "steps": whole.steps,
+        }
 
     @property
     def document(self) -> Document:
