@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
+from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from .brief import write_brief
 from .plain import plain
 
+LONGEST = 100
+"""Characters of a `repr`."""
 SCALES = {"mm": 1e3, "mm/s": 1e3, "ms": 1e3, "deg": 180 / math.pi, "%": 1e2}
 """What numbers in SI units are multiplied by in a column of that unit."""
 
@@ -152,7 +155,35 @@ class Document(NamedTuple):
         return "\n".join(parts)
 
 
-class Result:
+class Brief:
+    """What is one line as a `repr`."""
+
+    @property
+    def headline(self) -> str:
+        """What it is, in a line."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        line = f"{type(self).__name__}({self.headline})"
+        return line if len(line) <= LONGEST else f"{line[: LONGEST - 4]}...)"
+
+
+class Drawn(Brief):
+    """A motion or a map, which is a picture in notebooks: SVG under its line."""
+
+    def _repr_html_(self) -> str:
+        name, function = "plots", "force_margins"
+        if hasattr(self, "crossings"):
+            name, function = "formation_map", "draw_map"
+        # Figures stand on everything else, so that nothing loads them before it is drawn.
+        figure = getattr(import_module(f"wholearm.figures.{name}"), function)(self)
+        stream = io.StringIO()
+        figure.savefig(stream, format="svg")
+        picture = stream.getvalue()
+        return f"<p>{escape(repr(self))}</p>{picture[picture.index('<svg') :]}"
+
+
+class Result(Brief):
     """A result that says what it is by its `document`; rendering is the same for all.
 
     Attributes
@@ -203,9 +234,6 @@ class Result:
 
     def _repr_html_(self) -> str:
         return self.document.to_html()
-
-    def __repr__(self) -> str:
-        return write_brief(self)
 
 
 def _escape_bar(text: str) -> str:

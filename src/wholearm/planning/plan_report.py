@@ -76,7 +76,7 @@ def _list_modes(plan: Plan) -> Table:
             if phase.sequences and mode is phase.modes[-1]:
                 text += f"; best of {phase.sequences} sequences of modes"
             rows.append((phase.number, mode.start, mode.stop, text))
-    heads = ["phase:d", "from [s]:.4f", "to [s]:.4f", "what slides"]
+    heads = ["phase:d", "from [s]:.4f", "to [s]:.4f", "contact modes"]
     return Table(heads, rows, "modes, from the start of each phase")
 
 

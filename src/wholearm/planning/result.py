@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
-from ..common.brief import draw_html
-from ..common.document import Document, Result
+from ..common.document import Document, Drawn, Result
 from ..problem.definition import Problem
 from ..results.certificate import Certificate
 from ..results.modes import ModeSpan
@@ -120,7 +119,7 @@ class Timings(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Plan(Result):
+class Plan(Drawn, Result):
     """A planned motion with what it was asked and what is known about it.
 
     Attributes
@@ -158,8 +157,6 @@ class Plan(Result):
     versions: Mapping[str, str]
     certificate: Certificate | None = None
     ranges: RangeFigures | None = None
-
-    _repr_html_ = draw_html
 
     @property
     def headline(self) -> str:

@@ -332,11 +332,6 @@ class Report(Result):
     derived = ("ok", "exit_status", "reason")
 
     @property
-    def headline(self) -> str:
-        """The verdict, in a line."""
-        return f"{self.name!r}: {'ok' if self.ok else 'FAILED'}: {self.reason}"
-
-    @property
     def trajectory(self) -> Trajectory:
         """The replayed motion, to be saved and drawn like a plan."""
         assert self.replay is not None
@@ -378,7 +373,7 @@ class Report(Result):
         ends = _ENDS | (_IMPACTS if impacts else {}) | (_DEVIATIONS if planned else {})
         heads = ["phase:d", "contact", f"least c_n [N]:{force}", f"margin [N]:+{force}"]
         slip = f"least mu c_n - |c_t| [N]:+{force}"
-        parts = [
+        parts: list[str | Table] = [
             *lines,
             self._list_losses(force),
             Table([*heads, "at t [s]:.5f"], forces),
