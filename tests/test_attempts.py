@@ -92,7 +92,7 @@ def tried(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> li
         return Solution(attempt.stages, 1.0, 0.0, "Ipopt stopped", success, nlp, {})
 
     monkeypatch.setattr(time_plan, "solve_attempt", pretend)
-    monkeypatch.setattr(time_plan, "_find_short", lambda *_: (None, []))
+    monkeypatch.setattr(time_plan, "find_short", lambda *_: (None, []))
     monkeypatch.setattr(time_plan, "list_plans", lambda *given: [given[-1]])
     return names
 
@@ -108,7 +108,8 @@ def tried(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> li
 )
 def test_a_plan_names_the_attempt_that_led_to_it(tried: list[str], order: list[str]) -> None:
     problem, _ = shove()
-    assert plan_phases(problem, problem.phases, problem.start, OPTIONS) == [order[-1]]
+    plans: list[Any] = plan_phases(problem, problem.phases, problem.start, OPTIONS)
+    assert plans == [order[-1]]
     assert tried == order
 
 
@@ -118,7 +119,7 @@ def test_attempts_end_where_motions_of_two_are_short_of_limits(
 ) -> None:
     """Before that all are made; what is like what is short is first asked what it is short of."""
     problem, _ = shove()
-    with pytest.raises(SolverError, match="did not converge from 5 initial guesses"):
+    with pytest.raises(SolverError, match="from 5 guesses"):
         plan_phases(problem, problem.phases, problem.start, OPTIONS, explained=False)
     assert tried == [NEAREST, NEAREST + GRADUAL, *AHEAD]
     asked = list[object]()
@@ -128,8 +129,8 @@ def test_attempts_end_where_motions_of_two_are_short_of_limits(
         return given[2], given[2]
 
     tried.clear()
-    monkeypatch.setattr(time_plan, "_find_short", find_short)
-    monkeypatch.setattr(time_plan, "_explain", lambda *_: InfeasibleError("short"))
+    monkeypatch.setattr(time_plan, "find_short", find_short)
+    monkeypatch.setattr(time_plan, "explain_lost", lambda *_: InfeasibleError("short"))
     with pytest.raises(InfeasibleError, match="short"):
         plan_phases(problem, problem.phases, problem.start, OPTIONS, explained=False)
     assert tried == [NEAREST, NEAREST + GRADUAL] and len(asked) == time_plan.CONVINCING == 2

@@ -173,10 +173,6 @@ def test_what_is_no_plan_is_an_error(
         ("slides", {"objective": "time"}),
         ("slides", {"objective": "margin"}),
         ("impacts", {"objective": "time"}),
-        (
-            "impacts",
-            {"objective": "time", "transcription": "time", "time_intervals": 4, "replay": False},
-        ),
     ],
 )
 def test_every_solve_is_counted_once(

@@ -30,6 +30,7 @@ from .bench import add_bench, name_study
 from .compare import compare
 from .completion import add_completion
 from .engines import add_export, add_replay
+from .help import add_help
 from .map import draw, protect
 from .new import add_new, add_schema
 from .origin import tell_origin
@@ -130,6 +131,7 @@ def build_parser() -> argparse.ArgumentParser:
         ("animate", add_animate, None, "make a movie of a plan, or a page that plays it"),
         ("report", add_report, None, "put a problem and its plans into one page to open anywhere"),
         ("gallery", add_gallery, None, "plan problems and show them all on one page"),
+        ("help", add_help, None, "print a page of the documentation, or list its topics"),
         ("completion", add_completion, None, "print what makes a shell complete all this"),
         ("bench", add_bench, None, "measure run time against error, or run the stress study"),
     ):

@@ -13,7 +13,7 @@ from .trajectory import Trajectory
 from .tuning import TuningHelp
 
 _UNIQUENESS = {
-    "number": "phase:d", "uniqueness_margin.value": "uniqueness of forces:.4f",
+    "number": "phase:d", "uniqueness_margin.value": "uniqueness margin:.4f",
     "uniqueness_margin.contacts": "least of", "uniqueness_margin.time": "at t [s]:.5f",
     "wedged": "wedged [ms]:.1f",
 }  # fmt: skip

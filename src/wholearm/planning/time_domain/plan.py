@@ -184,7 +184,7 @@ def _look_further(
         return list_plans(problem, search, phases, last.solution, last.name)
     if not any(own.short for own in outcomes):
         refuse_pinned(search, problem, phases, moved)
-    raise _explain(search, problem, attempts, outcomes, replan if explained else None)
+    raise explain_lost(search, problem, attempts, outcomes, replan if explained else None)
 
 
 def _begin(
@@ -258,7 +258,7 @@ def _try_all(
             break
     looked = not begun.is_lost and any(own.name == NEAREST for own in outcomes)
     if not (looked or outcomes[-1].solution.success or any(own.short for own in outcomes)):
-        short = _find_short(search, problem, attempts.first.stages)[1]
+        short = find_short(search, problem, attempts.first.stages)[1]
         outcomes.append(_Outcome(NEAREST, begun, short))
     return outcomes
 
@@ -277,15 +277,15 @@ def _try(search: Search, problem: Problem, attempt: Attempt, known: Solution | N
     # What coarse intervals are not short of, finer ones may be.
     lost = solution.is_lost
     stages = halve(solution.stages, search.scheme) if lost else attempt.stages
-    elastic, short = _find_short(search, problem, stages)
+    elastic, short = find_short(search, problem, stages)
     if elastic is not None and not short and not lost:
         solution = solve_attempt(search, attempt._replace(stages=elastic))
         if not solution.success:
-            short = _find_short(search, problem, halve(elastic, search.scheme))[1]
+            short = find_short(search, problem, halve(elastic, search.scheme))[1]
     return _Outcome(attempt.name, solution, short)
 
 
-def _find_short(
+def find_short(
     search: Search, problem: Problem, stages: list[Stage]
 ) -> tuple[list[Stage] | None, list[Stage]]:
     """The motion with the least shortfalls, if one is found, and again if it is short at all."""
@@ -297,7 +297,7 @@ def _find_short(
     return elastic, elastic
 
 
-def _explain(
+def explain_lost(
     search: Search,
     problem: Problem,
     attempts: Attempts,
