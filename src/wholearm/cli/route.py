@@ -94,6 +94,7 @@ def _warn(message: Warning | str, *_: object, **__: object) -> None:
 
 
 def hasten() -> None:
+    """Say that the best route so far is being planned; raises where the command was terminated."""
     from ..common.interrupts import check
 
     # After SIGTERM nothing is planned any more.

@@ -12,7 +12,7 @@ it is a better guess, or says why there is no plan.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple
@@ -99,12 +99,18 @@ def plan_phases(
     known = _go_on(search, attempts, begun[0]) if begun else None
     if known is not None:
         return list_plans(problem, search, phases, known, begun[0].attempt)
-    first, name = _begin(search, attempts.first, fastest, pinned)
-    if first.success:
-        return list_plans(problem, search, phases, first, name)
-    moved = approach(search, problem, phases, z)
-    if moved.solution is not None:
-        return list_plans(problem, search, phases, moved.solution, MOVED)
+    begin = attempts.begin()
+    for attempt in begin:
+        first, name = _begin(search, attempt, fastest, pinned)
+        if first.success:
+            break
+    # Straight to a pinned end modes may be found that are not the best: phase 3 of query 33.
+    enough = first.success and (len(begin) == 1 or bool(fastest))
+    moved = Approach() if enough else approach(search, problem, phases, z)
+    found = [(own, how) for own, how in ((first, name), (moved.solution, MOVED)) if own]
+    if any(own.success for own, _ in found):
+        best = min((own for own in found if own[0].success), key=lambda own: own[0].cost)
+        return list_plans(problem, search, phases, *best)
     return _look_further(search, attempts, problem, phases, first, moved, explained)
 
 
@@ -134,13 +140,10 @@ def try_phases(
     own = replace(options, mode_search=False)
     search = Search.of(problem, own, None, None, math.inf, True)
     attempts = Attempts(problem, phases, z, search, None, further > 0)
-    straight = None if goal is None else attempts.towards(goal)
-    begin = [straight] if straight else []
-    first = (attempts.first for _ in range(straight is None or further > 0))
-    guesses: Iterable[Attempt] = chain(begin, first, attempts.list_further(further))
+    begin = attempts.begin(goal)[: None if further else 1]
     if hurried:
-        guesses = [own._replace(most=FEW) for own in (begin if goal is not None else first)]
-    for attempt in guesses:
+        begin = [own._replace(most=FEW) for own in begin]
+    for attempt in chain(begin, attempts.list_further(further)):
         solution = solve_attempt(search, attempt)
         if solution.success:
             return _list_begun(problem, search, phases, solution, attempt.name, options)
