@@ -20,8 +20,8 @@ import wholearm
 from shipped import BOX, HEPTAGON, IMPACTS, plan_of, solved
 from tipping import scale, tipped
 from wholearm.cli.command import build_parser, main
-from wholearm.cli.summary import summarise
 from wholearm.planning.options import PlanOptions
+from wholearm.planning.plan_report import describe_plan
 from wholearm.results.torque_table import format_rows, place_rows
 from wholearm.results.trajectory import Trajectory
 from wholearm.results.trajectory_file import load_trajectory
@@ -100,7 +100,7 @@ def test_solve_writes_the_plan(folder: Path, capsys: pytest.CaptureFixture[str])
     assert main(arguments) == 0
     out, err = capsys.readouterr()
     assert err == ""
-    lines = out.splitlines()
+    lines = list(filter(None, out.splitlines()))
     assert len(lines) == 7 and lines[0].split()[:2] == ["phase", "duration"]
     plan = load_trajectory("a.npz")
     shown = [float(line.split()[1]) for line in lines[1:3]]
@@ -149,7 +149,7 @@ def test_solve_writes_samples_and_what_becomes_of_them(
     first = capsys.readouterr().out.splitlines()[0]
     assert figures["replay"]["reason"].split(" at t = ")[0] in first
     assert main([*command, *given]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = list(filter(None, capsys.readouterr().out.splitlines()))
     assert f"{kind} at 200 Hz; its replay " in lines[4]
     assert lines[5].split("  ") == [
         "phase", "arrival [s]", "planned [s]", "least c_n [N]", "planned [N]", "contact"
@@ -182,7 +182,7 @@ def test_solve_without_a_replay(folder: Path, capsys: pytest.CaptureFixture[str]
     path = write_problem(folder, keep(1))
     command = ["solve", path, "-o", "a.npz", "--intervals", "20", "--no-replay"]
     assert main([*command, "--torques", "a.csv"]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = list(filter(None, capsys.readouterr().out.splitlines()))
     assert lines[2] == "the plan was not replayed" and lines[3].endswith(" rows")
     assert load_trajectory("a.npz").meta["replay"] is None
 
@@ -195,7 +195,7 @@ def test_solve_names_its_output_after_the_problem(folder: Path) -> None:
 def test_solve_lists_the_impacts(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plan = solved(IMPACTS)
     plan.save("a.npz")
-    lines = summarise(plan, "a.npz").splitlines()
+    lines = describe_plan(plan, "a.npz").to_text().splitlines()
     assert lines[6] == lines[12] == ""
     assert lines[7].split("  ")[0].strip() == "after phase" and lines[7].endswith("saves [s]")
     rows = plan.meta["transitions"]

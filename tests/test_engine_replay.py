@@ -18,7 +18,6 @@ from wholearm.engines.departure import Departure
 from wholearm.engines.drive import Drive
 from wholearm.engines.mjcf import write_mjcf
 from wholearm.engines.replay import EngineReport, Level, list_settings, replay_in, require_engine
-from wholearm.engines.report_text import to_dict, write
 from wholearm.engines.stretch import Setting, list_stretches
 from wholearm.planning.plan import solve
 from wholearm.planning.result import Plan
@@ -47,11 +46,11 @@ def test_an_engine_keeps_to_the_plan(engine: str) -> None:
     pytest.importorskip(EXTRAS[engine], reason=f"wholearm[{engine}] is not installed")
     problem, plan = slide()
     report = replay_in(engine, problem, plan, setting=COARSE)
-    assert report.ok and report.exit_status == 0, write(report)
+    assert report.ok and report.exit_status == 0, report.to_text()
     (found,) = report.levels[0].departures
     assert found.position.max() < 1e-4 and found.angle.max() < 3.5e-3
     assert max(abs(force.off) for force in found.forces if force.planned > 0.5) < 0.02
-    figures = to_dict(report)
+    figures = report.to_dict()
     assert json.loads(json.dumps(figures)) == figures
     (stretch,) = figures["levels"][0]["stretches"]
     assert stretch["phases"] == [1] and len(stretch["t"]) == len(stretch["position"])
@@ -117,7 +116,7 @@ def test_an_engine_with_other_friction_departs(engine: str) -> None:
     problem, plan = slide()
     report = replay_in(engine, problem.with_(friction=0.2), plan, setting=COARSE)
     assert report.exit_status == 1
-    lines = write(report).splitlines()
+    lines = report.to_text().splitlines()
     assert "DEPARTS" in lines[0] and lines[1].startswith("phase 1 departs at t = ")
 
 
@@ -150,7 +149,7 @@ def test_what_departs_with_some_settings_only_has_not_converged() -> None:
     for finer, verdict in ((held, "NOT CONVERGED"), (lost, "DEPARTS")):
         levels = tuple(Level(COARSE, (own,)) for own in (lost, finer))
         report = EngineReport(problem, "MuJoCo", 3e-3, (stretch,), levels)
-        assert report.exit_status == 1 and f": {verdict}: " in write(report).splitlines()[0]
+        assert report.exit_status == 1 and f": {verdict}: " in report.to_text().splitlines()[0]
 
 
 def test_settings_get_finer() -> None:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from shipped import HEPTAGON, IMPACTS, problem_of
-from wholearm.cli.summary import summarise
 from wholearm.common.errors import InputError
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.path_domain.nlp import build_path_nlp
 from wholearm.planning.plan import solve
+from wholearm.planning.plan_report import describe_plan
 from wholearm.planning.result import Plan, Status
 from wholearm.planning.saved import load_plan, write_meta
 from wholearm.problem.definition import Problem
@@ -129,7 +129,7 @@ def test_a_certificate_has_every_phase_and_all_together(certified: Plan) -> None
     assert total.phases == (1, 2) and total.duration == pytest.approx(certified.duration)
     assert total.bound == pytest.approx(sum(part.bound or 0 for part in certificate.parts))
     assert certified.meta["certificate"]["total"]["gap"] == total.gap
-    text = summarise(certified, "a.npz")
+    text = describe_plan(certified, "a.npz").to_text()
     (table,) = (part for part in text.split("\n\n") if "lower bounds" in part)
     rows = [line.split() for line in table.splitlines()[1:]]
     assert [row[0] for row in rows] == ["1", "2", "all"]
@@ -142,7 +142,7 @@ def test_an_accuracy_that_is_not_reached_is_said(certified: Plan, error: float, 
     phases = tuple(own._replace(error=error) for own in certified.phases)
     options = dataclasses.replace(certified.options, accuracy=1e-4)
     plan = dataclasses.replace(certified, phases=phases, options=options)
-    last = summarise(plan, "a.npz").splitlines()[-1]
+    last = describe_plan(plan, "a.npz").to_text().splitlines()[-1]
     assert f"(to {error:.0e}" in last
     assert ("; accuracy 0.0001 not reached)" in last) == said
 
@@ -152,7 +152,7 @@ def test_what_is_planned_over_time_is_not_certified(within: Plan) -> None:
     assert certificate is not None and certificate.total is None
     (part,) = certificate.parts
     assert part.bound is None and part.gap is None and part.phases == (1,)
-    assert "  not certified: planned over time" in summarise(within, "a.npz")
+    assert "  not certified: planned over time" in describe_plan(within, "a.npz").to_text()
 
 
 @pytest.mark.parametrize(

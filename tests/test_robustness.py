@@ -17,7 +17,6 @@ from wholearm.common.errors import InputError
 from wholearm.figures.robustness import draw_robustness
 from wholearm.planning.result import Plan
 from wholearm.problem.definition import Problem
-from wholearm.robustness.report import to_dict, to_text
 from wholearm.robustness.sensitivity import measure_sensitivities
 from wholearm.robustness.study import Robustness, assess_robustness
 from wholearm.robustness.trial import Trial, Window, make_trial
@@ -121,7 +120,7 @@ def test_a_study_grows_and_is_reported_in_part(
     path.write_text(written.read_text())
     run = partial(assess_robustness, problem, plan, uncertainty=FEW, path=path, start=THREADS)
     part = run(samples=2, progress=calls.append)
-    assert part.records == study.records[:2] and "2 of 5 samples" in to_text(part)
+    assert part.records == study.records[:2] and "2 of 5 samples" in part.to_text()
     assert not calls and path.read_text() == written.read_text()
     more = run(samples=7, progress=calls.append)
     assert len(calls) == 2 and more.records[:5] == study.records
@@ -133,11 +132,12 @@ def test_a_study_grows_and_is_reported_in_part(
 
 
 def test_the_report_says_what_was_counted(study: Robustness) -> None:
-    text, values = to_text(study), to_dict(study)
+    text, values = study.to_text(), study.to_dict()
     reached = sum(record["reached"] for record in study.records)
     assert f"({reached} of 5," in text and values["reached"]["count"] == reached
     assert json.loads(json.dumps(values))["samples"] == 5
-    assert "mass               5 %" in text and "start_x" not in text
+    assert ["mass", "5", "%"] in [line.split()[:3] for line in text.splitlines()]
+    assert "start_x" not in text
 
 
 def test_sensitivities_are_those_of_the_simulator_that_is_told_contacts(

@@ -13,7 +13,6 @@ from scipy.optimize import linprog
 
 from once import once
 from shipped import HEPTAGON, problem_of, solved
-from wholearm.cli.summary import summarise
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InputError
 from wholearm.contacts.formation import Formation
@@ -21,6 +20,7 @@ from wholearm.free_simulation.simulate import simulate_free
 from wholearm.mechanics.arrival import DRIVE, Standstill, find_hold, maximise_margin
 from wholearm.planning import shares
 from wholearm.planning.phase_plan import PhasePlan
+from wholearm.planning.plan_report import describe_plan
 from wholearm.planning.result import Plan
 from wholearm.planning.saved import load_plan, write_meta
 from wholearm.planning.settling import End, list_touching, settle_plans
@@ -124,7 +124,7 @@ def test_the_whole_ends_where_it_was_planned_to() -> None:
     away = np.abs(run.z[-1] - motion.z[-1])
     assert away[:2].max() < 1e-7 and away[2:].max() < 1e-6
     assert motion.duration == pytest.approx(solved(HEPTAGON).duration + sum(HELD), rel=1e-12)
-    assert f"held for {sum(HELD):.6g} s in all" in summarise(plan, "plan.npz")
+    assert f"held for {sum(HELD):.6g} s in all" in describe_plan(plan, "plan.npz").to_text()
 
 
 def test_a_start_that_is_short_makes_little_difference() -> None:

@@ -10,13 +10,13 @@ import pytest
 from once import once
 from plane import measure_gaps
 from shipped import IMPACTS, LANDING, plan_of, problem_of
-from wholearm.cli.summary import summarise
 from wholearm.common.arrays import Array
 from wholearm.contacts.formation import Formation
 from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.impact import compute_impact
 from wholearm.mechanics.metric import metric_weights
 from wholearm.planning.plan import solve
+from wholearm.planning.plan_report import describe_plan
 from wholearm.planning.result import Plan
 from wholearm.problem.definition import End, Problem
 from wholearm.results.trajectory import Samples, Trajectory
@@ -133,7 +133,7 @@ def test_it_stops_where_no_impact_is_possible() -> None:
 
 
 def test_impacts_are_listed() -> None:
-    lines = summarise(solved("time"), "a.npz").splitlines()
+    lines = describe_plan(solved("time"), "a.npz").to_text().splitlines()
     (head,) = (k for k, line in enumerate(lines) if "least impulse [N s per m/s]" in line)
     for line, row in zip(
         lines[head + 1 : head + 2], planned("time").meta["transitions"], strict=True

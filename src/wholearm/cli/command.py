@@ -35,6 +35,7 @@ from .help import add_help
 from .map import draw, protect
 from .new import add_new, add_schema
 from .origin import tell_origin
+from .output import name_files, print_result
 from .overlay import overlay
 from .policy import add_policy
 from .predict import predict
@@ -46,7 +47,7 @@ from .viewer import add_animate, add_gallery, add_report
 
 if TYPE_CHECKING:
     from ..planning.result import Plan
-    from ..planning.table_check import Table
+    from ..planning.table_check import TorqueTable
     from ..policy.policy import Policy
     from ..problem.definition import Problem
     from ..results.report import Report
@@ -156,8 +157,8 @@ def _solve(options: argparse.Namespace) -> int:
     from ..geometry.path_guess import load
     from ..planning.options import PlanOptions
     from ..planning.plan import solve_with
+    from ..planning.plan_report import describe_plan
     from ..scene.ranges import find_unit_hint
-    from .summary import summarise
 
     output = options.output or _stem(options.problem) + ".npz"
     given = {
@@ -202,9 +203,9 @@ def _solve(options: argparse.Namespace) -> int:
     figures = None if table is None else {"file": options.torques, **table.figures}
     if options.json:
         extra = {} if figures is None else {"torques": figures}
-        print(json.dumps({**plan.meta, **extra}, indent=2))
+        print(json.dumps(plan.to_dict() | extra, indent=2))
     else:
-        print(found + summarise(plan, output, figures))
+        print(found + describe_plan(plan, output, figures).to_text())
     return 0
 
 
@@ -221,7 +222,7 @@ def _check_sampling(options: argparse.Namespace) -> None:
     require_sampling(options.sample_rate, options.interpolation or "linear")
 
 
-def _make_table(options: argparse.Namespace, plan: Plan) -> Table:
+def _make_table(options: argparse.Namespace, plan: Plan) -> TorqueTable:
     """The torque table that is asked for, replayed."""
     from ..planning.table_check import make_table, sample_table
 
@@ -273,13 +274,11 @@ def _verify(options: argparse.Namespace) -> int:
     else:
         announce(f"replaying {len(problem.phases)} phases")
         report = verify(problem, torques, reduced=options.reduced, **given)
-    clear_progress()
     if options.output is not None:
         report.trajectory.save(options.output)
-    print(json.dumps(report.to_dict() | notes, indent=2) if options.json else report.to_text())
-    if options.output is not None and not options.json:
-        print(f"wrote {options.output}")
-    return report.exit_status
+    status = print_result(options, report, notes)
+    name_files(options, options.output)
+    return status
 
 
 def _read_policy(options: argparse.Namespace, torques: Trajectory | TorqueProfile) -> Policy | None:
@@ -353,8 +352,7 @@ def _plot(options: argparse.Namespace) -> int:
             trajectory, simulation=simulation, width=width, motion=options.motion
         )
     plots.save(figure, options.output)
-    clear_progress()
-    print(f"wrote {options.output}")
+    name_files(options, options.output)
     return 0
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import json
 
-from .progress import clear_progress, show_progress
+from .output import name_files, print_result
+from .progress import show_progress
 
 
 def compare(options: argparse.Namespace) -> int:
@@ -20,12 +20,10 @@ def compare(options: argparse.Namespace) -> int:
         plots.require_format(options.output)
         require_writable(options.output)
     found = run(load(options.problem), options.files, show_progress())
-    clear_progress()
     if options.output is not None:
         from ..figures.comparison import draw_comparison
 
         plots.save(draw_comparison(found), options.output)
-    print(json.dumps(found.to_dict(), indent=2) if options.json else found.to_text())
-    if options.output is not None and not options.json:
-        print(f"wrote {options.output}")
-    return found.exit_status
+    status = print_result(options, found)
+    name_files(options, options.output)
+    return status

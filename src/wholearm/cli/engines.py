@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 from typing import TYPE_CHECKING
 
 from ..common.errors import InputError, name_source
 from .arguments import DEPARTURE, STEP, number
 from .origin import tell_origin
-from .progress import clear_progress, show_progress
+from .output import name_files, print_result
+from .progress import show_progress
 
 if TYPE_CHECKING:
     from ..engines.stretch import Setting
@@ -70,13 +70,12 @@ def _export(options: argparse.Namespace) -> int:
         tell_origin(problem, (options.plan, plan))
     with name_source(options.problem):
         write_text(options.mjcf, write_mjcf(problem, plan, step=options.step))
-    print(f"wrote {options.mjcf}")
+    name_files(options, options.mjcf)
     return 0
 
 
 def _replay(options: argparse.Namespace) -> int:
     from ..engines.replay import ENGINES, replay_in, require_engine
-    from ..engines.report_text import to_dict, write
     from ..problem.read import read_problem
 
     require_engine(options.engine)
@@ -101,9 +100,7 @@ def _replay(options: argparse.Namespace) -> int:
             halvings=options.refine,
             progress=show_progress(),
         )
-    clear_progress()
-    print(json.dumps(to_dict(report) | notes, indent=2) if options.json else write(report))
-    return report.exit_status
+    return print_result(options, report, notes)
 
 
 def _play_policy(
@@ -132,9 +129,7 @@ def _play_policy(
             allowed=ALLOWED if departure is None else departure,
             progress=show_progress(),
         )
-    clear_progress()
-    print(json.dumps(report.to_dict() | notes, indent=2) if options.json else report.to_text())
-    return report.exit_status
+    return print_result(options, report, notes)
 
 
 def _read_step(step: float, time: float) -> float:

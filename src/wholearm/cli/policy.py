@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 from typing import TYPE_CHECKING
 
 from ..common.errors import name_source
 from .arguments import DEPARTURE, number
+from .output import print_result
 from .progress import clear_progress, show_progress
 
 _QUICK = 2e-4
 """Period of the loop that is tried where a policy fails [s]; case: flips onto another edge."""
 
 if TYPE_CHECKING:
-    from ..policy.policy import Policy
     from ..problem.definition import Problem
     from ..results.trajectory import Trajectory
 
@@ -109,32 +108,7 @@ def _policy(options: argparse.Namespace) -> int:
             f"{enough}{advise()}; --write-anyway writes it all the same"
         )
     policy.save(output)
-    told = {key: value for key, value in policy.about.items() if key != "problem"}
-    print(json.dumps(told, indent=2) if options.json else _describe(policy))
+    status = print_result(options, policy)
     if not options.json:
         print(f"{policy.duration:.6f} s in all, the plan {plan.duration:.6f} s; wrote {output}")
-    return 0
-
-
-def _describe(policy: Policy) -> str:
-    """How long the phases take, what reserve they keep, and within which ranges."""
-    from ..results.report_text import align
-
-    rows = []
-    for own in policy.about["phases"]:
-        times = [f"{own[name]:.6f}" for name in ("plan", "duration")]
-        kept = [f"{level:.2f} {name}" for name, level in own.get("reserves", {}).items()]
-        share = f"{own['share']:.2f}" if kept else ""
-        rows.append([str(own["number"]), *times, share, ", ".join(kept)])
-    header = ["phase", "plan [s]", "policy [s]", "reserve", "least of each contact"]
-    lines = list(align(header, rows, {4}))
-    parts = {own["number"]: own["share"] for own in policy.about["phases"] if "reserves" in own}
-    if "ranges" in policy.about and parts:
-        short = [f"{part:.2f} of them in phase {k}" for k, part in parts.items() if part < 1]
-        text = f"contacts are kept within {policy.about['reserve']:g} times the plan's ranges"
-        lines.append(f"{text}, {', '.join(short)}" if short else text)
-    if largest := policy.about.get("largest"):
-        factors = ", ".join(f"{factor:.3g}" for factor in largest.values())
-        text = f"a policy exists for ranges {min(largest.values()):.3g} times as wide as the plan's"
-        lines.append(f"{text} (by phase: {factors})")
-    return "\n".join(lines)
+    return status

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 
 from ..common.errors import InputError
-from .progress import clear_progress, show_progress
+from .output import name_files, print_result
+from .progress import show_progress
 
 _SPEED = 0.05
 """Mean speed along the phases of the torques that are written [m/s]."""
@@ -32,19 +32,14 @@ def predict(options: argparse.Namespace) -> int:
     prediction = run(
         read_problem(options.problem), squeeze=options.squeeze, progress=show_progress()
     )
-    clear_progress()
-    wrote = []
     if options.output is not None:
         from ..figures.prediction import draw_prediction
 
         plots.save(draw_prediction(prediction), options.output)
-        wrote.append(options.output)
-    print(json.dumps(prediction.to_dict()) if options.json else prediction.to_text())
+    status = print_result(options, prediction)
     if options.torques is not None:
         from ..results.narrow import save
 
         save(make_torques(prediction, options.speed or _SPEED), options.torques)
-        wrote.append(options.torques)
-    if wrote and not options.json:
-        print(f"wrote {', '.join(wrote)}")
-    return 0
+    name_files(options, options.output, options.torques)
+    return status

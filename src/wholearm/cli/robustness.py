@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 from collections.abc import Callable
@@ -13,7 +12,8 @@ from typing import TYPE_CHECKING
 from ..common.errors import InputError
 from .arguments import JOBS, TOLERANCE, number
 from .origin import tell_origin
-from .progress import clear_progress, show_progress
+from .output import name_files, print_result
+from .progress import show_progress
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -74,7 +74,6 @@ def _robustness(options: argparse.Namespace) -> int:
     from ..policy.policy import Policy
     from ..problem.read import adopt_phases, read_problem
     from ..results.trajectory_file import load_trajectory
-    from ..robustness.report import to_dict, to_text
     from ..robustness.study import assess_robustness
 
     output = options.output or _name_output(options)
@@ -108,15 +107,13 @@ def _robustness(options: argparse.Namespace) -> int:
         start=_choose_executor(options),
         progress=show_progress(),
     )
-    clear_progress()
     if options.figure is not None:
         from ..figures.robustness import draw_robustness
 
         plots.save(draw_robustness(study), options.figure)
-    print(json.dumps(to_dict(study) | notes, indent=2) if options.json else to_text(study))
-    if not options.json:
-        print("wrote " + ", ".join(filter(None, (output, options.figure))))
-    return 0
+    status = print_result(options, study, notes)
+    name_files(options, output, options.figure)
+    return status
 
 
 def _name_output(options: argparse.Namespace) -> str:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import json
 
-from .progress import clear_progress, show_progress
+from .output import name_files, print_result
+from .progress import show_progress
 
 
 def tune(options: argparse.Namespace) -> int:
@@ -19,10 +19,8 @@ def tune(options: argparse.Namespace) -> int:
         require_ending(options.output, ".csv")
     given = {key: getattr(options, key) for key in ("brake", "stops", "squeeze", "share")}
     found = run(load(options.problem), **given, progress=show_progress())
-    clear_progress()
-    print(json.dumps(found.to_dict(), indent=2) if options.json else found.to_text())
+    status = print_result(options, found)
     if options.output is not None and found.ok:
         write_text(options.output, found.to_csv())
-        if not options.json:
-            print(f"wrote {options.output}")
-    return found.exit_status
+        name_files(options, options.output)
+    return status

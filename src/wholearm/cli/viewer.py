@@ -6,8 +6,9 @@ import argparse
 import os
 
 from .arguments import SIMULATORS, number
+from .output import name_files
 from .overlay import overlay
-from .progress import clear_progress, show_progress
+from .progress import show_progress
 
 
 def add_animate(parser: argparse.ArgumentParser) -> None:
@@ -47,8 +48,7 @@ def _gallery(options: argparse.Namespace) -> int:
     require_ending(options.output, ".md")
     require_writable(options.output)
     write_gallery(options.files, options.output, show_progress())
-    clear_progress()
-    print(f"wrote {options.output}")
+    name_files(options, options.output)
     return 0
 
 
@@ -76,8 +76,7 @@ def _animate(options: argparse.Namespace) -> int:
 
             movie = Movie(problem, trajectory, ghost, options.speed)
             write_movie(movie, options.output, show_progress())
-    clear_progress()
-    print(f"wrote {options.output}")
+    name_files(options, options.output)
     return 0
 
 
@@ -104,6 +103,5 @@ def _report(options: argparse.Namespace) -> int:
         text = Path(options.problem).read_text(encoding="utf-8")
         content = build_report(problem, paths, text, say)
     write_text(output, content)
-    clear_progress()
-    print(f"wrote {output}")
+    name_files(options, output)
     return 0

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, fields
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from itertools import zip_longest
 
-from ..common.brief import write_brief
+from ..common.document import Document, Result, Table
 from ..problem.definition import Problem
-from ..results.report import Report, plain
-from ..results.report_text import align, show
+from ..results.report import Report
 from ..results.trajectory import Trajectory
 
 
@@ -69,8 +67,14 @@ class Contender:
         """Whether it holds, in a word."""
         return "ok" if self.ok else "FAILED"
 
+    @property
+    def place(self) -> str:
+        """The contact with the least margin, and its phase."""
+        return f"{self.contact}, phase {self.phase}" if self.contact else "-"
 
-class Comparison(NamedTuple):
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(Result):
     """Plans and torques for one problem.
 
     Attributes
@@ -85,67 +89,38 @@ class Comparison(NamedTuple):
     epsilon: float
     contenders: tuple[Contender, ...]
 
-    def __repr__(self) -> str:
-        return write_brief(self)
-
     @property
     def headline(self) -> str:
         """Verdicts, in a line."""
         return "; ".join(f"{own.name}: {own.verdict}" for own in self.contenders)
 
     @property
-    def exit_status(self) -> int:
-        """Exit status of the command line: 1 if one of them does not hold."""
-        return 0 if all(own.ok for own in self.contenders) else 1
+    def ok(self) -> bool:
+        """Whether all of them hold."""
+        return all(own.ok for own in self.contenders)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Everything but motions and replays as plain values for JSON."""
-        # What is left out of the text of one is no plain value.
-        keys = [own.name for own in fields(Contender) if own.repr]
-        rows = [plain({key: getattr(own, key) for key in keys}) for own in self.contenders]
-        return {"name": self.name, "epsilon": self.epsilon, "contenders": rows}
+    @property
+    def summary(self) -> Table:
+        """What each comes to."""
+        columns = {
+            "name": "", "verdict": "verdict", "duration": "duration [s]:.5f",
+            "effort": "effort [(N m)^2 s]:.5f", "margin": "least margin [N]:+z.5f", "place": "of",
+            "peaks": "peak torques [N m]:.4f", "lost": "energy lost [J]:.5f",
+            "simulations": "simulations:d",
+        }  # fmt: skip
+        return Table.of(self.contenders, columns)
 
-    def to_text(self) -> str:
+    @property
+    def document(self) -> Document:
         """A table of all, one of their phases, and the reasons of those that fail."""
         failed = [f"{own.name}: {own.reason}" for own in self.contenders if not own.ok]
-        head = f"{self.name}, epsilon = {self.epsilon:g} N"
-        parts = [[head, *failed], self._list_all(), self._list_phases()]
-        return "\n\n".join("\n".join(lines) for lines in parts if lines)
-
-    def _list_all(self) -> list[str]:
-        rows = []
-        for own in self.contenders:
-            at = f"{own.contact}, phase {own.phase}" if own.contact else "-"
-            peaks = " ".join(f"{peak:.4f}" for peak in own.peaks)
-            rows.append(
-                [
-                    own.name,
-                    own.verdict,
-                    show(own.duration, ".5f"),
-                    show(own.effort, ".5f"),
-                    show(own.margin, "+z.5f"),
-                    at,
-                    peaks,
-                    show(own.lost, ".5f"),
-                    "-" if own.simulations is None else str(own.simulations),
-                ]
-            )
-        header = ["", "verdict", "duration [s]", "effort [(N m)^2 s]", "least margin [N]", "of"]
-        header += ["peak torques [N m]", "energy lost [J]", "simulations"]
-        return align(header, rows, {0, 1, 5})
-
-    def _list_phases(self) -> list[str]:
-        """Durations and least margins, phase by phase."""
-        count = max(len(own.lasts) for own in self.contenders)
-        rows = []
-        for k in range(count):
-            row = [str(k + 1)]
-            for part, form in (("lasts", ".5f"), ("margins", "+z.4f")):
-                for own in self.contenders:
-                    values = getattr(own, part)
-                    row.append(show(values[k] if k < len(values) else math.nan, form))
-            rows.append(row)
         names = [own.name for own in self.contenders]
-        header = ["phase", *names, *names]
+        heads = [f"{name}:{form}" for form in (".5f", "+z.4f") for name in names]
+        lasts = zip_longest(*(own.lasts for own in self.contenders))
+        margins = zip_longest(*(own.margins for own in self.contenders))
+        pairs = zip(lasts, margins, strict=True)
+        rows = [(number, *one, *two) for number, (one, two) in enumerate(pairs, start=1)]
         title = "phases: durations [s], then least margins [N]"
-        return [title, *align(header, rows, set())] if rows else []
+        phases = Table(["phase:d", *heads], rows, title)
+        head = f"{self.name}, epsilon = {self.epsilon:g} N"
+        return Document(head, parts=[*failed, self.summary, phases])

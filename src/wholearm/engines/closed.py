@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..common.brief import write_brief
+from ..common.document import Document, Result, Table
 from ..common.errors import InputError
 from ..policy.closed_loop import ROOM, ClosedLoop
 from ..policy.policy import Policy
 from ..problem.definition import Problem
 from ..results.narrow import Moved, adopt_motion
-from ..results.report_text import align
 from ..results.trajectory import Trajectory
 from .between import find_between
 from .departure import find_pairs
 from .replay import ENGINES, require_engine
-from .report_text import name_phases
 from .stretch import Run, Setting, Stretch, list_stretches
 
 ALLOWED = 1e-2
@@ -55,7 +54,8 @@ class Arrival(NamedTuple):
     gap: float
 
 
-class PolicyReport(NamedTuple):
+@dataclass(frozen=True, eq=False, repr=False)
+class PolicyReport(Result):
     """What a policy does in an engine; `allowed` is over the scene's length and in rad."""
 
     problem: Problem
@@ -68,63 +68,37 @@ class PolicyReport(NamedTuple):
         """Whether every stretch ends, and where it is to end."""
         return all(self.find_failure(own) is None for own in self.arrivals)
 
-    @property
-    def exit_status(self) -> int:
-        """Exit status of the command line."""
-        return 0 if self.ok else 1
-
     def find_failure(self, own: Arrival) -> str | None:
         """What is wrong with a stretch."""
         far = max(own.position / self.problem.scene.scales.length, own.angle)
         if not far <= self.allowed:
             text = f"{own.position * 1e3:.3g} mm and {math.degrees(own.angle):.3g} degrees"
-            return f"phase {name_phases(own.stretch)} ends {text} away from the plan"
+            return f"phase {own.stretch.name} ends {text} away from the plan"
         if not own.over:
-            return f"phase {name_phases(own.stretch)} does not end within {own.duration:.4g} s"
+            return f"phase {own.stretch.name} does not end within {own.duration:.4g} s"
         return None
 
-    def __repr__(self) -> str:
-        return write_brief(self)
+    @property
+    def document(self) -> Document:
+        """Durations beside those of the plan, and where stretches end."""
+        columns = {
+            "stretch.name": "phase:d", "stretch.duration": "plan [s]:.6f",
+            "duration": "policy [s]:.6f", "position": "end off [mm]:.4f", "angle": "[deg]:.4f",
+            "gap": "largest gap [mm]:.4f", "contact": "",
+        }  # fmt: skip
+        failures = [self.find_failure(own) or "" for own in self.arrivals]
+        title = f"{self.problem.name} in {self.title}, by the policy"
+        verdict, table = "ok" if self.ok else "FAILS", Table.of(self.arrivals, columns)
+        return Document(title, verdict, parts=[*failures, table])
 
-    def to_text(self) -> str:
-        """The report as lines of text; lengths in mm and angles in degrees."""
-        failures = [self.find_failure(own) for own in self.arrivals]
-        rows = [
-            [
-                name_phases(own.stretch),
-                f"{own.stretch.stop - own.stretch.start:.6f}",
-                f"{own.duration:.6f}",
-                f"{own.position * 1e3:.4f}",
-                f"{math.degrees(own.angle):.4f}",
-                f"{own.gap * 1e3:.4f} {own.contact}",
-            ]
-            for own in self.arrivals
-        ]
-        header = ["phase", "plan [s]", "policy [s]", "end off [mm]", "[deg]", "largest gap [mm]"]
-        lines = [
-            f"{self.problem.name} in {self.title}, by the policy: {'ok' if self.ok else 'FAILS'}",
-            *(failure for failure in failures if failure is not None),
-            "",
-            *align(header, rows, {5}),
-        ]
-        return "\n".join(lines)
-
-    def to_dict(self) -> dict[str, Any]:
+    @property
+    def values(self) -> dict[str, Any]:
         """The report for machines, in m, rad and s."""
-        stretches = [
-            {
-                "phases": [index + 1 for index in own.stretch.phases],
-                **{key: value for key, value in own._asdict().items() if key != "stretch"},
-            }
-            for own in self.arrivals
-        ]
-        return {
-            "problem": self.problem.name,
-            "engine": self.title,
-            "ok": self.ok,
-            "allowed": self.allowed,
-            "stretches": stretches,
-        }
+        stretches = [{"phases": own.stretch.numbers, **own._asdict()} for own in self.arrivals]
+        for own in stretches:
+            del own["stretch"]
+        values = {"problem": self.problem.name, "engine": self.title, "ok": self.ok}
+        return {**values, "allowed": self.allowed, "stretches": stretches}
 
 
 def play_policy(
@@ -168,7 +142,7 @@ def play_policy(
     arrivals = []
     for stretch in _join(list_stretches(find_between(plan), False), policy, whole):
         if progress is not None:
-            progress(f"phase {name_phases(stretch)} in {known.title}")
+            progress(f"phase {stretch.name} in {known.title}")
         last = stretch.phases[-1] + 1
         loop = ClosedLoop(policy.cut(last), stretch.phases[0] + 1)
         until = stretch.start + (1 + ROOM) * loop.find_duration(last)

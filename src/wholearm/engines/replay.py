@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from importlib.metadata import version
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from ..common.brief import write_brief
+import numpy as np
+
+from ..common.document import Document, Result, Table
 from ..common.errors import InputError
 from ..problem.definition import Problem
 from ..results.narrow import Moved, adopt_motion, require_same_phases
 from ..results.trajectory import Trajectory
 from .applied import apply_friction
 from .between import find_between
-from .departure import Departure, compare
-from .report_text import name_phases
+from .departure import PRESS, Departure, compare
 from .stretch import Engine, Setting, Stretch, list_stretches
+
+PARTS = 5
+"""Equal parts of a stretch at whose ends the error is listed."""
 
 
 class Known(NamedTuple):
@@ -52,7 +58,8 @@ class Level(NamedTuple):
     departures: tuple[Departure, ...]
 
 
-class EngineReport(NamedTuple):
+@dataclass(frozen=True, eq=False, repr=False)
+class EngineReport(Result):
     """What replays in an engine have shown.
 
     Attributes
@@ -72,15 +79,6 @@ class EngineReport(NamedTuple):
     stretches: tuple[Stretch, ...]
     levels: tuple[Level, ...]
 
-    def __repr__(self) -> str:
-        return write_brief(self)
-
-    def to_text(self) -> str:
-        """The report as lines of text."""
-        from .report_text import write
-
-        return write(self)
-
     @property
     def ok(self) -> bool:
         """Whether no stretch departs by more than is allowed."""
@@ -95,9 +93,83 @@ class EngineReport(NamedTuple):
         )
 
     @property
-    def exit_status(self) -> int:
-        """Exit status of the command line."""
-        return 0 if self.ok else 1
+    def document(self) -> Document:
+        """How far replays are from the plan, and the forces that they find."""
+        scales, departures = self.problem.scene.scales, self.levels[0].departures
+        setting = self.levels[0].setting
+        millimetres, degrees = self.allowed * scales.length * 1e3, math.degrees(self.allowed)
+        worst = max(float(np.max(each.position)) for each in departures) * 1e3
+        turned = math.degrees(max(float(np.max(each.angle)) for each in departures))
+        says = "departs" if self.converged else "departs with some settings only, here"
+        pairs = list(zip(self.stretches, departures, strict=True))
+        errors, forces, levels = list[list[Any]](), list[tuple[Any, ...]](), list[list[Any]]()
+        for stretch, found in pairs:
+            at = np.linspace(stretch.start, stretch.stop, PARTS + 1)[1:]
+            largest = np.max(found.position), np.max(found.angle)
+            over = np.interp(at, found.t, found.position)
+            errors.append([stretch.name, stretch.duration, *largest, *over])
+            for force in found.forces:
+                off = force.off if force.planned > PRESS * scales.force else None
+                forces.append((force.phase, force.contact, force.planned, force.found, off))
+        for level in self.levels if len(self.levels) > 1 else ():
+            farthest = [np.max(found.position) for found in level.departures]
+            levels.append([level.setting.step * scales.time, level.setting.softness, *farthest])
+        shares = [f"{k / PARTS:.0%} [mm]:.4f" for k in range(1, PARTS + 1)]
+        names = [f"{stretch.name} [mm]:.4f" for stretch in self.stretches]
+        heads = ["phase:d", "duration [s]:.6f", "largest [mm]:.4f", "[deg]:.4f", *shares]
+        other = ["phase:d", "contact", "planned mean c_n [N]:.4f", "found [N]:.4f", "off [%]:+.2f"]
+        lost = [
+            f"phase {stretch.name} {says} at t = {found.time:.5g} s: {found.reason}"
+            for stretch, found in pairs
+            if found.time is not None
+        ]
+        settings = f"steps of up to {setting.step * scales.time:.3g} s, softness "
+        settings += f"{setting.softness:g}; torques contain the dry friction of the joints, with "
+        tables = Table(heads, errors), Table(other, forces)
+        return Document(
+            f"{self.problem.name} in {self.title}",
+            "ok" if self.ok else "DEPARTS" if self.converged else "NOT CONVERGED",
+            f"within {worst:.4f} mm and {turned:.4f} degrees of the plan "
+            f"(allowed {millimetres:.4g} mm, {degrees:.3g} degrees)",
+            [
+                *lost,
+                f"{settings}its planned signs",
+                *tables,
+                Table(["step [s]:.3g", "softness:g", *names], levels),
+            ],
+        )
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The report for machines, in m, rad, s and N; null where an engine fails."""
+        scales = self.problem.scene.scales
+        return {
+            "problem": self.problem.name,
+            "engine": self.title,
+            "ok": self.ok,
+            "converged": self.converged,
+            "allowed": {"position": self.allowed * scales.length, "angle": self.allowed},
+            "levels": [
+                {
+                    "step": level.setting.step * scales.time,
+                    "softness": level.setting.softness,
+                    "stretches": list(map(_describe, self.stretches, level.departures)),
+                }
+                for level in self.levels
+            ],
+        }
+
+
+def _describe(stretch: Stretch, found: Departure) -> dict[str, Any]:
+    departs = {"time": found.time, "reason": found.reason}
+    return {
+        "phases": stretch.numbers,
+        "start": stretch.start,
+        "stop": stretch.stop,
+        "largest": {"position": found.position.max(), "angle": found.angle.max()},
+        "departs": None if found.time is None else departs,
+        **{name: getattr(found, name) for name in ("forces", "t", "position", "angle")},
+    }
 
 
 def require_engine(name: str) -> Engine:
@@ -169,7 +241,7 @@ def replay_in(
         found = []
         for stretch in stretches:
             if progress is not None:
-                progress(f"phase {name_phases(stretch)} in {known.title}, step {own.step:.3g}")
+                progress(f"phase {stretch.name} in {known.title}, step {own.step:.3g}")
             run = play(problem, stretch, torque, own)
             found.append(compare(problem, plan, stretch, run, allowed))
         levels.append(Level(own, tuple(found)))

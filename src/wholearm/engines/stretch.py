@@ -45,6 +45,21 @@ class Stretch(NamedTuple):
     z_ddot: Array
     c_n: Mapping[str, float]
 
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of its phases, from 1."""
+        return [index + 1 for index in self.phases]
+
+    @property
+    def name(self) -> str:
+        """Numbers of the phases, first to last."""
+        return "-".join(map(str, dict.fromkeys((self.numbers[0], self.numbers[-1]))))
+
+    @property
+    def duration(self) -> float:
+        """How long it is planned to last [s]."""
+        return self.stop - self.start
+
 
 class Setting(NamedTuple):
     """How finely an engine computes.

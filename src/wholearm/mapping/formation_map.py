@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.brief import draw_html, write_brief
+from ..common.document import Drawn
 from ..common.errors import InputError
 from ..common.sharing import exclusive
 from ..contacts.closing import (
@@ -105,8 +105,8 @@ class Crossing:
     flush: tuple[Flush, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class FormationMap:
+@dataclass(frozen=True, eq=False, repr=False)
+class FormationMap(Drawn):
     """The cells, borders and crossings of a window of the (x, phi) plane.
 
     Attributes
@@ -140,9 +140,6 @@ class FormationMap:
     places: Array
     possible: Flags
     ambiguous: Flags
-
-    __repr__ = write_brief
-    _repr_html_ = draw_html
 
     @property
     def headline(self) -> str:

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 from ..common.arrays import Array
 from ..common.errors import InfeasibleError, InputError, JammingError, SolverError
+from ..common.plain import plain
 from ..common.shortfalls import Change, Parameter, Place, Shortfall
 from ..contacts.formation import Formation
 from ..mechanics.limits import LimitSet
@@ -91,7 +92,7 @@ def assemble_least(
     meta = {
         "status": SHORT_OF,
         "rolling": [[contact.name for contact in own.rolling] for own in formations],
-        "modes": [[mode.to_dict() for mode in getattr(own, "modes", ())] for own in motions],
+        "modes": plain([getattr(own, "modes", ()) for own in motions]),
     }
     return assemble(motions, TorqueProfile.chain(torques), meta, ROWS)
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from .. import __version__
 from ..common.errors import InfeasibleError, SolverError
+from ..common.plain import plain
 from ..common.pulse import OutOfTime, Reporter, limited
 from ..common.sharing import exclusive
 from ..geometry.curve import Curve
@@ -246,7 +247,7 @@ def assemble_plan(planning: Planning) -> Trajectory:
     phases = _list_phases(planning, Ledger(None))
     meta = {
         "rolling": [list(phase.rolling) for phase in phases],
-        "modes": [[mode.to_dict() for mode in phase.modes] for phase in phases],
+        "modes": plain([phase.modes for phase in phases]),
     }
     motions = [plan.motion for plan in planning.settled.plans]
     return assemble(motions, torque, meta, planning.options.samples)

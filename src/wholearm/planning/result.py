@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
-from ..common.brief import draw_html, write_brief
+from ..common.document import Document, Drawn, Result
 from ..problem.definition import Problem
 from ..results.certificate import Certificate
 from ..results.modes import ModeSpan
@@ -118,8 +118,8 @@ class Timings(NamedTuple):
     assess: float
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
+@dataclass(frozen=True, eq=False, repr=False)
+class Plan(Drawn, Result):
     """A planned motion with what it was asked and what is known about it.
 
     Attributes
@@ -158,9 +158,6 @@ class Plan:
     certificate: Certificate | None = None
     ranges: RangeFigures | None = None
 
-    __repr__ = write_brief
-    _repr_html_ = draw_html
-
     @property
     def headline(self) -> str:
         """Name, value and status, in a line."""
@@ -198,6 +195,18 @@ class Plan:
     def meta(self) -> Mapping[str, Any]:
         """The plan in plain values, as its file has them."""
         return self.trajectory.meta
+
+    @property
+    def values(self) -> Mapping[str, Any]:
+        """The same, for JSON."""
+        return self.meta
+
+    @property
+    def document(self) -> Document:
+        """Phases, what the replay has shown and what is known of the value."""
+        from .plan_report import describe_plan
+
+        return describe_plan(self)
 
     def at(self, t: ArrayLike) -> Samples:
         """The motion at some times [s]; see `Trajectory.at`."""

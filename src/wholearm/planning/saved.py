@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from math import isnan, nan
-from typing import Any
+from math import nan
+from typing import Any, get_type_hints
 
 from ..common.errors import InputError
+from ..common.plain import plain, restore
 from ..problem.definition import Problem
 from ..problem.read import read_own_problem
 from ..results.certificate import Certificate
-from ..results.modes import ModeSpan
 from ..results.range_figures import RangeFigures
 from ..results.replay_figures import ReplayFigures
-from ..results.report import UniquenessMargin
-from ..results.settling import Settling
 from ..results.trajectory import Trajectory
 from ..results.trajectory_file import load_trajectory
 from ..results.transition import Transition
@@ -29,47 +27,55 @@ _OPTIONS = (
     "robust", "largest",
 )  # fmt: skip
 """Options that stand in `meta` by themselves; `objective` and `replay` do in other ways."""
+_PHASES: Mapping[str, tuple[str, Any]] = {
+    "phase_values": ("value", 0.0), "phase_durations": ("duration", 0.0),
+    "rolling": ("rolling", ()), "modes": ("modes", ()), "sequences": ("sequences", 0),
+    "complete": ("complete", True), "attempts": ("attempt", ""), "phase_errors": ("error", nan),
+    "uniqueness_margins": ("uniqueness_margin", None), "wedged": ("wedged", None),
+    "settling": ("settling", None), "unheld": ("unheld", None),
+}  # fmt: skip
+"""Lists of `meta` with a value for each phase: what that is, and as what it counts where it is
+missing, in files of earlier versions."""
+_STATISTICS = {
+    "iterations": "iterations", "solves": "solves", "build_times": "build_time",
+    "solve_times": "solve_time",
+}  # fmt: skip
+"""Likewise of solving; missing ones are zero."""
+_UNITS = ("m", "rad", "s")
+"""What files call the fields of deviations."""
 
 
 def write_meta(plan: Plan) -> dict[str, Any]:
     """What a plan is but for its motion, in plain values for its file."""
     phases, options = plan.phases, plan.options
-    return {
-        "status": plan.status.value,
-        "name": plan.problem.name,
-        "objective": options.goal.value,
-        "value": plan.value,
-        "value_unit": plan.unit,
-        "error": None if isnan(plan.error) else plan.error,
-        "epsilon": plan.problem.epsilon,
-        "phase_values": [phase.value for phase in phases],
-        "rolling": [list(phase.rolling) for phase in phases],
-        "modes": [[mode.to_dict() for mode in phase.modes] for phase in phases],
-        "sequences": [phase.sequences for phase in phases],
-        "complete": [phase.complete for phase in phases],
-        "attempts": [phase.attempt for phase in phases],
-        "phase_errors": [None if isnan(phase.error) else phase.error for phase in phases],
-        "uniqueness_margins": [
-            None if own.uniqueness_margin is None else own.uniqueness_margin._asdict()
-            for own in phases
-        ],
-        "wedged": [phase.wedged for phase in phases],
-        "settling": [own.settling and own.settling.to_dict() for own in phases],
-        "unheld": [own.unheld for own in phases],
-        "phase_durations": [phase.duration for phase in phases],
-        **{name: getattr(options, name) for name in _OPTIONS},
-        "iterations": [phase.statistics.iterations for phase in phases],
-        "solves": [phase.statistics.solves for phase in phases],
-        "build_times": [phase.statistics.build_time for phase in phases],
-        "solve_times": [phase.statistics.solve_time for phase in phases],
-        "versions": dict(plan.versions),
-        "problem": plan.problem.table,
-        "transitions": [transition.to_dict() for transition in plan.transitions],
-        "replay": None if plan.replay is None else plan.replay.to_dict(),
-        "certificate": None if plan.certificate is None else plan.certificate.to_dict(),
-        "timings": plan.timings._asdict(),
-        "ranges": None if plan.ranges is None else plan.ranges._asdict(),
-    }
+    values: dict[str, Any] = plain(
+        {
+            "status": plan.status,
+            "name": plan.problem.name,
+            "objective": options.goal,
+            "value": plan.value,
+            "value_unit": plan.unit,
+            "error": plan.error,
+            "epsilon": plan.problem.epsilon,
+            **{key: [getattr(own, name) for own in phases] for key, (name, _) in _PHASES.items()},
+            **{
+                key: [getattr(own.statistics, name) for own in phases]
+                for key, name in _STATISTICS.items()
+            },
+            **{name: getattr(options, name) for name in _OPTIONS},
+            "versions": plan.versions,
+            "transitions": plan.transitions,
+            "replay": plan.replay,
+            "certificate": plan.certificate,
+            "timings": plan.timings,
+            "ranges": plan.ranges,
+        }
+    )
+    # Deviations have the names of their units in files.
+    for own in values["replay"]["phases"] if plan.replay else ():
+        for key in ("end_deviation", "deviation"):
+            own[key] = own[key] and dict(zip(_UNITS, own[key].values(), strict=True))
+    return values | {"problem": plan.problem.table}
 
 
 def load_plan(path: str | os.PathLike[str]) -> Plan:
@@ -95,16 +101,19 @@ def load_plan(path: str | os.PathLike[str]) -> Plan:
         raise InputError(source, f"meta.{error.key}", error.problem) from None
 
 
-def _read_uniqueness_margin(given: Mapping[str, Any] | None) -> UniquenessMargin | None:
-    return None if given is None else UniquenessMargin(**given)
+def _read_replay(given: Mapping[str, Any]) -> ReplayFigures:
+    """The replay, whose deviations have the names of their units in files."""
 
+    def rename(own: Mapping[str, Any]) -> dict[str, Any]:
+        # Files of earlier versions do not say when.
+        return {"position": own["m"], "angle": own["rad"], "time": own.get("s")}
 
-def _read_settling(given: Mapping[str, Any] | None) -> Settling | None:
-    return None if given is None else Settling.of(given)
-
-
-def _read_error(given: Any) -> float:
-    return nan if given is None else float(given)
+    phases = [
+        {**own, **{key: own[key] and rename(own[key]) for key in ("end_deviation", "deviation")}}
+        for own in given["phases"]
+    ]
+    found: ReplayFigures = restore(ReplayFigures, {**given, "phases": phases})
+    return found
 
 
 def _read(trajectory: Trajectory, problem: Problem) -> Plan:
@@ -114,38 +123,22 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
     options = PlanOptions(meta["objective"], **given, replay=meta.get("replay") is not None)
     options = options.scale_ranges(problem.ranges)
 
-    def column(key: str, missing: Any) -> list[Any]:
-        values = meta.get(key, [missing] * count)
+    def column(key: str, kind: Any, missing: Any) -> list[Any]:
+        values = meta.get(key)
+        if values is None:
+            return [missing] * count
         if len(values) != count:
             raise InputError("", key, f"{len(values)} values given, {count} needed")
-        return list(values)
+        return [restore(kind, value) for value in values]
 
-    statistics = [
-        SolverStatistics(int(iterations), int(solves), float(build), float(solve))
-        for iterations, solves, build, solve in zip(
-            column("iterations", 0),
-            column("solves", 0),
-            column("build_times", 0.0),
-            column("solve_times", 0.0),
-            strict=True,
-        )
-    ]
+    kinds, costs = get_type_hints(PlannedPhase), get_type_hints(SolverStatistics)
+    known = {name: column(key, kinds[name], miss) for key, (name, miss) in _PHASES.items()}
+    spent = {name: column(key, costs[name], 0) for key, name in _STATISTICS.items()}
     phases = tuple(
         PlannedPhase(
-            k + 1,
-            float(column("phase_values", 0.0)[k]),
-            float(column("phase_durations", 0.0)[k]),
-            tuple(map(str, column("rolling", ())[k])),
-            tuple(map(ModeSpan.of, column("modes", ())[k])),
-            int(column("sequences", 0)[k]),
-            bool(column("complete", True)[k]),
-            str(column("attempts", "")[k]),
-            _read_error(column("phase_errors", None)[k]),
-            statistics[k],
-            _read_uniqueness_margin(column("uniqueness_margins", None)[k]),
-            column("wedged", None)[k],
-            _read_settling(column("settling", None)[k]),
-            column("unheld", None)[k],
+            number=k + 1,
+            statistics=SolverStatistics(**{name: values[k] for name, values in spent.items()}),
+            **{name: values[k] for name, values in known.items()},
         )
         for k in range(count)
     )
@@ -158,10 +151,10 @@ def _read(trajectory: Trajectory, problem: Problem) -> Plan:
         float(meta["value"]),
         trajectory,
         phases,
-        tuple(map(Transition.of, meta.get("transitions", ()))),
-        None if replay is None else ReplayFigures.of(replay),
+        restore(tuple[Transition, ...], meta.get("transitions", ())),
+        None if replay is None else _read_replay(replay),
         Timings(*(float(timings.get(name, 0.0)) for name in Timings._fields)),
         dict(meta.get("versions", {})),
-        None if certificate is None else Certificate.of(certificate),
-        None if ranges is None else RangeFigures(**ranges),
+        restore(Certificate | None, certificate),
+        restore(RangeFigures | None, ranges),
     )

@@ -24,7 +24,7 @@ ATTEMPTS = 3
 """Most tables that are tried."""
 
 
-class Table(NamedTuple):
+class TorqueTable(NamedTuple):
     """Rows of torques, and what their replay does.
 
     Attributes
@@ -54,7 +54,7 @@ def _list_commands(problem: Problem, trajectory: Trajectory, rows: Array) -> Arr
     return find_commands(trajectory.torque, lag).at(rows[:, 0]) if lag.any() else None
 
 
-def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) -> Table:
+def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) -> TorqueTable:
     """Rows from which a replay gives the plan back, as dense as that takes.
 
     Parameters
@@ -81,7 +81,7 @@ def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) ->
         rows = place_rows(trajectory.torque, error, rate_limit)
     if not replay:
         commands = _list_commands(problem, trajectory, rows)
-        return Table(rows, {"rows": len(rows), "replay": None}, commands)
+        return TorqueTable(rows, {"rows": len(rows), "replay": None}, commands)
     for _ in range(ATTEMPTS):
         # The table has to keep the limits of the plan, and to stay near it.
         seen = observe(problem, read_rows(rows), trajectory)
@@ -98,7 +98,7 @@ def make_table(problem: Problem, trajectory: Trajectory, replay: bool = True) ->
             f"{report.reason}; --no-replay (replay=False) leaves the check out"
         )
     figures = {"rows": len(rows), "replay": _compare(trajectory, report)}
-    return Table(rows, figures, _list_commands(problem, trajectory, rows))
+    return TorqueTable(rows, figures, _list_commands(problem, trajectory, rows))
 
 
 def sample_table(
@@ -107,7 +107,7 @@ def sample_table(
     rate: float,
     interpolation: str,
     replay: bool = True,
-) -> Table:
+) -> TorqueTable:
     """Samples of a plan's torques at a rate [Hz], and what becomes of the motion with them.
 
     That they lose contacts or miss the goal is a result and not an error.
@@ -126,15 +126,15 @@ def sample_table(
         "replay": None,
     }
     if not replay:
-        return Table(rows, figures, _list_commands(problem, trajectory, rows))
+        return TorqueTable(rows, figures, _list_commands(problem, trajectory, rows))
     try:
         seen = observe(problem, read_rows(rows), trajectory)
     except (JammingError, SimulationError) as error:
-        return Table(
+        return TorqueTable(
             rows, figures | {"replay": {"ok": False, "reason": str(error), "phases": []}}, commands
         )
     report = judge(seen._replace(plan=None), Allowance())
-    return Table(rows, figures | {"replay": _compare(trajectory, report)}, commands)
+    return TorqueTable(rows, figures | {"replay": _compare(trajectory, report)}, commands)
 
 
 def _compare(trajectory: Trajectory, report: Report) -> dict[str, Any]:

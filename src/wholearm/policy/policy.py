@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..common.archive import read_arrays
-from ..common.brief import write_brief
+from ..common.document import Document, Result, Table
 from ..common.errors import InputError
 from ..common.files import require_ending, write_whole
 from ..common.require import require_number
@@ -39,7 +39,7 @@ KINDS: Mapping[str, Mapping[str, tuple[int, ...]]] = {"curve": CURVE, "motion": 
 Law = CurveLaw | MotionLaw
 
 
-class Policy:
+class Policy(Result):
     """Torques as a function of what a hand can measure.
 
     Parameters
@@ -109,12 +109,35 @@ class Policy:
                 found.update(dict.fromkeys([*names, gained] if gained else names))
         return list(found)
 
-    __repr__ = write_brief
-
     @property
     def headline(self) -> str:
         """Name, phases and duration, in a line."""
         return f"{self.about.get('name', '')!r}, {self.count} phases, {self.duration:.6g} s"
+
+    @property
+    def document(self) -> Document:
+        """How long the phases take, what reserve they keep, and within which ranges."""
+        phases, rows, lines = self.about.get("phases", []), [], []
+        for own in phases:
+            kept = [f"{level:.2f} {name}" for name, level in own.get("reserves", {}).items()]
+            share = own["share"] if kept else ""
+            rows.append([own["number"], own["plan"], own["duration"], share, ", ".join(kept)])
+        heads = ["phase:d", "plan [s]:.6f", "policy [s]:.6f", "reserve:.2f"]
+        parts = {own["number"]: own["share"] for own in phases if "reserves" in own}
+        if "ranges" in self.about and parts:
+            text = f"contacts are kept within {self.about['reserve']:g} times the plan's ranges"
+            short = [f"{part:.2f} of them in phase {k}" for k, part in parts.items() if part < 1]
+            lines.append(", ".join([text, *short]))
+        if largest := self.about.get("largest"):
+            text = f"a policy exists for ranges {min(largest.values()):.3g} times as wide as the "
+            factors = ", ".join(f"{factor:.3g}" for factor in largest.values())
+            lines.append(f"{text}plan's (by phase: {factors})")
+        return Document("", parts=[Table([*heads, "least of each contact"], rows), *lines])
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """What the policy is of, but for the problem, as plain values."""
+        return {key: value for key, value in self.about.items() if key != "problem"}
 
     @property
     def count(self) -> int:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 from ..common.arrays import Array
-from ..common.brief import write_brief
-from ..results.report import plain
-from ..results.report_text import align, fixed, show
+from ..common.document import Document, Result, Table, fixed
 
 
 class Place(NamedTuple):
@@ -145,25 +143,16 @@ class PhasePrediction:
     torques: QuasistaticTorques | None = None
     curves: Curves | None = None
 
+    derived = ("is_kept",)
+
     @property
     def is_kept(self) -> bool:
         """Whether the quasistatic motion keeps every contact all along."""
         return len(self.kept) == 1 and self.kept[0][1].s - self.kept[0][0].s >= self.length
 
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain values for JSON."""
-        own = {**asdict(self), "is_kept": self.is_kept}
-        if self.torques is not None:
-            own["torques"] = {key: own.tolist() for key, own in self.torques._asdict().items()}
-        if self.curves is not None:
-            forces = {name: force.tolist() for name, force in self.curves.force.items()}
-            own["curves"] = {"speed": self.curves.speed.tolist(), "force": forces}
-        found: dict[str, Any] = plain(own)
-        return found
 
-
-@dataclass(frozen=True, eq=False)
-class Prediction:
+@dataclass(frozen=True, eq=False, repr=False)
+class Prediction(Result):
     """What is predicted of a problem.
 
     Attributes
@@ -177,41 +166,41 @@ class Prediction:
     epsilon: float
     phases: tuple[PhasePrediction, ...]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain values for JSON, with None where there is no number."""
-        phases = [phase.to_dict() for phase in self.phases]
-        return {"name": self.name, "epsilon": self.epsilon, "phases": phases}
-
-    __repr__ = write_brief
-
-    def to_text(self) -> str:
+    @property
+    def document(self) -> Document:
         """Tables of quasistatic motions, and of the speeds at which they break."""
-        slow = [phase.number for phase in self.phases if phase.path != "left out"]
         bad = [phase.number for phase in self.phases if phase.slow and not phase.is_kept]
         verdict = "keeps every contact"
         if bad:
             verdict += f" but in phase{'s' * (len(bad) > 1)} {', '.join(map(str, bad))}"
-        head = f"{self.name}: a quasistatic motion, epsilon = {self.epsilon:g} N, {verdict}"
-        if not slow:
-            head = f"{self.name}: no phase has one or two freedoms"
-        return "\n".join([head, "", *self._list_slow(), "", *self._list_speeds()])
+        head = f"a quasistatic motion, epsilon = {self.epsilon:g} N, {verdict}"
+        if all(phase.path == "left out" for phase in self.phases):
+            head = "no phase has one or two freedoms"
+        return Document(self.name, reason=head, parts=[self._list_slow(), self._list_speeds()])
 
-    def _list_slow(self) -> list[str]:
+    def _list_slow(self) -> Table:
         known = [abs(phase.slow.force) for phase in self.phases if phase.slow and phase.slow.force]
-        rows, form = [], fixed(self.epsilon or 1e-3 * max(known, default=0.0))
+        rows, form = list[tuple[object, ...]](), fixed(self.epsilon or 1e-3 * max(known, default=0))
         for phase in self.phases:
-            row = [str(phase.number), phase.until, phase.path]
+            row = phase.number, phase.until, phase.path
             if phase.slow is None:
-                rows.append([*row, "-", "-", "-", "-", "has not one or two freedoms"])
+                rows.append((*row, None, None, "-", "-", "has not one or two freedoms"))
                 continue
             parts = "; ".join(f"{a.to_text()} to {b.to_text()}" for a, b in phase.kept)
-            kept = "all along" if phase.is_kept else parts or "nowhere"
-            figures = [show(phase.length, ".4g"), show(phase.slow.force, f"+{form}")]
-            rows.append([*row, *figures, phase.slow.name, phase.slow.place.to_text(), kept])
-        header = ["phase", "until", "along", "length [m]", "least c_n [N]", "of", "at", "kept"]
-        return align(header, rows, {1, 2, 5, 6, 7})
+            kept, slow = "all along" if phase.is_kept else parts or "nowhere", phase.slow
+            rows.append((*row, phase.length, slow.force, slow.name, slow.place.to_text(), kept))
+        heads = [
+            "phase:d",
+            "until",
+            "along",
+            "length [m]:.4g",
+            f"least c_n [N]:+{form}",
+            "of",
+            "at",
+        ]
+        return Table([*heads, "kept"], rows)
 
-    def _list_speeds(self) -> list[str]:
+    def _list_speeds(self) -> Table:
         rows = []
         for phase in self.phases:
             for own in phase.survivals:
@@ -220,7 +209,7 @@ class Prediction:
                 speed, lost = ("any speed" if v is None else f"{v:.4g}" for v in speeds)
                 if own.again is not None:
                     speed = f"0; from {own.again:.4g} on"
-                row = [str(phase.number), own.motion, speed, show(own.duration, ".4g"), lost]
-                rows.append([*row, first if own.speed is not None else "nothing gives way"])
-        header = ["phase", "motion", "keeps epsilon to [m/s]", "lasting [s]", "contacts to [m/s]"]
-        return align([*header, "first"], rows, {1, 5})
+                row = phase.number, own.motion, speed, own.duration, lost
+                rows.append((*row, first if own.speed is not None else "nothing gives way"))
+        heads = ["phase:d", "motion", "keeps epsilon to [m/s]:.4g", "lasting [s]:.4g"]
+        return Table([*heads, "contacts to [m/s]:.4g", "first"], rows)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from dataclasses import dataclass
 
 
-class TimeBound(NamedTuple):
+@dataclass(frozen=True)
+class TimeBound:
     """A lower bound of the time of phases that are planned together.
 
     Attributes
@@ -29,20 +29,21 @@ class TimeBound(NamedTuple):
     error: float | None
     reason: str = ""
 
+    derived = ("gap",)
+
     @property
     def gap(self) -> float | None:
         """How much longer than the bound the plan takes at most, relative to the bound."""
         return None if self.bound is None else self.duration / self.bound - 1
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        return {**self._asdict(), "phases": list(self.phases), "gap": self.gap}
 
-
-class Certificate(NamedTuple):
+@dataclass(frozen=True)
+class Certificate:
     """Lower bounds of the durations of all phases of a plan."""
 
     parts: tuple[TimeBound, ...]
+
+    derived = ("total",)
 
     @property
     def gaps(self) -> dict[int, float]:
@@ -65,21 +66,4 @@ class Certificate(NamedTuple):
             sum(part.duration for part in known),
             sum(part.bound or 0.0 for part in known),
             sum(part.error or 0.0 for part in known),
-        )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        total = self.total
-        return {
-            "parts": [part.to_dict() for part in self.parts],
-            "total": None if total is None else total.to_dict(),
-        }
-
-    @staticmethod
-    def of(given: Mapping[str, Any]) -> Certificate:
-        """The certificate that `to_dict` has written."""
-        names = TimeBound._fields
-        rows = [{name: part[name] for name in names} for part in given["parts"]]
-        return Certificate(
-            tuple(TimeBound(**row | {"phases": tuple(row["phases"])}) for row in rows)
         )

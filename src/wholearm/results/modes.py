@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 ROLLS = "rolls"
 """Mode of a contact that rolls; one that slides has the sign of its direction."""
@@ -26,17 +26,3 @@ class ModeSpan(NamedTuple):
     stop: float
     contacts: Mapping[str, str]
     joints: tuple[str, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        return self._asdict() | {"contacts": dict(self.contacts), "joints": list(self.joints)}
-
-    @staticmethod
-    def of(given: Mapping[str, Any]) -> ModeSpan:
-        """The span that `to_dict` has written."""
-        return ModeSpan(
-            float(given["start"]),
-            float(given["stop"]),
-            {str(name): str(mode) for name, mode in given["contacts"].items()},
-            tuple(map(str, given["joints"])),
-        )

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from .report import Deviation
 
@@ -62,48 +60,3 @@ class ReplayFigures(NamedTuple):
     refinements: tuple[int, ...]
     steps: int
     simulations: int | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        phases = [
-            own._asdict()
-            | {key: _write(getattr(own, key)) for key in ("end_deviation", "deviation")}
-            for own in self.phases
-        ]
-        lists = {"phases": phases, "refinements": list(self.refinements)}
-        return self._asdict() | {"least_c_n": self.least_c_n._asdict()} | lists
-
-    @staticmethod
-    def of(given: Mapping[str, Any]) -> ReplayFigures:
-        """The figures that `to_dict` has written."""
-        phases = [
-            ReplayedPhase(
-                own["arrival"],
-                own["end_speed"],
-                _read(own["end_deviation"]),
-                _read(own["deviation"]),
-            )
-            for own in given["phases"]
-        ]
-        return ReplayFigures(
-            LeastForce(**given["least_c_n"]),
-            tuple(phases),
-            float(given["residual"]),
-            tuple(given["refinements"]),
-            int(given["steps"]),
-            given.get("simulations"),
-        )
-
-
-def _write(deviation: Deviation | None) -> dict[str, float | None] | None:
-    if deviation is None:
-        return None
-    when = deviation.time if math.isfinite(deviation.time) else None
-    return {"m": deviation.position, "rad": deviation.angle, "s": when}
-
-
-def _read(given: Mapping[str, Any] | None) -> Deviation | None:
-    if given is None:
-        return None
-    when = given.get("s")
-    return Deviation(float(given["m"]), float(given["rad"]), math.nan if when is None else when)

@@ -1,15 +1,44 @@
-"""The report of a replay: numbers, text and plain values."""
+"""What a replay of torques showed, phase by phase, as numbers and as tables."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
-from ..common.brief import write_brief
+from ..common.document import Document, Result, Table, fixed
 from .narrow import Moved
 from .trajectory import Trajectory
 from .tuning import TuningHelp
+
+_UNIQUENESS = {
+    "number": "phase:d", "uniqueness_margin.value": "uniqueness margin:.4f",
+    "uniqueness_margin.contacts": "least of", "uniqueness_margin.time": "at t [s]:.5f",
+    "wedged": "wedged [ms]:.1f",
+}  # fmt: skip
+_CHANGES = {"phase": "phase:d", "what": "mode of", "kind": "", "time": "at t [s]:.5f"}
+_REDUCED = {
+    "phase": "phase:d", "time": "at t [s]:.5f", "Phi_1": "Phi_1 [kg m^2]:.6g",
+    "Phi_2": "Phi_2 [N m s]:.6g", "Phi_3": "Phi_3 [N m]:.6g",
+    "theta_1_dot": "theta_1' [rad/s]:.6g", "theta_1_ddot": "theta_1'' [rad/s^2]:.6g",
+    "residual": "residual [N m]:.1e",
+}  # fmt: skip
+_ENDS = {
+    "number": "phase:d", "until": "until", "end": "end", "arrival": "arrival [s]:.5f",
+    "arrival_rate": "rate [m/s, rad/s]:.1e", "end_speed": "left [m/s]:.1e",
+}  # fmt: skip
+_IMPACTS = {"impact.impulse": "least impulse [N s]:.4g", "impact.contact": "on"}
+_DEVIATIONS = {
+    "end_deviation.position": "end dev. [m]:.1e", "end_deviation.angle": "[rad]:.1e",
+    "deviation.position": "largest dev. [m]:.1e", "deviation.angle": "[rad]:.1e",
+}  # fmt: skip
+_ENERGIES = (
+    "work of the torques", "change of kinetic energy", "change of potential energy",
+    "viscous joint friction", "dry joint friction", "sliding friction", "contacts gained",
+    "residual",
+)  # fmt: skip
+"""Tables of a replay: columns by attributes, and what parts of the energy are called."""
 
 
 class ContactMargin(NamedTuple):
@@ -243,8 +272,8 @@ class EnergyBalance(NamedTuple):
     relative: float
 
 
-@dataclass(frozen=True)
-class Report:
+@dataclass(frozen=True, repr=False)
+class Report(Result):
     """What a replay of torques showed.
 
     Attributes
@@ -300,12 +329,7 @@ class Report:
     help: TuningHelp = field(default_factory=TuningHelp)
     replay: Moved | None = field(default=None, repr=False, compare=False)
 
-    __repr__ = write_brief
-
-    @property
-    def headline(self) -> str:
-        """The verdict, in a line."""
-        return f"{self.name!r}: {'ok' if self.ok else 'FAILED'}: {self.reason}"
+    derived = ("ok", "exit_status", "reason")
 
     @property
     def trajectory(self) -> Trajectory:
@@ -324,32 +348,55 @@ class Report:
         return self.failures[0] if self.failures else self.outcome
 
     @property
-    def exit_status(self) -> int:
-        """Exit status of the command line: 0 or 1."""
-        return 0 if self.ok else 1
+    def document(self) -> Document:
+        """The verdict with its reason, then everything else as tables."""
+        lines = [f"failure: {text}" for text in self.failures[1:]]
+        if self.outcome not in (*self.failures, self.reason):
+            lines.append(f"end of the replay: {self.outcome}")
+        lines += [f"warning: {text}" for text in self.warnings]
+        help, gap = self.help, self.finger_gap
+        lines += [f"help: {own.to_text()}" for own in (*help.losses, help.approach) if own]
+        if gap is not None:
+            lines.append(f"least gap of the fingers: {gap.least:.5g} m at t = {gap.time:.5g} s")
+        # Epsilon with three digits, or a thousandth of the largest.
+        least = [own.least for phase in self.phases for own in phase.contacts]
+        largest = max((force for force in least if not math.isnan(force)), default=0.0)
+        force = fixed(self.epsilon or 1e-3 * largest)
+        forces = [
+            (p.number, c.contact, c.least, c.margin, c.time)
+            for p in self.phases
+            for c in p.contacts
+        ]
+        slips = [(p.number, *own) for p in self.phases for own in p.rolling]
+        impacts = any(p.end == "impact" for p in self.phases)
+        planned = any(p.deviation is not None for p in self.phases)
+        ends = _ENDS | (_IMPACTS if impacts else {}) | (_DEVIATIONS if planned else {})
+        heads = ["phase:d", "contact", f"least c_n [N]:{force}", f"margin [N]:+{force}"]
+        slip = f"least mu c_n - |c_t| [N]:+{force}"
+        parts: list[str | Table] = [
+            *lines,
+            self._list_losses(force),
+            Table([*heads, "at t [s]:.5f"], forces),
+            Table(["phase:d", "rolling", slip, "at t [s]:.5f"], slips),
+            Table.of(self.phases, ends),
+            Table.of(self.phases, _UNIQUENESS),
+            Table.of(self.changes, _CHANGES),
+            Table.of(self.reduced, _REDUCED),
+            Table(["energy", "[J]: .6e"], list(zip(_ENERGIES, self.energy, strict=False))),
+        ]
+        return self.judge(self.name, self.reason, parts)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain values for JSON, with None where there is no number."""
-        values = plain(asdict(replace(self, replay=None)))
-        del values["replay"]
-        verdict = {"ok": self.ok, "exit_status": self.exit_status, "reason": self.reason}
-        return {**verdict, **values}
-
-    def to_text(self) -> str:
-        """The verdict with its reason, then everything else as aligned tables."""
-        from .report_text import write
-
-        return write(self)
-
-
-def plain(value: Any) -> Any:
-    """`value` with None for NaN and infinity and plain containers."""
-    if hasattr(value, "_asdict"):
-        value = value._asdict()
-    if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    return value
+    def _list_losses(self, force: str) -> Table:
+        """Forces where contacts are lost or slip, and what torques change of them."""
+        rows: list[Sequence[object]] = []
+        for loss in self.help.losses:
+            if loss.kind == "thin":
+                continue
+            for own in loss.forces:
+                rows.append((loss.time, f"c_n of {own.contact}", own.c_n, own.c_t, *own.per_tau))
+            if loss.closing:
+                value, *per_tau = loss.closing
+                until = self.phases[loss.phase - 1].until
+                rows.append((loss.time, f"acceleration to {until}", f"{value:+.3f}", "", *per_tau))
+        columns = ["at t [s]:.5f", "where lost", f"c_n [N]:+{force}", f"c_t [N]:+{force}"]
+        return Table([*columns, "per N m of tau_1:+.3f", "of tau_2:+.3f"], rows)

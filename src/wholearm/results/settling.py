@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,17 +53,6 @@ class Settling(NamedTuple):
     speed: float = 0.0
     parts: tuple[str, ...] = ()
     warning: str = ""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        return self._asdict() | {"tau": list(self.tau), "parts": list(self.parts)}
-
-    @staticmethod
-    def of(given: Mapping[str, Any]) -> Settling:
-        """What `to_dict` has written."""
-        values: dict[str, Any] = dict(given)
-        first, second = map(float, values["tau"])
-        return Settling(**values | {"tau": (first, second), "parts": tuple(values["parts"])})
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.arrays import Array
-from ..common.brief import draw_html, write_brief
+from ..common.document import Drawn
 from ..common.files import require_ending, write_text
 from .torque import TorqueProfile
 
@@ -51,8 +51,8 @@ class Motion(Protocol):
         """Samples at times `t` from the start of the phase, shape (n,) [s]."""
 
 
-@dataclass(frozen=True, eq=False)
-class Trajectory:
+@dataclass(frozen=True, eq=False, repr=False)
+class Trajectory(Drawn):
     """A planned motion: samples for files and plots, motions for any instant.
 
     Attributes
@@ -95,9 +95,6 @@ class Trajectory:
     torque: TorqueProfile
     motions: tuple[Motion, ...]
     meta: Mapping[str, Any]
-
-    __repr__ = write_brief
-    _repr_html_ = draw_html
 
     @property
     def headline(self) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from ..common.archive import read_arrays
 from ..common.errors import InputError
 from ..common.files import require_ending, write_whole
+from ..common.plain import restore
 from .modes import ModeSpan
 from .sampled import sample_phases
 from .torque import MOST, TorqueProfile
@@ -65,7 +66,7 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     if not isinstance(named, list) or not all(isinstance(names, list) for names in named):
         raise InputError(source, "meta.rolling", "is not a list of names for each phase")
     try:
-        [ModeSpan.of(span) for spans in meta.get("modes", []) for span in spans]
+        restore(tuple[tuple[ModeSpan, ...], ...], meta.get("modes", []))
     except (AttributeError, KeyError, TypeError, ValueError):
         text = "is not a list of spans with start, stop, contacts and joints for each phase"
         raise InputError(source, "meta.modes", text) from None

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 
 class Transition(NamedTuple):
@@ -43,15 +41,7 @@ class Transition(NamedTuple):
     speed: float
     saves: float
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, with None where there is no number."""
-        return {
-            key: None if isinstance(value, float) and not math.isfinite(value) else value
-            for key, value in self._asdict().items()
-        }
-
-    @staticmethod
-    def of(given: Mapping[str, Any]) -> Transition:
-        """The transition that `to_dict` has written."""
-        values: dict[str, Any] = {k: math.nan if v is None else v for k, v in given.items()}
-        return Transition(**values)
+    @property
+    def stop(self) -> str:
+        """Why the motion stops there; empty if it does not."""
+        return "" if self.possible else f"stops: {self.reason}"

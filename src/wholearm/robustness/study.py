@@ -21,8 +21,8 @@ import numpy as np
 from .. import __version__
 from ..common.arrays import Array
 from ..common.bounds import Bounds
-from ..common.brief import write_brief
 from ..common.crowd import DiedError, run_all
+from ..common.document import Document, Result, Table
 from ..common.journal import Journal
 from ..common.workers import Spawning
 from ..policy.policy import Policy
@@ -39,10 +39,12 @@ SAMPLES = Bounds(1, 10**6)
 """Samples of a study."""
 DRAWN = 200
 """Samples whose paths are kept, for figures."""
+_ROWS = 8
+"""Contacts lost first that the text lists; the others are counted."""
 
 
-@dataclass(frozen=True, eq=False)
-class Robustness:
+@dataclass(frozen=True, eq=False, repr=False)
+class Robustness(Result):
     """What a plan bears.
 
     Attributes
@@ -75,8 +77,6 @@ class Robustness:
             return Sensitivities("", math.nan, math.nan, ())
         return measure_sensitivities(self.trial)
 
-    __repr__ = write_brief
-
     @property
     def headline(self) -> str:
         """What it is, in a line."""
@@ -99,6 +99,73 @@ class Robustness:
         """Which contact goes first, by number of the phase and name, the most frequent first."""
         names = Counter(_name_loss(own) for own in self.records if own["lost"])
         return {name: count_share(n, len(self.records)) for name, n in names.most_common()}
+
+    @property
+    def document(self) -> Document:
+        """How many samples reach the goal, what is lost first, and what matters most."""
+        trial, count, least = self.trial, len(self.records), self.sensitivities
+        phases = [window.phase for window in trial.windows]
+        place = "whole plan" if len(phases) > 1 else f"phase {phases[0]}"
+        many = f"{count} of {self.known}" if self.known > count else f"{count}"
+        near = 1e3 * trial.uncertainty.find_distance(trial.problem.scene)
+        off = f"{near:.3g} mm and {math.degrees(trial.uncertainty.angle):.3g} deg"
+        shares = [(f"goal reached within {off}", str(self.reached))]
+        shares.append(("and all planned contacts kept", str(self.kept)))
+        lost = [(name, str(share)) for name, share in self.first_lost.items()]
+        rest = sum(share.hits for share in list(self.first_lost.values())[_ROWS:])
+        others = [(f"{len(lost) - _ROWS} others", f"{rest} times")] if lost[_ROWS:] else []
+        ended = Counter(record["ended"] for record in self.records if record["ended"])
+        rows = []
+        for own in least.of:
+            width = f"{own.width:g} {own.unit}" if own.unit else f"{100 * own.width:g} %"
+            slope = f"{own.slope:.5g} N{'/' + own.unit if own.unit else ''}"
+            slope = slope if own.slope == own.slope else "a contact is lost at once"
+            rows.append((own.name, width, slope, own.over_range))
+        heads = ["parameter", "range (+-)", "d(least c_n)/d:.5g", "over the range [N]:.4g"]
+        missed = "" if self.nominal["reached"] else _name_miss(self.nominal)
+        place_of = f" on {least.contact} at t = {least.time:.4g} s"
+        return Document(
+            f"{trial.problem.name}, {place}",
+            reason=f"{many} samples, seed {self.seed}",
+            parts=[
+                Table(["", "share of the samples"], shares),
+                f"without anything off the goal is missed too: by {missed}" if missed else "",
+                Table(["contact lost first", "share of the samples"], lost[:_ROWS] + others),
+                *(f"{count} ended early: {text}" for text, count in ended.most_common(3)),
+                f"least c_n: {least.c_n:.4g} N{place_of}" if least.contact else "",
+                Table(heads, rows),
+            ],
+        )
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Counts, shares and sensitivities, as JSON has them."""
+        trial, least = self.trial, self.sensitivities
+        keys = ("parameter", "unit", "range", "slope")
+        return {
+            "problem": trial.problem.name,
+            "phases": [window.phase for window in trial.windows],
+            "samples": len(self.records),
+            "seed": self.seed,
+            "ranges": trial.uncertainty.widths,
+            "sample_rate": trial.uncertainty.sample_rate,
+            "reached": _list_share(self.reached),
+            "kept": _list_share(self.kept),
+            "first_lost": {name: _list_share(share) for name, share in self.first_lost.items()},
+            "least_c_n": {"contact": least.contact, "time": least.time, "c_n": least.c_n},
+            "sensitivities": [dict(zip(keys, own, strict=True)) for own in least.of],
+            "nominal": {key: own for key, own in self.nominal.items() if key != "path"},
+        }
+
+
+def _name_miss(record: dict[str, Any]) -> str:
+    if "distance" not in record:
+        return str(record["ended"])
+    return f"{1e3 * record['distance']:.3g} mm and {math.degrees(record['angle']):.3g} deg"
+
+
+def _list_share(share: Share) -> dict[str, float]:
+    return {"count": share.hits, "share": share.value, "low": share.low, "high": share.high}
 
 
 def _name_loss(record: dict[str, Any]) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ..common.brief import write_brief
+from ..common.document import Document, Result, Table
 from ..contacts.formation import describe
 from ..mapping.walk import format_until
 from ..planning.options import Objective
@@ -29,9 +29,9 @@ NOT_CONSIDERED = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Alternative:
-    """Another route with its plan.
+@dataclass(frozen=True, eq=False, repr=False)
+class Alternative(Result):
+    """A route with its plan.
 
     Attributes
     ----------
@@ -43,16 +43,34 @@ class Alternative:
     plan: Plan
     problem: Problem
 
-    __repr__ = write_brief
-
     @property
     def headline(self) -> str:
         """What it is, in a line."""
         return f"{self.plan.headline}, phases: {len(self.problem.phases)}"
 
+    @property
+    def document(self) -> Document:
+        """The phases of the route, under what is known of it."""
+        rows = [
+            (phase.number, ", ".join(phase.formation.names), str(phase.until), phase.end.value)
+            for phase in self.problem.phases
+        ]
+        route = Table(["phase:d", "contacts", "until", "end"], rows)
+        return Document("", parts=[*self.describe(), route])
 
-@dataclass(frozen=True, eq=False)
-class Answer:
+    def describe(self) -> list[str]:
+        """What is known of it, in lines."""
+        return [f"{self.plan.value:.6f} {self.plan.unit}, {self.plan.duration:.6f} s"]
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Everything that JSON has."""
+        phases = list(self.problem.table.get("phases", []))
+        return {"value": self.plan.value, "duration": self.plan.duration, "phases": phases}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Answer(Alternative):
     """The best route that was found, with its plan.
 
     Attributes
@@ -76,8 +94,6 @@ class Answer:
         Whether the search ended by itself.
     """
 
-    plan: Plan
-    problem: Problem
     route: Route
     bound: BorderBound | None
     alternatives: tuple[Alternative, ...]
@@ -98,27 +114,20 @@ class Answer:
             return None
         return max(0.0, self.plan.duration / self.bound.value - 1.0)
 
-    __repr__ = write_brief
-
-    @property
-    def headline(self) -> str:
-        """What it is, in a line."""
-        return f"{self.plan.headline}, phases: {len(self.problem.phases)}"
-
     def to_text(self) -> str:
         """The route as ``[[phases]]``, and how good it is, as comments."""
-        lines = [f"# {line}" for line in self._describe()]
+        lines = [f"# {line}" for line in self.describe()]
         lines += ["", format_phases(self.problem).rstrip()]
         for number, other in enumerate(self.alternatives, start=2):
             lines += [
                 "",
-                f"# alternative {number}: {other.plan.value:.6f} {other.plan.unit}, "
-                f"{other.plan.duration:.6f} s",
+                f"# alternative {number}: {other.describe()[0]}",
                 *(f"# {line}".rstrip() for line in format_phases(other.problem).splitlines()),
             ]
         return "\n".join(lines).rstrip() + "\n"
 
-    def _describe(self) -> list[str]:
+    def describe(self) -> list[str]:
+        """What is known of it, in lines."""
         plan, count = self.plan, len(self.problem.phases)
         lines = [
             f"{count} phase{'s'[: count != 1]}, {plan.options.goal.value} = {plan.value:.6f} "
@@ -140,25 +149,17 @@ class Answer:
         lines.append(f"{tried}, {len(self.failures)} routes without a plan")
         return [*lines, NOT_CONSIDERED]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain values."""
+    @property
+    def values(self) -> dict[str, Any]:
+        """Everything that JSON has."""
         return {
-            "value": self.plan.value,
+            **super().values,
             "unit": self.plan.unit,
-            "duration": self.plan.duration,
-            "phases": list(self.problem.table.get("phases", [])),
             "bound": None if self.bound is None else self.bound.value,
             "gap": self.gap,
             "complete": self.complete,
             "in_cells": self.route.in_cells,
-            "alternatives": [
-                {
-                    "value": other.plan.value,
-                    "duration": other.plan.duration,
-                    "phases": list(other.problem.table.get("phases", [])),
-                }
-                for other in self.alternatives
-            ],
+            "alternatives": [other.values for other in self.alternatives],
             "failures": [failure.reason for failure in self.failures],
             "blocked": [_describe_blocked(own) for own in self.blocked],
             "not_considered": NOT_CONSIDERED,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
-from ..common.brief import draw_html, write_brief
+from ..common.document import Drawn
 from ..mechanics.dynamics import energy
 from ..problem.definition import Phase, Problem
 from ..results.torque import TorqueProfile
@@ -163,8 +163,8 @@ class Glimpses(NamedTuple):
     c_n: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Simulation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Simulation(Drawn):
     """A simulated motion, at every accepted step and every instant asked for.
 
     A phase boundary and a step of the torques are there twice, since forces jump.
@@ -210,9 +210,6 @@ class Simulation:
     missed_by: float
     steps: int
     rejected: int
-
-    __repr__ = write_brief
-    _repr_html_ = draw_html
 
     @property
     def headline(self) -> str:

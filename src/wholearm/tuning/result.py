@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 from ..common.arrays import Array
-from ..common.brief import write_brief
-from ..results.report import plain
-from ..results.report_text import align, show
+from ..common.document import Document, Result, Table
 from ..results.torque import TorqueProfile
 from ..results.torque_table import format_rows, read_rows
 from ..verification.free_report import FreeReport
@@ -62,7 +59,7 @@ class PhaseTuning:
     rate: float = math.nan
     least: float = math.nan
     weakest: str = ""
-    trials: tuple[Trial, ...] = field(default=(), repr=False)
+    trials: tuple[Trial, ...] = ()
     simulations: int = 0
 
     @property
@@ -70,9 +67,19 @@ class PhaseTuning:
         """Its numbers, for people."""
         return name_numbers(self.number, self.last)
 
+    @property
+    def finger(self) -> str:
+        """The finger behind the motion, for people."""
+        return f"finger {self.acting}"
 
-@dataclass(frozen=True, eq=False)
-class Tuning:
+    @property
+    def support(self) -> int | None:
+        """How many times the supporting torque is raised while braking; None if it is not."""
+        return self.supported or None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Tuning(Result):
     """Torques tuned by the 10 % rule.
 
     Attributes
@@ -91,11 +98,11 @@ class Tuning:
 
     name: str
     phases: tuple[PhaseTuning, ...]
-    rows: Array | None
-    report: FreeReport | None
+    rows: Array | None = field(repr=False)
+    report: FreeReport | None = field(repr=False)
     reason: str
 
-    __repr__ = write_brief
+    derived = ("ok", "exit_status", "reason", "simulations", "duration")
 
     @property
     def torque(self) -> TorqueProfile | None:
@@ -108,9 +115,9 @@ class Tuning:
         return self.report is not None and self.report.ok
 
     @property
-    def exit_status(self) -> int:
-        """Exit status of the command line: 0 or 1."""
-        return 0 if self.ok else 1
+    def duration(self) -> float | None:
+        """How long the torques last [s]; None if there are none."""
+        return None if self.rows is None else float(self.rows[-1, 0])
 
     @property
     def simulations(self) -> int:
@@ -137,61 +144,15 @@ class Tuning:
             notes.append(f"# phase {phase.title} = {text}")
         return "\n".join([*notes, format_rows(self.rows)])
 
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain values for JSON, with None where there is no number."""
-        values: dict[str, Any] = {
-            "ok": self.ok,
-            "exit_status": self.exit_status,
-            "reason": self.reason,
-            "name": self.name,
-            "simulations": self.simulations,
-            "duration": None if self.rows is None else float(self.rows[-1, 0]),
-            "phases": [_list_values(phase) for phase in self.phases],
-        }
-        found: dict[str, Any] = plain(values)
-        return found
-
-    def to_text(self) -> str:
+    @property
+    def document(self) -> Document:
         """The verdict with its reason, and a table of the phases."""
-        rows = [_make_row(phase) for phase in self.phases if phase.acting]
-        header = ["phase", "until", "acts", "from [N m]", "drive", "brake", "support", "lasts [s]"]
-        header += ["closing at", "least c_n [N]", "of", "simulations"]
-        head = f"{self.name}: {'ok' if self.ok else 'FAILED'}: {self.reason}"
-        table = ["", *align(header, rows, {1, 2, 3, 10})] if rows else []
-        last = f"{self.simulations} simulations"
-        if self.rows is not None:
-            last += f", {self.rows[-1, 0]:.5f} s"
-        return "\n".join([head, *table, "", last])
-
-
-def _list_values(phase: PhaseTuning) -> dict[str, Any]:
-    keys = [key for key in PhaseTuning.__dataclass_fields__ if key not in ("steps", "trials")]
-    steps = [step._asdict() for step in phase.steps]
-    trials = [
-        trial._asdict()
-        | {
-            "outcome": trial.outcome.value,
-            "steps": [step._asdict() for step in trial.steps],
-            "z": trial.z.tolist(),
-        }
-        for trial in phase.trials
-    ]
-    return {key: getattr(phase, key) for key in keys} | {"steps": steps, "trials": trials}
-
-
-def _make_row(phase: PhaseTuning) -> list[str]:
-    start = " ".join(f"{tau:.4f}" for tau in phase.quasistatic)
-    return [
-        phase.title,
-        phase.until,
-        f"finger {phase.acting}",
-        start,
-        "-" if phase.raised is None else f"{phase.raised:+d}",
-        "-" if phase.braked is None else f"{phase.braked:+d}",
-        f"{phase.supported:+d}" if phase.supported else "-",
-        show(phase.duration, ".5f"),
-        show(phase.rate, ".2g"),
-        show(phase.least, ".4f"),
-        phase.weakest or "-",
-        str(phase.simulations),
-    ]
+        columns = {
+            "title": "phase:d", "until": "until", "finger": "acts",
+            "quasistatic": "from [N m]:.4f", "raised": "drive:+d", "braked": "brake:+d",
+            "support": "support:+d", "duration": "lasts [s]:.5f", "rate": "closing at:.2g",
+            "least": "least c_n [N]:.4f", "weakest": "of", "simulations": "simulations:d",
+        }  # fmt: skip
+        tuned = Table.of((phase for phase in self.phases if phase.acting), columns)
+        last = "" if self.duration is None else f", {self.duration:.5f} s"
+        return self.judge(self.name, self.reason, [tuned, f"{self.simulations} simulations{last}"])

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from ..common.brief import write_brief
+from ..common.document import Document, Result, Table, fixed
 from ..free_simulation.result import FreeSimulation
-from ..results.report import Deviation, plain
-from ..results.report_text import align, fixed, show
+from ..results.report import Deviation
 from ..results.trajectory import Trajectory
 
 MOST = 60
@@ -47,8 +46,8 @@ class FreePhase(NamedTuple):
     deviation: Deviation | None
 
 
-@dataclass(frozen=True)
-class FreeReport:
+@dataclass(frozen=True, repr=False)
+class FreeReport(Result):
     """What a simulation without assumptions showed.
 
     Attributes
@@ -74,8 +73,6 @@ class FreeReport:
     failures: tuple[str, ...]
     warnings: tuple[str, ...]
 
-    __repr__ = write_brief
-
     @property
     def trajectory(self) -> Trajectory:
         """The whole motion, to be saved and drawn like a plan."""
@@ -85,11 +82,6 @@ class FreeReport:
     def ok(self) -> bool:
         """Whether every contact held, and every phase ended where it should."""
         return not self.failures
-
-    @property
-    def exit_status(self) -> int:
-        """Exit status of the command line: 0 or 1."""
-        return 0 if self.ok else 1
 
     @property
     def reason(self) -> str:
@@ -106,77 +98,57 @@ class FreeReport:
             f"{position:.1e} m and {angle:.1e} rad of the plan"
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """Everything as plain values for JSON, with None where there is no number."""
+    @property
+    def values(self) -> dict[str, Any]:
+        """Everything that JSON has."""
         whole = self.whole
-        energies = {name: float(values[-1]) for name, values in whole.energies._asdict().items()}
-        events = [{**e._asdict(), "kind": e.kind.value, "phase": e.phase + 1} for e in whole.events]
-        values: dict[str, Any] = plain(
-            {
-                "ok": self.ok,
-                "exit_status": self.exit_status,
-                "reason": self.reason,
-                "name": self.name,
-                "failures": self.failures,
-                "warnings": self.warnings,
-                "phases_alone": self.alone,
-                "phases": self.phases,
-                "outcome": whole.outcome.text,
-                "events": events,
-                "contacts": whole.stretches,
-                "energy": {**energies, "residual": float(whole.energies.residual[-1])},
-                "residual": whole.residual,
-                "steps": whole.steps,
-            }
+        energies = {name: values[-1] for name, values in whole.energies._asdict().items()}
+        return {
+            **{key: getattr(self, key) for key in ("ok", "exit_status", "reason", "name")},
+            "failures": self.failures,
+            "warnings": self.warnings,
+            "phases_alone": self.alone,
+            "phases": self.phases,
+            "outcome": whole.outcome.text,
+            "events": [{**e._asdict(), "phase": e.phase + 1} for e in whole.events],
+            "contacts": whole.stretches,
+            "energy": {**energies, "residual": whole.energies.residual[-1]},
+            "residual": whole.residual,
+            "steps": whole.steps,
+        }
+
+    @property
+    def document(self) -> Document:
+        """The verdict with its reason, then what happened."""
+        whole, lines = self.whole, [f"failure: {text}" for text in self.failures[1:]]
+        form = fixed(1e-3 * max((s.least for s in whole.stretches if s.least > 0), default=0.0))
+        events = [
+            (e.time, e.phase + 1, e.text.rpartition(" at t =")[0] or e.text) for e in whole.events
+        ]
+        columns = {"contact": "contact", "start": "presses from [s]:.6f", "stop": "to [s]:.6f"}
+        columns |= {"least": f"least c_n [N]:{form}", "time": "at [s]:.6f"}
+        told = "the whole from the start, by the clock" if self.alone else ""
+        return self.judge(
+            self.name,
+            self.reason,
+            [
+                *lines,
+                *(f"warning: {text}" for text in self.warnings),
+                _list_phases(self.alone, "each phase from its planned start"),
+                _list_phases(self.phases, told),
+                Table.of(whole.stretches, columns)._replace(most=MOST),
+                Table(["at t [s]:.6f", "phase:d", "event"], events, most=MOST),
+                f"residual of the contact problems {whole.residual:.1e}, of the energy "
+                f"{abs(whole.energies.residual).max():.1e} J; {whole.outcome.text}",
+            ],
         )
-        return values
-
-    def to_text(self) -> str:
-        """The verdict with its reason, then what happened, as aligned tables."""
-        lines = [f"{self.name}: {'ok' if self.ok else 'FAILED'}: {self.reason}"]
-        lines += [f"failure: {text}" for text in self.failures[1:]]
-        lines += [f"warning: {text}" for text in self.warnings]
-        if self.alone:
-            lines += ["", "each phase from its planned start", *_list_phases(self.alone)]
-            lines += ["", "the whole from the start, by the clock", *_list_phases(self.phases)]
-        else:
-            lines += ["", *_list_phases(self.phases)]
-        lines += ["", *self._list_contacts(), "", *self._list_events()]
-        energies = self.whole.energies
-        lines += ["", f"residual of the contact problems {self.whole.residual:.1e}, of the energy"]
-        lines[-1] += f" {abs(energies.residual).max():.1e} J; {self.whole.outcome.text}"
-        return "\n".join(lines)
-
-    def _list_contacts(self) -> list[str]:
-        known = [s.least for s in self.whole.stretches if s.least > 0]
-        form = fixed(1e-3 * max(known, default=0.0))
-        rows = [
-            [s.contact, f"{s.start:.6f}", f"{s.stop:.6f}", show(s.least, form), f"{s.time:.6f}"]
-            for s in self.whole.stretches[:MOST]
-        ]
-        header = ["contact", "presses from [s]", "to [s]", "least c_n [N]", "at [s]"]
-        return [*align(header, rows, {0}), *_more(len(self.whole.stretches))]
-
-    def _list_events(self) -> list[str]:
-        events = self.whole.events
-        rows = [
-            [f"{e.time:.6f}", str(e.phase + 1), e.text.rpartition(" at t =")[0] or e.text]
-            for e in events[:MOST]
-        ]
-        return [*align(["at t [s]", "phase", "event"], rows, {2}), *_more(len(events))]
 
 
-def _list_phases(phases: tuple[FreePhase, ...]) -> list[str]:
+def _list_phases(phases: tuple[FreePhase, ...], title: str) -> Table:
     rows = []
     for phase in phases:
         lost = ", ".join(f"{loss.contact} at {loss.time:.5f}" for loss in phase.losses)
-        end = phase.deviation
-        away = ("-", "-") if end is None else (f"{end.position:.1e}", f"{end.angle:.1e}")
-        stop = f"{phase.stop:.5f}" if phase.reached else "-"
-        rows.append([str(phase.number), f"{phase.start:.5f}", stop, *away, lost or "-"])
-    header = ["phase", "from [s]", "to [s]", "end dev. [m]", "[rad]", "contacts lost [s]"]
-    return align(header, rows, {5})
-
-
-def _more(count: int) -> list[str]:
-    return [f"... and {count - MOST} more, see --json"] if count > MOST else []
+        end, stop = phase.deviation or (None, None), phase.stop if phase.reached else None
+        rows.append((phase.number, phase.start, stop, *end[:2], lost or "-"))
+    heads = ["phase:d", "from [s]:.5f", "to [s]:.5f", "end dev. [m]:.1e", "[rad]:.1e"]
+    return Table([*heads, "contacts lost [s]"], rows, title)

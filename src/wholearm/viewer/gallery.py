@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from functools import partial
 
+from ..common.document import Table
 from ..common.files import make_folder, write_text
 from ..figures import plots
 from ..geometry.path_guess import load
@@ -18,7 +19,7 @@ _WIDTH, _DOTS = 8.0, 110
 """Of figures [in] and [dots per inch]."""
 _LASTS, _RESOLUTION = 2.0, 50
 """Of movies [s] and [dots per inch]."""
-_HEADS = "| problem | phases | least time [s] | least c_n [N] | finger gap [mm] | replayed |"
+_HEADS = ["problem", "phases:d", "least time [s]:.6f", "least c_n [N]:.4f", "finger gap [mm]:.1f"]
 
 
 def write_gallery(
@@ -35,7 +36,7 @@ def write_gallery(
     """
     folder = os.path.splitext(page)[0]
     make_folder(folder)
-    rows, pictures = [_HEADS, "|---|---|---|---|---|---|"], []
+    rows, pictures = [], list[str]()
     for path in paths:
         name = os.path.splitext(os.path.basename(path))[0]
         progress(name)
@@ -50,7 +51,8 @@ def write_gallery(
         f"Least-time plans, each slowed down to {_LASTS:g} s: contact forces in their friction "
         "cones, and torques as arcs at the joints."
     )
-    write_text(page, "\n\n".join(["# Gallery", text, "\n".join(rows), *pictures]) + "\n")
+    table = Table([*_HEADS, "replayed"], rows).to_markdown()
+    write_text(page, "\n\n".join(["# Gallery", text, table, *pictures]) + "\n")
 
 
 def _say(progress: Callable[[str], None], name: str, text: str) -> None:
@@ -65,12 +67,12 @@ def _draw(plan: Plan, stem: str) -> None:
     write_movie(movie, f"{stem}.gif")
 
 
-def _list_figures(name: str, plan: Plan) -> str:
+def _list_figures(name: str, plan: Plan) -> tuple[object, ...]:
     """A row of the table: what the plan comes to, and what a replay says."""
     report = verify(plan.problem, plan)
-    gap = "" if report.finger_gap is None else f"{1e3 * report.finger_gap.least:.1f}"
+    gap = "" if report.finger_gap is None else report.finger_gap.least
     least = min(
         own.least for phase in report.phases for own in phase.contacts if own.least == own.least
     )
     verdict = "ok" if report.ok else "FAILED"
-    return f"| {name} | {len(plan.phases)} | {plan.value:.6f} | {least:.4f} | {gap} | {verdict} |"
+    return name, len(plan.phases), plan.value, least, gap, verdict

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from html import escape
 from importlib import resources
 from typing import Any
@@ -33,28 +33,14 @@ def write_heading(text: str) -> str:
     return f"<h2>{escape(text)}</h2>"
 
 
-def write_paragraph(text: str, kind: str = "") -> str:
-    """A paragraph, of class `kind` if one is given."""
-    look = f' class="{kind}"' if kind else ""
-    return f"<p{look}>{escape(text)}</p>"
+def write_text(text: str, title: str) -> str:
+    """Text as it stands, folded away under a title."""
+    return fold(f"<pre>{escape(text)}</pre>", title)
 
 
-def write_text(text: str, title: str = "") -> str:
-    """Text as it stands; under a title it is folded away."""
-    block = f"<pre>{escape(text)}</pre>"
-    return f"<details><summary>{escape(title)}</summary>{block}</details>" if title else block
-
-
-def write_table(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int = 1) -> str:
-    """A table whose first `words` columns are text, and the others numbers."""
-
-    def line(kind: str, cells: Sequence[str]) -> str:
-        looks = [' class="text"' if k < words else "" for k in range(len(cells))]
-        own = zip(looks, cells, strict=True)
-        return "<tr>" + "".join(f"<{kind}{look}>{escape(c)}</{kind}>" for look, c in own) + "</tr>"
-
-    lines = [line("th", heads), *(line("td", row) for row in rows)]
-    return f'<div class="scroll"><table>{"".join(lines)}</table></div>'
+def fold(content: str, title: str) -> str:
+    """HTML folded away under a title."""
+    return f"<details><summary>{escape(title)}</summary>{content}</details>"
 
 
 def write_player(motion: dict[str, Any]) -> str:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import platform
 from collections.abc import Callable, Sequence
 
+from ..common.document import Document, Table
 from ..comparison.compare import compare
-from ..comparison.side_by_side import Comparison, Contender
+from ..comparison.side_by_side import Contender
 from ..mapping.formation_map import FormationMap, build_map, choose_window
 from ..problem.definition import Problem
-from ..results.report_text import fixed
 from . import page
 from .chart import describe_map
 from .motion import describe_motion
-from .tables import JOINT_HEADS, PHASE_HEADS, list_joints, list_phases
+from .tables import list_joints, list_phases
 
 _SAMPLES = 8000
 """Of all motions in a page, which they leave at some 3 MB."""
@@ -48,7 +48,7 @@ def build_report(
         If a file cannot be read, or is one of another problem; names the file.
     """
     comparison = compare(problem, paths, progress)
-    parts = [_summarise(comparison)]
+    parts = [comparison.summary.to_html()]
     for contender in comparison.contenders:
         progress(f"writing {contender.name}")
         parts += _describe(contender, _SAMPLES // len(comparison.contenders))
@@ -63,24 +63,8 @@ def build_report(
         page.write_heading("Problem"),
         page.write_text(text or str(problem), "the problem file"),
     ]
-    parts += [page.write_paragraph(_name_versions())]
+    parts += [Document(_name_versions()).to_html()]
     return page.build_page(problem.name, parts)
-
-
-def _summarise(comparison: Comparison) -> str:
-    heads = ("", "verdict", "duration [s]", "effort [(N m)^2 s]", "least margin [N]", "of")
-    rows = [
-        (
-            own.name,
-            own.verdict,
-            f"{own.duration:.6g}",
-            f"{own.effort:.6g}",
-            "" if own.margin is None else f"{own.margin:{fixed(comparison.epsilon or 0.05)}}",
-            f"{own.contact} in phase {own.phase}" if own.contact else "",
-        )
-        for own in comparison.contenders
-    ]
-    return page.write_table(heads, rows, words=2)
 
 
 def _describe(contender: Contender, most: int) -> list[str]:
@@ -90,26 +74,22 @@ def _describe(contender: Contender, most: int) -> list[str]:
     """
     problem, planned = contender.problem, contender.planned
     parts = [page.write_heading(contender.name)]
-    kind = "ok" if contender.ok else "bad"
-    parts.append(page.write_paragraph(f"{contender.verdict}: {contender.reason}", kind))
+    parts.append(Document("", contender.verdict, contender.reason).to_html())
     replayed = None if contender.report is None else contender.report.trajectory
     shown = planned or replayed
     if shown is None or problem is None:
         return parts
     ghost = replayed if planned is not None else None
     parts.append(page.write_player(describe_motion(shown, problem, ghost, most)))
-    parts.append(page.write_table(PHASE_HEADS, list_phases(problem, shown), words=4))
-    joints = list_joints(shown)
-    if joints:
-        parts.append(page.write_table(JOINT_HEADS, joints, words=2))
-    if contender.report is not None:
-        parts.append(page.write_text(contender.report.to_text(), "what verify says"))
     timings = shown.meta.get("timings")
-    if isinstance(timings, dict):
-        # Routes are planned from parts that are replayed before: then nothing is left of a step.
-        known = {name: value for name, value in timings.items() if value and value >= 1e-3}
-        rows = [(str(name), f"{value:.4g}") for name, value in known.items()]
-        parts.append(page.write_table(("planning took", "s"), rows))
+    # Routes are planned from parts that are replayed before: then nothing is left of a step.
+    known = timings.items() if isinstance(timings, dict) else ()
+    took = [(str(name), value) for name, value in known if value and value >= 1e-3]
+    tables = [list_phases(problem, shown), list_joints(shown)]
+    tables.append(Table(["planning took", "[s]:.4g"], took))
+    parts.append(Document("", parts=tables).to_html())
+    if contender.report is not None:
+        parts.append(page.fold(contender.report.document.to_html(), "what verify says"))
     return parts
 
 

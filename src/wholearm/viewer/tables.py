@@ -6,19 +6,13 @@ import math
 
 import numpy as np
 
+from ..common.document import Table, fixed, show
 from ..problem.definition import Problem
-from ..results.report_text import fixed
 from ..results.trajectory import Trajectory
 
-PHASE_HEADS = ("phase", "contacts", "until", "end", "duration [s]", "least c_n [N]", "of")
-JOINT_HEADS = (
-    "after phase", "contacts: c_n before \u2192 after [N]", "t [s]", "x [mm]", "phi [deg]",
-    "speed before [m/s]", "after", "tau1 before [N m]", "after", "tau2 before", "after",
-)  # fmt: skip
 
-
-def list_phases(problem: Problem, trajectory: Trajectory) -> list[list[str]]:
-    """A row for each phase that the motion enters, under `PHASE_HEADS`."""
+def list_phases(problem: Problem, trajectory: Trajectory) -> Table:
+    """A row for each phase that the motion enters."""
     rows = []
     for index in np.unique(trajectory.phase):
         phase, own = problem.phases[index], trajectory.phase == index
@@ -28,33 +22,32 @@ def list_phases(problem: Problem, trajectory: Trajectory) -> list[list[str]]:
             least = float(np.nanmin(c_n))
             name = trajectory.contacts[int(np.nanargmin(c_n)) % c_n.shape[1]]
         contacts = " ".join(contact.name for contact in phase.formation.contacts)
-        figures = [f"{t[-1] - t[0]:.6f}", f"{least:{fixed(problem.epsilon or 0.05)}}", name]
-        rows.append([str(index + 1), contacts, str(phase.until), phase.end.value, *figures])
-    return rows
+        text = contacts, str(phase.until), phase.end.value
+        rows.append((index + 1, *text, t[-1] - t[0], least, name))
+    force = fixed(problem.epsilon or 0.05)
+    heads = ["phase:d", "contacts", "until", "end", "duration [s]:.6f", f"least c_n [N]:{force}"]
+    return Table([*heads, "of"], rows)
 
 
-def list_joints(trajectory: Trajectory) -> list[list[str]]:
-    """A row for each place where a phase passes into the next one, under `JOINT_HEADS`."""
+def list_joints(trajectory: Trajectory) -> Table:
+    """A row for each place where a phase passes into the next one."""
     rows, planar = [], np.hypot(*trajectory.q_dot[:, :2].T)
     force = fixed(min(float(np.nanmax(trajectory.c_n, initial=0.0)), 10.0), 5)
     speed = fixed(min(float(planar.max()), 0.5), 4)
     torque = fixed(min(float(np.abs(trajectory.tau).max()), 2.0), 5)
     for after in np.flatnonzero(np.diff(trajectory.phase)) + 1:
-        sides = (after - 1, after)
-        before, later = (trajectory.c_n[k] for k in sides)
+        sides = [after - 1, after]
         forces = [
-            f"{name}: {_show(before[k], force)} \u2192 {_show(later[k], force)}"
-            for k, name in enumerate(trajectory.contacts)
-            if math.isfinite(before[k]) or math.isfinite(later[k])
+            f"{name}: {show(before, force)} \u2192 {show(later, force)}"
+            for name, before, later in zip(trajectory.contacts, *trajectory.c_n[sides], strict=True)
+            if math.isfinite(before) or math.isfinite(later)
         ]
         x, _, phi = trajectory.q[after]
-        place = [f"{trajectory.t[after]:.6f}", f"{1e3 * x:z.3f}", f"{math.degrees(phi):z.3f}"]
-        speeds = [f"{planar[k]:{speed}}" for k in sides]
-        torques = [f"{trajectory.tau[k, j]:{torque}}" for j in (0, 1) for k in sides]
-        number = str(trajectory.phase[after - 1] + 1)
-        rows.append([number, ", ".join(forces), *place, *speeds, *torques])
-    return rows
-
-
-def _show(value: float, form: str) -> str:
-    return f"{value:{form}}" if math.isfinite(value) else "none"
+        place = trajectory.t[after], x, phi
+        torques = trajectory.tau[sides].T.ravel()
+        number = trajectory.phase[after - 1] + 1
+        rows.append((number, ", ".join(forces), *place, *planar[sides], *torques))
+    heads = ["after phase:d", "c_n before \u2192 after [N]", "t [s]:.6f", "x [mm]:z.3f"]
+    heads += ["phi [deg]:z.3f", f"speed before [m/s]:{speed}", f"after:{speed}"]
+    heads += [f"tau1 before [N m]:{torque}", f"after:{torque}"]
+    return Table([*heads, f"tau2 before:{torque}", f"after:{torque}"], rows)

@@ -1,0 +1,263 @@
+"""Reports as data: a title with a verdict, lines and tables, rendered as text, HTML, JSON."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .plain import plain
+
+LONGEST = 100
+"""Characters of a `repr`."""
+SCALES = {"mm": 1e3, "mm/s": 1e3, "ms": 1e3, "deg": 180 / math.pi, "%": 1e2}
+"""What numbers in SI units are multiplied by in a column of that unit."""
+
+
+class Table(NamedTuple):
+    """Rows of values under columns.
+
+    Attributes
+    ----------
+    columns : sequence of str
+        ``"name [unit]:format"``: numbers in SI units, written in that unit (`SCALES`) and format,
+        flush right. Without a format cells are text, flush left.
+    rows : sequence of sequence
+        Numbers, several of them for one cell, or text; None and NaN are written as a dash.
+    title : str
+    most : int or None
+        Most rows that are rendered as text; the others are counted.
+    """
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+    title: str = ""
+    most: int | None = None
+
+    @staticmethod
+    def of(items: Iterable[Any], columns: Mapping[str, str], title: str = "") -> Table:
+        """A row for each item, with the attributes that columns are given by, such as ``a.b``.
+
+        Where there is no a there is no value.
+        """
+        rows = [[_find(item, name) for name in columns] for item in items]
+        return Table(list(columns.values()), rows, title)
+
+    @property
+    def heads(self) -> list[str]:
+        """Names of the columns, with units."""
+        parts = [column.rpartition(":") for column in self.columns]
+        return [name if colon else text for name, colon, text in parts]
+
+    @property
+    def forms(self) -> list[str]:
+        """Formats of the columns, empty for text."""
+        return [column.rpartition(":")[2] if ":" in column else "" for column in self.columns]
+
+    @property
+    def cells(self) -> list[list[str]]:
+        """The rows as text."""
+        units = [head.rpartition("[")[2].rstrip("]") for head in self.heads]
+        how = [(form, SCALES.get(unit, 1.0)) for form, unit in zip(self.forms, units, strict=True)]
+        return [
+            [show(value, *own) for value, own in zip(row, how, strict=True)] for row in self.rows
+        ]
+
+    def to_text(self) -> str:
+        """Aligned columns under their names."""
+        forms, lines = self.forms, [self.heads, *self.cells[: self.most]]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        text = [self.title] if self.title else []
+        for line in lines:
+            padded = (
+                cell.rjust(width) if form else cell.ljust(width)
+                for cell, width, form in zip(line, widths, forms, strict=True)
+            )
+            text.append("  ".join(padded).rstrip())
+        rest = len(self.rows) - len(self.rows[: self.most])
+        return "\n".join([*text, *([f"... and {rest} more, see --json"] if rest else [])])
+
+    def to_html(self) -> str:
+        """The table as HTML; cells of text have the class ``text``."""
+        looks = ["" if form else ' class="text"' for form in self.forms]
+        lines = [
+            "".join(
+                f"<{kind}{look}>{escape(cell)}</{kind}>"
+                for look, cell in zip(looks, line, strict=True)
+            )
+            for kind, part in (("th", [self.heads]), ("td", self.cells))
+            for line in part
+        ]
+        table = "".join(f"<tr>{line}</tr>" for line in lines)
+        title = f"<caption>{escape(self.title)}</caption>" if self.title else ""
+        return f'<div class="scroll"><table>{title}{table}</table></div>'
+
+    def to_markdown(self) -> str:
+        """The table as Markdown."""
+        rule = ["---:" if form else "---" for form in self.forms]
+        lines = (" | ".join(map(_escape_bar, line)) for line in (self.heads, rule, *self.cells))
+        return "\n".join(f"| {line} |" for line in lines)
+
+
+class Document(NamedTuple):
+    """What a result says.
+
+    Attributes
+    ----------
+    title : str
+        What it is about.
+    verdict, reason : str
+        Whether that holds, in a word, and the sentence behind it; empty where nothing is judged.
+    parts : sequence of (str or Table)
+        Lines, and tables with what they are called, in the order of reading; empty ones are left
+        out.
+    """
+
+    title: str
+    verdict: str = ""
+    reason: str = ""
+    parts: Sequence[str | Table] = ()
+
+    @property
+    def head(self) -> str:
+        """Title, verdict and reason, in a line."""
+        return ": ".join(filter(None, (self.title, self.verdict, self.reason)))
+
+    @property
+    def shown(self) -> list[str | Table]:
+        """The parts that are not empty."""
+        return [part for part in self.parts if (part.rows if isinstance(part, Table) else part)]
+
+    def to_text(self) -> str:
+        """Lines of text, with an empty one above and below tables."""
+        blocks, lines = list[str](), [self.head] if self.head else []
+        for part in self.shown:
+            if isinstance(part, str):
+                lines.append(part)
+                continue
+            blocks += ["\n".join(lines)] if lines else []
+            blocks, lines = [*blocks, part.to_text()], []
+        return "\n\n".join([*blocks, *(["\n".join(lines)] if lines else [])])
+
+    def to_html(self) -> str:
+        """Paragraphs and tables of HTML; of class ``ok`` or ``bad`` as the verdict is."""
+        look = {"": "", "ok": ' class="ok"'}.get(self.verdict, ' class="bad"')
+        parts = [f"<p{look}>{escape(self.head)}</p>"] if self.head else []
+        parts += [
+            f"<p>{escape(part)}</p>" if isinstance(part, str) else part.to_html()
+            for part in self.shown
+        ]
+        return "\n".join(parts)
+
+
+class Brief:
+    """What is one line as a `repr`."""
+
+    @property
+    def headline(self) -> str:
+        """What it is, in a line."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        line = f"{type(self).__name__}({self.headline})"
+        return line if len(line) <= LONGEST else f"{line[: LONGEST - 4]}...)"
+
+
+class Drawn(Brief):
+    """A motion or a map, which is a picture in notebooks: SVG under its line."""
+
+    def _repr_html_(self) -> str:
+        name, function = "plots", "force_margins"
+        if hasattr(self, "crossings"):
+            name, function = "formation_map", "draw_map"
+        # Figures stand on everything else, so that nothing loads them before it is drawn.
+        figure = getattr(import_module(f"wholearm.figures.{name}"), function)(self)
+        stream = io.StringIO()
+        figure.savefig(stream, format="svg")
+        picture = stream.getvalue()
+        return f"<p>{escape(repr(self))}</p>{picture[picture.index('<svg') :]}"
+
+
+class Result(Brief):
+    """A result that says what it is by its `document`; rendering is the same for all.
+
+    Attributes
+    ----------
+    derived : tuple of str
+        Properties that plain values have beside the fields.
+    """
+
+    derived: tuple[str, ...] = ()
+
+    @property
+    def document(self) -> Document:
+        """What it says."""
+        raise NotImplementedError
+
+    @property
+    def values(self) -> Any:
+        """What `to_dict` makes plain."""
+        return self
+
+    @property
+    def ok(self) -> bool:
+        """Whether everything holds that was looked at."""
+        return True
+
+    @property
+    def exit_status(self) -> int:
+        """Exit status of the command line: 0 or 1."""
+        return 0 if self.ok else 1
+
+    @property
+    def headline(self) -> str:
+        """What it is, in a line."""
+        return self.document.head
+
+    def judge(self, name: str, reason: str, parts: Sequence[str | Table]) -> Document:
+        """The document of a result that holds or does not."""
+        return Document(name, "ok" if self.ok else "FAILED", reason, parts)
+
+    def to_text(self) -> str:
+        """Lines of text and aligned tables."""
+        return self.document.to_text()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON, with None where there is no number."""
+        found: dict[str, Any] = plain(self.values)
+        return found
+
+    def _repr_html_(self) -> str:
+        return self.document.to_html()
+
+
+def _escape_bar(text: str) -> str:
+    return text.replace("|", "\\|")
+
+
+def _find(item: Any, name: str) -> Any:
+    for part in name.split("."):
+        item = None if item is None else getattr(item, part)
+    return item
+
+
+def show(value: Any, form: str, scale: float = 1.0) -> str:
+    """A value as text, a number in a format and times a scale; a dash where there is none."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, tuple | list | np.ndarray):
+        return " ".join(show(own, form, scale) for own in value)
+    if value is None or math.isnan(value):
+        return "-"
+    return format(value if scale == 1.0 else scale * value, form)
+
+
+def fixed(size: float, digits: int = 3) -> str:
+    """The format that gives a value of this size so many significant digits; no zero is minus."""
+    places = digits - 1 - math.floor(math.log10(size)) if size > 0 else digits
+    return f"z.{min(max(places, 0), 15)}f"
