@@ -29,6 +29,8 @@ def add_new(parser: argparse.ArgumentParser) -> None:
 def add_schema(parser: argparse.ArgumentParser) -> None:
     """Add what `schema` takes."""
     parser.add_argument("-o", "--output", metavar="FILE", help="file to write, instead of printing")
+    text = "print all keys with unit, default and range as tables (Markdown) instead"
+    parser.add_argument("--table", action="store_true", help=text)
     parser.set_defaults(run=_show_schema)
 
 
@@ -64,11 +66,12 @@ def _read_vertices(text: str) -> Array:
 
 
 def _show_schema(options: argparse.Namespace) -> int:
-    from importlib import resources
+    import json
 
     from ..common.files import require_writable, write_text
+    from ..problem.keys import build_schema, write_page
 
-    text = resources.files("wholearm.problem").joinpath("schema.json").read_text(encoding="utf-8")
+    text = write_page() if options.table else json.dumps(build_schema(), indent=2) + "\n"
     if options.output is None:
         print(text, end="")
         return 0

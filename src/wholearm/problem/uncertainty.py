@@ -11,6 +11,9 @@ from ..common.errors import InputError
 from ..common.require import require_number
 from ..scene.model import Friction, Scene
 
+LENGTH = 1 / 30
+"""Length of a scene, where none is known [m]: about that of the scenes in `problems/`."""
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -29,9 +32,11 @@ class Parameter:
     default: float
     unit: str = ""
 
+    def find_default(self, length: float = LENGTH) -> float:
+        """The default in its unit, with the length of the scene [m]."""
+        return self.default * length if self.unit == "m" else self.default
 
-LENGTH = 1 / 30
-"""Length of a scene, where none is known [m]: about that of the scenes in `problems/`."""
+
 PARAMETERS = (
     Parameter("mass", 0.05),
     Parameter("inertia", 0.05),
@@ -72,8 +77,7 @@ def read_widths(
     length : float, [m]
         The scene's, which defaults of lengths are in proportion to.
     """
-    defaults = {own.name: own.default * (length if own.unit == "m" else 1) for own in PARAMETERS}
-    return defaults | spread_widths(given, label)
+    return {own.name: own.find_default(length) for own in PARAMETERS} | spread_widths(given, label)
 
 
 def spread_widths(given: Mapping[str, object], label: str) -> dict[str, float]:

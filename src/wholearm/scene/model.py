@@ -41,8 +41,33 @@ from numpy.typing import ArrayLike
 
 from ..common.arrays import Array
 from ..common.errors import InputError
-from ..common.require import require_number, require_vector
+from ..common.fields import (
+    BOOLEAN,
+    COEFFICIENT,
+    NONNEGATIVE,
+    POINT,
+    POSITIVE,
+    choice,
+    key,
+    read_keys,
+)
 from .polygon import Polygon
+from .ranges import (
+    CONTROL_PERIOD,
+    DRY,
+    FRICTION,
+    GRAVITY,
+    JOINT,
+    LAG,
+    LENGTH,
+    PLACE,
+    RADIUS,
+    SPEED,
+    STRENGTH,
+    TORQUE,
+    TORQUE_RATE,
+    VISCOUS,
+)
 
 LIGHT = 1e-4
 """Weight, over what the weaker finger can press with, that is next to nothing."""
@@ -52,75 +77,63 @@ TOUCHING = 3e-6
 """Gap below which features count as touching, in radii of gyration of the object."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Finger:
     """A single-link finger: a capsule on a motorised revolute joint.
 
-    Parameters
-    ----------
-    base : array_like, shape (2,), [m]
-        The joint.
-    length : float, [m]
-        From the joint to the centre of the tip.
-    radius : float, [m]
-        Half thickness of the link and radius of its tip; zero for a pointed line.
-    inertia : float, [kg m^2]
-        J_i about the joint.
-    viscous, dry : float, [N m s], [N m]
-        Viscous and dry friction of the joint, B_i and D_i.
-    torque_limit : float, [N m]
-    speed_limit : float, optional, [rad/s]
-        Infinite when left out.
-    torque_rate_limit : float, optional, [N m/s]
-        Largest rate at which the torque changes; infinite when left out, and then it may step.
-    actuator_lag : float, [s]
-        Time constant with which the torque follows its command.
-    name : str
-        Key of this finger in messages.
-
-    Notes
-    -----
-    The unit of a field is that of `Scales` with this name.
+    `name` is the key of the finger in messages.
     """
 
-    base: ArrayLike = field(metadata={"unit": "length"})
-    length: float = field(metadata={"unit": "length"})
-    radius: float = field(metadata={"unit": "length"})
-    inertia: float = field(metadata={"unit": "inertia"})
-    viscous: float = field(metadata={"unit": "drag"})
-    dry: float = field(metadata={"unit": "torque"})
-    torque_limit: float = field(metadata={"unit": "torque"})
-    speed_limit: float = field(default=math.inf, metadata={"unit": "rate"})
-    torque_rate_limit: float = field(default=math.inf, metadata={"unit": "torque_rate"})
-    actuator_lag: float = field(default=0.0, metadata={"unit": "time"})
+    base: ArrayLike = field(metadata=key("The joint [m].", POINT, "length", PLACE))
+    length: float = field(
+        metadata=key("From the joint to the centre of the tip [m].", POSITIVE, "length", LENGTH)
+    )
+    radius: float = field(
+        default=0.0, metadata=key("Half thickness of the link [m].", NONNEGATIVE, "length", RADIUS)
+    )
+    inertia: float = field(metadata=key("About the joint [kg m^2].", POSITIVE, "inertia", JOINT))
+    viscous: float = field(
+        default=0.0,
+        metadata=key("Viscous friction of the joint [N m s].", NONNEGATIVE, "drag", VISCOUS),
+    )
+    dry: float = field(
+        default=0.0, metadata=key("Dry friction of the joint [N m].", NONNEGATIVE, "torque", DRY)
+    )
+    torque_limit: float = field(metadata=key("[N m]", POSITIVE, "torque", TORQUE, STRENGTH))
+    speed_limit: float = field(
+        default=math.inf,
+        metadata=key("Of the joint [rad/s]; none by default.", POSITIVE, "rate", SPEED),
+    )
+    torque_rate_limit: float = field(
+        default=math.inf,
+        metadata=key(
+            "How quickly the torque may change [N m/s]; none by default: it may step.",
+            *(POSITIVE, "torque_rate", TORQUE_RATE),
+        ),
+    )
+    actuator_lag: float = field(
+        default=0.0,
+        metadata=key(
+            "Time constant with which the torque follows its command [s].",
+            *(NONNEGATIVE, "time", LAG),
+        ),
+    )
     name: str = "fingers"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "base", require_vector(self.base, f"{self.name}.base", 2))
-        for key in ("length", "inertia", "torque_limit"):
-            value = require_number(getattr(self, key), f"{self.name}.{key}", positive=True)
-            object.__setattr__(self, key, value)
-        for key in ("radius", "viscous", "dry", "actuator_lag"):
-            value = require_number(getattr(self, key), f"{self.name}.{key}", nonnegative=True)
-            object.__setattr__(self, key, value)
-        for key in ("speed_limit", "torque_rate_limit"):
-            if getattr(self, key) != math.inf:
-                value = require_number(getattr(self, key), f"{self.name}.{key}", positive=True)
-                object.__setattr__(self, key, value)
+        read_keys(self, f"{self.name}.")
 
 
 @dataclass(frozen=True)
 class Friction:
     """Coulomb coefficients between the object and each part of the hand."""
 
-    palm: float
-    finger1: float
-    finger2: float
+    palm: float = field(metadata=key("", COEFFICIENT, "", FRICTION))
+    finger1: float = field(metadata=key("", COEFFICIENT, "", FRICTION))
+    finger2: float = field(metadata=key("", COEFFICIENT, "", FRICTION))
 
     def __post_init__(self) -> None:
-        for key in ("palm", "finger1", "finger2"):
-            value = require_number(getattr(self, key), f"friction.{key}", nonnegative=True)
-            object.__setattr__(self, key, value)
+        read_keys(self, "friction.")
 
     def of(self, finger: int | None) -> float:
         """Coefficient with finger 0 or 1, or with the palm when `finger` is None."""
@@ -190,19 +203,12 @@ class Scales(NamedTuple):
 class Scene:
     """Everything that does not move by plan: object, both fingers, friction and gravity.
 
-    Parameters
+    Attributes
     ----------
     polygon : Polygon
     fingers : (Finger, Finger)
         The right one, then the left one.
     friction : Friction
-    gravity : float, [m/s^2]
-    control_period : float, [s]
-        Over which planned torques are held, from the start of each phase; 0 for free torques.
-    control_hold : {"constant", "linear"}
-        How they are held over it.
-    fingers_collide : bool
-        Whether the links are solid to each other; False for fingers in different planes.
 
     Raises
     ------
@@ -213,22 +219,33 @@ class Scene:
     polygon: Polygon
     fingers: tuple[Finger, Finger]
     friction: Friction
-    gravity: float = 9.81
-    fingers_collide: bool = True
-    control_period: float = 0.0
-    control_hold: str = "constant"
+    gravity: float = field(
+        default=9.81, metadata=key("[m/s^2]", NONNEGATIVE, "acceleration", GRAVITY)
+    )
+    fingers_collide: bool = field(
+        default=True,
+        metadata=key(
+            "Whether the links stop each other; false where they move in different planes.", BOOLEAN
+        ),
+    )
+    control_period: float = field(
+        default=0.0,
+        metadata=key(
+            "Period over which torques are held; with 0 they are free [s].",
+            *(NONNEGATIVE, "time", CONTROL_PERIOD),
+        ),
+    )
+    control_hold: str = field(
+        default=HOLDS[0],
+        metadata=key(
+            "Whether torques are constant over each period, or lines that go on from period to "
+            "period.",
+            choice(*HOLDS),
+        ),
+    )
 
     def __post_init__(self) -> None:
-        value = require_number(self.gravity, "gravity", nonnegative=True)
-        object.__setattr__(self, "gravity", value)
-        if not isinstance(self.fingers_collide, bool):
-            given = f"{self.fingers_collide!r} given; allowed are true and false"
-            raise InputError("", "fingers_collide", given)
-        period = require_number(self.control_period, "control_period", nonnegative=True)
-        object.__setattr__(self, "control_period", period)
-        if self.control_hold not in HOLDS:
-            given = f"{self.control_hold!r} given; allowed are {' and '.join(map(repr, HOLDS))}"
-            raise InputError("", "control_hold", given)
+        read_keys(self)
         # Messages name a finger by its place here, whatever it was made as.
         named = zip(self.fingers, ("fingers.1", "fingers.2"), strict=True)
         fingers = tuple(f if f.name == name else replace(f, name=name) for f, name in named)

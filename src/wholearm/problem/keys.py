@@ -1,0 +1,167 @@
+"""Keys of a problem file, table by table: names for `Problem.with_`, JSON Schema, and a page.
+
+Most are declared where their values are kept, in `Polygon`, `Finger`, `Friction`, `Scene`,
+`Problem`, `Phase` and `Goal`; what else a file has is declared here.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from ..common.fields import NONNEGATIVE, POINT, Field, keys_of, leave, refer
+from ..scene.model import Finger, Friction, Scene
+from ..scene.polygon import Polygon
+from ..scene.ranges import FRICTION as COEFFICIENTS
+from ..scene.ranges import PLACE
+from .definition import CONTACT, Phase, Problem
+from .goal import INDEX, Goal
+from .uncertainty import GROUPS, PARAMETERS
+
+Table = Mapping[str, Field]
+"""Keys of a table by name."""
+
+
+def list_keys(owner: type) -> dict[str, Field]:
+    """The declared fields of a dataclass, by their names in a file."""
+    return {own.name: own for own in keys_of(owner).values()}
+
+
+_RELATIVE = leave({"type": "number", "minimum": 0, "exclusiveMaximum": 1})
+_WIDTHS = {
+    own.name: Field(f"Half width [{own.unit}].", NONNEGATIVE, default=own.find_default())
+    if own.unit
+    else Field("Half width, relative.", _RELATIVE, default=own.default)
+    for own in PARAMETERS
+}
+OBJECT, FINGER, FRICTION = list_keys(Polygon), list_keys(Finger), list_keys(Friction)
+PHASE, GOAL = list_keys(Phase), list_keys(Goal)
+FINGERS: Table = {
+    "1": Field("The right finger.", leave(refer("finger"))),
+    "2": Field("The left finger.", leave(refer("finger"))),
+}
+START: Table = {
+    "flush": Field("The edge that lies on the palm; edge 0 runs from vertex 0 to vertex 1.", INDEX),
+    "x": Field("Of the centroid [m]; both fingers close on the object.", ranges=(PLACE,)),
+}
+UNTIL: Table = {
+    "contact": Field("", leave(refer("contact")), default=None),
+    "x": Field("[m]", default=None),
+    "phi_deg": Field("[degrees]", default=None),
+}
+UNCERTAINTY: Table = {name: _WIDTHS[names[0]] for name, names in GROUPS.items()} | _WIDTHS
+_TABLE, _OPTIONAL = Field(), Field(default=None)
+TOP: Table = {
+    **list_keys(Problem),
+    **list_keys(Scene),
+    **dict.fromkeys(("object", "fingers", "friction", "start"), _TABLE),
+    **dict.fromkeys(("uncertainty", "goal", "phases"), _OPTIONAL),
+}
+
+
+def name_keys() -> dict[str, tuple[str, ...]]:
+    """Short names for `Problem.with_` and the dotted keys that each stands for."""
+    names: dict[str, tuple[str, ...]] = {key: (key,) for key in TOP}
+    names |= {key: (f"object.{key}",) for key in OBJECT}
+    names |= {key: (f"start.{key}",) for key in START}
+    names |= {f"friction_{key}": (f"friction.{key}",) for key in FRICTION}
+    names["friction"] = tuple(f"friction.{key}" for key in FRICTION)
+    for key, own in FINGER.items():
+        name = f"finger_{key}" if key in OBJECT else key
+        names |= {f"{name}{number}": (f"fingers.{number}.{key}",) for number in FINGERS}
+        if own.kind is not POINT:
+            names[name] = tuple(f"fingers.{number}.{key}" for number in FINGERS)
+    return names
+
+
+def build_schema() -> dict[str, Any]:
+    """The JSON Schema of problem files."""
+    goal = {"oneOf": [{"required": ["flush"]}, {"required": ["phi_deg"]}]}
+    until = {
+        "type": "object",
+        "additionalProperties": False,
+        "minProperties": 1,
+        "properties": _describe(UNTIL),
+    }
+    ends = [
+        {"required": ["until"]},
+        {"required": ["end"], "properties": {"end": {"const": "smooth"}}},
+    ]
+    phase = _describe_table(PHASE) | {"anyOf": ends}
+    phase["properties"]["until"]["oneOf"] = [refer("contact"), until]
+    goals = [refer("goal"), {"type": "array", "items": refer("goal")}]
+    parts = {
+        "object": _describe_table(OBJECT),
+        "fingers": _describe_table(FINGERS),
+        "friction": _describe_table(FRICTION, "Coefficients of friction with the object."),
+        "start": _describe_table(START),
+        "uncertainty": _describe_table(
+            UNCERTAINTY,
+            "Ranges of what is not known exactly, for robustness and solve --robust.",
+        ),
+        "goal": {
+            "description": "Where the object shall come to lie, in place of phases; several are "
+            "visited in order.",
+            "oneOf": goals,
+        },
+        "phases": {"type": "array", "items": phase},
+    }
+    whole = _describe_table(
+        TOP,
+        "A polygon, a hand of a palm and two fingers, a start, and the contact formations to go "
+        "through. SI units.",
+    )
+    whole["properties"] |= parts
+    definitions = {
+        "contact": CONTACT,
+        "goal": _describe_table(GOAL) | goal,
+        "point": {"type": "array", "minItems": 2, "maxItems": 2, "items": {"type": "number"}},
+        "coefficient": {**NONNEGATIVE.schema, "maximum": COEFFICIENTS.high},
+        "finger": _describe_table(FINGER),
+    }
+    first = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "wholearm problem"}
+    return first | whole | {"definitions": definitions}
+
+
+def _describe(table: Table) -> dict[str, Any]:
+    return {name: own.schema for name, own in table.items()}
+
+
+def _describe_table(table: Table, text: str = "") -> dict[str, Any]:
+    """The schema of a table."""
+    return {
+        "type": "object",
+        **({"description": text} if text else {}),
+        "additionalProperties": False,
+        "required": [name for name, own in table.items() if own.required],
+        "properties": _describe(table),
+    }
+
+
+def write_page() -> str:
+    """All keys of a problem file, as tables in Markdown."""
+    tables = {
+        "": TOP,
+        "object": OBJECT,
+        "fingers.1": FINGER,
+        "friction": FRICTION,
+        "start": START,
+        "uncertainty": UNCERTAINTY,
+        "goal": GOAL,
+        "phases": PHASE,
+    }
+    heads = {"": "At the top", "fingers.1": "`[fingers.1]`, `[fingers.2]`", "goal": "`[goal]`"}
+    heads["phases"] = "`[[phases]]`"
+    parts = []
+    for where, table in tables.items():
+        title = heads.get(where, f"`[{where}]`")
+        lines = [f"| {title} | unit | default | allowed | |", "|---|---|---|---|---|"]
+        for name, own in table.items():
+            if own not in (_TABLE, _OPTIONAL):
+                text = re.sub(r" ?\[[^]]*\]", "", own.text)
+                default = "required" if own.required else own.describe_default()
+                allowed = ", ".join(filter(None, (one.describe() for one in own.ranges)))
+                lines.append(f"| `{name}` | {own.unit} | {default} | {allowed} | {text} |")
+        parts.append("\n".join(lines) + "\n")
+    return "\n".join(parts)
