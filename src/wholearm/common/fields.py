@@ -1,6 +1,6 @@
 """Values that a user may give: name, unit, scale, range, default and text, declared once for each.
 
-A dataclass declares its keys as ``field(metadata=key(...))``. From what `keys_of` lists follow the
+A dataclass declares its keys by the decorator `declare`. From what `keys_of` lists follow the
 reader of problem files with its messages, ranges relative to the scene, the JSON Schema, the names
 of `Problem.with_`, the writer, options of the command line with their help, and tables of keys.
 """
@@ -12,14 +12,15 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, replace
-from functools import cache, partial
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 
 from .errors import InputError
 from .require import require_number, require_vector
 
+T = TypeVar("T")
 REQUIRED: Any = object()
 """Default of what has to be given."""
 Schema = Mapping[str, Any]
@@ -167,6 +168,7 @@ class Field:
 
     Attributes
     ----------
+    name : str
     text : str
         What it is, with its unit in brackets.
     kind : Kind or Range
@@ -174,18 +176,19 @@ class Field:
         Unit of the scene, of `Scales`, that it counts in.
     ranges : tuple of Range
         Which it has to be in, relative to the scene.
-    name : str
-        In a file, if it is another one than that of the attribute.
     default : object
         REQUIRED where a value has to be given.
+    attribute : str
+        Of the dataclass that keeps it, if it is not the name.
     """
 
+    name: str
     text: str = ""
     kind: Kind | Range = NUMBER
     scale: str = ""
     ranges: tuple[Range, ...] = ()
-    name: str = ""
     default: Any = REQUIRED
+    attribute: str = ""
 
     @property
     def required(self) -> bool:
@@ -234,29 +237,46 @@ class Field:
 
 
 def key(
-    text: str, kind: Kind | Range = NUMBER, scale: str = "", *ranges: Range, **more: Any
-) -> dict[str, Field]:
-    """Metadata of a dataclass's field that is a key of a file or an option; see `Field`.
+    name: str,
+    text: str = "",
+    kind: Kind | Range = NUMBER,
+    scale: str = "",
+    *ranges: Range,
+    **more: Any,
+) -> Field:
+    """A `Field` with its ranges one after the other."""
+    return Field(name, text, kind, scale, ranges, **more)
 
-    A default is given here only if the field has none, or another one.
+
+def name_fields(*fields: Field) -> dict[str, Field]:
+    """Fields by name."""
+    return {own.name: own for own in fields}
+
+
+def declare(*fields: Field) -> Callable[[type[T]], type[T]]:
+    """Say which fields of a dataclass are keys of a file or options, and what they are.
+
+    Their defaults are those of the dataclass, where it has any, and its docstring lists them.
     """
-    return {"key": Field(text, kind, scale, ranges, **more)}
+
+    def describe(owner: type[T]) -> type[T]:
+        known = {own.name: own.default for own in dataclasses.fields(owner)}  # type: ignore[arg-type]
+        found = {}
+        for own in fields:
+            attribute = own.attribute or own.name
+            default = known[attribute]
+            found[attribute] = own if default is MISSING else replace(own, default=default)
+        lines = [f"    {name}\n        {own.text}" for name, own in found.items() if own.text]
+        owner.__doc__ = "\n".join([owner.__doc__ or "", "    Keys", "    ----", *lines, ""])
+        owner.__keys__ = found  # type: ignore[attr-defined]
+        return owner
+
+    return describe
 
 
 def keys_of(owner: Any) -> dict[str, Field]:
     """The declared fields of a dataclass, or of an object of one, by attribute."""
-    kind: Any = owner if isinstance(owner, type) else type(owner)
-    return _find_keys(kind)
-
-
-@cache
-def _find_keys(owner: Any) -> dict[str, Field]:
-    found = dict[str, Field]()
-    for own in dataclasses.fields(owner):
-        if known := own.metadata.get("key"):
-            default = REQUIRED if own.default is MISSING else own.default
-            default = default if known.required else known.default
-            found[own.name] = replace(known, name=known.name or own.name, default=default)
+    found: dict[str, Field] = owner.__keys__
     return found
 
 

@@ -10,13 +10,13 @@ from typing import Any
 
 from ..common.arrays import Array
 from ..common.errors import InputError, name_source
-from ..common.fields import NONNEGATIVE, POSITIVE, TEXT, Kind, choice, key, leave
+from ..common.fields import NONNEGATIVE, POSITIVE, TEXT, Kind, choice, declare, key, leave
 from ..common.require import read_share
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..scene.model import Scene
 from ..scene.ranges import EPSILON, SETTLE
-from ..scene.ranges import SETTLE_GAP as SETTLE_GAPS
+from ..scene.ranges import SETTLE_GAP as GAP_RANGE
 from .goal import Goal
 from .table import change_table, match_table, write_table
 from .uncertainty import read_widths
@@ -107,6 +107,33 @@ class Until:
         return ", ".join(parts)
 
 
+@declare(
+    key(
+        "contacts",
+        "Contacts that touch throughout, such as v1-palm, v3-finger1, e2-tip1; with ' rolling' "
+        "behind it one does not slide.",
+        leave({"type": "array", "minItems": 1, "items": _name_contact("( rolling)?")}),
+        attribute="formation",
+    ),
+    key(
+        "until",
+        "What ends the phase: a contact that is gained, or a coordinate; with two freedoms also "
+        "both, or both coordinates, the first of which ends it. Left out with end = 'smooth': "
+        "where the planner lets a contact go.",
+        leave({}),
+        default=None,
+    ),
+    key(
+        "end",
+        "How the phase passes into the next one.",
+        choice(*(end.value for end in End)),
+    ),
+    key(
+        "settle",
+        "For how long its end is held, instead of the problem's [s].",
+        *(NONNEGATIVE, "time", SETTLE),
+    ),
+)
 @dataclass(frozen=True, eq=False)
 class Phase:
     """A stretch of the motion on one contact formation.
@@ -120,36 +147,10 @@ class Phase:
     """
 
     index: int
-    formation: Formation = field(
-        metadata=key(
-            "Contacts that touch throughout, such as v1-palm, v3-finger1, e2-tip1; with ' rolling' "
-            "behind it one does not slide.",
-            leave({"type": "array", "minItems": 1, "items": _name_contact("( rolling)?")}),
-            name="contacts",
-        )
-    )
-    until: Until = field(
-        metadata=key(
-            "What ends the phase: a contact that is gained, or a coordinate; with two freedoms "
-            "also both, or both coordinates, the first of which ends it. Left out with end = "
-            "'smooth': where the planner lets a contact go.",
-            leave({}),
-            default=None,
-        )
-    )
-    end: End = field(
-        default=End.REST,
-        metadata=key(
-            "How the phase passes into the next one.", choice(*(end.value for end in End))
-        ),
-    )
-    settle: float | None = field(
-        default=None,
-        metadata=key(
-            "For how long its end is held, instead of the problem's [s].",
-            *(NONNEGATIVE, "time", SETTLE),
-        ),
-    )
+    formation: Formation
+    until: Until
+    end: End = End.REST
+    settle: float | None = None
 
     @property
     def number(self) -> int:
@@ -163,6 +164,17 @@ class Phase:
         return replace(self, formation=replace(self.formation, scene=scene))
 
 
+@declare(
+    key("name", "", TEXT, default="unnamed"),
+    key("epsilon", "Least normal force of every contact [N].", NONNEGATIVE, "force", EPSILON),
+    key(
+        "settle",
+        "For how long ends at rest are held, so that contacts close [s]; or a share of the "
+        'motion\'s time for all of them, such as "10 %".',
+        *(DWELL, "time", SETTLE),
+    ),
+    key("settle_gap", "From how far open they then close [m].", POSITIVE, "length", GAP_RANGE),
+)
 @dataclass(frozen=True, eq=False)
 class Problem:
     """A manipulation to plan.
@@ -198,29 +210,17 @@ class Problem:
     `dataclasses.replace` makes another problem of one scene, without checking it; `with_` checks.
     """
 
-    name: str = field(metadata=key("", TEXT, default="unnamed"))
+    name: str
     scene: Scene
-    epsilon: float = field(
-        metadata=key("Least normal force of every contact [N].", NONNEGATIVE, "force", EPSILON)
-    )
+    epsilon: float
     start: Array
     phases: tuple[Phase, ...]
     source: str = ""
     table: Mapping[str, Any] = field(default_factory=dict, repr=False)
     uncertainty: Mapping[str, float] | None = None
     checked: bool = field(default=False, repr=False)
-    settle: float | str = field(
-        default=0.0,
-        metadata=key(
-            "For how long ends at rest are held, so that contacts close [s]; or a share of the "
-            'motion\'s time for all of them, such as "10 %".',
-            *(DWELL, "time", SETTLE),
-        ),
-    )
-    settle_gap: float | None = field(
-        default=None,
-        metadata=key("From how far open they then close [m].", POSITIVE, "length", SETTLE_GAPS),
-    )
+    settle: float | str = 0.0
+    settle_gap: float | None = None
     goals: tuple[Goal, ...] = ()
 
     def __post_init__(self) -> None:

@@ -4,34 +4,37 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from ..common.errors import InputError
-from ..common.fields import key, leave
+from ..common.fields import NUMBER, declare, key, leave
 from ..common.require import require_number
 from ..scene.model import Scene
-from ..scene.ranges import TURN, check_place
+from ..scene.ranges import PLACE, TURN, check_place
 
 INDEX = leave({"type": "integer", "minimum": 0})
 """Number of an edge."""
 _ALLOWED = "allowed is a table with flush or phi_deg, and x"
 
 
+@declare(
+    key("flush", "The edge that shall lie on the palm.", INDEX),
+    key(
+        "phi_deg",
+        "The angle that the object shall have instead [degrees].",
+        *(NUMBER, "", TURN),
+        attribute="phi",
+    ),
+    key("x", "Of the centroid [m]; anywhere if it is left out.", NUMBER, "length", PLACE),
+)
 @dataclass(frozen=True)
 class Goal:
     """Where the object shall come to rest: with an edge on the palm or at an angle, phi [rad]."""
 
-    flush: int | None = field(
-        default=None, metadata=key("The edge that shall lie on the palm.", INDEX)
-    )
-    phi: float | None = field(
-        default=None,
-        metadata=key("The angle that the object shall have instead [degrees].", name="phi_deg"),
-    )
-    x: float | None = field(
-        default=None, metadata=key("Of the centroid [m]; anywhere if it is left out.")
-    )
+    flush: int | None = None
+    phi: float | None = None
+    x: float | None = None
 
     def __str__(self) -> str:
         if self.flush is not None:

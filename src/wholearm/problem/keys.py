@@ -10,7 +10,17 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from ..common.fields import NONNEGATIVE, POINT, Field, keys_of, leave, refer
+from ..common.fields import (
+    NONNEGATIVE,
+    NUMBER,
+    POINT,
+    Field,
+    key,
+    keys_of,
+    leave,
+    name_fields,
+    refer,
+)
 from ..scene.model import Finger, Friction, Scene
 from ..scene.polygon import Polygon
 from ..scene.ranges import FRICTION as COEFFICIENTS
@@ -23,41 +33,33 @@ Table = Mapping[str, Field]
 """Keys of a table by name."""
 
 
-def list_keys(owner: type) -> dict[str, Field]:
-    """The declared fields of a dataclass, by their names in a file."""
-    return {own.name: own for own in keys_of(owner).values()}
-
-
 _RELATIVE = leave({"type": "number", "minimum": 0, "exclusiveMaximum": 1})
 _WIDTHS = {
-    own.name: Field(f"Half width [{own.unit}].", NONNEGATIVE, default=own.find_default())
+    own.name: key(own.name, f"Half width [{own.unit}].", NONNEGATIVE, default=own.find_default())
     if own.unit
-    else Field("Half width, relative.", _RELATIVE, default=own.default)
+    else key(own.name, "Half width, relative.", _RELATIVE, default=own.default)
     for own in PARAMETERS
 }
-OBJECT, FINGER, FRICTION = list_keys(Polygon), list_keys(Finger), list_keys(Friction)
-PHASE, GOAL = list_keys(Phase), list_keys(Goal)
-FINGERS: Table = {
-    "1": Field("The right finger.", leave(refer("finger"))),
-    "2": Field("The left finger.", leave(refer("finger"))),
-}
-START: Table = {
-    "flush": Field("The edge that lies on the palm; edge 0 runs from vertex 0 to vertex 1.", INDEX),
-    "x": Field("Of the centroid [m]; both fingers close on the object.", ranges=(PLACE,)),
-}
-UNTIL: Table = {
-    "contact": Field("", leave(refer("contact")), default=None),
-    "x": Field("[m]", default=None),
-    "phi_deg": Field("[degrees]", default=None),
-}
-UNCERTAINTY: Table = {name: _WIDTHS[names[0]] for name, names in GROUPS.items()} | _WIDTHS
-_TABLE, _OPTIONAL = Field(), Field(default=None)
-TOP: Table = {
-    **list_keys(Problem),
-    **list_keys(Scene),
-    **dict.fromkeys(("object", "fingers", "friction", "start"), _TABLE),
-    **dict.fromkeys(("uncertainty", "goal", "phases"), _OPTIONAL),
-}
+OBJECT, FINGER, FRICTION, PHASE, GOAL = (
+    name_fields(*keys_of(own).values()) for own in (Polygon, Finger, Friction, Phase, Goal)
+)
+FINGERS = name_fields(
+    key("1", "The right finger.", leave(refer("finger"))),
+    key("2", "The left finger.", leave(refer("finger"))),
+)
+START = name_fields(
+    key("flush", "The edge that lies on the palm; edge 0 runs from vertex 0 to vertex 1.", INDEX),
+    key("x", "Of the centroid [m]; both fingers close on the object.", NUMBER, "length", PLACE),
+)
+UNTIL = name_fields(
+    key("contact", "", leave(refer("contact"))), key("x", "[m]"), key("phi_deg", "[degrees]")
+)
+UNCERTAINTY = {name: _WIDTHS[names[0]] for name, names in GROUPS.items()} | _WIDTHS
+_PARTS = name_fields(
+    *map(key, ("object", "fingers", "friction", "start")),
+    *(key(name, default=None) for name in ("uncertainty", "goal", "phases")),
+)
+TOP = name_fields(*keys_of(Problem).values(), *keys_of(Scene).values()) | _PARTS
 
 
 def name_keys() -> dict[str, tuple[str, ...]]:
@@ -67,11 +69,11 @@ def name_keys() -> dict[str, tuple[str, ...]]:
     names |= {key: (f"start.{key}",) for key in START}
     names |= {f"friction_{key}": (f"friction.{key}",) for key in FRICTION}
     names["friction"] = tuple(f"friction.{key}" for key in FRICTION)
-    for key, own in FINGER.items():
-        name = f"finger_{key}" if key in OBJECT else key
-        names |= {f"{name}{number}": (f"fingers.{number}.{key}",) for number in FINGERS}
+    for finger, own in FINGER.items():
+        name = f"finger_{finger}" if finger in OBJECT else finger
+        names |= {f"{name}{number}": (f"fingers.{number}.{finger}",) for number in FINGERS}
         if own.kind is not POINT:
-            names[name] = tuple(f"fingers.{number}.{key}" for number in FINGERS)
+            names[name] = tuple(f"fingers.{number}.{finger}" for number in FINGERS)
     return names
 
 
@@ -158,7 +160,7 @@ def write_page() -> str:
         title = heads.get(where, f"`[{where}]`")
         lines = [f"| {title} | unit | default | allowed | |", "|---|---|---|---|---|"]
         for name, own in table.items():
-            if own not in (_TABLE, _OPTIONAL):
+            if name not in _PARTS:
                 text = re.sub(r" ?\[[^]]*\]", "", own.text)
                 default = "required" if own.required else own.describe_default()
                 allowed = ", ".join(filter(None, (one.describe() for one in own.ranges)))

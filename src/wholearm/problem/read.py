@@ -159,8 +159,8 @@ def _read_scene(table: Mapping[str, Any]) -> Scene:
     fingers = _table(table, "fingers", FINGERS)
     friction = Friction(**collect_keys(Friction, _table(table, "friction", FRICTION)))
     right, left = (
-        Finger(**_table(fingers, key, FINGER, f"fingers.{key}"), name=f"fingers.{key}")
-        for key in FINGERS
+        Finger(**collect_keys(Finger, _table(fingers, key, FINGER, name)), name=name)
+        for key, name in ((key, f"fingers.{key}") for key in FINGERS)
     )
     return Scene(polygon, (right, left), friction, **collect_keys(Scene, table))
 

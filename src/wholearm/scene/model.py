@@ -32,7 +32,7 @@ S. L. Yeap and J. C. Trinkle, "Dynamic Whole-Arm Dexterous Manipulation in the P
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -48,6 +48,7 @@ from ..common.fields import (
     POINT,
     POSITIVE,
     choice,
+    declare,
     key,
     read_keys,
 )
@@ -77,60 +78,64 @@ TOUCHING = 3e-6
 """Gap below which features count as touching, in radii of gyration of the object."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@declare(
+    key("base", "The joint [m].", POINT, "length", PLACE),
+    key("length", "From the joint to the centre of the tip [m].", POSITIVE, "length", LENGTH),
+    key("radius", "Half thickness of the link [m].", NONNEGATIVE, "length", RADIUS, default=0.0),
+    key("inertia", "About the joint [kg m^2].", POSITIVE, "inertia", JOINT),
+    key(
+        "viscous",
+        "Viscous friction of the joint [N m s].",
+        NONNEGATIVE,
+        "drag",
+        VISCOUS,
+        default=0.0,
+    ),
+    key("dry", "Dry friction of the joint [N m].", NONNEGATIVE, "torque", DRY, default=0.0),
+    key("torque_limit", "[N m]", POSITIVE, "torque", TORQUE, STRENGTH),
+    key("speed_limit", "Of the joint [rad/s]; none by default.", POSITIVE, "rate", SPEED),
+    key(
+        "torque_rate_limit",
+        "How quickly the torque may change [N m/s]; none by default: it may step.",
+        *(POSITIVE, "torque_rate", TORQUE_RATE),
+    ),
+    key(
+        "actuator_lag",
+        "Time constant with which the torque follows its command [s].",
+        *(NONNEGATIVE, "time", LAG),
+    ),
+)
+@dataclass(frozen=True, eq=False)
 class Finger:
     """A single-link finger: a capsule on a motorised revolute joint.
 
     `name` is the key of the finger in messages.
     """
 
-    base: ArrayLike = field(metadata=key("The joint [m].", POINT, "length", PLACE))
-    length: float = field(
-        metadata=key("From the joint to the centre of the tip [m].", POSITIVE, "length", LENGTH)
-    )
-    radius: float = field(
-        default=0.0, metadata=key("Half thickness of the link [m].", NONNEGATIVE, "length", RADIUS)
-    )
-    inertia: float = field(metadata=key("About the joint [kg m^2].", POSITIVE, "inertia", JOINT))
-    viscous: float = field(
-        default=0.0,
-        metadata=key("Viscous friction of the joint [N m s].", NONNEGATIVE, "drag", VISCOUS),
-    )
-    dry: float = field(
-        default=0.0, metadata=key("Dry friction of the joint [N m].", NONNEGATIVE, "torque", DRY)
-    )
-    torque_limit: float = field(metadata=key("[N m]", POSITIVE, "torque", TORQUE, STRENGTH))
-    speed_limit: float = field(
-        default=math.inf,
-        metadata=key("Of the joint [rad/s]; none by default.", POSITIVE, "rate", SPEED),
-    )
-    torque_rate_limit: float = field(
-        default=math.inf,
-        metadata=key(
-            "How quickly the torque may change [N m/s]; none by default: it may step.",
-            *(POSITIVE, "torque_rate", TORQUE_RATE),
-        ),
-    )
-    actuator_lag: float = field(
-        default=0.0,
-        metadata=key(
-            "Time constant with which the torque follows its command [s].",
-            *(NONNEGATIVE, "time", LAG),
-        ),
-    )
+    base: ArrayLike
+    length: float
+    radius: float
+    inertia: float
+    viscous: float
+    dry: float
+    torque_limit: float
+    speed_limit: float = math.inf
+    torque_rate_limit: float = math.inf
+    actuator_lag: float = 0.0
     name: str = "fingers"
 
     def __post_init__(self) -> None:
         read_keys(self, f"{self.name}.")
 
 
+@declare(*(key(part, "", COEFFICIENT, "", FRICTION) for part in ("palm", "finger1", "finger2")))
 @dataclass(frozen=True)
 class Friction:
     """Coulomb coefficients between the object and each part of the hand."""
 
-    palm: float = field(metadata=key("", COEFFICIENT, "", FRICTION))
-    finger1: float = field(metadata=key("", COEFFICIENT, "", FRICTION))
-    finger2: float = field(metadata=key("", COEFFICIENT, "", FRICTION))
+    palm: float
+    finger1: float
+    finger2: float
 
     def __post_init__(self) -> None:
         read_keys(self, "friction.")
@@ -199,6 +204,24 @@ class Scales(NamedTuple):
         return self.force / self.mass
 
 
+@declare(
+    key("gravity", "[m/s^2]", NONNEGATIVE, "acceleration", GRAVITY),
+    key(
+        "fingers_collide",
+        "Whether the links stop each other; false where they move in different planes.",
+        BOOLEAN,
+    ),
+    key(
+        "control_period",
+        "Period over which torques are held; with 0 they are free [s].",
+        *(NONNEGATIVE, "time", CONTROL_PERIOD),
+    ),
+    key(
+        "control_hold",
+        "Whether torques are constant over each period, or lines that go on from period to period.",
+        choice(*HOLDS),
+    ),
+)
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Everything that does not move by plan: object, both fingers, friction and gravity.
@@ -219,30 +242,10 @@ class Scene:
     polygon: Polygon
     fingers: tuple[Finger, Finger]
     friction: Friction
-    gravity: float = field(
-        default=9.81, metadata=key("[m/s^2]", NONNEGATIVE, "acceleration", GRAVITY)
-    )
-    fingers_collide: bool = field(
-        default=True,
-        metadata=key(
-            "Whether the links stop each other; false where they move in different planes.", BOOLEAN
-        ),
-    )
-    control_period: float = field(
-        default=0.0,
-        metadata=key(
-            "Period over which torques are held; with 0 they are free [s].",
-            *(NONNEGATIVE, "time", CONTROL_PERIOD),
-        ),
-    )
-    control_hold: str = field(
-        default=HOLDS[0],
-        metadata=key(
-            "Whether torques are constant over each period, or lines that go on from period to "
-            "period.",
-            choice(*HOLDS),
-        ),
-    )
+    gravity: float = 9.81
+    fingers_collide: bool = True
+    control_period: float = 0.0
+    control_hold: str = HOLDS[0]
 
     def __post_init__(self) -> None:
         read_keys(self)

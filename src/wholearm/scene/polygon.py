@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..common.arrays import Array
 from ..common.errors import InputError
-from ..common.fields import POINT, POSITIVE, Kind, key, read_keys
+from ..common.fields import POINT, POSITIVE, Kind, declare, key, read_keys
 from ..common.require import frozen
 from .ranges import INERTIA, MASS
 
@@ -41,13 +41,23 @@ CORNERS = Kind(
 )
 
 
+@declare(
+    key(
+        "vertices",
+        "Corners of a convex polygon, anticlockwise, from any origin [m].",
+        *(CORNERS, "length"),
+        attribute="points",
+    ),
+    key("mass", "[kg]", POSITIVE, "mass", MASS),
+    key(
+        "inertia",
+        "About the centroid [kg m^2]; by default that of uniform density.",
+        *(POSITIVE, "inertia", INERTIA),
+    ),
+)
 @dataclass(frozen=True, eq=False)
 class Polygon:
     """The object: a rigid convex polygon.
-
-    Parameters
-    ----------
-    points, mass, inertia : as `object.vertices`, `object.mass`, `object.inertia` of a file
 
     Attributes
     ----------
@@ -67,21 +77,9 @@ class Polygon:
         if the polygon is too small, too large or too slender, or has too short an edge.
     """
 
-    points: ArrayLike = field(
-        metadata=key(
-            "Corners of a convex polygon, anticlockwise, from any origin [m].",
-            *(CORNERS, "length"),
-            name="vertices",
-        )
-    )
-    mass: float = field(metadata=key("[kg]", POSITIVE, "mass", MASS))
-    inertia: float | None = field(
-        default=None,
-        metadata=key(
-            "About the centroid [kg m^2]; by default that of uniform density.",
-            *(POSITIVE, "inertia", INERTIA),
-        ),
-    )
+    points: ArrayLike
+    mass: float
+    inertia: float | None = None
     vertices: Array = field(init=False, repr=False)
     centroid: Array = field(init=False, repr=False)
     uniform_inertia: float = field(init=False, repr=False)

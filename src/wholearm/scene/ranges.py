@@ -13,76 +13,58 @@ from typing import TYPE_CHECKING, Any
 from ..common.fields import Range, keys_of
 
 if TYPE_CHECKING:
-    from .model import Finger, Scene
-    from .polygon import Polygon
+    from .model import Scene
+
+_SIZE, _DRIVE = "times the object's size", "times the torque limit or m g length"
 
 
-def _get_size(scene: Scene, _: object) -> float:
-    return scene.polygon.size
+def _get_drive(scene: Any, finger: Any) -> float:
+    return float(max(finger.torque_limit, scene.polygon.mass * scene.gravity * finger.length))
 
 
-def _get_time(scene: Scene, _: object) -> float:
-    return scene.scales.time
-
-
-def _get_length(scene: Scene, _: object) -> float:
-    return scene.scales.length
-
-
-def _get_tip_torque(scene: Scene, finger: Finger) -> float:
-    """The torque limit, or what the weight makes at the tip where that is more."""
-    return max(finger.torque_limit, scene.polygon.mass * scene.gravity * finger.length)
-
-
-def _get_weight_torque(scene: Scene, finger: Finger) -> float | None:
-    """What the weight makes at the tip; None without gravity."""
-    return scene.polygon.mass * scene.gravity * finger.length if scene.gravity else None
-
-
-def _get_other_strength(scene: Scene, finger: Finger) -> float | None:
+def _get_strength(scene: Any, finger: Any) -> float | None:
     """The torque with which finger 1 presses with its tip like finger 2; None for finger 2."""
     right, left = scene.fingers
     return left.torque_limit / left.length * right.length if finger is right else None
 
 
-def _get_press(scene: Scene, _: object) -> float:
-    """The weight, or what the stronger finger can press with at its tip where that is more."""
-    press = max(finger.torque_limit / finger.length for finger in scene.fingers)
-    return max(scene.polygon.mass * scene.gravity, press)
+def _get_press(scene: Any, _: object) -> float:
+    press = (finger.torque_limit / finger.length for finger in scene.fingers)
+    return float(max(scene.polygon.mass * scene.gravity, *press))
 
 
-def _get_uniform(_: Scene, body: Polygon) -> float:
-    return body.uniform_inertia
-
-
-_SIZE, _DRIVE = "times the object's size", "times the torque limit or m g length"
 MASS = Range(1e-6, 1e6)
-INERTIA = Range(1e-2, 1e2, _get_uniform, "times uniform density")
+INERTIA = Range(1e-2, 1e2, lambda _, body: body.uniform_inertia, "times uniform density")
 GRAVITY = Range(1e-3, 1e5)
 FRICTION = Range(0.0, 10.0)
-PLACE = Range(-300.0, 300.0, _get_size, _SIZE)
+PLACE = Range(-300.0, 300.0, lambda all, _: all.polygon.size, _SIZE)
 """Coordinates of joints and of the object."""
 TURN = Range(-3600.0, 3600.0)
 """Angle of the object at which a phase ends [degrees]."""
-LENGTH = Range(0.03, 100.0, _get_size, _SIZE)
+LENGTH = Range(0.03, 100.0, PLACE.scale, _SIZE)
 RADIUS = Range(1e-4, 1.0, lambda _, own: own.length, "times the length, or 0")
 JOINT = Range(1e-8, 1e3, lambda all, own: all.polygon.mass * own.length**2, "times m length^2")
-TORQUE = Range(1e-6, 1e3, _get_weight_torque, "times m g length")
-STRENGTH = Range(1e-6, 1e6, _get_other_strength, "times finger 2's strength")
+TORQUE = Range(
+    1e-6,
+    1e3,
+    lambda all, own: all.polygon.mass * all.gravity * own.length or None,
+    "times m g length",
+)
+STRENGTH = Range(1e-6, 1e6, _get_strength, "times finger 2's strength")
 VISCOUS = Range(
     *(0.0, 200.0),
-    lambda all, own: _get_tip_torque(all, own) * all.scales.time,
+    lambda all, own: _get_drive(all, own) * all.scales.time,
     f"{_DRIVE}, x {{time}}",
 )
-DRY = Range(0.0, 1e3, _get_tip_torque, _DRIVE)
-SPEED = Range(1e-3, 1e6, lambda all, _: 1 / all.scales.time, "radians in {time}")
+DRY = Range(0.0, 1e3, _get_drive, _DRIVE)
+SPEED = Range(1e-3, 1e6, lambda all, _: all.scales.rate, "radians in {time}")
 TORQUE_RATE = Range(
     1e-4, 1e9, lambda all, own: own.torque_limit / all.scales.time, "torque limits in {time}"
 )
-LAG = Range(0.0, 1e2, _get_time, "x {time}")
-CONTROL_PERIOD = Range(1e-3, 1e2, _get_time, "times the scene's time")
-SETTLE = Range(1e-4, 1e3, _get_time, "times the scene's time, or 0")
-SETTLE_GAP = Range(1e-6, 0.1, _get_length, "times the scene's length")
+LAG = Range(0.0, 1e2, lambda all, _: all.scales.time, "x {time}")
+CONTROL_PERIOD = Range(1e-3, 1e2, LAG.scale, "times the scene's time")
+SETTLE = Range(1e-4, 1e3, LAG.scale, "times the scene's time, or 0")
+SETTLE_GAP = Range(1e-6, 0.1, lambda all, _: all.scales.length, "times the scene's length")
 EPSILON = Range(0.0, 1e3, _get_press, "times what presses at most")
 
 
