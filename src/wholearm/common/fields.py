@@ -15,8 +15,6 @@ from dataclasses import MISSING, dataclass, replace
 from functools import partial
 from typing import Any, TypeVar
 
-import numpy as np
-
 from .errors import InputError
 from .require import require_number, require_vector
 
@@ -81,7 +79,7 @@ class Range:
 
     def read(self, given: Any, key: str) -> Any:
         """The value as int or float, or an `InputError` that names `key`."""
-        value = given.item() if isinstance(given, np.number) else given
+        value = given.item() if hasattr(given, "dtype") else given
         if text := self.find_fault(value):
             raise InputError("", key, text)
         return value if self.whole else float(value)
@@ -111,7 +109,9 @@ class Range:
             return
         low, high = self.low * scale, self.high * scale
         time = f"{scene.scales.time:.3g} s" if scene is not None else ""
-        for value in np.ravel(given).tolist():
+        for value in (
+            given if hasattr(given, "__len__") and not isinstance(given, str) else (given,)
+        ):
             number = isinstance(value, int | float) and value and math.isfinite(value)
             if number and not low <= value <= high:
                 what = f" ({self.describe(time)})" if self.of else ""
@@ -120,10 +120,10 @@ class Range:
 
 
 def choice(*words: str) -> Kind:
-    """One of several words."""
+    """One of several words, or the member of an enumeration that has it."""
 
     def read(given: Any, key: str) -> Any:
-        if given not in words:
+        if getattr(given, "value", given) not in words:
             allowed = " and ".join(map(repr, words)) if len(words) == 2 else str(words)[1:-1]
             raise InputError("", key, f"{given!r} given; allowed are {allowed}")
         return given

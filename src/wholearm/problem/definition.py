@@ -123,11 +123,7 @@ class Until:
         leave({}),
         default=None,
     ),
-    key(
-        "end",
-        "How the phase passes into the next one.",
-        choice(*(end.value for end in End)),
-    ),
+    key("end", "How the phase passes into the next one.", choice(*(end.value for end in End))),
     key(
         "settle",
         "For how long its end is held, instead of the problem's [s].",

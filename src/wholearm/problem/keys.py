@@ -99,8 +99,7 @@ def build_schema() -> dict[str, Any]:
         "friction": _describe_table(FRICTION, "Coefficients of friction with the object."),
         "start": _describe_table(START),
         "uncertainty": _describe_table(
-            UNCERTAINTY,
-            "Ranges of what is not known exactly, for robustness and solve --robust.",
+            UNCERTAINTY, "Ranges of what is not known exactly, for robustness and solve --robust."
         ),
         "goal": {
             "description": "Where the object shall come to lie, in place of phases; several are "

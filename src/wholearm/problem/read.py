@@ -27,18 +27,7 @@ from ..scene.polygon import Polygon
 from ..scene.ranges import TURN, check_place, check_ranges
 from .definition import End, Phase, Problem, Until
 from .goal import read_goals
-from .keys import (
-    FINGER,
-    FINGERS,
-    FRICTION,
-    OBJECT,
-    PHASE,
-    START,
-    TOP,
-    UNCERTAINTY,
-    UNTIL,
-    Table,
-)
+from .keys import FINGER, FINGERS, FRICTION, OBJECT, PHASE, START, TOP, UNCERTAINTY, UNTIL, Table
 
 _T = TypeVar("_T")
 

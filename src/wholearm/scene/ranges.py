@@ -52,9 +52,7 @@ TORQUE = Range(
 )
 STRENGTH = Range(1e-6, 1e6, _get_strength, "times finger 2's strength")
 VISCOUS = Range(
-    *(0.0, 200.0),
-    lambda all, own: _get_drive(all, own) * all.scales.time,
-    f"{_DRIVE}, x {{time}}",
+    *(0.0, 200.0), lambda all, own: _get_drive(all, own) * all.scales.time, f"{_DRIVE}, x {{time}}"
 )
 DRY = Range(0.0, 1e3, _get_drive, _DRIVE)
 SPEED = Range(1e-3, 1e6, lambda all, _: all.scales.rate, "radians in {time}")

@@ -1,0 +1,103 @@
+"""Tables of command-line options: flags, what they are, default and range, one to a line.
+
+A table reads like the help that it becomes, as with docopt. Two spaces or more end the flags, and
+lines that begin with spaces go on with the text::
+
+    [files PLAN ...]    none, one or more files
+    -o --output FILE    figure to write (required)
+    --stops N           how often it may stop = 0 in 0..7
+    --scheme NAME       of the points = radau among radau|legendre
+    --robust [FACTOR]   without a factor, 1 = 0 in 0.0..1000
+    --simulate [free]   the first of these words if it is left out among told|free
+    --brake             without the name of a value, a range or words: a switch
+    --no-replay         a switch that is on
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from .fields import BOOLEAN, TEXT, Field, Kind, Range, choice
+
+_NUMBER = r"-?\d[\w.+-]*?"
+_TEXT = re.compile(
+    rf"(.*?)(?: = (\S+))?(?: in ({_NUMBER})\.\.({_NUMBER}))?(?: among (\S+))?", re.DOTALL
+)
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option of a command, or a file that it takes.
+
+    Attributes
+    ----------
+    own : Field
+    flags : sequence of str
+        The name alone where it is a file.
+    metavar : str or None
+    nargs : {"*", "+", "?", None}
+    """
+
+    own: Field
+    flags: Sequence[str]
+    metavar: str | None = None
+    nargs: str | None = None
+
+    def add(self, parser: argparse.ArgumentParser) -> None:
+        """Give it to a parser, with its default behind its text."""
+        own, more = self.own, dict[str, Any]()
+        if own.kind is BOOLEAN:
+            more = {"action": f"store_{str(not own.default).lower()}", "dest": own.name}
+        else:
+            more = {"metavar": self.metavar, "nargs": self.nargs}
+            more |= {"type": own.kind.parse} if isinstance(own.kind, Range) else {}
+            if self.flags[0].startswith("-"):
+                required = own.text.endswith("(required)")
+                more |= {"default": own.default, "required": required}
+            if self.nargs == "?" and "enum" in own.kind.schema:
+                # The value may be left out, even before a file: the caller puts the first one in.
+                words = own.kind.schema["enum"]
+                more |= {"nargs": None, "metavar": f"[{self.metavar}]", "choices": words}
+            elif self.nargs == "?" and isinstance(own.kind, Range):
+                more["const"] = 1.0
+        default = "" if own.kind is BOOLEAN or own.default == [] else own.describe_default()
+        parser.add_argument(*self.flags, help=own.text + (default and f" ({default})"), **more)
+
+
+def read_options(table: str) -> list[Option]:
+    """Options of a table."""
+    rows: list[list[str]] = []
+    for line in table.strip().splitlines():
+        if line.startswith(" "):
+            rows[-1].append(line.strip())
+        else:
+            rows.append(re.split(r" {2,}", line, maxsplit=1))
+    return [_read_option(usage, " ".join(rest)) for usage, *rest in rows]
+
+
+def _read_option(usage: str, rest: str) -> Option:
+    found = _TEXT.fullmatch(rest)
+    assert found is not None
+    text, default, low, high, words = found.groups()
+    optional, several = usage.endswith("]"), usage.rstrip("]").endswith("...")
+    parts = usage.removeprefix("[").rstrip("]").removesuffix("...").split()
+    flags = [part for part in parts if part.startswith("-")] or parts[:1]
+    metavar = " ".join(parts[len(flags) :]).removeprefix("[") or None
+    name = flags[-1].lstrip("-").replace("-", "_")
+    kind: Kind | Range = TEXT
+    given: Any = [] if several else default
+    if low:
+        read = float if re.search(r"[.e]", low) else int
+        kind = Range(read(low), read(high))
+        given = None if default is None else kind.parse(default)
+    elif words:
+        kind = choice(*words.split("|"))
+    elif metavar is None and flags[0].startswith("-"):
+        kind, given = BOOLEAN, name.startswith("no_")
+        name = name.removeprefix("no_")
+    nargs = ("*" if optional else "+") if several else "?" if optional else None
+    return Option(Field(name, text, kind, default=given), flags, metavar, nargs)
