@@ -88,10 +88,11 @@ def build_parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="wholearm", description="Plan and verify whole-arm manipulation.")
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    known = {name: (own.text, own.add) for name, own in COMMANDS.items()}
-    known["bench"] = ("measure run time against error, or run the stress study", add_bench)
-    for name, (text, add) in known.items():
-        add(commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}."))
+    for name, own in COMMANDS.items():
+        text = f"{own.text[0].upper()}{own.text[1:]}."
+        own.add(commands.add_parser(name, help=own.text, description=text))
+    text = "measure run time against error, or run the stress study"
+    add_bench(commands.add_parser("bench", help=text, description=text))
     return parser
 
 

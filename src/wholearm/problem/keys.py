@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from ..common.fields import (
@@ -27,17 +28,14 @@ from ..scene.ranges import FRICTION as COEFFICIENTS
 from ..scene.ranges import PLACE
 from .definition import CONTACT, Phase, Problem
 from .goal import INDEX, Goal
-from .uncertainty import GROUPS, PARAMETERS
+from .uncertainty import GROUPS, LENGTH, PARAMETERS
 
 Table = Mapping[str, Field]
 """Keys of a table by name."""
 
 
-_RELATIVE = leave({"type": "number", "minimum": 0, "exclusiveMaximum": 1})
 _WIDTHS = {
-    own.name: key(own.name, f"Half width [{own.unit}].", NONNEGATIVE, default=own.find_default())
-    if own.unit
-    else key(own.name, "Half width, relative.", _RELATIVE, default=own.default)
+    own.name: replace(own, default=own.default * (LENGTH if own.unit == "m" else 1))
     for own in PARAMETERS
 }
 OBJECT, FINGER, FRICTION, PHASE, GOAL = (
@@ -143,20 +141,17 @@ def _describe_table(table: Table, text: str = "") -> dict[str, Any]:
 def write_page() -> str:
     """All keys of a problem file, as tables in Markdown."""
     tables = {
-        "": TOP,
-        "object": OBJECT,
-        "fingers.1": FINGER,
-        "friction": FRICTION,
-        "start": START,
-        "uncertainty": UNCERTAINTY,
-        "goal": GOAL,
-        "phases": PHASE,
+        "At the top": TOP,
+        "`[object]`": OBJECT,
+        "`[fingers.1]`, `[fingers.2]`": FINGER,
+        "`[friction]`": FRICTION,
+        "`[start]`": START,
+        "`[uncertainty]`": UNCERTAINTY,
+        "`[goal]`": GOAL,
+        "`[[phases]]`": PHASE,
     }
-    heads = {"": "At the top", "fingers.1": "`[fingers.1]`, `[fingers.2]`", "goal": "`[goal]`"}
-    heads["phases"] = "`[[phases]]`"
     parts = []
-    for where, table in tables.items():
-        title = heads.get(where, f"`[{where}]`")
+    for title, table in tables.items():
         lines = [f"| {title} | unit | default | allowed | |", "|---|---|---|---|---|"]
         for name, own in table.items():
             if name not in _PARTS:

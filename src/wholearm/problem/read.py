@@ -25,9 +25,9 @@ from ..contacts.reach import name_reach
 from ..scene.model import Finger, Friction, Scene
 from ..scene.polygon import Polygon
 from ..scene.ranges import TURN, check_place, check_ranges
+from . import keys
 from .definition import End, Phase, Problem, Until
 from .goal import read_goals
-from .keys import FINGER, FINGERS, FRICTION, OBJECT, PHASE, START, TOP, UNCERTAINTY, UNTIL, Table
 
 _T = TypeVar("_T")
 
@@ -77,10 +77,10 @@ def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
 
 
 def _build_problem(table: Mapping[str, Any], source: str) -> Problem:
-    check_keys(table, "", TOP)
+    check_keys(table, "", keys.TOP)
     scene = _read_scene(table)
     check_ranges(scene)
-    start = _read_start(scene, _table(table, "start", START))
+    start = _read_start(scene, _table(table, "start", keys.START))
     given = table.get("phases", [])
     if not isinstance(given, list):
         raise InputError("", "phases", f"{given!r} is not a list of [[phases]]")
@@ -90,7 +90,9 @@ def _build_problem(table: Mapping[str, Any], source: str) -> Problem:
         phases=tuple(_read_phase(scene, i, entry) for i, entry in enumerate(given)),
         source=source,
         table=table,
-        uncertainty=_table(table, "uncertainty", UNCERTAINTY) if "uncertainty" in table else None,
+        uncertainty=_table(table, "uncertainty", keys.UNCERTAINTY)
+        if "uncertainty" in table
+        else None,
         goals=read_goals(table),
         **collect_keys(Problem, table),
     )
@@ -144,12 +146,12 @@ def adopt_phases(problem: Problem, meta: Mapping[str, Any], q: Array, source: st
 
 
 def _read_scene(table: Mapping[str, Any]) -> Scene:
-    polygon = Polygon(**collect_keys(Polygon, _table(table, "object", OBJECT)))
-    fingers = _table(table, "fingers", FINGERS)
-    friction = Friction(**collect_keys(Friction, _table(table, "friction", FRICTION)))
+    polygon = Polygon(**collect_keys(Polygon, _table(table, "object", keys.OBJECT)))
+    fingers = _table(table, "fingers", keys.FINGERS)
+    friction = Friction(**collect_keys(Friction, _table(table, "friction", keys.FRICTION)))
     right, left = (
-        Finger(**collect_keys(Finger, _table(fingers, key, FINGER, name)), name=name)
-        for key, name in ((key, f"fingers.{key}") for key in FINGERS)
+        Finger(**collect_keys(Finger, _table(fingers, key, keys.FINGER, name)), name=name)
+        for key, name in ((key, f"fingers.{key}") for key in keys.FINGERS)
     )
     return Scene(polygon, (right, left), friction, **collect_keys(Scene, table))
 
@@ -195,12 +197,12 @@ def _read_phase(scene: Scene, index: int, entry: object) -> Phase:
     key = f"phases[{index + 1}]"
     if not isinstance(entry, dict):
         raise InputError("", key, f"{entry!r} is not a table")
-    check_keys(entry, key, PHASE)
+    check_keys(entry, key, keys.PHASE)
     names = entry["contacts"]
     if not isinstance(names, list) or not names:
         raise InputError("", f"{key}.contacts", f"{names!r} is not a list of contact names")
     formation = _at(f"{key}.contacts", lambda: read_formation(scene, names))
-    end = End(PHASE["end"].kind.read(entry.get("end", "rest"), f"{key}.end"))
+    end = End(keys.PHASE["end"].kind.read(entry.get("end", "rest"), f"{key}.end"))
     until = Until()
     if "until" in entry:
         until = _at(f"{key}.until", lambda: read_until(scene, entry["until"]))
@@ -244,7 +246,7 @@ def read_until(scene: Scene, given: object) -> Until:
     if isinstance(given, str):
         return Until(contact=parse_contact(given, scene))
     allowed = "allowed are a contact name, or a table with contact, phi_deg or x, or several"
-    if not isinstance(given, dict) or not given or not set(given) <= set(UNTIL):
+    if not isinstance(given, dict) or not given or not set(given) <= set(keys.UNTIL):
         raise InputError("", "", f"{given!r} does not end a phase; {allowed}")
     pins = tuple(_read_pin(key, value) for key, value in given.items() if key != "contact")
     if "contact" in given:
@@ -269,26 +271,28 @@ def _at(key: str, read: Callable[[], _T]) -> _T:
         raise InputError("", key, error.problem) from None
 
 
-def _table(parent: Mapping[str, Any], key: str, keys: Table, name: str = "") -> Mapping[str, Any]:
+def _table(
+    parent: Mapping[str, Any], key: str, known: keys.Table, name: str = ""
+) -> Mapping[str, Any]:
     """The table at a key, with all the keys that it has to have and no others."""
     value = parent[key]
     if not isinstance(value, dict):
         raise InputError("", name or key, f"{value!r} is not a table")
-    check_keys(value, name or key, keys)
+    check_keys(value, name or key, known)
     return value
 
 
-def check_keys(table: Mapping[str, Any], where: str, keys: Table) -> None:
+def check_keys(table: Mapping[str, Any], where: str, known: keys.Table) -> None:
     """Check that a table has what is required, and nothing unknown."""
     prefix = f"{where}." if where else ""
     for key in table:
-        if key not in keys:
+        if key not in known:
             from difflib import get_close_matches
 
-            near = get_close_matches(key, keys, 1, 0.5)
+            near = get_close_matches(key, known, 1, 0.5)
             hint = f"did you mean {near[0]!r}? " if near else ""
-            allowed = ", ".join(sorted(keys))
+            allowed = ", ".join(sorted(known))
             raise InputError("", f"{prefix}{key}", f"unknown key; {hint}allowed are {allowed}")
-    for key in sorted(name for name, own in keys.items() if own.required):
+    for key in sorted(name for name, own in known.items() if own.required):
         if key not in table:
             raise InputError("", f"{prefix}{key}", "is missing")
