@@ -106,8 +106,7 @@ class _Version(argparse.Action):
 
 def solve(options: argparse.Namespace) -> int:
     """Plan, and write the plan."""
-    from dataclasses import fields
-
+    from ..common.fields import keys_of
     from ..common.files import require_ending, require_writable, together
     from ..geometry.path_guess import load
     from ..planning.options import PlanOptions
@@ -116,12 +115,8 @@ def solve(options: argparse.Namespace) -> int:
     from .summary import summarise
 
     output = options.output or _stem(options.problem) + ".npz"
-    given = {
-        key: getattr(options, key)
-        for key in (field.name for field in fields(PlanOptions))
-        if getattr(options, key, None) is not None
-    }
-    plan_options = PlanOptions(**given)
+    given = {key: getattr(options, key) for key in keys_of(PlanOptions)}
+    plan_options = PlanOptions(**{key: own for key, own in given.items() if own is not None})
     for path, ending in ((output, ".npz"), (options.torques, ".csv")):
         if path is not None:
             require_writable(path)

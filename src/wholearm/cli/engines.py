@@ -7,6 +7,7 @@ import json
 from typing import TYPE_CHECKING
 
 from ..common.errors import InputError, name_source
+from ..common.fields import Range
 from .origin import tell_origin
 from .progress import clear_progress, show_progress
 
@@ -15,8 +16,8 @@ if TYPE_CHECKING:
     from ..problem.definition import Problem
     from ..results.trajectory import Trajectory
 
-STEPS = (1e-6, 1e-1)
-"""Shortest and longest time step that is allowed, over the scene's time."""
+STEPS = Range(1e-6, 1e-1, lambda scene, _: scene.scales.time, "times the scene's time")
+"""Time steps with which engines get along."""
 
 
 def export(options: argparse.Namespace) -> int:
@@ -29,7 +30,7 @@ def export(options: argparse.Namespace) -> int:
     require_ending(options.mjcf, ".xml")
     problem = read_problem(options.problem)
     if options.step is not None:
-        _read_step(options.step, problem.scene.scales.time)
+        STEPS.check("--step", options.step, "s", problem.scene)
     plan = None
     if options.plan is not None:
         problem, plan = _load_plan(options.plan, problem)
@@ -49,9 +50,10 @@ def replay(options: argparse.Namespace) -> int:
     require_engine(options.engine)
     problem = read_problem(options.problem)
     problem, plan = _load_plan(options.plan, problem)
-    setting, time = ENGINES[options.engine].setting, problem.scene.scales.time
+    setting = ENGINES[options.engine].setting
     if options.step is not None:
-        setting = setting._replace(step=_read_step(options.step, time))
+        STEPS.check("--step", options.step, "s", problem.scene)
+        setting = setting._replace(step=options.step / problem.scene.scales.time)
     if options.softness is not None:
         setting = setting._replace(softness=options.softness)
     if options.policy is not None:
@@ -102,15 +104,6 @@ def _play_policy(
     clear_progress()
     print(json.dumps(report.to_dict() | notes, indent=2) if options.json else report.to_text())
     return report.exit_status
-
-
-def _read_step(step: float, time: float) -> float:
-    """A time step over the scene's time, if it is one that engines get along with."""
-    least, most = (share * time for share in STEPS)
-    if not least <= step <= most:
-        text = f"{step:g} s given; allowed are {least:.3g} to {most:.3g} s"
-        raise InputError("", "--step", text)
-    return step / time
 
 
 def _load_plan(path: str, problem: Problem) -> tuple[Problem, Trajectory]:

@@ -153,6 +153,7 @@ def leave(schema: Schema) -> Kind:
     return Kind(lambda given, _: given, schema)
 
 
+SHARE = Range(0.0, 1.0)
 NUMBER = Kind(require_number, {"type": "number"})
 POSITIVE = Kind(partial(require_number, positive=True), {"type": "number", "exclusiveMinimum": 0})
 NONNEGATIVE = Kind(partial(require_number, nonnegative=True), {"type": "number", "minimum": 0})
