@@ -1,12 +1,17 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from shipped import HEPTAGON, problem_of
 from thrown import shove
+from timed import landing
 from wholearm.common.errors import InfeasibleError, SolverError
+from wholearm.geometry.path_guess import find_end
+from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.time_domain import attempts as attempts_module
 from wholearm.planning.time_domain import plan as time_plan
@@ -16,7 +21,7 @@ from wholearm.planning.time_domain.search import Search, Solution
 from wholearm.planning.time_domain.stage import Stage
 from wholearm.planning.time_domain.staging import guess_stages
 from wholearm.planning.time_domain.way_guess import PacedWay
-from wholearm.problem.definition import Problem
+from wholearm.problem.definition import End, Problem
 
 OPTIONS = PlanOptions(time_intervals=12, transcription="time")
 PACE = "{}, {} times as long as a fall over that height"
@@ -76,6 +81,28 @@ def test_phases_in_motion_are_tried_ahead() -> None:
     assert [own.name for own in attempts.list_further(3)] == [NEAREST + GRADUAL, AHEAD[0]]
 
 
+def test_an_end_that_is_known_is_first_looked_for_straight() -> None:
+    """As on a route, which is given it: pinned in a file the first guess is the same."""
+    problem = landing()
+    start, index = trace_phases(problem)[-1].end, 4
+    straight, nearest = "a straight path that keeps limits ", NEAREST
+    phase = problem.phases[index]
+    goal = find_end(phase, start, problem.phases[index + 1 :])
+    pins = (("x", float(goal[0])),)
+    pinned = replace(phase, until=replace(phase.until, pins=pins), end=End.REST)
+    for own, given in ((replace(phase, end=End.REST), goal), (pinned, None)):
+        search = Search.of(problem, OPTIONS)
+        attempts = Attempts(problem, [own], start, search, None, True)
+        names = [attempt.name for attempt in attempts.begin(given)]
+        assert names[-1] == nearest and len(names) <= 2
+        assert all(name.startswith(straight) for name in names[:-1])
+        found = attempts.begin(given)[0].stages[-1].guess.nodes[-1, 0]
+        np.testing.assert_allclose(found[:2] * problem.scene.scales.length, goal[:2], atol=1e-9)
+    # Without one there is nothing to go straight to, nor are there straight ways of two phases.
+    free = Attempts(problem, [phase], start, search, None, True)
+    assert [attempt.name for attempt in free.begin()] == [nearest]
+
+
 def test_where_patience_is_not_asked_for_there_is_one_attempt() -> None:
     attempts = list_attempts(problem_of(HEPTAGON), 1, patient=False)
     assert list(attempts) == [attempts.first]
@@ -92,7 +119,7 @@ def tried(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> li
         return Solution(attempt.stages, 1.0, 0.0, "Ipopt stopped", success, nlp, {})
 
     monkeypatch.setattr(time_plan, "solve_attempt", pretend)
-    monkeypatch.setattr(time_plan, "_find_short", lambda *_: (None, []))
+    monkeypatch.setattr(time_plan, "find_short", lambda *_: (None, []))
     monkeypatch.setattr(time_plan, "list_plans", lambda *given: [given[-1]])
     return names
 
@@ -108,7 +135,8 @@ def tried(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> li
 )
 def test_a_plan_names_the_attempt_that_led_to_it(tried: list[str], order: list[str]) -> None:
     problem, _ = shove()
-    assert plan_phases(problem, problem.phases, problem.start, OPTIONS) == [order[-1]]
+    plans: list[Any] = plan_phases(problem, problem.phases, problem.start, OPTIONS)
+    assert plans == [order[-1]]
     assert tried == order
 
 
@@ -118,7 +146,7 @@ def test_attempts_end_where_motions_of_two_are_short_of_limits(
 ) -> None:
     """Before that all are made; what is like what is short is first asked what it is short of."""
     problem, _ = shove()
-    with pytest.raises(SolverError, match="did not converge from 5 initial guesses"):
+    with pytest.raises(SolverError, match="from 5 guesses"):
         plan_phases(problem, problem.phases, problem.start, OPTIONS, explained=False)
     assert tried == [NEAREST, NEAREST + GRADUAL, *AHEAD]
     asked = list[object]()
@@ -128,8 +156,8 @@ def test_attempts_end_where_motions_of_two_are_short_of_limits(
         return given[2], given[2]
 
     tried.clear()
-    monkeypatch.setattr(time_plan, "_find_short", find_short)
-    monkeypatch.setattr(time_plan, "_explain", lambda *_: InfeasibleError("short"))
+    monkeypatch.setattr(time_plan, "find_short", find_short)
+    monkeypatch.setattr(time_plan, "explain_lost", lambda *_: InfeasibleError("short"))
     with pytest.raises(InfeasibleError, match="short"):
         plan_phases(problem, problem.phases, problem.start, OPTIONS, explained=False)
     assert tried == [NEAREST, NEAREST + GRADUAL] and len(asked) == time_plan.CONVINCING == 2

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from wholearm.planning import blocks
 from wholearm.planning.block_plan import Planning
 from wholearm.planning.blocks import plan_alone
 from wholearm.planning.options import Objective, PlanOptions
+from wholearm.planning.stops import Plans
 from wholearm.planning.time_domain import impacts
 
 
@@ -63,6 +65,13 @@ def test_no_phase_has_to_press_much_more_than_those_before_it(
         assert given[index][0] == pytest.approx(blocks.AMPLE * before)
 
 
+@cache
+def plan_along() -> Plans:
+    problem = problem_of(HEPTAGON)
+    given = problem, trace_phases(problem), PlanOptions(intervals=20)
+    return blocks.plan_blocks(*given, lambda _: None).plans
+
+
 @pytest.mark.parametrize("share", [2.0, 0.1])
 def test_what_is_far_from_possible_later_stops_planning_before(
     monkeypatch: pytest.MonkeyPatch, share: float
@@ -70,7 +79,7 @@ def test_what_is_far_from_possible_later_stops_planning_before(
     """What is near to being possible may be so from where a better plan ends."""
     problem, begun = problem_of(HEPTAGON), list[tuple[int, bool, bool]]()
     curves, options = trace_phases(problem), PlanOptions(intervals=20)
-    known = blocks.plan_blocks(problem, curves, options, lambda _: None).plans
+    known = plan_along()
     place = Place(3, 0.0, "there")
     short = Shortfall("press", "v1-palm", "c_n", 1.0, "N", place, share * blocks.CLEAR)
 

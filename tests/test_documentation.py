@@ -9,22 +9,29 @@ import inspect
 import re
 import shlex
 import sys
+import tomllib
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import wholearm
+from once import once
 from shipped import FOLDER, HEPTAGON, LANDING, chart, problem_of, solved
 from wholearm.cli.arguments import name_simulator
 from wholearm.cli.bench import name_study
 from wholearm.cli.command import build_parser, main
+from wholearm.cli.help import TOPICS, read_page
 from wholearm.cli.map import protect
 from wholearm.planning.result import Plan
 from wholearm.problem.definition import Problem
 
 ROOT = FOLDER.parent
-PAGES = [ROOT / "README.md", *FOLDER.rglob("README.md"), *sorted((ROOT / "results").glob("*.md"))]
+SOURCE = ROOT / "src" / "wholearm"
+PAGES = [ROOT / "README.md", *sorted(SOURCE.rglob("README.md"))]
+"""How the package is used, and what it does; the parts beside the code are topics of `help`."""
+EVERY = [*PAGES, *sorted(FOLDER.rglob("README.md")), *sorted((ROOT / "results").glob("*.md"))]
 QUICK = ("new", "schema", "export", "verify", "plot")
 """Commands that are run; the others plan, search, draw movies or sample, which tests of their own
 do with less: of these the real parser reads the lines."""
@@ -44,9 +51,14 @@ def list_lines(path: Path) -> list[str]:
     return [line for line in own if line.startswith(("wholearm ", "python -m wholearm"))]
 
 
-LINES = list(dict.fromkeys(line for path in PAGES for line in list_lines(path)))
-BLOCKS = re.findall(r"^```python\n(.*?)^```", read(ROOT / "README.md"), re.M | re.S)
-CALLS = re.findall(r"`(wholearm\.\w[\w.]*\([^`]*\))`", read(ROOT / "README.md"))
+def list_blocks(path: Path, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", read(path), re.M | re.S)
+
+
+make_parser = cache(build_parser)
+LINES = list(dict.fromkeys(line for path in EVERY for line in list_lines(path)))
+BLOCKS = [block for path in PAGES for block in list_blocks(path, "python")]
+CALLS = re.findall(r"`(wholearm\.\w[\w.]*\([^`]*\))`", "".join(map(read, PAGES)))
 
 
 @pytest.fixture
@@ -59,14 +71,18 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     solved(HEPTAGON).save("plan.npz")
     tuned = read(FOLDER / "torques" / "heptagon_tuned.csv")
     (tmp_path / "tuned.csv").write_text(tuned, encoding="utf-8")
-    block = re.findall(r"^```toml\n(.*?)^```", read(FOLDER / "README.md"), re.M | re.S)[0]
+    block = list_blocks(FOLDER / "README.md", "toml")[0]
     (tmp_path / "flip.toml").write_text(block, encoding="utf-8")
     return tmp_path
 
 
+@once
+def policy() -> wholearm.Policy:
+    return wholearm.make_policy(problem_of(HEPTAGON), solved(HEPTAGON), reserve=0.0)
+
+
 def test_python_blocks_run(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = solved(HEPTAGON)
-    wholearm.make_policy(problem_of(HEPTAGON), plan, reserve=0.0).save("policy.npz")
+    policy().save("policy.npz")
     solve, known = wholearm.solve, {"heptagon, landing on edge 1": solved(LANDING)}
 
     def look_up(problem: Problem, **options: Any) -> Plan:
@@ -100,7 +116,7 @@ def test_shell_lines_are_read(line: str, folder: Path, monkeypatch: pytest.Monke
         if len(words) == 2:
             words.append("--help")
         try:
-            build_parser().parse_args(name_study(protect(name_simulator(words[1:]))))
+            make_parser().parse_args(name_study(protect(name_simulator(words[1:]))))
         except SystemExit as error:
             assert error.code == 0
     elif words[0] == "python":
@@ -116,13 +132,13 @@ def test_shell_lines_are_read(line: str, folder: Path, monkeypatch: pytest.Monke
             importlib.import_module(words[2]).main()
 
 
-@pytest.mark.parametrize("path", [ROOT / "README.md", FOLDER / "README.md"], ids=str)
+@pytest.mark.parametrize("pages", [PAGES, [FOLDER / "README.md"]], ids=["package", "problems"])
 def test_quick_shell_lines_run(
-    path: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+    pages: list[Path], folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     solved(LANDING).save("pent.npz")
     run = 0
-    for line in dict.fromkeys(list_lines(path)):
+    for line in dict.fromkeys(line for path in pages for line in list_lines(path)):
         words = shlex.split(line)
         if (
             len(words) < 3
@@ -142,7 +158,7 @@ def test_results_are_one_line_and_motions_a_picture() -> None:
         plan.trajectory,
         wholearm.simulate(problem, plan),
         wholearm.verify(problem, plan),
-        wholearm.make_policy(problem, plan, reserve=0.0),
+        policy(),
         chart(),
         problem,
     ]
@@ -151,3 +167,56 @@ def test_results_are_one_line_and_motions_a_picture() -> None:
         assert len(text) <= 100 and "\n" not in text
         assert text.startswith(f"{type(result).__name__}(")
     assert "<svg" in plan._repr_html_() and "<svg" in chart()._repr_html_()
+
+
+def test_problem_files_are_toml_and_that_of_the_readme_plans(tmp_path: Path) -> None:
+    for path in EVERY:
+        for block in list_blocks(path, "toml"):
+            assert tomllib.loads(block)
+    (tmp_path / "box.toml").write_text(list_blocks(PAGES[0], "toml")[0], encoding="utf-8")
+    assert wholearm.solve(wholearm.load(str(tmp_path / "box.toml"))).replay is not None
+
+
+def name_anchor(heading: str) -> str:
+    """What a link to a heading ends with."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
+@pytest.mark.parametrize("path", EVERY, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links_lead_somewhere(path: Path) -> None:
+    text = re.sub(r"^```.*?^```", "", read(path), flags=re.M | re.S)
+    for target, anchor in re.findall(r"\]\(([^)#\s]*)#?([^)\s]*)\)", text):
+        if target.startswith("http"):
+            continue
+        found = path if not target else path.parent / target
+        assert found.exists(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", read(found), re.M)
+            assert anchor in map(name_anchor, headings), f"{target}#{anchor}"
+
+
+def test_pages_are_short_and_topics_of_help(capsys: pytest.CaptureFixture[str]) -> None:
+    beside = {page.parent for page in PAGES[1:]}
+    assert beside == {SOURCE / folder for folder in TOPICS.values()}
+    assert len(read(PAGES[0]).splitlines()) <= 300
+    assert all(len(read(page).splitlines()) <= 120 for page in PAGES[1:])
+    assert main(["help"]) == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(TOPICS)
+    assert main(["help", "time-domain"]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("# Time domain") and "(wholearm help path-domain)" in text
+    for folder in TOPICS.values():
+        text = read_page(folder)
+        assert text.startswith("# ") and "README.md)" not in text, folder
+    assert main(["help", "planing"]) == 2
+    assert "'planning'" in capsys.readouterr().err
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        data = tomllib.load(file)["tool"]["setuptools"]["package-data"]
+    assert "README.md" in data["*"]
+
+
+def test_set_up_takes_two_commands_which_are_those_of_ci() -> None:
+    solving, testing = re.findall(r"^    (python3 -m venv .*)$", read(ROOT / "README.md"), re.M)
+    script = read(ROOT / ".ci" / "run")
+    assert testing in script.splitlines()
+    assert solving.split("wholearm ")[1].split(" -o")[0] in script

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -16,7 +17,7 @@ from wholearm.engines.closed import play_policy
 from wholearm.engines.departure import Departure
 from wholearm.engines.drive import Drive
 from wholearm.engines.mjcf import write_mjcf
-from wholearm.engines.replay import EngineReport, Level, list_settings, replay_in
+from wholearm.engines.replay import EngineReport, Level, list_settings, replay_in, require_engine
 from wholearm.engines.report_text import to_dict, write
 from wholearm.engines.stretch import Setting, list_stretches
 from wholearm.planning.plan import solve
@@ -160,6 +161,16 @@ def test_settings_get_finer() -> None:
         Setting(0.5, 2.0),
         Setting(0.25, 4.0),
     ]
+
+
+def test_an_engine_that_is_installed_in_part_is_said_to_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "mujoco.py").write_text("raise ImportError('core bindings are\\nmissing')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "mujoco", raising=False)
+    with pytest.raises(InputError, match="--engine: mujoco: core bindings are missing"):
+        require_engine("mujoco")
 
 
 def test_an_engine_that_is_missing_or_unknown(

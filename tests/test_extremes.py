@@ -35,10 +35,8 @@ def edited(friction: dict[str, float] | None = None, **joints: float) -> Problem
     [
         {"viscous": 16.0},
         {"speed_limit": 0.1},
-        {"inertia": 6.0},
         {"inertia": 1e-9, "viscous": 0.0},
         {"torque_limit": 350.0},
-        {"gravity": 1.62},
         {"gravity": 100.0, "torque_limit": 20.0},
     ],
     ids=str,

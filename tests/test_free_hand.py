@@ -136,7 +136,7 @@ def test_a_law_is_sampled_held_and_late(share: float) -> None:
     assert run.z_dot[-1, 3:] == pytest.approx(omega, abs=1e-9)
 
 
-@pytest.mark.parametrize("seed", [3, 45, 103, 264, 512, 862])
+@pytest.mark.parametrize("seed", [3, 103, 512])
 def test_random_runs_gain_no_energy_and_overlap_nowhere(seed: int) -> None:
     draw = draw_run(seed)
     run = run_draw(draw)

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from numpy.polynomial import Chebyshev, Polynomial
 
 from shipped import FOLDER
 from wholearm.common.arrays import Array
@@ -13,17 +14,20 @@ from wholearm.geometry.curve import find_tied, tangent_basis
 from wholearm.geometry.explore import close_contacts
 from wholearm.geometry.path_guess import list_ends
 from wholearm.mechanics.metric import metric_weights
-from wholearm.planning.options import Objective, PlanOptions
+from wholearm.planning.options import PlanOptions
+from wholearm.planning.plan import solve
 from wholearm.planning.time_domain.attempts import Attempts
 from wholearm.planning.time_domain.equations import least_rates, least_senses
-from wholearm.planning.time_domain.gradual import find_modes, split_by_senses
+from wholearm.planning.time_domain.gradual import MOST, ONSETS, find_modes, split_by_senses
 from wholearm.planning.time_domain.kernels import goal_kernel
-from wholearm.planning.time_domain.modes import merge, mode_of
-from wholearm.planning.time_domain.motion import make_motions
+from wholearm.planning.time_domain.modes import mode_of
 from wholearm.planning.time_domain.nlp import bound_unknowns
+from wholearm.planning.time_domain.refinement import bisect_intervals
 from wholearm.planning.time_domain.search import Search, Solution
+from wholearm.planning.time_domain.stage import Stage
 from wholearm.problem.definition import Phase, Problem
 from wholearm.problem.read import build_problem, read_problem
+from wholearm.verification.verify import verify
 
 
 def with_phase(name: str, contacts: str, until: object) -> tuple[Problem, Phase]:
@@ -44,12 +48,35 @@ def corner() -> tuple[Problem, Phase, Array]:
     return problem, phase, z
 
 
-@cache
-def begun() -> tuple[Search, Solution]:
+SMALL = 0.005
+"""How much the link turns back and forth, so little that all that is not tied to it goes on."""
+
+
+def turned(rates: Polynomial | Chebyshev) -> tuple[Search, Stage]:
+    """The triangle turns on and on; the link, and its vertex, goes at such rates back and forth.
+
+    No forces are looked for: every motion of two freedoms is one of the contacts.
+    """
     problem, phase, z = corner()
     search = Search.of(problem, PlanOptions())
-    first = Attempts(problem, [phase], z, search, None, True).first
-    return search, find_modes(search, first.stages)
+    (stage, *_) = Attempts(problem, [phase], z, search, None, True).first.stages
+    (stage,) = bisect_intervals([stage], search.scheme, [np.full(stage.intervals, 2)])
+    part, formation = stage.guess, stage.formation
+    scale = np.abs(rates(np.linspace(0, 1, 99))).max()
+    link, start = SMALL / scale * rates.integ(), part.nodes[0, 0]
+
+    def state(share: float) -> tuple[Array, Array]:
+        fixed = ((2, start[2] - 0.05 * share), (3, start[3] + link(share)))
+        z = close_contacts(formation, start, np.zeros(0), fixed)
+        assert z is not None
+        A = formation.evaluate(z[None], np.zeros((1, 5))).A[0]
+        moving = np.append(np.zeros(3), [-0.05, SMALL / scale * rates(share)])
+        return z, np.linalg.solve(np.vstack([A, np.eye(5)[2:4]]), moving) / part.duration
+
+    states = [[state(share) for share in own] for own in part.places(search.scheme.points)]
+    nodes = np.array([state(share) for share in part.breaks])
+    z, v = np.moveaxis(np.array(states), 2, 0)
+    return search, replace(stage, guess=part._replace(nodes=nodes, z=z, v=v))
 
 
 def test_what_is_in_the_corner_turns_with_the_link() -> None:
@@ -66,30 +93,74 @@ def test_what_is_in_the_corner_turns_with_the_link() -> None:
     assert set(find_tied(formation, z, 0)) == {0, 1, 3}
 
 
-def test_modes_are_found_where_the_given_ones_lead_nowhere() -> None:
-    search, found = begun()
-    assert found.success and all(stage.onset == 0 for stage in found.stages)
-    solution = search.solve(found.stages)
-    assert solution.success
-    # A contact slides back first.
-    signs = np.array([mode_of(stage).signs for stage in solution.stages])
-    assert len(signs) > 1 and (signs[0] != signs[1]).sum() == 1
-    motions = make_motions(solution.stages, search.scheme)
-    for stage, motion in zip(solution.stages, motions, strict=True):
-        samples = motion.evaluate(np.linspace(0.01, 0.99, 30) * motion.duration)
-        assert stage.measure_senses(samples.z, samples.z_dot).min() > -1e-4
+TIED = {0, 1, 3}
+"""Rows of (contacts, joints) that turn together in the corner."""
 
 
 def test_pieces_move_one_way_and_make_up_the_stage() -> None:
-    search, found = begun()
-    (whole,) = merge([found.stages[0]])
-    for stage in found.stages:
+    for places in (), (0.3,), (0.2, 0.7):
+        search, stage = turned(Polynomial.fromroots(places) if places else Polynomial([1.0]))
         pieces = split_by_senses(stage, search.scheme)
-        assert sum(p.guess.duration for p in pieces) == pytest.approx(stage.guess.duration)
+        shares = np.diff([0.0, *places, 1.0])
+        # Turns are found by straight lines between points.
+        lasts = [own.guess.duration / stage.guess.duration for own in pieces]
+        np.testing.assert_allclose(lasts, shares, atol=0.01)
         for one, other in pairwise(pieces):
             assert one.guess.nodes[-1] == pytest.approx(other.guess.nodes[0], abs=1e-9)
-            assert mode_of(one) != mode_of(other)
-    assert found.stages[-1].until is not None and whole.until is None
+            signs = np.array([mode_of(one).signs, mode_of(other).signs])
+            assert {0, 3} <= set(np.flatnonzero(signs[0] != signs[1]).tolist()) <= TIED
+        for own in pieces:
+            senses = own.measure_senses(
+                own.guess.z[1:-1].reshape(-1, 5), own.guess.v[1:-1].reshape(-1, 5)
+            )
+            assert senses.min() > -1e-4 * np.abs(senses).max()
+        assert pieces[-1].until is not None and all(own.until is None for own in pieces[:-1])
+
+
+class Given(Search):
+    """A search whose solutions are all one motion."""
+
+    motion: Stage
+    onsets: list[float]
+
+    def solve(self, stages: list[Stage], before: Solution | None = None, most: int = 0) -> Solution:
+        (stage,) = stages
+        self.onsets.append(stage.onset)
+        found = [replace(stage, guess=self.motion.guess)]
+        return Solution(found, 1.0, 0.0, "", True, None, {})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "rates",
+    [Polynomial([1.0]), Polynomial.fromroots([0.3]), Chebyshev.basis(15, domain=[0.0, 1.0])],
+    ids=["on", "turning back", "trembling"],
+)
+def test_modes_are_those_of_the_motion_with_friction_that_sets_in_gradually(
+    rates: Polynomial | Chebyshev,
+) -> None:
+    plain, stage = turned(rates)
+    search = Given(**vars(plain))
+    search.motion, search.onsets = stage, []
+    found = find_modes(search, [stage])
+    assert search.onsets == list(ONSETS)
+    assert found.success == (rates.degree() < MOST)
+    if found.success:
+        assert len(found.stages) == rates.degree() + 1
+        assert all(own.onset == 0 for own in found.stages)
+        assert (
+            {0, 3} <= set(found.stages[0].turns) <= TIED
+            if rates.degree()
+            else not found.stages[0].turns
+        )
+
+
+def test_a_vertex_in_a_corner_may_go_back_first() -> None:
+    """The modes of its outline lead nowhere."""
+    problem, phase, z = corner()
+    own = replace(problem, start=z, phases=(replace(phase, index=0),))
+    plan = solve(own, time_intervals=10, replay=False).trajectory
+    report = verify(own, plan)
+    assert report.ok, report.to_text()
 
 
 def test_an_end_where_a_contact_changes_its_name_has_a_slope() -> None:
@@ -108,28 +179,23 @@ def test_an_end_where_a_contact_changes_its_name_has_a_slope() -> None:
 
 
 def test_where_the_last_stage_stops_may_be_given() -> None:
-    """The largest margin ends elsewhere, but for that."""
-    search, found = begun()
-    quick = search.solve(found.stages)
-    times = 2 * sum(stage.guess.duration for stage in quick.stages)
-    slow = replace(search, goal=Objective.MARGIN, duration=times)
-    free = slow.solve(quick.stages)
-    last = replace(quick.stages[-1], stop=quick.end)
-    pinned = slow.solve([*quick.stages[:-1], last])
-    assert quick.success and free.success and pinned.success
-    assert np.abs(pinned.end - quick.end).max() < 1e-7 < 0.01 < np.abs(free.end - quick.end).max()
-    assert 0.0 < pinned.margin < free.margin + 1e-6
-    spent = [sum(own.guess.duration for own in found.stages) for found in (free, pinned)]
-    assert max(spent) < times * (1 + 1e-6)
+    """By as many equations as there are freedoms, on the place where it ends."""
+    search, stage = turned(Polynomial([1.0]))
+    stop = stage.guess.nodes[-1, 0]
+    free, held = (search.build([replace(stage, until=None, stop=at)]) for at in (None, stop))
+    there = tangent_basis(stage.formation, stop).T @ stop
+    for before, after in zip(free.rows.bounds, held.rows.bounds, strict=True):
+        assert len(after) == len(before) + 2
+        assert np.setdiff1d(after, before) == pytest.approx(np.sort(there))
 
 
 def test_the_second_contact_of_a_vertex_need_not_move() -> None:
     """Its rate has a zero where the link stands across, however fast the vertex moves."""
-    _, found = begun()
+    _, stage = turned(Polynomial([1.0]))
     places = np.linspace(0.1, 0.9, 9)
-    least = least_senses(found.stages[0], places)
+    least = least_senses(stage, places)
     assert least.shape == (9, 5) and (least[:, 1] == 0.0).all()
-    assert (least[:, [0, 2, 3, 4]] == least_rates(found.stages[0], places)[:, None]).all()
+    assert (least[:, [0, 2, 3, 4]] == least_rates(stage, places)[:, None]).all()
     assert least[:, 0].min() > 0.0
 
 
@@ -147,4 +213,4 @@ def test_what_ends_a_phase_is_not_reached_before() -> None:
     assert (np.diff(least[:-1]) <= 0).all() and (least[:-1] > value).all()
     assert np.isinf(least[-1]) and np.isinf(high[layout.z[..., row]]).all()
     # Other phases end by contacts alone.
-    assert all(own.ahead is None for own in begun()[1].stages)
+    assert turned(Polynomial([1.0]))[1].ahead is None

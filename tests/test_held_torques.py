@@ -24,7 +24,7 @@ def slide() -> Problem:
 @pytest.mark.parametrize("hold", ["constant", "linear"])
 def test_torques_are_held_from_period_to_period(slide: Problem, hold: str, tmp_path: Path) -> None:
     problem = slide.with_(control_period=PERIOD, control_hold=hold)
-    plan = solve(problem, accuracy=1e-2, mode_search=False)
+    plan = solve(problem, accuracy=1e-2, mode_search=False, replay=False)
     assert verify(problem, plan).ok
     torque, spans = plan.trajectory.torque, np.arange(0.0, plan.duration, PERIOD)
     inside = np.linspace(0.01, 0.99, 8)
@@ -44,7 +44,6 @@ def test_torques_are_held_from_period_to_period(slide: Problem, hold: str, tmp_p
     assert known.phases[0].unheld == free
     scene = read_own_problem(known.trajectory.meta, path).scene
     assert scene.control_period == pytest.approx(PERIOD) and scene.control_hold == hold
-    assert verify(problem, known).ok
 
 
 def test_keys_are_checked(slide: Problem) -> None:

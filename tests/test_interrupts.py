@@ -14,6 +14,7 @@ import pytest
 
 from shipped import HEPTAGON
 from wholearm.benchmark.interrupts import STARTED, interrupt
+from wholearm.cli.route import hasten
 from wholearm.common import interrupts
 from wholearm.common.files import together, write_whole
 from wholearm.common.interrupts import check, guard, held
@@ -71,6 +72,22 @@ def test_a_swallowed_interrupt_counts(
 ) -> None:
     assert guard(run) == 130
     assert capsys.readouterr().err == "wholearm: interrupted\n"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_search_says_that_it_plans_unless_it_is_terminated(
+    number: signal.Signals, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def search() -> int:
+        try:
+            with interrupts.yielding():
+                signal.raise_signal(number)
+        except KeyboardInterrupt:
+            hasten()
+        return 0
+
+    assert guard(search) == (0 if number is signal.SIGINT else 128 + number)
+    assert ("again to stop" in capfd.readouterr().err) == (number is signal.SIGINT)
 
 
 def test_no_file_appears_after_a_swallowed_interrupt(tmp_path: Path) -> None:

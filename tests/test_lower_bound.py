@@ -10,11 +10,12 @@ import pytest
 from shipped import HEPTAGON, IMPACTS, problem_of
 from toys import LIMIT, Toy, constant, find_time_growing, find_time_viscous, inertia
 from wholearm.geometry.curve import Curve
-from wholearm.geometry.tracing import trace_phases
+from wholearm.geometry.tracing import trace_phase, trace_phases
 from wholearm.mechanics.dynamics import Directions, inverse
 from wholearm.mechanics.limits import make_limits
+from wholearm.planning.lower_bound import lower_bound
 from wholearm.planning.lower_bound.dual import find_least
-from wholearm.planning.lower_bound.lower_bound import LowerBound, bound_least_time
+from wholearm.planning.lower_bound.lower_bound import LowerBound, bound_least_time, look_along
 from wholearm.planning.lower_bound.rows import GIVE, Rows, evaluate_rows
 from wholearm.planning.lower_bound.sweep import NoMotionError, find_fastest
 from wholearm.planning.options import PlanOptions
@@ -22,6 +23,7 @@ from wholearm.planning.path_domain.impact_sequence import make_sequence
 from wholearm.planning.path_domain.misses import MISS
 from wholearm.planning.path_domain.plan import plan_path
 from wholearm.planning.path_domain.sequence_plan import plan_sequence
+from wholearm.problem.read import build_problem
 
 EPSILON = 0.05
 
@@ -175,3 +177,54 @@ def test_the_bound_shares_nothing_with_the_nlp() -> None:
                 assert node.level or first not in ("casadi", "wholearm")
             elif isinstance(node, ast.Import):
                 assert [alias.name for alias in node.names] == ["numpy"]
+
+
+OCTAGON = """
+    v0-palm v1-palm e2-tip1 v7-finger2 > v0-finger2
+    v0-palm e2-tip1 v0-finger2 v7-finger2 > v2-tip1
+    v0-palm v2-tip1 v0-finger2 v7-finger2 > e1-tip1
+    v0-palm e1-tip1 v0-finger2 v7-finger2 > v1-palm
+"""
+"""A slide on edge 0 until an edge is flush on finger 2, and the flip that follows."""
+
+
+def trace_octagon() -> tuple[list[Curve], float]:
+    """The curves of the flip, which is slowest by far where a joint turns back, and epsilon."""
+    finger = {"length": 0.2, "radius": 0.015, "inertia": 0.004, "viscous": 0.01, "dry": 0.01}
+    finger["torque_limit"] = 5.0
+    near, far = 0.02296, 0.05543
+    corners = [(-near, -far), (near, -far), (far, -near), (far, near)]
+    phases = [own.split(" > ") for own in OCTAGON.split("\n") if own.strip()]
+    problem = build_problem(
+        {
+            "object": {"vertices": [*corners, *((-x, -y) for x, y in corners)], "mass": 0.5},
+            "fingers": {
+                "1": {"base": [0.14, -0.02], **finger},
+                "2": {"base": [-0.14, -0.02], **finger},
+            },
+            "friction": {"palm": 0.29, "finger1": 0.2, "finger2": 0.2},
+            "epsilon": 0.05,
+            "start": {"flush": 0, "x": -0.11},
+            "phases": [{"contacts": own.split(), "until": until} for own, until in phases],
+        }
+    )
+    z, curves = problem.start, []
+    for phase in problem.phases:
+        curves.append(trace_phase(phase, z, problem.phases[phase.index + 1 :]))
+        z = curves[-1].end
+    return curves[1:], problem.epsilon
+
+
+def test_a_place_that_motions_hardly_pass_is_found_on_any_first_grid(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Some of the grids are too coarse there for any motion, others for more than a crawl."""
+    curves, epsilon = trace_octagon()
+    least = []
+    for intervals in (50, 100):
+        monkeypatch.setattr(lower_bound, "GRID_INTERVALS", intervals)
+        found = bound_least_time(curves, epsilon)
+        assert found is not None
+        least.append(found.value)
+    assert least == pytest.approx([least[-1]] * len(least), rel=1e-5)
+    assert look_along(curves, epsilon, 1000) == pytest.approx(least[-1], rel=1e-3)

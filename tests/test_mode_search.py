@@ -12,10 +12,9 @@ import wholearm.planning.time_domain.attempts as attempts
 import wholearm.planning.time_domain.mode_search as mode_search
 from plane import make_formation, measure_gaps, measure_slip
 from thrown import parting, raised
-from timed import instants, landing, plan_landing, total
+from timed import instants
 from tipping import roll, tilting
 from wholearm.contacts.formation import find_touching
-from wholearm.geometry.tracing import trace_phases
 from wholearm.mechanics.dynamics import Directions
 from wholearm.planning.options import PlanOptions
 from wholearm.planning.plan import solve
@@ -164,19 +163,11 @@ def test_what_may_slide_or_roll_is_faster_than_what_has_to_roll() -> None:
     problem = tilting()
     (phase,) = problem.phases
     rolls = replace(phase, formation=roll(phase.formation, "v1-palm"))
-    bound = solve(replace(problem, phases=(rolls,)), intervals=40, replay=False).trajectory
-    plan = solve(problem, time_intervals=10, replay=False).trajectory
+    bound = solve(replace(problem, phases=(rolls,)), intervals=10, replay=False).trajectory
+    plan = solve(problem, time_intervals=6, replay=False).trajectory
     assert plan.duration < 0.95 * bound.duration
     report = verify(problem, plan)
     assert report.ok, report.to_text()
-
-
-def test_rounding_of_masses_decides_nothing() -> None:
-    problem = landing()
-    noisy = problem.with_(mass=problem.scene.polygon.mass * (1 + 2.04e-10))
-    start = trace_phases(problem)[-1].end
-    plans = plan_phases(noisy, noisy.phases[4:], start, PlanOptions(time_intervals=6))
-    assert total(plans) == pytest.approx(total(plan_landing(time_intervals=6)), rel=1e-7)
 
 
 def test_a_first_phase_lets_go_what_touches_at_the_start() -> None:

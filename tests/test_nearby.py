@@ -15,11 +15,16 @@ def test_near_miss_names_the_border_and_its_distance(heptagon: Problem) -> None:
     assert miss is not None and miss.track.flush == (1, 6)
     assert 1.0 < miss.off <= 2.0
     text = describe_miss(scene, miss)
-    assert "e6 flush on finger 2" in text and "mm in x" in text and "0.5 deg" in text
+    assert (
+        "e6 flush on finger 2" in text
+        and " up to -" in text
+        and "mm in x" in text
+        and "0.5 deg" in text
+    )
     assert find_miss(scene, start + 10 * aside, stop + 10 * aside) is None
     phi = scene.polygon.flush_angle(0) + 3 * near[1]
     palm = find_miss(scene, np.array([0.045, phi]), np.array([0.0, phi]))
-    assert palm is not None and "e0 flush on the palm, is up to 1.5 deg" in describe_miss(
+    assert palm is not None and "e0 flush on the palm, is up to -1.5 deg" in describe_miss(
         scene, palm
     )
 

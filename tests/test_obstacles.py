@@ -122,7 +122,7 @@ def test_a_link_that_touches_overlaps_elsewhere_where_a_limit_says_so(
     for _ in range(3):
         scene = random_scene(rng, radius, int(rng.integers(3, 9)))
         formation = make_formation(scene, name)
-        z = np.array([hold(rng, scene, name) for _ in range(84)])
+        z = np.array([hold(rng, scene, name) for _ in range(56)])
         assert np.abs(formation.evaluate(z, z).C).max() < 1e-14
         # A little smaller, the object touches nothing where it only touched.
         body = replace(scene.polygon, points=(1 - 1e-6) * scene.polygon.vertices)
@@ -136,7 +136,7 @@ def test_a_link_that_touches_overlaps_elsewhere_where_a_limit_says_so(
             thick = radius > 0 or name.startswith("e")
             assert not (clear and thick and least < -2e-3), (place, least)
             seen[clear] += 1
-    assert min(seen.values()) > 20
+    assert min(seen.values()) > 10
 
 
 @pytest.mark.parametrize("radius", [0.0, 0.01])

@@ -5,17 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import pytest
 
-from shipped import HEPTAGON, problem_of
+from shipped import HEPTAGON, HEXAGON, problem_of
+from wholearm.common.pulse import OutOfTime
 from wholearm.common.shortfalls import Change, Parameter
+from wholearm.contacts.closing import close_fingers
 from wholearm.planning.options import PlanOptions
 from wholearm.problem.goal import Goal
+from wholearm.problem.read import build_problem
 from wholearm.search.chart import Chart
 from wholearm.search.find import Search
 from wholearm.search.gates import Opening, list_cut, list_gates, list_openings, look_through
 from wholearm.search.links import Link
-from wholearm.search.opening import choose_opening, explain, find_opening
+from wholearm.search.opening import choose_opening, explain, find_hand, find_opening, list_hands
 from wholearm.search.places import make_place
 from wholearm.search.result import describe_block
 
@@ -68,7 +72,7 @@ def test_what_is_advised_opens_the_way() -> None:
             if not math.isnan(value):
                 change = Change(opening.parameter, value)
                 assert isinstance(look_through(gate, change), Link)
-    text, (change,) = find_opening(own, rough, PlanOptions())
+    text, (change,) = find_opening(own, rough, PlanOptions(), 0.0, lambda _: None)
     assert change.parameter.key == "friction.palm" and change.value < 1.5
     assert text.startswith(f"with {change} the goal is reached, in about ")
     eased = rough.with_({"friction.palm": change.value})
@@ -77,3 +81,43 @@ def test_what_is_advised_opens_the_way() -> None:
     ).duration == pytest.approx(float(text.split()[-2]), rel=0.05)
     said = describe_block(own, [], text, lambda blocked: explain(rough, PlanOptions(), blocked))
     assert "blocked; v0-palm" in said and said.endswith(text) and " N short; " in said
+
+
+def test_hands_are_changed_alike_where_they_are_alike() -> None:
+    """And each change is one that a problem takes, by its data."""
+    alike = problem_of(HEPTAGON)
+    changes = list_hands(alike.scene)
+    assert {own.parameter.key for own in changes} == {"length", "fingers.1.base[1]"}
+    sizes = [abs(own.value / own.parameter.value - 1) for own in changes]
+    assert sizes == pytest.approx(sorted(sizes), abs=5e-3) and max(sizes) < 0.21
+    for own in changes:
+        right, left = alike.with_(own.values, phases=[]).scene.fingers
+        bases = np.array([right.base, left.base])
+        assert right.length == left.length
+        assert bases[0].tolist() == [-bases[1, 0], bases[1, 1]]
+    uneven = alike.with_(length1=0.9 * alike.scene.fingers[0].length, base2=[-0.085, -0.01])
+    keys = [f"fingers.{k}.{what}" for what in ("base[1]", "length") for k in (1, 2)]
+    assert [own.parameter.key for own in list_hands(uneven.scene)[:4]] == keys
+
+
+def test_fingers_that_cross_on_the_way_are_mounted_elsewhere(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With links of 0.18 m the fingers touch halfway through the slide; none closes at x = 0."""
+    table = {key: own for key, own in problem_of(HEXAGON).table.items() if key != "phases"}
+    crossing = build_problem({**table, "goal": {"flush": 0, "x": -0.01}}).with_(length=0.18)
+    (goal,), place = crossing.goals, make_place(crossing.scene, crossing.start)
+    own, told = Search(Chart(crossing, 0.1), place, goal), list[str]()
+    monkeypatch.setattr("wholearm.search.opening.HANDS", (0.95,))
+    text, (change,) = find_hand(own, crossing, PlanOptions(), 0.0, told.append)
+    assert text.startswith(f"with {change} the goal is reached") and f"{change}" in told[0]
+    assert change.values == {"fingers.1.base[1]": 0.076, "fingers.2.base[1]": -0.076}
+    changed = crossing.with_(change.values)
+    closed = [close_fingers(p.scene, np.zeros(1), p.start[2:3]) for p in (crossing, changed)]
+    assert [bool(c.obstacle.any()) for c in closed] == [True, False]
+
+    def end(_: str) -> None:
+        raise OutOfTime
+
+    text, changes = find_hand(own, crossing, PlanOptions(), 0.0, end)
+    assert changes == () and "not reached with 0 other" in text

@@ -13,11 +13,15 @@ from planned import plan_landing
 from shipped import HEPTAGON, problem_of
 from timed import landing
 from wholearm.common.errors import InfeasibleError, InputError
+from wholearm.common.shortfalls import Place, Shortfall
 from wholearm.geometry.tracing import trace_phases
 from wholearm.planning.options import PlanOptions
-from wholearm.planning.time_domain.pinning import Approach, refuse_pinned
-from wholearm.planning.time_domain.plan import plan_phases, try_phases
+from wholearm.planning.time_domain import explain
+from wholearm.planning.time_domain.pinning import NEARER, Approach, refuse_pinned
+from wholearm.planning.time_domain.plan import plan_phases
 from wholearm.planning.time_domain.search import Search, Solution
+from wholearm.planning.time_domain.stage import Stage
+from wholearm.planning.time_domain.staging import guess_stages
 from wholearm.problem.definition import Problem
 from wholearm.simulation.simulate import simulate
 from wholearm.verification.verdict import Allowance, describe_ends
@@ -34,7 +38,7 @@ def pin(problem: Problem, index: int, *pins: tuple[str, float]) -> Problem:
 
 
 def test_a_landing_comes_to_rest_where_it_is_pinned() -> None:
-    """Also beside the end that is the fastest, and far from the nearest; or it is said why not."""
+    """Also beside the end that is the fastest, and far from the nearest."""
     problem = pin(landing(), 5, ("x", 0.0195))
     start = trace_phases(problem)[-1].end
     # All guesses: what a single one leads to depends on the last bits.
@@ -49,15 +53,37 @@ def test_a_landing_comes_to_rest_where_it_is_pinned() -> None:
         problem.scene, " ".join([*problem.phases[5].formation.names, "v2-palm"])
     )
     assert np.abs(measure_gaps(formation, end.z)).max() < 1e-6 * size
-    # Much nearer to where the flip starts torques would have to be larger.
-    begun = try_phases(landing(), landing().phases[4:], start, options)
-    assert begun is not None and isinstance(begun[0].solution, Solution)
-    short, solution = pin(landing(), 5, ("x", 0.0145)), begun[0].solution
-    search = Search.of(short, options, None, None, math.inf, True)
-    ends = {stage.phase: stage.guess.nodes[-1, 0] for stage in solution.stages}
-    with pytest.raises(InfeasibleError, match=r"ends at x = .* mm, .* at the nearest") as own:
-        refuse_pinned(search, short, short.phases[4:], Approach(None, solution, ends, 0.0))
-    assert {lack.part for lack in own.value.shortfalls} & {"finger 1", "finger 2"}
+
+
+def test_where_no_plan_ends_it_is_said_what_motions_nearer_to_it_are_short_of(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """All the way is asked for first, and then less of it: until a motion is found at all."""
+    problem, options = pin(landing(), 5, ("x", 0.0145)), PlanOptions(time_intervals=6)
+    start, phases = trace_phases(problem)[-1].end, problem.phases[4:]
+    search = Search.of(problem, options, None, None, math.inf, True)
+    stages = guess_stages(problem, phases, start, search.scheme, 6, 2.0)
+    nearest = Solution(stages, 1.0, 0.0, "", True, search.build(stages), {})
+    free = guess_stages(landing(), landing().phases[4:], start, search.scheme, 6, 2.0)
+    ends = {stage.phase: stage.guess.nodes[-1, 0] for stage in free}
+    lack = Shortfall("torque", "finger 2", "torque limit", 1.0, "N m", Place(6, 0.1, ""), 0.5)
+    asked = list[float]()
+
+    def solve_elastic(_: Search, own: list[Stage]) -> list[Stage] | None:
+        until = own[-1].until
+        assert until is not None
+        asked.append(until.pins[0][1] * problem.scene.scales.length)
+        return own if len(asked) == 3 else None
+
+    monkeypatch.setattr(explain, "solve_elastic", solve_elastic)
+    monkeypatch.setattr(explain, "list_shortfalls", lambda _, own, __: [lack] if own else [])
+    with pytest.raises(InfeasibleError, match=r"ends at x = .* mm, .* at the nearest") as caught:
+        refuse_pinned(search, problem, phases, Approach(None, nearest, ends, 0.2))
+    assert caught.value.shortfalls == (lack,)
+    begin = ends[5][0] * problem.scene.scales.length
+    assert abs(begin - 0.0145) > 1e-3
+    shares = [0.2 + 0.8 * part for part in (1.0, *NEARER)]
+    assert asked == pytest.approx([begin + share * (0.0145 - begin) for share in shares])
 
 
 def test_with_one_freedom_pins_have_to_agree_with_the_curve() -> None:

@@ -2,21 +2,20 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
 
-from once import once
 from plane import measure_gaps, measure_slip, unbalance
-from shipped import HEPTAGON, TWICE, plan_of, problem_of
+from shipped import HEPTAGON, plan_of
 from thrown import shove
 from tipping import tipped
 from wholearm.common.arrays import Array
 from wholearm.common.errors import InfeasibleError, InputError
-from wholearm.geometry.tracing import trace_phases
-from wholearm.planning.blocks import plan_blocks
+from wholearm.planning.durations import share_again
 from wholearm.planning.options import Objective, PlanOptions
 from wholearm.planning.phase_plan import PhasePlan
 from wholearm.planning.plan import solve
@@ -193,7 +192,7 @@ def test_more_time_never_lowers_the_margin(heptagon: Problem) -> None:
 
 
 def test_a_heavier_weight_on_time_makes_it_faster(heptagon: Problem) -> None:
-    problem = replace(heptagon, phases=heptagon.phases[:2])
+    problem = replace(heptagon, phases=heptagon.phases[:1])
     plans = [
         solve(problem, "effort", time_weight=weight, intervals=20, replay=False)
         for weight in (0.1, 1.0, 10.0)
@@ -204,7 +203,7 @@ def test_a_heavier_weight_on_time_makes_it_faster(heptagon: Problem) -> None:
 
 
 def test_default_margin_takes_twice_the_least_time(heptagon: Problem) -> None:
-    problem = replace(heptagon, phases=heptagon.phases[:2])
+    problem = replace(heptagon, phases=heptagon.phases[:1])
     default = solve(problem, "margin", intervals=20, replay=False)
     least = solve(problem, intervals=20, replay=False).duration
     given = solve(problem, "margin", intervals=20, replay=False, duration=2 * least)
@@ -295,41 +294,25 @@ def test_meta_names_what_rolls(trajectory: Trajectory) -> None:
     assert trajectory.meta["rolling"] == [[]] * 5
 
 
-def test_a_block_that_starts_elsewhere_gets_another_share() -> None:
-    """Where a landing with another goal ends elsewhere, the slide after it has another length."""
-    whole = problem_of(TWICE)
-    phases = tuple(replace(phase, index=k) for k, phase in enumerate(whole.phases[4:8]))
-    problem = replace(whole, start=trace_phases(whole)[-1].end, phases=phases)
-    options = PlanOptions(
-        "margin", duration=0.258, time_intervals=4, intervals=20, mode_search=False
-    )
-    planning = plan_blocks(problem, trace_phases(problem), options, lambda _: None)
-    times = np.array([plan.motion.duration for plan in planning.least])
-    more = 0.258 / times.sum()
-    got = [plan.motion.duration for plan in planning.plans]
-    starts = [
-        each[2].motion.evaluate(np.zeros(1)).z[0] for each in (planning.plans, planning.least)
-    ]
-    assert np.abs(starts[0] - starts[1]).max() > 1e-5
-    # Such a slide may take its time in proportion to its own least time, and the next one the rest.
-    slide = replace(problem, start=starts[0], phases=(replace(phases[2], index=0),))
-    own = solve(slide, intervals=20).duration
-    assert got[0] + got[1] < more * (times[0] + times[1]) * (1 + 1e-6)
-    assert got[2] == pytest.approx(more * own, rel=2e-3)
-    assert got[3] == pytest.approx(more * (times[2] + times[3] - own), rel=2e-3)
-    assert min(plan.value for plan in planning.plans) >= problem.epsilon
+def test_a_block_that_starts_elsewhere_gets_another_share(heptagon: Problem) -> None:
+    """In proportion to its own least time; those after it share what that leaves of the whole."""
+    least, quick = ([SimpleNamespace(motion=SimpleNamespace(duration=t))] for t in (0.1, 0.12))
+    allowed: list[float | None] = [0.3, 0.2, 0.4, 0.1]
+    share_again(allowed, heptagon.phases[1:2], cast(Any, least * 4), cast(Any, quick))
+    assert allowed == pytest.approx([0.3, 0.24, 0.4 * 0.92, 0.1 * 0.92])
+    known = list(allowed)
+    share_again(allowed, heptagon.phases[3:4], cast(Any, least * 4), cast(Any, quick))
+    assert allowed == known
 
 
-@once
 def shoved_in() -> list[float]:
     """Least durations of the phases of a square that is shoved [s]."""
     durations: list[float] = solve(shove()[0], time_intervals=4).meta["phase_durations"]
     return durations
 
 
-@pytest.mark.parametrize("low", [1, 2])
-def test_a_phase_without_margin_is_named(monkeypatch: pytest.MonkeyPatch, low: int) -> None:
-    problem, _ = shove()
+def test_a_phase_without_margin_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    (problem, _), low = shove(), 2
     plan_phases = time_plan.plan_phases
 
     def plan_tightly(*arguments: Any, **options: Any) -> list[PhasePlan[TimeMotion]]:

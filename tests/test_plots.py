@@ -329,7 +329,7 @@ def test_text_is_inside_and_apart(figure: Figure) -> None:
 
 
 def test_text_is_inside_and_apart_for_longer_plans(planned: Trajectory) -> None:
-    check_layout(plots.force_margins(repeat(planned, [0, 1, 2, 3, 4] * 4)))
+    check_layout(plots.force_margins(repeat(planned, [0, 1, 2, 3, 4] * 2)))
 
 
 @pytest.mark.parametrize("width", [3.5, 7.0])

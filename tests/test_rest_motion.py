@@ -14,7 +14,7 @@ from wholearm.planning.time_domain.resting import find_block
 
 
 @pytest.mark.parametrize("ends", [False, True])
-@pytest.mark.parametrize("phase", range(4))
+@pytest.mark.parametrize("phase", [0, 3])
 def test_planner_and_linear_programme_agree_on_what_rests(phase: int, ends: bool) -> None:
     """As epsilon grows, both find that nothing moves from the same value on."""
     problem = landing()

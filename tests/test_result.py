@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -135,6 +136,17 @@ def test_a_certificate_has_every_phase_and_all_together(certified: Plan) -> None
     assert float(rows[2][2]) == pytest.approx(total.bound, abs=1e-8)
 
 
+@pytest.mark.parametrize("error, said", [(1.4e-4, False), (1.6e-4, True), (2e-6, False)])
+def test_an_accuracy_that_is_not_reached_is_said(certified: Plan, error: float, said: bool) -> None:
+    """Where the error as it is printed, to one digit, is larger."""
+    phases = tuple(own._replace(error=error) for own in certified.phases)
+    options = dataclasses.replace(certified.options, accuracy=1e-4)
+    plan = dataclasses.replace(certified, phases=phases, options=options)
+    last = summarise(plan, "a.npz").splitlines()[-1]
+    assert f"(to {error:.0e}" in last
+    assert ("; accuracy 0.0001 not reached)" in last) == said
+
+
 def test_what_is_planned_over_time_is_not_certified(within: Plan) -> None:
     certificate = within.certificate
     assert certificate is not None and certificate.total is None
@@ -173,10 +185,6 @@ def test_what_is_no_plan_is_an_error(
         ("slides", {"objective": "time"}),
         ("slides", {"objective": "margin"}),
         ("impacts", {"objective": "time"}),
-        (
-            "impacts",
-            {"objective": "time", "transcription": "time", "time_intervals": 4, "replay": False},
-        ),
     ],
 )
 def test_every_solve_is_counted_once(

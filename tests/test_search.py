@@ -67,8 +67,6 @@ def test_the_first_route_is_about_as_fast_as_its_certified_bounds() -> None:
             assert bound is not None
             total, z = total + bound.value, curve.end
         assert np.allclose(z, link.stop.z, atol=1e-9)
-    # A plan as stored takes 0.2105 s at most.
-    assert total < 0.2105
     assert route.bound <= total * (1 + 1e-6)
     assert route.duration == pytest.approx(total, rel=5e-3)
     assert {c.name for c in route.links[-1].stop.contacts} >= {"v6-palm", "v0-palm"}
@@ -215,6 +213,10 @@ def test_a_route_whose_planning_is_interrupted_is_still_there(
     assert chooser.found == [route] and not chooser.made
 
 
+def fail(*_: object) -> None:
+    raise InputError("found", "", "cannot be written: No space left on device")
+
+
 def test_route_prints_phases_that_load(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = HEPTAGON.read_text(encoding="utf-8").split("[[phases]]")[0]
     path = tmp_path / "goal.toml"
@@ -227,6 +229,12 @@ def test_route_prints_phases_that_load(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(["solve", str(path), "-o", str(plan), "--cache", str(found)]) == 0
     assert phase["until"] == load_plan(plan).problem.table["phases"][0]["until"]
     assert f"wrote {plan}" in capsys.readouterr().out
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("wholearm.search.route.store_chart", fail)
+        assert main(["route", str(path), "--cache", str(found)]) == 0
+    said = capsys.readouterr()
+    assert tomllib.loads(said.out)["phases"] == [phase]
+    assert "wholearm: warning: found: cannot be written: No space left" in said.err
     assert main(["route", str(path), "--alternatives", "-1"]) == 2
     assert "--alternatives: -1 given" in capsys.readouterr().err
     assert main(["route", str(path), "--jobs", "0"]) == 2

@@ -179,7 +179,7 @@ def test_a_block_is_refined_by_twice_its_intervals(
         asked.append((k, options.intervals))
         return planning.blocks[k].plans, planning.blocks[k].chain
 
-    monkeypatch.setattr(blocks, "_plan_block", plan_again)
+    monkeypatch.setattr(blocks, "plan_block", plan_again)
     once = refine_block(planning, 1, lambda _: None)
     twice = refine_block(once, 1, lambda _: None)
     assert [own.finer for own in twice.blocks] == [0, 2, 0] and asked == [(1, 20), (1, 40)]
@@ -224,7 +224,11 @@ def test_a_plan_that_is_allowed_is_kept_where_finer_ones_are_not(
     own = Replayed(slide, monkeypatch, 99)
     own.usual_before = 1
     planning, _, figures = own.run()
-    assert planning is own.planning and figures.simulations > 1
+    assert planning is own.planning and (figures.simulations or 0) > 1
+    # One that is always allowed, and never strictly, is refined once.
+    own.usual_before = 100
+    planning, _, figures = own.run()
+    assert figures.simulations == 2 and [block.finer for block in planning.blocks] == [0, 1, 0]
 
 
 def test_meta_keeps_the_figures(heptagon: Problem, trajectory: Trajectory) -> None:

@@ -31,3 +31,12 @@ def test_where_nothing_limits_the_speed_there_is_still_a_time() -> None:
     least = find_durations(rows, *grid)[0]
     # To and from the middle it speeds up and brakes as before, at most.
     assert 0.9 * 2 * np.sqrt(LENGTH) < least < 2 * np.sqrt(LENGTH) * (1 + 1e-9)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_closed_place_lets_no_viscous_motion_pass() -> None:
+    rows, grid = push()
+    closed = slice(0, COUNT // 4)
+    rows.a[0, closed], rows.one[0, closed] = 0.0, -1.0
+    rows.v[:] = -0.1
+    assert find_durations(rows, *grid)[0] == np.inf

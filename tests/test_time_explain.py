@@ -251,8 +251,8 @@ def test_failures_that_no_limit_explains_are_the_solvers() -> None:
     assert all(name in text for name in problem.phases[0].formation.names)
     assert text.endswith("intervals per phase (--time-intervals)") and "\n" not in text
     slide, own = box(), replace(COARSE, transcription="time")
-    given = Search.of(slide, own), slide, slide.phases[:1], [], "Restoration_Failed", None
-    assert "leave out --transcription time" in str(explain(*given))
+    failed = explain(Search.of(slide, own), slide, slide.phases[:1], [], "Failed", None)
+    assert "leave out --transcription time" in str(failed)
 
 
 def test_the_motion_that_is_short_of_least_is_described() -> None:

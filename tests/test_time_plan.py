@@ -10,7 +10,7 @@ import pytest
 
 from once import once
 from plane import make_formation, measure_gaps, measure_slip
-from shipped import BOX, HEPTAGON, plan_of, problem_of
+from shipped import HEPTAGON, problem_of
 from thrown import heave, lift, shove
 from timed import (
     fastest_landing,
@@ -110,9 +110,13 @@ def test_least_times_agree_with_those_along_the_curve(
     end = motion.stages[-1].points.nodes[-1]
     np.testing.assert_allclose(end[0], curves[phase].end, atol=1e-8)
     np.testing.assert_allclose(end[1], 0.0, atol=1e-6)
-    for stage, segment in zip(motion.stages, curves[phase].segments, strict=True):
-        np.testing.assert_array_equal(stage.directions.Xi, segment.Xi)
-        np.testing.assert_array_equal(stage.directions.sigma, segment.sigma)
+    # Friction is against the motion, which one freedom leaves no choice.
+    for stage in motion.stages:
+        samples = stage.evaluate(instants(stage, 12))
+        slip = measure_slip(stage.formation, samples.z, samples.z_dot)
+        rates = np.hstack([slip, samples.z_dot[:, 3:]])
+        senses = rates * np.concatenate(stage.directions)
+        assert (senses.min(axis=0) > -1e-4 * np.abs(rates).max(axis=0)).all()
 
 
 def test_a_problem_planned_in_the_time_domain_is_carried_out() -> None:
@@ -160,18 +164,6 @@ def test_rolling_contacts_are_planned_like_along_the_curve() -> None:
                 slip = measure_slip(stage.formation, samples.z, samples.z_dot)
                 assert np.abs(slip[:, k]).max() < 1e-12
     assert verify(problem, within).ok
-
-
-def test_margins_with_rolling_contacts_are_those_along_the_curve() -> None:
-    problem, along = box(), plan_of(BOX, "margin")
-    phase, allowed = problem.phases[1], along.meta["phase_durations"][1]
-    assert phase.formation.rolling
-    start = along.motions[1].evaluate(np.zeros(1)).z[0]
-    options = PlanOptions("margin", time_intervals=8, mode_search=False)
-    (within,) = plan_phases(problem, (phase,), start, options, allowed)
-    # Forces on an eighth of the phase cannot follow as closely.
-    assert within.value == pytest.approx(along.meta["phase_values"][1], rel=3e-2)
-    assert within.value < along.meta["phase_values"][1] * (1 + 1e-3)
 
 
 @pytest.mark.parametrize(
@@ -333,11 +325,6 @@ def test_values_are_those_of_the_objective(
     assert plans[0].value < least + SLACK
     assert plans[0].value == pytest.approx(least, rel=2e-3)
     assert plans[0].value > 0.5
-    # Where another phase has less, modes are left as they are first found, and that is enough.
-    options = PlanOptions("margin", time_intervals=COARSE)
-    start = trace_phases(landing())[-1].end
-    fewer = plan_phases(landing(), landing().phases[4:], start, options, allowed, ample=0.5)
-    assert 0.5 < fewer[0].value < plans[0].value * (1 + 1e-3)
 
 
 def test_the_effort_of_a_gentle_plan_is_least(

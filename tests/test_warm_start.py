@@ -120,7 +120,7 @@ def test_friction_is_worth_what_a_little_less_of_it_saves(contact: str) -> None:
         stages = replace_scene(solution.stages, in_own_units(problem))
         nlp = Search.of(problem, least).build(stages)
         x = pack([stage.guess for stage in stages], nlp.layouts, 0.0)
-        g = nlp.solver.function.get_function("nlp_g")(x, [])  # type: ignore[attr-defined]
+        g = nlp.solver.function.get_function("nlp_g")(x, [])
         values.append(float(solution.multipliers["lam_g0"] @ g.full()[:, 0]))
     own = [
         solution.price_friction(k)[..., [n.endswith(contact) for n in stage.formation.names]].sum()

@@ -201,7 +201,7 @@ def run_query(
 ) -> dict[str, Any]:
     """Look at every route of a query, of which is known what came of its search."""
     problem = draw_query(query)
-    chart = charts.setdefault(problem.name, Chart(problem, PlanOptions().least_minor))
+    chart = charts.setdefault(problem.name, Chart(problem, PlanOptions().uniqueness_margin))
     record: dict[str, Any] = {"query": query.number, "scene": problem.name}
     record |= {"search": outcome.kind, "duration": outcome.duration, "phases": outcome.phases}
     enough = FASTER * outcome.duration if outcome.kind == "solved" else math.inf

@@ -35,13 +35,14 @@ HEAD = (
 def list_rows(name: str, plan: Plan) -> Iterator[str]:
     """The rows of a plan in the table."""
     for phase in plan.phases:
-        if phase.minor is None:
+        margin = phase.uniqueness_margin
+        if margin is None:
             continue
-        row = int(np.searchsorted(plan.trajectory.t, phase.minor.time))
-        where = f"t = {phase.minor.time:.4f} s, {describe_pose(plan.trajectory.z[row])}"
+        row = int(np.searchsorted(plan.trajectory.t, margin.time))
+        where = f"t = {margin.time:.4f} s, {describe_pose(plan.trajectory.z[row])}"
         wedged = "-" if phase.wedged is None else f"{1e3 * phase.wedged:.1f}"
-        cells = name, plan.options.goal.value, phase.number, f"{phase.minor.ratio:.4f}"
-        yield f"| {' | '.join(map(str, (*cells, phase.minor.contacts, where, wedged)))} |"
+        cells = name, plan.options.goal.value, phase.number, f"{margin.value:.4f}"
+        yield f"| {' | '.join(map(str, (*cells, margin.contacts, where, wedged)))} |"
 
 
 def main() -> int:

@@ -11,6 +11,7 @@ from ..common.fields import Range
 from ..common.options import read_options
 from ..mechanics.keys import MARGIN
 from ..planning.options import PLANNER
+from .help import TOPICS
 
 SIMULATORS = ("told", "free")
 """What `plot --simulate` takes; the first one if it is left out."""
@@ -290,6 +291,12 @@ files PROBLEM ...  problem files (TOML)
 -o --output FILE   page to write (.md); figures and movies go to a folder beside it
     = results/gallery.md
 """,
+    ),
+    "help": Command(
+        "print a page of the documentation, or list its topics",
+        "help:show",
+        "[topic TOPIC]  what the page is about (left out: list the topics) among "
+        + "|".join(TOPICS),
     ),
     "completion": Command(
         "print what makes a shell complete all this",

@@ -89,11 +89,15 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     for name, own in COMMANDS.items():
-        text = f"{own.text[0].upper()}{own.text[1:]}."
-        own.add(commands.add_parser(name, help=own.text, description=text))
+        own.add(commands.add_parser(name, help=own.text, description=_to_sentence(own.text)))
     text = "measure run time against error, or run the stress study"
-    add_bench(commands.add_parser("bench", help=text, description=text))
+    add_bench(commands.add_parser("bench", help=text, description=_to_sentence(text)))
     return parser
+
+
+def _to_sentence(text: str) -> str:
+    """With a capital first, and a full stop."""
+    return f"{text[0].upper()}{text[1:]}."
 
 
 class _Version(argparse.Action):

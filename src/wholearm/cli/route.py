@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -62,13 +63,26 @@ def find(
     try:
         folder = None if cache is None else Path(cache)
         given = options, alternatives, show_progress(), folder, count
-        return find_route_with(problem, *given, time_limit=time_limit, hurry=_hurry)
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", UserWarning)
+            warnings.showwarning = _warn
+            return find_route_with(problem, *given, time_limit=time_limit, hurry=hasten)
     except WholearmError:
         clear_progress()
         raise
 
 
-def _hurry() -> None:
+def _warn(message: Warning | str, *_: object, **__: object) -> None:
+    clear_progress()
+    print(f"wholearm: warning: {message}", file=sys.stderr, flush=True)
+
+
+def hasten() -> None:
+    """Say that the best route so far is being planned; raises where the command was terminated."""
+    from ..common.interrupts import check
+
+    # After SIGTERM nothing is planned any more.
+    check()
     clear_progress()
     print("wholearm: planning the best route; again to stop", file=sys.stderr, flush=True)
 

@@ -59,9 +59,11 @@ def summarise(plan: Plan, output: str, table: Mapping[str, Any] | None = None) -
     figure = f"{plan.value:.6f}" if abs(plan.value) >= 1e-2 else f"{plan.value:.6g}"
     value = f"{plan.status.value}: {plan.options.goal.value} = {figure} {plan.unit}"
     if not math.isnan(plan.error):
-        missed = plan.error > 1.5 * plan.options.accuracy
-        text = f"; accuracy {plan.options.accuracy:.0e} not reached" if missed else ""
-        value += f" (to {max(plan.error, _LEAST_ERROR):.0e}{text})"
+        # By the figure that is printed: one digit of an estimate.
+        error = f"{max(plan.error, _LEAST_ERROR):.0e}"
+        missed = float(error) > plan.options.accuracy
+        text = f"; accuracy {plan.options.accuracy:g} not reached" if missed else ""
+        value += f" (to {error}{text})"
     return "\n".join([*lines, f"{value}, {plan.duration:.6f} s in all; wrote {output}"])
 
 

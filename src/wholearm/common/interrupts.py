@@ -3,8 +3,8 @@
 A signal raises KeyboardInterrupt, so that files and child processes are cleaned up on the way out.
 Code in between may swallow that (CasADi stops its solver and goes on), so the signal is remembered:
 no file appears after it (`check`), and the command's status is that of the signal. A thread watches
-over it: a command that has not ended when `PATIENCE` is over, because it swallowed the exception or
-is inside a long call, is ended there.
+over it: children of a command that has not ended in half of `PATIENCE` are ended, and when that is
+over, because it swallowed the exception or is inside a long call, it is ended itself.
 """
 
 from __future__ import annotations
@@ -189,7 +189,10 @@ def _watcher() -> Iterator[None]:
             number = os.read(source, 1)[0]
             if _is_pardoned(number):
                 continue
-            if number in _WORDS and not over.wait(PATIENCE):
+            if number in _WORDS and not over.wait(PATIENCE / 2):
+                # Who waits for a child goes on; case: `bench skip`.
+                end_children()
+                over.wait(PATIENCE / 2)
                 with _ending:
                     if not over.is_set():
                         _end(number, errors)

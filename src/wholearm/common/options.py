@@ -4,6 +4,7 @@ A table reads like the help that it becomes, as with docopt. Two spaces or more 
 lines that begin with spaces go on with the text::
 
     [files PLAN ...]    none, one or more files
+    [topic]             one of these words, or none among model|map
     -o --output FILE    figure to write (required)
     --stops N           how often it may stop = 0 in 0..7
     --scheme NAME       of the points = radau among radau|legendre
@@ -59,9 +60,10 @@ class Option:
                 required = own.text.endswith("(required)")
                 more |= {"default": own.default, "required": required}
             if self.nargs == "?" and "enum" in own.kind.schema:
-                # The value may be left out, even before a file: the caller puts the first one in.
-                words = own.kind.schema["enum"]
-                more |= {"nargs": None, "metavar": f"[{self.metavar}]", "choices": words}
+                more["choices"] = own.kind.schema["enum"]
+                if self.flags[0].startswith("-"):
+                    # It may be left out before a file, too: the caller puts the first word in.
+                    more |= {"nargs": None, "metavar": f"[{self.metavar}]"}
             elif self.nargs == "?" and isinstance(own.kind, Range):
                 more["const"] = 1.0
         default = "" if own.kind is BOOLEAN or own.default == [] else own.describe_default()

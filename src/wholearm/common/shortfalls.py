@@ -17,7 +17,9 @@ class Parameter(NamedTuple):
     sign : int
         1 if limits give way as it grows, -1 if as it falls (not below zero).
     key : str
-        Dotted key of it in a problem, for `Problem.with_`; `duration` is an option.
+        Key of it in a problem, for `Problem.with_`; `duration` is an option.
+    mirrored : str
+        Key of what has minus this value, such as the base of the other finger.
     """
 
     name: str
@@ -25,6 +27,7 @@ class Parameter(NamedTuple):
     unit: str
     sign: int
     key: str = ""
+    mirrored: str = ""
 
     @property
     def is_speed(self) -> bool:
@@ -37,6 +40,12 @@ class Change(NamedTuple):
 
     parameter: Parameter
     value: float
+
+    @property
+    def values(self) -> dict[str, float]:
+        """What changes, as `Problem.with_` takes it."""
+        own = self.parameter
+        return {own.key: self.value} | ({own.mirrored: -self.value} if own.mirrored else {})
 
     def __str__(self) -> str:
         own = self.parameter

@@ -113,6 +113,11 @@ def require_engine(name: str) -> Engine:
     if importlib.util.find_spec(ENGINES[name].package) is None:
         text = f"{name} is not installed; pip install 'wholearm[{name}]'"
         raise InputError("", "--engine", text)
+    try:
+        importlib.import_module(ENGINES[name].package)
+    except ImportError as error:
+        # MuJoCo 4 without mujoco-core, for one.
+        raise InputError("", "--engine", f"{name}: {' '.join(str(error).split())}") from None
     engine: Engine = importlib.import_module(f".{name}", __package__).play
     return engine
 

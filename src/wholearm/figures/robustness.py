@@ -77,19 +77,24 @@ def _draw_motion(axes: Axes, study: Robustness) -> None:
 
 def _draw_ends(axes: Axes, study: Robustness) -> None:
     records = [record for record in study.records if "distance" in record]
-    for kind, (label, colour, marker) in enumerate(_KINDS):
-        own = [record for record in records if find_kind(record) == kind]
-        across = np.maximum([1e3 * record["distance"] for record in own], _LEAST)
-        up = np.maximum([math.degrees(record["angle"]) for record in own], _LEAST)
-        text = f"{label}: {len(own)}"
-        axes.plot(across, up, marker, ms=3.5, color=colour, alpha=0.7, label=text, mew=0.9)
     known = study.trial.uncertainty
     goal = 1e3 * known.find_distance(study.trial.problem.scene), math.degrees(known.angle)
-    axes.set(xscale="log", yscale="log", xlabel=f"distance from the goal [mm], {_LEAST:g} or more")
-    axes.set_ylabel(f"angle from the goal [deg], {_LEAST:g} or more")
-    axes.set(
-        xlim=(min(axes.get_xlim()[0], 0.05), None), ylim=(_LEAST / 2, max(axes.get_ylim()[1], 2.0))
-    )
+    given = [(1e3 * own["distance"], math.degrees(own["angle"])) for own in records]
+    places = np.maximum(np.array(given).reshape(-1, 2), _LEAST)
+    kinds = np.array([find_kind(record) for record in records])
+    for kind, (label, colour, marker) in enumerate(_KINDS):
+        own = places[kinds == kind]
+        text = f"{label}: {len(own)}"
+        axes.plot(*own.T, marker, ms=3.5, color=colour, alpha=0.7, label=text, mew=0.9)
+    axes.set(xscale="log", yscale="log")
+    around = np.vstack([places, goal])
+    # Whole powers of ten, so that both ends of an axis have a number.
+    low = 0.8 * 10 ** np.floor(np.log10(around.min(axis=0)))
+    high = 1.25 * 10 ** np.ceil(np.log10(around.max(axis=0)))
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    least = [f" (at least {_LEAST:g})" if min(own) <= _LEAST else "" for own in around.T.tolist()]
+    axes.set_xlabel(f"distance from the goal [mm]{least[0]}")
+    axes.set_ylabel(f"angle from the goal [deg]{least[1]}")
     axes.axvline(goal[0], color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
     axes.axhline(goal[1], color=INK, linewidth=0.8, linestyle=(0, (1, 2)))
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, fontsize=8)

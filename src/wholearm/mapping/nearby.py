@@ -160,21 +160,20 @@ def find_miss(scene: Scene, start: Array, stop: Array) -> Miss | None:
     if abs(stop[0] - start[0]) > near[0]:
         for track, off in _list_palm(scene, start, stop):
             if off < MISSED and cut(scene, [track]):
-                ends = [
-                    abs(float(track.pose(np.zeros(1))[1][0]) - pose[1]) for pose in (start, stop)
-                ]
-                text = f"{np.degrees(max(ends)):.3g} deg in phi"
+                angle = float(track.pose(np.zeros(1))[1][0])
+                turn = max((angle - pose[1] for pose in (start, stop)), key=abs)
+                text = f"{np.degrees(turn):+.3g} deg in phi"
                 misses.append(Miss(track, off, text))
     for track, _ in _list_fingers(scene, start, stop):
         located = [_locate(track, pose, near) for pose in (start, stop)]
         off = max(distance for _, distance in located)
         if off < MISSED and abs(located[0][0] - located[1][0]) > near[1] and cut(scene, [track]):
             gaps = [
-                np.abs(np.array(track.pose(np.array([place]))).ravel() - pose)
+                np.array(track.pose(np.array([place]))).ravel() - pose
                 for (place, _), pose in zip(located, (start, stop), strict=True)
             ]
-            dx, dphi = np.max(gaps, axis=0)
-            text = f"{1e3 * dx:.3g} mm in x and {np.degrees(dphi):.3g} deg in phi"
+            dx, dphi = (max(pair, key=abs) for pair in np.transpose(gaps).tolist())
+            text = f"{1e3 * dx:+.3g} mm in x and {np.degrees(dphi):+.3g} deg in phi"
             misses.append(Miss(track, off, text))
     nearest = min(misses, key=lambda miss: miss.off, default=None)
     return nearest if nearest is not None and nearest.off >= 1 else None

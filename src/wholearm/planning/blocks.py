@@ -195,7 +195,7 @@ def plan_next(
     moved = known is None or _distance(problem.scene, known.start, z) > MOVED
     fastest: Plans = [] if moved or known is None else known.fastest
     if moved and least and _starts_off(problem.scene, least[phases[0].index].motion, z):
-        fastest = _plan_block(planning, phases, z, _for_time(options))[0]
+        fastest = plan_block(planning, phases, z, _for_time(options))[0]
     if fastest:
         share_again(allowed, phases, least, fastest)
     duration = add_up(phases, allowed)
@@ -207,7 +207,7 @@ def plan_next(
         with name_source(problem.source):
             more = planning.more.get(len(planning.blocks), 0.0)
             pressed = replace(problem, epsilon=problem.epsilon + more) if more else problem
-            made = _plan_block(
+            made = plan_block(
                 replace(planning, problem=pressed),
                 phases,
                 z,
@@ -242,7 +242,7 @@ def _refine(options: PlanOptions, known: BlockPlan | None, finer: int) -> PlanOp
     return replace(options, intervals=along, time_intervals=wanted)
 
 
-def _plan_block(
+def plan_block(
     planning: Planning,
     block: Sequence[Phase],
     z: Array,
@@ -266,7 +266,7 @@ def _plan_block(
             return plan_with_impacts(*given, pinned=pinned, **over_time)
 
         def plan_other(other: Planning, phases: Sequence[Phase], own: PlanOptions) -> Plans:
-            return _plan_block(other, phases, z, own, allowed)[0]
+            return plan_block(other, phases, z, own, allowed)[0]
 
         with charge(block[0].number):
             try:
@@ -299,7 +299,7 @@ def _plan_block(
 def _look_ahead(
     planning: Planning, block: Sequence[Phase], options: PlanOptions
 ) -> CostToGo | None:
-    return look_ahead(planning, block, options, _plan_block)
+    return look_ahead(planning, block, options, plan_block)
 
 
 def _require_margin(planning: Planning) -> Planning:

@@ -113,7 +113,7 @@ def _sure_table(report: Report) -> list[str]:
         ]
         for p in report.phases
     ]
-    header = ["phase", "uniqueness of forces", "least of", "at t [s]", "wedged [ms]"]
+    header = ["phase", "uniqueness margin", "least of", "at t [s]", "wedged [ms]"]
     return align(header, rows, {2})
 
 

@@ -90,9 +90,9 @@ class Chooser:
             # What had no plan bounds nothing.
             self.search.limit = math.inf
 
-    def glance(self, report: Callable[[str], None]) -> Route | None:
+    def glance(self, report: Callable[[str], None], most: int = NEARBY) -> Route | None:
         """Look for any route over few places whose ways through cells have plans."""
-        self._look_by(EAGER._replace(most=NEARBY), 1, report)
+        self._look_by(EAGER._replace(most=most), 1, report)
         return self.found[0] if self.found else None
 
     def plan(self, wanted: int, report: Callable[[str], None]) -> None:

@@ -94,8 +94,7 @@ class Link:
         """The same on a grid that is refined: no more than the least time, but by rounding [s]."""
         own = zip(self.borders, self.ratios, strict=True)
         curves = [border.curve.with_speed_ratio(ratio) for border, ratio in own]
-        with np.errstate(over="ignore"):
-            found = bound_least_time(curves, self.borders[0].terms.epsilon)
+        found = bound_least_time(curves, self.borders[0].terms.epsilon)
         return max(ROUGHLY * self.bound, found.value if found else 0.0)
 
     @property

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import time
+import warnings
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
@@ -15,6 +17,7 @@ from ..common.errors import InfeasibleError, InputError, SolverError
 from ..common.interrupts import yielding
 from ..common.pulse import OutOfTime, Reporter, limited
 from ..common.sharing import exclusive
+from ..common.shortfalls import Change
 from ..planning.options import Objective, PlanOptions
 from ..problem.definition import Problem
 from ..problem.goal import name_goal
@@ -134,7 +137,11 @@ def _find(
         answer = _choose(problem, before, search, options, wanted, report, jobs, hurry)
         before = [*before, answer.route]
     if cache is not None:
-        store_chart(cache, key_chart(problem, options), chart)
+        try:
+            store_chart(cache, key_chart(problem, options), chart)
+        except InputError as error:
+            # What was found counts, with or without a copy for later searches.
+            warnings.warn(str(error), stacklevel=2)
     return answer
 
 
@@ -163,11 +170,25 @@ def forget_charts() -> None:
 
 
 def _refuse(
-    problem: Problem, search: Search, options: PlanOptions, failures: list[Failure]
+    problem: Problem,
+    search: Search,
+    options: PlanOptions,
+    failures: list[Failure],
+    seconds: float,
+    report: Reporter,
+    hurry: Callable[[], None] | None,
 ) -> InfeasibleError:
-    """Why nothing leads to a goal, and what would open the way."""
-    opening, changes = find_opening(search, problem, options)
-    text = describe_block(search, failures, opening, partial(explain, problem, options))
+    """Why nothing leads to a goal, which took so many seconds to see, and what opens the way."""
+    opening, changes, why = "", tuple[Change, ...](), partial(explain, problem, options)
+    try:
+        with yielding():
+            opening, changes = find_opening(search, problem, options, seconds, report)
+            text = describe_block(search, failures, opening, why)
+    except KeyboardInterrupt as error:
+        if hurry is None and not isinstance(error, OutOfTime):
+            raise
+        # That nothing leads there is known; what would help, and why, is not looked for any more.
+        text = describe_block(search, failures, opening)
     return InfeasibleError(text, changes=changes)
 
 
@@ -193,6 +214,7 @@ def _choose(
     hurry: Callable[[], None] | None,
 ) -> Answer:
     """Plan routes to one goal, and say how good the best one is."""
+    begun = time.process_time()
     chooser, complete = Chooser(problem, before, search, options, jobs), True
     try:
         with yielding():
@@ -217,7 +239,8 @@ def _choose(
             chooser.plan(1, report)
     made, margin = chooser.made, options.goal is Objective.MARGIN
     if not made:
-        raise _refuse(problem, search, options, chooser.failures)
+        spent = time.process_time() - begun
+        raise _refuse(problem, search, options, chooser.failures, spent, report, hurry)
     made.sort(key=lambda own: -own[0].value if margin else own[0].value)
     plan, route = made[0]
     bound = None

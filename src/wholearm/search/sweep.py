@@ -28,7 +28,9 @@ def find_durations(rows: Rows, steps: Array, part: Array) -> Array:
     """
     b = _sweep(rows, steps, part, None)
     if rows.v.any():
-        near = np.maximum(b[:, :-1] + part * np.diff(b), 0.0)
+        # No row bounds b where a motion is closed; case: the map of a rolling octagon.
+        known = np.where(np.isfinite(b), b, 0.0)
+        near = np.maximum(known[:, :-1] + part * np.diff(known), 0.0)
         b = _sweep(rows, steps, part, near)
     speeds = np.sqrt(np.maximum(b, 0.0))
     moving = (b[:, 1:-1] > 0).all(axis=1)

@@ -77,7 +77,9 @@ def _follow(problem: Problem, borders: Sequence[Border], places: Array) -> Rows:
             inertia = reduced_inertia(formation, part, directions)
             ratios = find_minors(formation, part, directions.Xi).ratios
             closed = ~(inertia > 0) | (ratios < UNIQUENESS_MARGIN)
-            rows.one[closed], rows.a[closed], rows.b[closed] = -1.0, 0.0, 0.0
+            # Nothing moves there.
+            for values in rows:
+                values[closed] = 0.0
             chosen = mine.reshape(-1, count)[:, 0]
             for k, values in enumerate(rows):
                 split = values.reshape(-1, count, *values.shape[1:])

@@ -95,7 +95,8 @@ def explain(
         for short in _list_shortfalls(part, own, phase, len(phases) > 1)
     ]
     if not shortfalls:
-        return SolverError(f"{stopped} although limits can be kept")
+        text = f"{stopped} although limits can be kept; try other --intervals or --accuracy"
+        return SolverError(text)
     units = _quicken(data, units)
     may_change = [*data.speeds.parameters, *data.limits.parameters]
     if len(parts) == 1:

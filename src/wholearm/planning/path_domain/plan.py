@@ -42,15 +42,13 @@ _FINER = (1, 2, 4)
 """Elements to try, over those that are asked for."""
 _SPREADS = 3
 """Most plans within ranges, each with rows for the speed of the one before."""
-_NARROWER = (0.5, 0.2, 0.1)
-"""Shares of ranges that are tried where it is not known what leaves no plan within them."""
 _WASTED = 0.02
 """Share of the accuracy that limits may cost by being tightened more than they need."""
 _ROUGH = 1e-2
 """Accuracy of plans that are made to see whether there are any."""
 
 
-class _Stuck(NamedTuple):
+class Stuck(NamedTuple):
     """What has come instead of a plan.
 
     Attributes
@@ -137,20 +135,25 @@ def plan_curves(
         return _insist(_plan_finer(changes, insist=False))
 
     try:
-        found, guides = _plan_within(task)
+        found, guides = plan_within(task)
     except JammingError as jam:
         if not explained or len(curves) > 1:
             raise
         from .explain import explain_jam
 
         raise explain_jam(curves[0], epsilon, jam, replan) from None
-    if isinstance(found, _Stuck):
+    if isinstance(found, Stuck):
         if not explained:
             raise SolverError(found.reason)
-        error = _explain(task, found, replan)
-        # What guides is a plan without ranges.
-        unclear = guides and isinstance(error, SolverError)
-        raise _explain_ranges(task) if unclear else error
+        error = explain_stuck(task, found, replan)
+        if guides and isinstance(error, SolverError):
+            # What guides is a plan without ranges; case: the block of two landings of a pentagon.
+            raise SolverError(
+                f"{found.reason} within the ranges of numbers; without them there is a plan: try "
+                f"--robust {options.robust / 2:g}, or narrower [uncertainty], where 0 leaves a "
+                "number as it is"
+            )
+        raise error
     if options.goal is Objective.MARGIN and found.plans[0].value < task.lost:
         least = SolverError(f"{task.name}: the margin found is below epsilon")
         raise _explain_duration(task) or least
@@ -181,8 +184,8 @@ def _bound_error(task: Task, found: _Solved) -> _Solved:
     return found._replace(plans=[plan._replace(error=gap) for plan in found.plans])
 
 
-def _explain(
-    task: Task, found: _Stuck, replan: Callable[[Sequence[Curve], float], object]
+def explain_stuck(
+    task: Task, found: Stuck, replan: Callable[[Sequence[Curve], float], object]
 ) -> WholearmError:
     """Why there is no plan: slow motors, the duration, or what is short."""
     from .explain import explain
@@ -194,21 +197,7 @@ def _explain(
     return late or explain(found.parts, *slow, task.phases, found.reason, replan)
 
 
-def _explain_ranges(task: Task) -> SolverError:
-    """That there is no plan within the ranges, and with which narrower ones there is."""
-    given, options = task.options.robust, _roughen(task.options)
-    text = f"{task.name}: no plan was found that keeps the limits within the ranges of numbers"
-    for share in _NARROWER:
-        ranges = {name: share * half for name, half in options.ranges.items()}
-        narrow = replace(task, options=replace(options, ranges=ranges))
-        if isinstance(_plan_within(narrow)[0], _Solved):
-            return SolverError(
-                f"{text} (--robust {given:g}); with --robust {share * given:g} one is"
-            )
-    return SolverError(f"{text}, nor for a tenth of them; without --robust there is a plan")
-
-
-def _plan_within(task: Task) -> tuple[_Solved | _Stuck, tuple[Guide, ...]]:
+def plan_within(task: Task) -> tuple[_Solved | Stuck, tuple[Guide, ...]]:
     """Plan within the ranges that there are, from the plan without them on; also near what.
 
     Rows are those for the speed of the plan before. What other signs than theirs would miss is
@@ -221,7 +210,7 @@ def _plan_within(task: Task) -> tuple[_Solved | _Stuck, tuple[Guide, ...]]:
     found, guides = _plan_finer(replace(task, options=bare)), tuple[Guide, ...]()
     best: _Solved | None = None
     for _ in range(_SPREADS):
-        if isinstance(found, _Stuck):
+        if isinstance(found, Stuck):
             break
         guides = found.guides
         found = _plan_finer(replace(task, guides=guides))
@@ -292,24 +281,24 @@ def _roughen(options: PlanOptions) -> PlanOptions:
     return replace(options, accuracy=max(options.accuracy, _ROUGH))
 
 
-def _insist(found: _Solved | _Stuck) -> Plans:
+def _insist(found: _Solved | Stuck) -> Plans:
     """The plans, or an error."""
-    if isinstance(found, _Stuck):
+    if isinstance(found, Stuck):
         raise SolverError(found.reason)
     return found.plans
 
 
-def _plan_finer(task: Task, insist: bool = True) -> _Solved | _Stuck:
+def _plan_finer(task: Task, insist: bool = True) -> _Solved | Stuck:
     """Plan, on a finer grid where limits that hold between the nodes leave nothing, or no time.
 
     What so few elements cannot keep at their nodes, twice as many may: they are tried if that is
     insisted on. What is said of why there is no plan is said of the fewer.
     """
     task.require_unique()
-    stuck: _Stuck | None = None
+    stuck: Stuck | None = None
     for finer in _FINER:
         found = _plan(task, finer, insist)
-        if isinstance(found, _Stuck):
+        if isinstance(found, Stuck):
             if not found.between and (stuck or not insist):
                 return stuck or found
             stuck = found
@@ -318,18 +307,18 @@ def _plan_finer(task: Task, insist: bool = True) -> _Solved | _Stuck:
     return found
 
 
-def _plan(task: Task, finer: int = 1, insist: bool = True) -> _Solved | _Stuck:
+def _plan(task: Task, finer: int = 1, insist: bool = True) -> _Solved | Stuck:
     """Solve on meshes that suit the plan more and more, and make limits hold between nodes too.
 
     If that is not insisted on, only where a sweep has found a motion.
     """
     round_ = Round.begin(task, finer)
     if not round_.is_kept and (not insist or is_hopeless(round_.data)):
-        return _Stuck(round_.parts, f"{task.name}: no motion keeps the limits", between=False)
-    kept = _Stuck(round_.parts, "", between=False)
+        return Stuck(round_.parts, f"{task.name}: no motion keeps the limits", between=False)
+    kept = Stuck(round_.parts, "", between=False)
     for found in round_.solve_first():
         if isinstance(found, str):
-            kept = _Stuck(round_.parts, f"{task.name}: {found}", between=False)
+            kept = Stuck(round_.parts, f"{task.name}: {found}", between=False)
             continue
         refined = _refine(found)
         if isinstance(refined, _Solved):
@@ -338,16 +327,16 @@ def _plan(task: Task, finer: int = 1, insist: bool = True) -> _Solved | _Stuck:
     return kept
 
 
-def _refine(found: Round) -> _Solved | _Stuck:
+def _refine(found: Round) -> _Solved | Stuck:
     """Suit the mesh to a solution until limits hold between nodes, at no more than it may cost."""
-    best: _Solved | _Stuck | None = None
+    best: _Solved | Stuck | None = None
     for _ in range(_AGAIN):
         found = _suit(found)
         kept = _enforce_between(found)
-        if best is not None and isinstance(kept, _Stuck):
+        if best is not None and isinstance(kept, Stuck):
             return best
         best = kept
-        if isinstance(kept, _Stuck) or kept.plans[0].error <= found.task.options.accuracy:
+        if isinstance(kept, Stuck) or kept.plans[0].error <= found.task.options.accuracy:
             break
         better = found.adapt(dearer=True)[1]
         if better is not None and better.elements == found.elements and found.data.grid.held:
@@ -375,7 +364,7 @@ def _suit(found: Round) -> Round:
     return found
 
 
-def _enforce_between(round_: Round) -> _Solved | _Stuck:
+def _enforce_between(round_: Round) -> _Solved | Stuck:
     """Tighten limits until they hold between nodes too."""
     task, data = round_.task, round_.data
     wasteful = float(round_.wasted.sum()) > _WASTED * task.options.accuracy
@@ -385,9 +374,9 @@ def _enforce_between(round_: Round) -> _Solved | _Stuck:
             try:
                 return _Solved(round_.summarise(), round_)
             except StalledError as stall:
-                return _Stuck(round_.parts, f"{task.name}: {stall}", between=True)
+                return Stuck(round_.parts, f"{task.name}: {stall}", between=True)
         found = round_.tighten(wasteful).solve()
         if isinstance(found, str):
-            return _Stuck(round_.parts, f"{task.name}: {found}", between=True)
+            return Stuck(round_.parts, f"{task.name}: {found}", between=True)
         round_, wasteful = found, False
-    return _Stuck(round_.parts, f"{task.name}: {misses.describe(data)}", between=True)
+    return Stuck(round_.parts, f"{task.name}: {misses.describe(data)}", between=True)

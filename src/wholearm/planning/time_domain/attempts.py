@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 from ...common.arrays import Array
 from ...geometry.cost_to_go import CostToGo
+from ...geometry.path_guess import find_end
 from ...problem.definition import Phase, Problem
 from .ending import choose_end, keep_apart
 from .enforcing import DEARER, PATIENCE, enforce_between, is_hopeless
-from .mode_search import improve
+from .mode_search import drop_gone, improve
 from .refinement import halve
 from .search import Search, Solution
 from .stage import Stage
@@ -37,7 +38,8 @@ or less in one phase."""
 FEW = 35
 """The same where a plan is known, and others may be better: of up to two phases."""
 SPLIT = 80
-"""The same in modes that friction has shown which sets in gradually, with many stages."""
+"""The same in modes that friction has shown which sets in gradually, with many stages, and straight
+to a place: phase 4 of query 3 (`benchmark.queries`) takes 65."""
 MUCH_DEARER = 3.0
 """Cost of a plan, over that with friction that sets in gradually, with which it is none."""
 ROUNDING = 5e-7
@@ -108,12 +110,19 @@ class Attempts:
         stages = [replace(found.stages[0], guess=first._replace(nodes=nodes)), *found.stages[1:]]
         return Attempt("", self._halvings, self._leave_room(stages), before=found)
 
-    def towards(self, goal: Array) -> Attempt | None:
-        """Straight to an end, shape (5,); None where no motion that way is near its limits."""
-        if len(self.phases) > 1:
-            return None
-        way = pace_straight(self.problem, self.phases[0], self.z, goal)
-        return None if way is None or way.margin <= NEAR else self._follow(way)
+    def begin(self, goal: Array | None = None) -> list[Attempt]:
+        """Straight to the end of a single phase, shape (5,), given or pinned, and to the nearest.
+
+        Not straight where no motion that way is near its limits.
+        """
+        phase = self.phases[0]
+        if len(self.phases) > 1 or (goal is None and not phase.until.pins):
+            return [self.first]
+        goal = find_end(phase, self.z) if goal is None else goal
+        way = pace_straight(self.problem, phase, self.z, goal)
+        near = way is not None and way.margin > NEAR
+        straight = [self._follow(way)._replace(most=SPLIT)] if way and near else []
+        return [*straight, self.first]
 
     def _follow(self, way: PacedWay) -> Attempt:
         """Along a way, in its modes."""
@@ -223,6 +232,11 @@ def solve_attempt(search: Search, attempt: Attempt) -> Solution:
             finer = halve(solution.stages, search.scheme)
             solution = search.solve(finer, solution, most=search.wait(PATIENCE))
     solution = enforce_between(search, solution) if solution.success else solution
+    fewer = drop_gone(search, solution) if solution.success else solution
+    if fewer is not solution:
+        # Phase 3 of query 57 does not hold in its replay otherwise.
+        fewer = enforce_between(search, fewer)
+        solution = fewer if fewer.success else solution
     if solution.success and search.problem.scene.control_period:
         from .held import hold_torques
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .modes import sign_sequence
-from .moves import WORTH, list_moves
+from .moves import WORTH, list_dropped, list_moves
 from .search import Search, Solution
 from .stage import Stage
 
@@ -43,6 +43,15 @@ def improve(search: Search, solution: Solution) -> Solution:
             # No better by itself, but it tells which way its contacts would slide.
             waiting = [*list_neighbours(search, other, leaning=True), *waiting]
     search.tried.complete = all(sign_sequence(moved) in known for moved in waiting)
+    return solution
+
+
+def drop_gone(search: Search, solution: Solution) -> Solution:
+    """Leave out stages that have shrunk to nothing on finer intervals: replays of them diverge."""
+    for moved in list_dropped(solution.stages):
+        other = search.solve(moved, most=PATIENCE)
+        if other.success and other.cost - solution.cost < WORTH * abs(solution.cost):
+            return drop_gone(search, other)
     return solution
 
 

@@ -88,23 +88,29 @@ def list_moves(
         ]
         yield from _apply(stages, scheme, own, runs)
         return
+    yield from list_dropped(stages)
+    for index in range(len(stages)):
+        left = release_earlier(stages, index)
+        if left is not None:
+            yield link(merge(left))
+    for slow in (True, False):
+        runs = list[tuple[Run, int]]()
+        for index, stage in enumerate(stages):
+            held = _find_held(stage, scheme, slow)
+            if savings:
+                held = [run for run in held if _pays(run, stage, savings[index])]
+            leaning_too = _find_leaning(stage, scheme, own[index], epsilon)
+            runs += [(run, index) for run in [*held, *leaning_too]]
+        yield from _apply(stages, scheme, own, runs)
+
+
+def list_dropped(stages: Sequence[Stage]) -> Iterator[list[Stage]]:
+    """The stages without one that has shrunk to nothing, for each of these."""
     for index, stage in enumerate(stages):
         if stage.guess.duration < _GONE * stage.intervals:
             left = drop(stages, index)
             if left is not None:
                 yield link(merge(left))
-    for index in range(len(stages)):
-        left = release_earlier(stages, index)
-        if left is not None:
-            yield link(merge(left))
-    runs = list[tuple[Run, int]]()
-    for index, stage in enumerate(stages):
-        held = _find_held(stage, scheme)
-        if savings:
-            held = [run for run in held if _pays(run, stage, savings[index])]
-        leaning_too = _find_leaning(stage, scheme, own[index], epsilon)
-        runs += [(run, index) for run in [*held, *leaning_too]]
-    yield from _apply(stages, scheme, own, runs)
 
 
 def _apply(
@@ -113,24 +119,60 @@ def _apply(
     own: Sequence[Formation],
     runs: list[tuple[Run, int]],
 ) -> Iterator[list[Stage]]:
-    """Stages in which what is at its limit over a run moves in another way; whole ones first."""
+    """Stages in which what is at its limit over a run moves in another way.
+
+    First over runs that go on from one stage to the next: changed in one of them alone, what is
+    held back there would have to turn where the stages meet. Then over whole stages.
+    """
     wide = [
-        (run._replace(begin=0, stop=stages[k].intervals), k)
+        [(run._replace(begin=0, stop=stages[k].intervals), k)]
         for run, k in runs
         if _is_most(run, stages[k])
     ]
-    runs.sort(key=lambda found: -found[0].share)
-    wide.sort(key=lambda found: -found[0].share)
-    for run, index in [*wide, *runs]:
-        stage = stages[index]
-        signs = [run.sign] if run.sign else [0.0, -mode_of(stage).signs[run.row]]
-        if _comes_to_rest(stages, index, own, run.row):
-            signs = [sign for sign in signs if sign]
-        pieces = [_change(stages, index, run, sign, scheme) for sign in signs]
-        # What can roll turns by rolling first.
-        found = next((piece for piece in pieces if piece is not None), None)
-        if found is not None:
-            yield link(merge([*stages[:index], *found, *stages[index + 1 :]]))
+    across, single = _list_across(stages, runs), [[own] for own in runs]
+    for group in (across, wide, single):
+        group.sort(key=lambda found: -sum(run.share for run, _ in found))
+    for found in [*across, *wide, *single]:
+        pieces = [_turn(stages, index, run, own, scheme) for run, index in found]
+        first, last = found[0][1], found[-1][1]
+        if None not in pieces:
+            own_stages = (stage for piece in pieces for stage in piece or ())
+            yield link(merge([*stages[:first], *own_stages, *stages[last + 1 :]]))
+
+
+def _list_across(
+    stages: Sequence[Stage], runs: Sequence[tuple[Run, int]]
+) -> list[list[tuple[Run, int]]]:
+    """Runs of one thing that meet where stages of a phase do, without other runs beside them."""
+    known = {(k, run.row, run.sign, _sign(stages[k], run)): run for run, k in runs}
+    found = []
+    for (k, row, sign, way), run in known.items():
+        chain = [(run, k)]
+        while (own := chain[-1])[0].stop == stages[own[1]].intervals:
+            after = known.get((own[1] + 1, row, sign, way))
+            if after is None or after.begin or stages[own[1] + 1].phase != stages[k].phase:
+                break
+            chain.append((after, own[1] + 1))
+        if len(chain) > 1:
+            found.append(chain)
+    return found
+
+
+def _sign(stage: Stage, run: Run) -> float:
+    """Which way what is at its limit moves in a stage."""
+    return float(mode_of(stage).signs[run.row])
+
+
+def _turn(
+    stages: Sequence[Stage], index: int, run: Run, own: Sequence[Formation], scheme: Scheme
+) -> list[Stage] | None:
+    """Pieces of a stage in which what is at its limit over a run moves in another way, if any."""
+    signs = [run.sign] if run.sign else [0.0, -_sign(stages[index], run)]
+    if _comes_to_rest(stages, index, own, run.row):
+        signs = [sign for sign in signs if sign]
+    pieces = [_change(stages, index, run, sign, scheme) for sign in signs]
+    # What can roll turns by rolling first.
+    return next((piece for piece in pieces if piece is not None), None)
 
 
 def _pays(run: Run, stage: Stage, savings: Array) -> bool:
@@ -184,11 +226,11 @@ def _change(
     return split(stage, scheme, run.begin, run.stop, mode)
 
 
-def _find_held(stage: Stage, scheme: Scheme) -> list[Run]:
+def _find_held(stage: Stage, scheme: Scheme, slow: bool) -> list[Run]:
     """Stretches over which a least rate holds something back.
 
     A polynomial that is held back touches the least rate at few points of an interval, so whole
-    intervals count that touch it and are slow throughout.
+    intervals count that touch it and are `slow` throughout, or else those that touch it twice.
     """
     formation, part = stage.formation, stage.guess
     z, v = part.z.reshape(-1, 5), part.v.reshape(-1, 5)
@@ -199,8 +241,9 @@ def _find_held(stage: Stage, scheme: Scheme) -> list[Run]:
     touches = senses < least + _STALLED * fast
     touches &= (np.abs(senses).max(axis=1) > 1e-3 * fast)[:, None]
     shape = (stage.intervals, scheme.degree, -1)
-    slow = (senses < least + _SLOW * fast).reshape(shape).all(axis=1)
-    held = np.repeat(slow & touches.reshape(shape).any(axis=1), scheme.degree, axis=0)
+    count = touches.reshape(shape).sum(axis=1)
+    near = (senses < least + _SLOW * fast).reshape(shape).all(axis=1)
+    held = np.repeat(near & (count > 0) if slow else count > 1, scheme.degree, axis=0)
     held[:, np.delete(np.arange(formation.n_contacts), formation.rubbing_rows)] = False
     return _find_runs(held, stage, scheme, np.zeros(held.shape[1]))
 

@@ -15,6 +15,7 @@ from typing import NamedTuple
 from ...common.arrays import Array
 from ...common.errors import InfeasibleError, InputError
 from ...geometry.curve import describe_pose
+from ...geometry.path_guess import find_end
 from ...problem.definition import ROWS, Phase, Problem
 from ..advice import describe_shortfalls, name_phases, rank_shortfalls
 from .attempts import Attempt, Attempts, solve_attempt
@@ -71,7 +72,8 @@ def approach(search: Search, problem: Problem, phases: Sequence[Phase], z: Array
     if all(own is phase for own, phase in zip(free, phases, strict=True)):
         return Approach()
     every = [_set_free(phase) for phase in problem.phases]
-    begun = _begin(search, replace(problem, phases=tuple(every)), free, z)
+    goal = find_end(phases[0], z) if len(phases) == 1 else None
+    begun = _begin(search, replace(problem, phases=tuple(every)), free, z, goal)
     if begun is None:
         return Approach()
     ends = {stage.phase: stage.guess.nodes[-1, 0] for stage in begun.stages}
@@ -124,7 +126,9 @@ def refuse_pinned(
             )
 
 
-def _begin(search: Search, free: Problem, phases: Sequence[Phase], z: Array) -> Solution | None:
+def _begin(
+    search: Search, free: Problem, phases: Sequence[Phase], z: Array, goal: Array | None
+) -> Solution | None:
     """A plan on few intervals that chooses where it ends."""
     own = replace(
         search,
@@ -135,7 +139,7 @@ def _begin(search: Search, free: Problem, phases: Sequence[Phase], z: Array) -> 
     )
     attempts = Attempts(free, phases, z, own, None, True)
     try:
-        for attempt in chain([attempts.first], attempts.list_further(FURTHER)):
+        for attempt in chain(attempts.begin(goal), attempts.list_further(FURTHER)):
             solution = solve_attempt(own, attempt)
             if solution.success:
                 return solution

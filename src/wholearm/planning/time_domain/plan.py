@@ -12,7 +12,7 @@ it is a better guess, or says why there is no plan.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple
@@ -99,12 +99,18 @@ def plan_phases(
     known = _go_on(search, attempts, begun[0]) if begun else None
     if known is not None:
         return list_plans(problem, search, phases, known, begun[0].attempt)
-    first, name = _begin(search, attempts.first, fastest, pinned)
-    if first.success:
-        return list_plans(problem, search, phases, first, name)
-    moved = approach(search, problem, phases, z)
-    if moved.solution is not None:
-        return list_plans(problem, search, phases, moved.solution, MOVED)
+    begin = attempts.begin()
+    for attempt in begin:
+        first, name = _begin(search, attempt, fastest, pinned)
+        if first.success:
+            break
+    # Straight to a pinned end modes may be found that are not the best: phase 3 of query 33.
+    enough = first.success and (len(begin) == 1 or bool(fastest))
+    moved = Approach() if enough else approach(search, problem, phases, z)
+    found = [(own, how) for own, how in ((first, name), (moved.solution, MOVED)) if own]
+    if any(own.success for own, _ in found):
+        best = min((own for own in found if own[0].success), key=lambda own: own[0].cost)
+        return list_plans(problem, search, phases, *best)
     return _look_further(search, attempts, problem, phases, first, moved, explained)
 
 
@@ -134,13 +140,10 @@ def try_phases(
     own = replace(options, mode_search=False)
     search = Search.of(problem, own, None, None, math.inf, True)
     attempts = Attempts(problem, phases, z, search, None, further > 0)
-    straight = None if goal is None else attempts.towards(goal)
-    begin = [straight] if straight else []
-    first = (attempts.first for _ in range(straight is None or further > 0))
-    guesses: Iterable[Attempt] = chain(begin, first, attempts.list_further(further))
+    begin = attempts.begin(goal)[: None if further else 1]
     if hurried:
-        guesses = [own._replace(most=FEW) for own in (begin if goal is not None else first)]
-    for attempt in guesses:
+        begin = [own._replace(most=FEW) for own in begin]
+    for attempt in chain(begin, attempts.list_further(further)):
         solution = solve_attempt(search, attempt)
         if solution.success:
             return _list_begun(problem, search, phases, solution, attempt.name, options)
@@ -184,7 +187,7 @@ def _look_further(
         return list_plans(problem, search, phases, last.solution, last.name)
     if not any(own.short for own in outcomes):
         refuse_pinned(search, problem, phases, moved)
-    raise _explain(search, problem, attempts, outcomes, replan if explained else None)
+    raise explain_lost(search, problem, attempts, outcomes, replan if explained else None)
 
 
 def _begin(
@@ -258,7 +261,7 @@ def _try_all(
             break
     looked = not begun.is_lost and any(own.name == NEAREST for own in outcomes)
     if not (looked or outcomes[-1].solution.success or any(own.short for own in outcomes)):
-        short = _find_short(search, problem, attempts.first.stages)[1]
+        short = find_short(search, problem, attempts.first.stages)[1]
         outcomes.append(_Outcome(NEAREST, begun, short))
     return outcomes
 
@@ -277,15 +280,15 @@ def _try(search: Search, problem: Problem, attempt: Attempt, known: Solution | N
     # What coarse intervals are not short of, finer ones may be.
     lost = solution.is_lost
     stages = halve(solution.stages, search.scheme) if lost else attempt.stages
-    elastic, short = _find_short(search, problem, stages)
+    elastic, short = find_short(search, problem, stages)
     if elastic is not None and not short and not lost:
         solution = solve_attempt(search, attempt._replace(stages=elastic))
         if not solution.success:
-            short = _find_short(search, problem, halve(elastic, search.scheme))[1]
+            short = find_short(search, problem, halve(elastic, search.scheme))[1]
     return _Outcome(attempt.name, solution, short)
 
 
-def _find_short(
+def find_short(
     search: Search, problem: Problem, stages: list[Stage]
 ) -> tuple[list[Stage] | None, list[Stage]]:
     """The motion with the least shortfalls, if one is found, and again if it is short at all."""
@@ -297,7 +300,7 @@ def _find_short(
     return elastic, elastic
 
 
-def _explain(
+def explain_lost(
     search: Search,
     problem: Problem,
     attempts: Attempts,
