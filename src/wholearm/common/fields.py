@@ -13,6 +13,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, replace
 from functools import partial
+from numbers import Real
 from typing import Any, TypeVar
 
 from .errors import InputError
@@ -79,7 +80,8 @@ class Range:
 
     def read(self, given: Any, key: str) -> Any:
         """The value as int or float, or an `InputError` that names `key`."""
-        value = given.item() if hasattr(given, "dtype") else given
+        # Numbers of NumPy are no int.
+        value = given.item() if isinstance(given, Real) and hasattr(given, "item") else given
         if text := self.find_fault(value):
             raise InputError("", key, text)
         return value if self.whole else float(value)
@@ -109,11 +111,10 @@ class Range:
             return
         low, high = self.low * scale, self.high * scale
         time = f"{scene.scales.time:.3g} s" if scene is not None else ""
-        for value in (
-            given if hasattr(given, "__len__") and not isinstance(given, str) else (given,)
-        ):
-            number = isinstance(value, int | float) and value and math.isfinite(value)
-            if number and not low <= value <= high:
+        several = hasattr(given, "__len__") and not isinstance(given, str)
+        for value in given if several else (given,):
+            counts = isinstance(value, Real) and value and math.isfinite(value)
+            if counts and not low <= value <= high:
                 what = f" ({self.describe(time)})" if self.of else ""
                 text = f"{low:.3g} to {high:.3g} {unit}".rstrip()
                 raise InputError("", key, f"{value:g} given; allowed are {text}{what}")
@@ -223,6 +224,13 @@ class Field:
             return re.sub(r"e([+-])0*", lambda found: f"e{found[1]}".replace("+", ""), f"{value:g}")
         return "" if value is None else str(value)
 
+    def explain(self) -> str:
+        """The text, with range and default."""
+        allowed = [own.describe() for own in (self.kind, *self.ranges) if isinstance(own, Range)]
+        default = f"default {self.describe_default()}" if self.describe_default() else ""
+        more = "; ".join(filter(None, (*allowed, default)))
+        return self.text + (more and f" ({more})")
+
     def read(self, given: Any, key: str) -> Any:
         """The value, if it is of its kind; raises an `InputError` that names `key`."""
         if self.default is None and given is None:
@@ -267,7 +275,7 @@ def declare(*fields: Field) -> Callable[[type[T]], type[T]]:
             attribute = own.attribute or own.name
             default = known[attribute]
             found[attribute] = own if default is MISSING else replace(own, default=default)
-        lines = [f"    {name}\n        {own.text}" for name, own in found.items() if own.text]
+        lines = [f"    {name}\n        {own.explain()}" for name, own in found.items() if own.text]
         owner.__doc__ = "\n".join([owner.__doc__ or "", "    Keys", "    ----", *lines, ""])
         owner.__keys__ = found  # type: ignore[attr-defined]
         return owner

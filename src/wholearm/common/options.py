@@ -24,6 +24,7 @@ from typing import Any
 
 from .fields import BOOLEAN, TEXT, Field, Kind, Range, choice
 
+_OFF = "False: "
 _NUMBER = r"-?\d[\w.+-]*?"
 _TEXT = re.compile(
     rf"(.*?)(?: = (\S+))?(?: in ({_NUMBER})\.\.({_NUMBER}))?(?: among (\S+))?", re.DOTALL
@@ -67,7 +68,8 @@ class Option:
             elif self.nargs == "?" and isinstance(own.kind, Range):
                 more["const"] = 1.0
         default = "" if own.kind is BOOLEAN or own.default == [] else own.describe_default()
-        parser.add_argument(*self.flags, help=own.text + (default and f" ({default})"), **more)
+        text = own.text.removeprefix(_OFF) + (default and f" ({default})")
+        parser.add_argument(*self.flags, help=text, **more)
 
 
 def read_options(table: str) -> list[Option]:
@@ -101,5 +103,6 @@ def _read_option(usage: str, rest: str) -> Option:
     elif metavar is None and flags[0].startswith("-"):
         kind, given = BOOLEAN, name.startswith("no_")
         name = name.removeprefix("no_")
+        text = f"{_OFF if given else ''}{text}"
     nargs = ("*" if optional else "+") if several else "?" if optional else None
     return Option(Field(name, text, kind, default=given), flags, metavar, nargs)
