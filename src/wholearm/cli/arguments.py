@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -66,43 +67,26 @@ SEARCH = """\
     (none) in 1e-3..1e9
 """
 
-COMMANDS = {
-    "new": Command(
-        "write a problem file to begin with",
-        "new:write",
-        """
+TABLE = f"""\
+[[new]]  new:write  write a problem file to begin with
 name               the problem's name; NAME.toml is written
 --polygon CORNERS  corners of the regular polygon, 3 to 50 = 7 in 3..50
 --size             from its centre to its corners [m] = 0.05 in 1e-6..1e6
 --vertices 'X,Y ...'  corners of the object instead, anticlockwise [m], as in '0,0 0.08,0
     0.08,0.03 0,0.09'
 --mass             of the object [kg] (0.2 at a size of 0.05 m, growing with the area) in 1e-6..1e6
-""",
-    ),
-    "schema": Command(
-        "print the JSON Schema of problem files, for editors",
-        "new:show_schema",
-        """
+[[schema]]  new:show_schema  print the JSON Schema of problem files, for editors
 -o --output FILE  file to write, instead of printing
 --table           all keys with unit, default and range as tables (Markdown) instead
-""",
-    ),
-    "solve": Command(
-        "plan joint torques for a problem file",
-        "command:solve",
-        f"""
+[[solve]]  command:solve  plan joint torques for a problem file
 {PROBLEM}\
 -o --output FILE        trajectory file to write (default: NAME.npz)
 --torques FILE          also write the torques as CSV
 --sample-rate HZ        write samples at this rate [Hz] instead, and say what becomes of the motion
     (none) in 1e-9..1e12
 --interpolation NAME    of samples: linear, or hold for sample-and-hold (linear)
-{PLANNER}{MARGIN}{SEARCH}{JSON}""",
-    ),
-    "verify": Command(
-        "replay torques open loop and check the motion",
-        "command:verify",
-        f"""
+{PLANNER}{MARGIN}{SEARCH}{JSON}\
+[[verify]]  command:verify  replay torques open loop and check the motion
 {PROBLEM}\
 torques           trajectory file (.npz) or torques (.csv: t,tau1,tau2)
 --tolerance       of the simulator's steps, relative to the scene's scales = 1e-9 in 1e-14..1e-2
@@ -119,12 +103,8 @@ torques           trajectory file (.npz) or torques (.csv: t,tau1,tau2)
 {SENSOR}\
 --restitution     Poisson's coefficient of impacts, 0 to 1, with --free (0: plastic) in 0.0..1.0
 -o --output FILE  trajectory file to write (.npz) of the replayed motion, for plot
-{JSON}""",
-    ),
-    "plot": Command(
-        "draw force margins, torques and snapshots",
-        "command:plot",
-        """
+{JSON}\
+[[plot]]  command:plot  draw force margins, torques and snapshots
 trajectory         trajectory file (.npz), or torques to replay (.csv)
 --problem FILE     problem file (TOML) for torques
 -o --output FILE   figure to write (.png, .pdf, .svg) (required)
@@ -132,24 +112,15 @@ trajectory         trajectory file (.npz), or torques to replay (.csv)
     among told|free
 --width            of the figure [in], 3 to 40 (10) in 3.0..40
 --motion           also draw the object's pose, and the joints' angles and speeds
-""",
-    ),
-    "predict": Command(
-        "see up to which speed slow motions keep every contact",
-        "predict:predict",
-        f"""
+[[predict]]  predict:predict  see up to which speed slow motions keep every contact
 {PROBLEM}\
 -o --output FILE  figure to write (.png, .pdf, .svg) of the least normal force over speed
 {SQUEEZE}\
 --torques FILE    write the quasistatic torques as CSV, which hand tuning starts from
 --speed V         mean speed along the phases for these [m/s], over which they are spread in time
     (0.05) in 1e-9..1e6
-{JSON}""",
-    ),
-    "tune": Command(
-        "tune torques from quasistatic ones by steps of 10 percent",
-        "tune:tune",
-        f"""
+{JSON}\
+[[tune]]  tune:tune  tune torques from quasistatic ones by steps of 10 percent
 {PROBLEM}\
 -o --output FILE  torques to write (.csv)
 --brake           let each phase have one more step of its torques, which stops it at its end
@@ -158,52 +129,31 @@ trajectory         trajectory file (.npz), or torques to replay (.csv)
 {SQUEEZE}\
 --share           raises beyond the first that reaches the end: 0 none, 1 all that keep contacts
     = 1 in 0.0..1.0
-{JSON}""",
-    ),
-    "compare": Command(
-        "put plans and torques for a problem side by side",
-        "compare:compare",
-        f"""
+{JSON}\
+[[compare]]  compare:compare  put plans and torques for a problem side by side
 {PROBLEM}\
 files FILE ...    trajectory files (.npz) or torques (.csv) for that problem
 -o --output FILE  figure to write (.png, .pdf, .svg) of the force margins of all
-{JSON}""",
-    ),
-    "route": Command(
-        "find the contact formations that lead to a goal, and plan",
-        "route:route",
-        f"""
+{JSON}\
+[[route]]  route:route  find the contact formations that lead to a goal, and plan
 problem           problem file (TOML) with [goal] in place of [[phases]]
 -o --output FILE  figure to write (.png, .pdf, .svg) of the route over the map
 --alternatives N  how many routes of other formations are listed beside the best one = 0 in 0..100
 --objective NAME  of the plans: time, effort or margin; routes are looked for by time = time
-{SEARCH}{JSON}""",
-    ),
-    "map": Command(
-        "draw the contact formations over (x, phi)",
-        "map:draw",
-        f"""
+{SEARCH}{JSON}\
+[[map]]  map:draw  draw the contact formations over (x, phi)
 {PROBLEM}\
 -o --output FILE  figure to write (.png, .pdf, .svg; default: map_NAME.png)
 --plan FILE       trajectory file (.npz) to draw over it
 --phi LOW,HIGH    range of phi [deg] (default: the plan's)
 --list X,PHI ...  print the formations along a route of two or more poses [m, deg] as [[phases]]
-{MARGIN}""",
-    ),
-    "export": Command(
-        "write scene and plan for a physics engine",
-        "engines:export",
-        f"""
+{MARGIN}\
+[[export]]  engines:export  write scene and plan for a physics engine
 {PROBLEM}\
 [plan]            trajectory file (.npz) that the model plays
 --mjcf FILE       file to write (.xml): the scene in MuJoCo's format (required)
 --step            time step of the model [s] (from the scene) in 1e-15..1e6
-""",
-    ),
-    "replay": Command(
-        "replay a plan in MuJoCo or Drake and compare it with the plan",
-        "engines:replay",
-        f"""
+[[replay]]  engines:replay  replay a plan in MuJoCo or Drake and compare it with the plan
 {PROBLEM}{PLAN}\
 --engine NAME     mujoco or drake, installed with the extra of that name (required)
 --whole           from start to end, instead of phase by phase from each planned start
@@ -214,12 +164,8 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
 --departure       how far a replay may be from the plan, over the object's radius of gyration, and
     in rad (3e-3 for mujoco, 1.5e-3 for drake; of a policy's end, 3e-2) in 1e-9..1e3
 --refine N        also replay with steps of a half, a quarter, ... to N halvings = 0 in 0..6
-{JSON}""",
-    ),
-    "policy": Command(
-        "make torques a function of the joints, by feedback",
-        "policy:policy",
-        f"""
+{JSON}\
+[[policy]]  policy:policy  make torques a function of the joints, by feedback
 {PLAN}\
 -o --output FILE  policy to write (.npz; default: NAME_policy.npz)
 --reserve         normal force that is kept in reserve along the way: where plan or problem have
@@ -233,12 +179,8 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
 --departure       how far contacts may open in its simulation, over the object's radius of gyration
     (1e-3) in 1e-9..1e3
 --write-anyway    write the policy although its simulation does not hold, marked so in its file
-{JSON}""",
-    ),
-    "robustness": Command(
-        "see how much error a plan bears",
-        "robustness:robustness",
-        f"""
+{JSON}\
+[[robustness]]  robustness:robustness  see how much error a plan bears
 {PROBLEM}{PLAN}\
 --samples             samples to replay, a Latin hypercube of all ranges = 1000 in 1..1000000
 --seed                of the samples = 0 in 0..9223372036854775808
@@ -260,51 +202,32 @@ problem           problem file (TOML) with [goal] in place of [[phases]]
 --figure FILE         also draw the motion with its noisy copies (.png, .pdf, .svg)
 --jobs                worker processes (default: all cores) in 1..256
 --scheduler ADDRESS   run on the cluster of this Dask scheduler (extra: cluster)
-{JSON}""",
-    ),
-    "animate": Command(
-        "make a movie of a plan, or a page that plays it",
-        "viewer:animate",
-        """
+{JSON}\
+[[animate]]  viewer:animate  make a movie of a plan, or a page that plays it
 trajectory         trajectory file (.npz)
 -o --output FILE   what to write: .gif, .mp4 (needs ffmpeg), or .html, which plays in any browser
     (required)
 --speed            speed over real time, 0.1 is ten times slower = 0.1 in 1e-6..1e3
 --simulate [free]  draw the simulated motion behind; free: simulated without telling which contacts
     hold among told|free
-""",
-    ),
-    "report": Command(
-        "put a problem and its plans into one page to open anywhere",
-        "viewer:report",
-        f"""
+[[report]]  viewer:report  put a problem and its plans into one page to open anywhere
 {PROBLEM}\
 [files PLAN ...]  trajectory files (.npz) or torques (.csv); none: plan the least time
 -o --output FILE  page to write (default: NAME.html)
-""",
-    ),
-    "gallery": Command(
-        "plan problems and show them all on one page",
-        "viewer:gallery",
-        """
+[[gallery]]  viewer:gallery  plan problems and show them all on one page
 files PROBLEM ...  problem files (TOML)
 -o --output FILE   page to write (.md); figures and movies go to a folder beside it
     = results/gallery.md
-""",
-    ),
-    "help": Command(
-        "print a page of the documentation, or list its topics",
-        "help:show",
-        "[topic TOPIC]  what the page is about (left out: list the topics) among "
-        + "|".join(TOPICS),
-    ),
-    "completion": Command(
-        "print what makes a shell complete all this",
-        "completion:complete",
-        "shell  bash, zsh or tcsh; needs the extra completion",
-    ),
-}
-"""All commands but `bench`, which has studies of its own."""
+[[help]]  help:show  print a page of the documentation, or list its topics
+[topic TOPIC]  what the page is about (left out: list the topics) among {"|".join(TOPICS)}
+[[completion]]  completion:complete  print what makes a shell complete all this
+shell  bash, zsh or tcsh; needs the extra completion
+"""
+"""Commands but `bench`, which has studies of its own: name, module and function that carry it out,
+what it is for, and then its files and options as of `read_options`."""
+_ROWS = [own.partition("\n") for own in re.split(r"^(?=\[\[\w+\]\]  )", TABLE, flags=re.M)[1:]]
+_HEADS = [(re.split(r" {2,}", head), options) for head, _, options in _ROWS]
+COMMANDS = {name.strip("[]"): Command(text, run, own) for (name, run, text), own in _HEADS}
 
 
 def name_simulator(given: Sequence[str]) -> list[str]:
