@@ -102,18 +102,18 @@ problem             problem file
 --fresh             begin anew
 --no-replay         return it without a replay
 """
-OPTIONS = {option.own.name: option for option in read_options(TABLE)}
+OPTIONS = {option.field.name: option for option in read_options(TABLE)}
 
 
-@declare(*(OPTIONS[name].own for name in ("most_rounds", "share", "scheme", "replay")))
+@declare(*(OPTIONS[name].field for name in ("most_rounds", "share", "scheme", "replay")))
 @dataclass(frozen=True)
 class Given:
     """Options of a class."""
 
-    most_rounds: int = OPTIONS["most_rounds"].own.default
-    share: float = OPTIONS["share"].own.default
-    scheme: str = OPTIONS["scheme"].own.default
-    replay: bool = OPTIONS["replay"].own.default
+    most_rounds: int = OPTIONS["most_rounds"].field.default
+    share: float = OPTIONS["share"].field.default
+    scheme: str = OPTIONS["scheme"].field.default
+    replay: bool = OPTIONS["replay"].field.default
 
     def __post_init__(self) -> None:
         read_keys(self)

@@ -66,7 +66,7 @@ class Range:
 
     def describe(self, time: str = "the scene's time") -> str:
         """The range in words."""
-        low, high = (f"{own}" if self.whole else f"{own:g}" for own in (self.low, self.high))
+        low, high = (f"{end}" if self.whole else f"{end:g}" for end in (self.low, self.high))
         text = f"{'whole numbers from ' if self.whole else ''}{low} to {high}"
         return f"{text} {self.of.format(time=time)}".rstrip()
 
@@ -226,7 +226,9 @@ class Field:
 
     def explain(self) -> str:
         """The text, with range and default."""
-        allowed = [own.describe() for own in (self.kind, *self.ranges) if isinstance(own, Range)]
+        allowed = [
+            field.describe() for field in (self.kind, *self.ranges) if isinstance(field, Range)
+        ]
         default = f"default {self.describe_default()}" if self.describe_default() else ""
         more = "; ".join(filter(None, (*allowed, default)))
         return self.text + (more and f" ({more})")
@@ -241,8 +243,8 @@ class Field:
 
     def check(self, given: Any, key: str, scene: Any, owner: Any = None) -> None:
         """Raise an `InputError` if a value is out of a range relative to the scene."""
-        for own in self.ranges:
-            own.check(key, given, self.unit, scene, owner)
+        for field in self.ranges:
+            field.check(key, given, self.unit, scene, owner)
 
 
 def key(
@@ -259,7 +261,7 @@ def key(
 
 def name_fields(*fields: Field) -> dict[str, Field]:
     """Fields by name."""
-    return {own.name: own for own in fields}
+    return {field.name: field for field in fields}
 
 
 def declare(*fields: Field) -> Callable[[type[T]], type[T]]:
@@ -269,13 +271,15 @@ def declare(*fields: Field) -> Callable[[type[T]], type[T]]:
     """
 
     def describe(owner: type[T]) -> type[T]:
-        known = {own.name: own.default for own in dataclasses.fields(owner)}  # type: ignore[arg-type]
+        known = {field.name: field.default for field in dataclasses.fields(owner)}  # type: ignore[arg-type]
         found = {}
-        for own in fields:
-            attribute = own.attribute or own.name
+        for field in fields:
+            attribute = field.attribute or field.name
             default = known[attribute]
-            found[attribute] = own if default is MISSING else replace(own, default=default)
-        lines = [f"    {name}\n        {own.explain()}" for name, own in found.items() if own.text]
+            found[attribute] = field if default is MISSING else replace(field, default=default)
+        lines = [
+            f"    {name}\n        {field.explain()}" for name, field in found.items() if field.text
+        ]
         owner.__doc__ = "\n".join([owner.__doc__ or "", "    Keys", "    ----", *lines, ""])
         owner.__keys__ = found  # type: ignore[attr-defined]
         return owner
@@ -291,8 +295,8 @@ def keys_of(owner: Any) -> dict[str, Field]:
 
 def read_keys(owner: Any, prefix: str = "") -> None:
     """Check the declared fields of a frozen dataclass, and keep them as they are read."""
-    for attribute, own in keys_of(owner).items():
-        value = own.read(getattr(owner, attribute), f"{prefix}{own.name}")
+    for attribute, field in keys_of(owner).items():
+        value = field.read(getattr(owner, attribute), f"{prefix}{field.name}")
         object.__setattr__(owner, attribute, value)
 
 
@@ -300,7 +304,7 @@ def collect_keys(owner: type, table: Mapping[str, Any]) -> dict[str, Any]:
     """Values of a table, or their defaults, by attribute."""
     known = keys_of(owner).items()
     return {
-        name: table.get(own.name, own.default)
-        for name, own in known
-        if own.name in table or not own.required
+        name: table.get(field.name, field.default)
+        for name, field in known
+        if field.name in table or not field.required
     }

@@ -37,38 +37,38 @@ class Option:
 
     Attributes
     ----------
-    own : Field
+    field : Field
     flags : sequence of str
         The name alone where it is a file.
     metavar : str or None
     nargs : {"*", "+", "?", None}
     """
 
-    own: Field
+    field: Field
     flags: Sequence[str]
     metavar: str | None = None
     nargs: str | None = None
 
     def add(self, parser: argparse.ArgumentParser) -> None:
         """Give it to a parser, with its default behind its text."""
-        own, more = self.own, dict[str, Any]()
-        if own.kind is BOOLEAN:
-            more = {"action": f"store_{str(not own.default).lower()}", "dest": own.name}
+        field, more = self.field, dict[str, Any]()
+        if field.kind is BOOLEAN:
+            more = {"action": f"store_{str(not field.default).lower()}", "dest": field.name}
         else:
             more = {"metavar": self.metavar, "nargs": self.nargs}
-            more |= {"type": own.kind.parse} if isinstance(own.kind, Range) else {}
+            more |= {"type": field.kind.parse} if isinstance(field.kind, Range) else {}
             if self.flags[0].startswith("-"):
-                required = own.text.endswith("(required)")
-                more |= {"default": own.default, "required": required}
-            if self.nargs == "?" and "enum" in own.kind.schema:
-                more["choices"] = own.kind.schema["enum"]
+                required = field.text.endswith("(required)")
+                more |= {"default": field.default, "required": required}
+            if self.nargs == "?" and "enum" in field.kind.schema:
+                more["choices"] = field.kind.schema["enum"]
                 if self.flags[0].startswith("-"):
                     # It may be left out before a file, too: the caller puts the first word in.
                     more |= {"nargs": None, "metavar": f"[{self.metavar}]"}
-            elif self.nargs == "?" and isinstance(own.kind, Range):
+            elif self.nargs == "?" and isinstance(field.kind, Range):
                 more["const"] = 1.0
-        default = "" if own.kind is BOOLEAN or own.default == [] else own.describe_default()
-        text = own.text.removeprefix(_OFF) + (default and f" ({default})")
+        default = "" if field.kind is BOOLEAN or field.default == [] else field.describe_default()
+        text = field.text.removeprefix(_OFF) + (default and f" ({default})")
         parser.add_argument(*self.flags, help=text, **more)
 
 

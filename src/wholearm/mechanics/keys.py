@@ -24,4 +24,4 @@ def _read_margin(given: object, key: str) -> float:
 
 _KIND = Kind(_read_margin, {"type": "number", "exclusiveMaximum": 1})
 # Coefficients of friction are not known to better than a tenth.
-UNIQUENESS = replace(read_options(MARGIN)[0].own, kind=_KIND, default=0.1)
+UNIQUENESS = replace(read_options(MARGIN)[0].field, kind=_KIND, default=0.1)

@@ -54,7 +54,7 @@ PLANNER = """\
 --certify           bound the least time along curves from below, and print the gap
 """
 """What takes more than these ranges takes memory or hours for nothing."""
-_FIELDS = [own.own for own in read_options(PLANNER)]
+_FIELDS = [option.field for option in read_options(PLANNER)]
 _DEFAULTS: dict[str, Any] = {own.name: own.default for own in _FIELDS}
 DEFAULT_ACCURACY: float = _DEFAULTS["accuracy"]
 OPENING: float = _DEFAULTS["opening"]

@@ -35,11 +35,11 @@ Table = Mapping[str, Field]
 
 
 _WIDTHS = {
-    own.name: replace(own, default=own.default * (LENGTH if own.unit == "m" else 1))
-    for own in PARAMETERS
+    field.name: replace(field, default=field.default * (LENGTH if field.unit == "m" else 1))
+    for field in PARAMETERS
 }
 OBJECT, FINGER, FRICTION, PHASE, GOAL = (
-    name_fields(*keys_of(own).values()) for own in (Polygon, Finger, Friction, Phase, Goal)
+    name_fields(*keys_of(field).values()) for field in (Polygon, Finger, Friction, Phase, Goal)
 )
 FINGERS = name_fields(
     key("1", "The right finger.", leave(refer("finger"))),
@@ -67,10 +67,10 @@ def name_keys() -> dict[str, tuple[str, ...]]:
     names |= {key: (f"start.{key}",) for key in START}
     names |= {f"friction_{key}": (f"friction.{key}",) for key in FRICTION}
     names["friction"] = tuple(f"friction.{key}" for key in FRICTION)
-    for finger, own in FINGER.items():
+    for finger, field in FINGER.items():
         name = f"finger_{finger}" if finger in OBJECT else finger
         names |= {f"{name}{number}": (f"fingers.{number}.{finger}",) for number in FINGERS}
-        if own.kind is not POINT:
+        if field.kind is not POINT:
             names[name] = tuple(f"fingers.{number}.{finger}" for number in FINGERS)
     return names
 
@@ -124,7 +124,7 @@ def build_schema() -> dict[str, Any]:
 
 
 def _describe(table: Table) -> dict[str, Any]:
-    return {name: own.schema for name, own in table.items()}
+    return {name: field.schema for name, field in table.items()}
 
 
 def _describe_table(table: Table, text: str = "") -> dict[str, Any]:
@@ -133,7 +133,7 @@ def _describe_table(table: Table, text: str = "") -> dict[str, Any]:
         "type": "object",
         **({"description": text} if text else {}),
         "additionalProperties": False,
-        "required": [name for name, own in table.items() if own.required],
+        "required": [name for name, field in table.items() if field.required],
         "properties": _describe(table),
     }
 
@@ -153,11 +153,11 @@ def write_page() -> str:
     parts = []
     for title, table in tables.items():
         lines = [f"| {title} | unit | default | allowed | |", "|---|---|---|---|---|"]
-        for name, own in table.items():
+        for name, field in table.items():
             if name not in _PARTS:
-                text = re.sub(r" ?\[[^]]*\]", "", own.text)
-                default = "required" if own.required else own.describe_default()
-                allowed = ", ".join(filter(None, (one.describe() for one in own.ranges)))
-                lines.append(f"| `{name}` | {own.unit} | {default} | {allowed} | {text} |")
+                text = re.sub(r" ?\[[^]]*\]", "", field.text)
+                default = "required" if field.required else field.describe_default()
+                allowed = ", ".join(filter(None, (one.describe() for one in field.ranges)))
+                lines.append(f"| `{name}` | {field.unit} | {default} | {allowed} | {text} |")
         parts.append("\n".join(lines) + "\n")
     return "\n".join(parts)

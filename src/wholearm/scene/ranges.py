@@ -37,32 +37,39 @@ MASS = Range(1e-6, 1e6)
 INERTIA = Range(1e-2, 1e2, lambda _, body: body.uniform_inertia, "times uniform density")
 GRAVITY = Range(1e-3, 1e5)
 FRICTION = Range(0.0, 10.0)
-PLACE = Range(-300.0, 300.0, lambda all, _: all.polygon.size, _SIZE)
+PLACE = Range(-300.0, 300.0, lambda scene, _: scene.polygon.size, _SIZE)
 """Coordinates of joints and of the object."""
 TURN = Range(-3600.0, 3600.0)
 """Angle of the object at which a phase ends [degrees]."""
 LENGTH = Range(0.03, 100.0, PLACE.scale, _SIZE)
-RADIUS = Range(1e-4, 1.0, lambda _, own: own.length, "times the length, or 0")
-JOINT = Range(1e-8, 1e3, lambda all, own: all.polygon.mass * own.length**2, "times m length^2")
+RADIUS = Range(1e-4, 1.0, lambda _, finger: finger.length, "times the length, or 0")
+JOINT = Range(
+    1e-8, 1e3, lambda scene, finger: scene.polygon.mass * finger.length**2, "times m length^2"
+)
 TORQUE = Range(
     1e-6,
     1e3,
-    lambda all, own: all.polygon.mass * all.gravity * own.length or None,
+    lambda scene, finger: scene.polygon.mass * scene.gravity * finger.length or None,
     "times m g length",
 )
 STRENGTH = Range(1e-6, 1e6, _get_strength, "times finger 2's strength")
 VISCOUS = Range(
-    *(0.0, 200.0), lambda all, own: _get_drive(all, own) * all.scales.time, f"{_DRIVE}, x {{time}}"
+    *(0.0, 200.0),
+    lambda scene, finger: _get_drive(scene, finger) * scene.scales.time,
+    f"{_DRIVE}, x {{time}}",
 )
 DRY = Range(0.0, 1e3, _get_drive, _DRIVE)
-SPEED = Range(1e-3, 1e6, lambda all, _: all.scales.rate, "radians in {time}")
+SPEED = Range(1e-3, 1e6, lambda scene, _: scene.scales.rate, "radians in {time}")
 TORQUE_RATE = Range(
-    1e-4, 1e9, lambda all, own: own.torque_limit / all.scales.time, "torque limits in {time}"
+    1e-4,
+    1e9,
+    lambda scene, finger: finger.torque_limit / scene.scales.time,
+    "torque limits in {time}",
 )
-LAG = Range(0.0, 1e2, lambda all, _: all.scales.time, "x {time}")
+LAG = Range(0.0, 1e2, lambda scene, _: scene.scales.time, "x {time}")
 CONTROL_PERIOD = Range(1e-3, 1e2, LAG.scale, "times the scene's time")
 SETTLE = Range(1e-4, 1e3, LAG.scale, "times the scene's time, or 0")
-SETTLE_GAP = Range(1e-6, 0.1, lambda all, _: all.scales.length, "times the scene's length")
+SETTLE_GAP = Range(1e-6, 0.1, lambda scene, _: scene.scales.length, "times the scene's length")
 EPSILON = Range(0.0, 1e3, _get_press, "times what presses at most")
 
 
