@@ -15,7 +15,7 @@ from wholearm.common.errors import InputError
 from wholearm.comparison.compare import compare
 from wholearm.figures.comparison import draw_comparison
 from wholearm.problem.definition import Problem
-from wholearm.problem.read import NAMES
+from wholearm.problem.keys import name_keys
 from wholearm.problem.table import change_table
 from wholearm.results.narrow import save
 from wholearm.results.origin import describe_origin
@@ -116,7 +116,9 @@ def test_what_differs_from_the_problem_of_a_plan_is_said(
         ({"base2": [-0.5, 0.1]}, r"fingers.2.base"),
     ):
         with pytest.raises(InputError, match=f"{key}.*another hand"):
-            describe_origin(problem, {"problem": change_table(meta["problem"], senseless, NAMES)})
+            describe_origin(
+                problem, {"problem": change_table(meta["problem"], senseless, name_keys())}
+            )
     with pytest.raises(InputError, match=r"object\.vertices: 6 entries in the plan, 7 here"):
         describe_origin(problem, {"problem": meta["problem"] | {"object": chipped}})
     own = tmp_path / "own.toml"

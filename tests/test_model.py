@@ -8,6 +8,7 @@ import pytest
 
 from plane import SQUARE, make_finger, make_scene
 from wholearm.common.errors import InputError
+from wholearm.common.fields import keys_of
 from wholearm.scene.model import Finger, Friction, Scene
 from wholearm.scene.polygon import Polygon
 
@@ -103,6 +104,6 @@ def test_without_gravity_the_weaker_finger_sets_the_force() -> None:
 def test_every_number_of_a_finger_has_a_unit_of_the_scene() -> None:
     """Problem files and planning in own units take new fields from here."""
     scene = make_scene()
-    known = {own.name: own.metadata.get("unit", "") for own in fields(Finger)}
-    assert known.pop("name") == ""
-    assert all(getattr(scene.scales, unit) > 0 for unit in known.values())
+    known = keys_of(Finger)
+    assert {own.name for own in fields(Finger)} - set(known) == {"name"}
+    assert all(getattr(scene.scales, own.scale) > 0 for own in known.values())

@@ -7,7 +7,6 @@ import json
 import re
 import tomllib
 from collections.abc import Callable
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +15,11 @@ import pytest
 from shipped import FOLDER, HEPTAGON
 from wholearm.cli.command import main
 from wholearm.common.errors import InputError
+from wholearm.problem.keys import TOP, build_schema, write_page
 from wholearm.problem.read import build_problem
 
 jsonschema = pytest.importorskip("jsonschema")
-TEXT = resources.files("wholearm.problem").joinpath("schema.json").read_text(encoding="utf-8")
-SCHEMA = json.loads(TEXT)
+SCHEMA = build_schema()
 TABLE = tomllib.loads(HEPTAGON.read_text(encoding="utf-8")) | {"uncertainty": {"mass": 0.1}}
 PARTS = SCHEMA["properties"]
 TABLES: dict[str, tuple[dict[str, Any], Callable[[Any], Any]]] = {
@@ -91,4 +90,8 @@ def test_the_command_prints_it(capsys: pytest.CaptureFixture[str], tmp_path: Pat
     assert main(["schema"]) == 0
     assert json.loads(capsys.readouterr().out) == SCHEMA
     assert main(["schema", "-o", str(tmp_path / "schema.json")]) == 0
-    assert (tmp_path / "schema.json").read_text(encoding="utf-8") == TEXT
+    assert json.loads((tmp_path / "schema.json").read_text(encoding="utf-8")) == SCHEMA
+    capsys.readouterr()
+    assert main(["schema", "--table"]) == 0
+    assert capsys.readouterr().out == write_page()
+    assert all(f"| `{key}` |" in write_page() for key, own in TOP.items() if own.text)

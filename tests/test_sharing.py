@@ -268,7 +268,7 @@ def test_copies_leave_kept_values_behind(tracked: type[Tracked]) -> None:
     assert copy.deepcopy(owner).number == 3
 
 
-def _plan(problem: wholearm.problem.Problem) -> wholearm.Trajectory:
+def _plan(problem: wholearm.Problem) -> wholearm.Trajectory:
     return wholearm.solve(problem, intervals=10).trajectory
 
 

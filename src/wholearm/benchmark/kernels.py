@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.bounds import Bounds
+from ..common.fields import Range
 from ..common.files import read_json, write_text
 from ..scene.model import Finger, Friction, Scene
 from ..scene.polygon import Polygon
@@ -193,7 +193,7 @@ class Kernels(Study):
         text = "kernels of OpenBLAS, as for OPENBLAS_CORETYPE (default: the processor's own)"
         parser.add_argument("--kernels", nargs="+", default=[""], metavar="NAME", help=text)
         text = "seeds of changes to all numbers in the last bits; 0 for none (0)"
-        read = Bounds(0, 2**63).read
+        read = Range(0, 2**63).parse
         parser.add_argument("--seeds", nargs="+", type=read, default=[0], metavar="K", help=text)
         text = "interpreters that have the package (default: this one)"
         parser.add_argument("--pythons", nargs="+", default=[sys.executable], help=text)

@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..common.bounds import Bounds
 from ..common.errors import InfeasibleError, InputError, WholearmError
+from ..common.fields import Range
 from ..mapping.route import format_route, list_formations
 from ..problem.definition import Problem
 from ..problem.goal import Goal
@@ -54,7 +54,7 @@ class Queries(Study):
 
     def add_options(self, parser: argparse.ArgumentParser) -> None:
         """How many queries, and of which scenes."""
-        read = Bounds(0, 2**63).read
+        read = Range(0, 2**63).parse
         parser.add_argument("--queries", type=read, default=250, help="how many (250)")
         parser.add_argument("--seed", type=read, default=0, help="of everything drawn (0)")
         text = "folder of the shipped problems (problems)"

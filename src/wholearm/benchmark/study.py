@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from .. import __version__
-from ..common.bounds import Bounds
+from ..common.fields import Range
 from ..common.files import make_folder, together, write_text
 from ..common.journal import Journal
 from .pool import Answer, run_tasks
@@ -131,7 +131,7 @@ def add_common(parser: argparse.ArgumentParser, study: Study) -> None:
     if not study.timed:
         cores = os.cpu_count() or 1
         text = f"processes ({cores}, as many as cores)"
-        parser.add_argument("--jobs", type=Bounds(1, 256).read, default=cores, help=text)
+        parser.add_argument("--jobs", type=Range(1, 256).parse, default=cores, help=text)
     if study.keeps:
         text = "run all cases anew instead of going on with the records in the folder"
         parser.add_argument("--fresh", action="store_true", help=text)

@@ -1,13 +1,20 @@
-"""What each command takes."""
+"""What each command is for, what carries it out, and which files and options it takes."""
 
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
 from typing import NoReturn
 
-from ..common.bounds import PLANNER, Bounds
 from ..common.errors import InputError
+from ..common.fields import Range
+from ..common.options import read_options
+from ..mechanics.keys import MARGIN
+from ..planning.options import PLANNER
+from .help import TOPICS
 
 SIMULATORS = ("told", "free")
 """What `plot --simulate` takes; the first one if it is left out."""
@@ -24,17 +31,214 @@ class Parser(argparse.ArgumentParser):
 
 def number(low: float, high: float) -> Callable[[str], float]:
     """What reads an option that is a number from `low` to `high`, a whole one if `low` is."""
-    return Bounds(low, high).read
+    return Range(low, high).parse
 
 
 JOBS = number(1, 256)
 """Processes."""
-DEPARTURE = number(1e-9, 1e3)
-"""How far a motion may be from another one, relative to the scene."""
-TOLERANCE = number(1e-14, 1e-2)
-"""Of simulators, relative to the scene."""
-STEP = number(1e-15, 1e6)
-"""Time step [s], which has a range of its own in each scene, too."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command: what it is for, module and function that carry it out, and its options."""
+
+    text: str
+    run: str
+    options: str
+
+    def add(self, parser: argparse.ArgumentParser) -> None:
+        """Give what the command takes to its parser."""
+        for own in read_options(self.options):
+            own.add(parser)
+        parser.set_defaults(run=self._run)
+
+    def _run(self, options: argparse.Namespace) -> int:
+        module, name = self.run.split(":")
+        status: int = getattr(import_module(f".{module}", __package__), name)(options)
+        return status
+
+
+PROBLEM = "problem  problem file (TOML)\n"
+PLAN = "plan  trajectory file (.npz)\n"
+JSON = "--json  print the result as JSON\n"
+SQUEEZE = """\
+--squeeze  how hard quasistatic torques squeeze: 0 as little as needed, 1 as hard as helps
+    = 0.5 in 0.0..1.0
+"""
+POLICY = """\
+--policy FILE  torques by this policy (.npz), at its own period, instead of the plan's by the clock
+"""
+SENSOR = "--sensor  with --policy: measured normal forces are handed to it, exact ones\n"
+SEARCH = """\
+--cache DIR       folder to keep what is found out of the scene, for later searches for a goal
+    (none); nobody else may write there
+--jobs N          processes that a search for a [goal] uses (2, or 1 where there is one core)
+    in 1..256
+--time-limit S    longest time that this may take; a search then returns the best route so far
+    (none) in 1e-3..1e9
+"""
+
+TABLE = f"""\
+[[new]]  new:write  write a problem file to begin with
+name               the problem's name; NAME.toml is written
+--polygon CORNERS  corners of the regular polygon, 3 to 50 = 7 in 3..50
+--size             from its centre to its corners [m] = 0.05 in 1e-6..1e6
+--vertices 'X,Y ...'  corners of the object instead, anticlockwise [m], as in '0,0 0.08,0
+    0.08,0.03 0,0.09'
+--mass             of the object [kg] (0.2 at a size of 0.05 m, growing with the area) in 1e-6..1e6
+[[schema]]  new:show_schema  print the JSON Schema of problem files, for editors
+-o --output FILE  file to write, instead of printing
+--table           all keys with unit, default and range as tables (Markdown) instead
+[[solve]]  command:solve  plan joint torques for a problem file
+{PROBLEM}\
+-o --output FILE        trajectory file to write (default: NAME.npz)
+--torques FILE          also write the torques as CSV
+--sample-rate HZ        write samples at this rate [Hz] instead, and say what becomes of the motion
+    (none) in 1e-9..1e12
+--interpolation NAME    of samples: linear, or hold for sample-and-hold (linear)
+{PLANNER}{MARGIN}{SEARCH}{JSON}\
+[[verify]]  command:verify  replay torques open loop and check the motion
+{PROBLEM}\
+torques           trajectory file (.npz) or torques (.csv: t,tau1,tau2)
+--tolerance       of the simulator's steps, relative to the scene's scales = 1e-9 in 1e-14..1e-2
+--departure       how far the replay may be from the plan, over the object's radius of gyration, and
+    in rad (1e-3) in 1e-9..1e3
+--rest-speed      speed that passes for rest, over the root of that radius times gravity (2e-2)
+    in 1e-9..1e3
+{MARGIN}\
+--reduced         also list the paper's scalar equation of motion where a phase has four constraints
+--free            simulate without telling which contacts hold: whole, and a plan's phases one by
+    one too
+--policy FILE     with --free: torques by this policy (.npz) instead of the plan's, from the start
+    on
+{SENSOR}\
+--restitution     Poisson's coefficient of impacts, 0 to 1, with --free (0: plastic) in 0.0..1.0
+-o --output FILE  trajectory file to write (.npz) of the replayed motion, for plot
+{JSON}\
+[[plot]]  command:plot  draw force margins, torques and snapshots
+trajectory         trajectory file (.npz), or torques to replay (.csv)
+--problem FILE     problem file (TOML) for torques
+-o --output FILE   figure to write (.png, .pdf, .svg) (required)
+--simulate [free]  overlay the simulated forces; free: simulated without telling which contacts hold
+    among told|free
+--width            of the figure [in], 3 to 40 (10) in 3.0..40
+--motion           also draw the object's pose, and the joints' angles and speeds
+[[predict]]  predict:predict  see up to which speed slow motions keep every contact
+{PROBLEM}\
+-o --output FILE  figure to write (.png, .pdf, .svg) of the least normal force over speed
+{SQUEEZE}\
+--torques FILE    write the quasistatic torques as CSV, which hand tuning starts from
+--speed V         mean speed along the phases for these [m/s], over which they are spread in time
+    (0.05) in 1e-9..1e6
+{JSON}\
+[[tune]]  tune:tune  tune torques from quasistatic ones by steps of 10 percent
+{PROBLEM}\
+-o --output FILE  torques to write (.csv)
+--brake           let each phase have one more step of its torques, which stops it at its end
+--stops N         with --brake: let a phase that fails stop up to N times on its way, 0 to 7
+    = 0 in 0..7
+{SQUEEZE}\
+--share           raises beyond the first that reaches the end: 0 none, 1 all that keep contacts
+    = 1 in 0.0..1.0
+{JSON}\
+[[compare]]  compare:compare  put plans and torques for a problem side by side
+{PROBLEM}\
+files FILE ...    trajectory files (.npz) or torques (.csv) for that problem
+-o --output FILE  figure to write (.png, .pdf, .svg) of the force margins of all
+{JSON}\
+[[route]]  route:route  find the contact formations that lead to a goal, and plan
+problem           problem file (TOML) with [goal] in place of [[phases]]
+-o --output FILE  figure to write (.png, .pdf, .svg) of the route over the map
+--alternatives N  how many routes of other formations are listed beside the best one = 0 in 0..100
+--objective NAME  of the plans: time, effort or margin; routes are looked for by time = time
+{SEARCH}{JSON}\
+[[map]]  map:draw  draw the contact formations over (x, phi)
+{PROBLEM}\
+-o --output FILE  figure to write (.png, .pdf, .svg; default: map_NAME.png)
+--plan FILE       trajectory file (.npz) to draw over it
+--phi LOW,HIGH    range of phi [deg] (default: the plan's)
+--list X,PHI ...  print the formations along a route of two or more poses [m, deg] as [[phases]]
+{MARGIN}\
+[[export]]  engines:export  write scene and plan for a physics engine
+{PROBLEM}\
+[plan]            trajectory file (.npz) that the model plays
+--mjcf FILE       file to write (.xml): the scene in MuJoCo's format (required)
+--step            time step of the model [s] (from the scene) in 1e-15..1e6
+[[replay]]  engines:replay  replay a plan in MuJoCo or Drake and compare it with the plan
+{PROBLEM}{PLAN}\
+--engine NAME     mujoco or drake, installed with the extra of that name (required)
+--whole           from start to end, instead of phase by phase from each planned start
+{POLICY}\
+--step            longest time step [s] (from the scene) in 1e-15..1e6
+--softness        softness of contacts, over the default, which is in proportion to the step (1)
+    in 1e-6..1e6
+--departure       how far a replay may be from the plan, over the object's radius of gyration, and
+    in rad (3e-3 for mujoco, 1.5e-3 for drake; of a policy's end, 3e-2) in 1e-9..1e3
+--refine N        also replay with steps of a half, a quarter, ... to N halvings = 0 in 0..6
+{JSON}\
+[[policy]]  policy:policy  make torques a function of the joints, by feedback
+{PLAN}\
+-o --output FILE  policy to write (.npz; default: NAME_policy.npz)
+--reserve         normal force that is kept in reserve along the way: where plan or problem have
+    ranges of numbers, for so many times these (1); otherwise over what usual errors of masses,
+    friction and torques take away (2.5); 0 is as fast as the plan in 0.0..1e3
+--period          of the control loop [s] = 1e-3 in 1e-5..10
+--delay           time from measuring to when torques take effect [s] = 5e-4 in 0.0..10
+--torque-limit    of both fingers, if it is more than the plan was made with [N m] (default: the
+    same) in 1e-12..1e12
+--largest         also look for how many times as wide ranges a policy can keep contacts in
+--departure       how far contacts may open in its simulation, over the object's radius of gyration
+    (1e-3) in 1e-9..1e3
+--write-anyway    write the policy although its simulation does not hold, marked so in its file
+{JSON}\
+[[robustness]]  robustness:robustness  see how much error a plan bears
+{PROBLEM}{PLAN}\
+--samples             samples to replay, a Latin hypercube of all ranges = 1000 in 1..1000000
+--seed                of the samples = 0 in 0..9223372036854775808
+--phase K             only this phase, from its planned start at rest (default: the whole plan)
+    in 1..1000
+{POLICY}{SENSOR}\
+--vary NAME=WIDTH ...  half widths of ranges, instead of the problem's: mass, inertia (0.05),
+    friction (0.1), gain of the torques (0.01), all relative; geometry, start_x [m] (6e-3 radii of
+    gyration), delay (1e-3 s); 0 leaves a number as it is
+--sample-rate HZ      of a sample-and-hold of the torques [Hz], 0 for torques as planned
+    = 1000 in 0.0..1e6
+--tolerance           of the simulations, relative to the scene's scales = 1e-6 in 1e-14..1e-2
+--goal-distance M     how far from the plan's end the goal counts as reached [m] (0.03 radii of
+    gyration) in 1e-9..1e6
+--goal-angle DEG      and how far from its angle [degrees] = 1 in 1e-9..360
+-o --output FILE      file to write results to, one by one (default: NAME_robustness.jsonl, with
+    phase and policy in the name); a study that is there goes on where it was stopped
+--fresh               begin the file anew, whatever it holds
+--figure FILE         also draw the motion with its noisy copies (.png, .pdf, .svg)
+--jobs                worker processes (default: all cores) in 1..256
+--scheduler ADDRESS   run on the cluster of this Dask scheduler (extra: cluster)
+{JSON}\
+[[animate]]  viewer:animate  make a movie of a plan, or a page that plays it
+trajectory         trajectory file (.npz)
+-o --output FILE   what to write: .gif, .mp4 (needs ffmpeg), or .html, which plays in any browser
+    (required)
+--speed            speed over real time, 0.1 is ten times slower = 0.1 in 1e-6..1e3
+--simulate [free]  draw the simulated motion behind; free: simulated without telling which contacts
+    hold among told|free
+[[report]]  viewer:report  put a problem and its plans into one page to open anywhere
+{PROBLEM}\
+[files PLAN ...]  trajectory files (.npz) or torques (.csv); none: plan the least time
+-o --output FILE  page to write (default: NAME.html)
+[[gallery]]  viewer:gallery  plan problems and show them all on one page
+files PROBLEM ...  problem files (TOML)
+-o --output FILE   page to write (.md); figures and movies go to a folder beside it
+    = results/gallery.md
+[[help]]  help:show  print a page of the documentation, or list its topics
+[topic TOPIC]  what the page is about (left out: list the topics) among {"|".join(TOPICS)}
+[[completion]]  completion:complete  print what makes a shell complete all this
+shell  bash, zsh or tcsh; needs the extra completion
+"""
+"""Commands but `bench`, which has studies of its own: name, module and function that carry it out,
+what it is for, and then its files and options as of `read_options`."""
+_ROWS = [own.partition("\n") for own in re.split(r"^(?=\[\[\w+\]\]  )", TABLE, flags=re.M)[1:]]
+_HEADS = [(re.split(r" {2,}", head), options) for head, _, options in _ROWS]
+COMMANDS = {name.strip("[]"): Command(text, run, own) for (name, run, text), own in _HEADS}
 
 
 def name_simulator(given: Sequence[str]) -> list[str]:
@@ -47,182 +251,3 @@ def name_simulator(given: Sequence[str]) -> list[str]:
                 continue
         named.append(text)
     return [f"{text}={SIMULATORS[0]}" if text == "--simulate" else text for text in named]
-
-
-def add_solve(parser: argparse.ArgumentParser) -> None:
-    """Add what `solve` takes."""
-    parser.add_argument("problem", help="problem file (TOML)")
-    parser.add_argument("-o", "--output", help="trajectory file to write (default: NAME.npz)")
-    parser.add_argument("--torques", metavar="FILE", help="also write the torques as CSV")
-    text = "write samples at this rate [Hz] instead, and say what becomes of the motion (none)"
-    parser.add_argument("--sample-rate", metavar="HZ", type=number(1e-9, 1e12), help=text)
-    text = "of samples: linear, or hold for sample-and-hold (linear)"
-    parser.add_argument("--interpolation", help=text)
-    parser.add_argument("--objective", default="time", help="time, effort or margin (time)")
-    text = "relative error of the objective below which refining ends (1e-4)"
-    parser.add_argument("--accuracy", type=number(*PLANNER["accuracy"]), help=text)
-    text = "intervals of each phase along a curve (as many as the accuracy needs)"
-    parser.add_argument("--intervals", type=number(*PLANNER["intervals"]), help=text)
-    text = "longest duration, for margin [s] (twice the least time)"
-    parser.add_argument("--duration", type=number(*PLANNER["duration"]), help=text)
-    text = "weight of time, for effort [(N m)^2] (1)"
-    parser.add_argument("--time-weight", type=number(*PLANNER["time_weight"]), help=text)
-    text = "rows per phase of the trajectory file (201)"
-    parser.add_argument("--samples", type=number(*PLANNER["samples"]), help=text)
-    text = "auto, or time for the time domain throughout (auto)"
-    parser.add_argument("--transcription", help=text)
-    text = "least acceleration of contacts that are let go, over gravity (0.01)"
-    parser.add_argument("--opening", type=number(*PLANNER["opening"]), help=text)
-    text = "least gap of contacts that were let go, over the radius of gyration (5e-4)"
-    parser.add_argument("--clearance", type=number(*PLANNER["clearance"]), help=text)
-    text = "intervals of a phase in the time domain (as many as the accuracy needs)"
-    parser.add_argument("--time-intervals", type=number(*PLANNER["time_intervals"]), help=text)
-    text = "collocation points of an interval there (3)"
-    parser.add_argument("--degree", type=number(*PLANNER["degree"]), help=text)
-    parser.add_argument("--scheme", help="radau or legendre points (radau)")
-    text = "keep the contact modes of the first plan that is found"
-    parser.add_argument("--no-mode-search", dest="mode_search", action="store_false", help=text)
-    text = "return the plan without replaying it"
-    parser.add_argument("--no-replay", dest="replay", action="store_false", help=text)
-    text = "keep limits within the problem's ranges, [uncertainty], or FACTOR times these (0)"
-    parser.add_argument(
-        "--robust",
-        metavar="FACTOR",
-        nargs="?",
-        type=number(*PLANNER["robust"]),
-        const=1.0,
-        help=text,
-    )
-    text = "also look for the largest factor with which there is a plan"
-    parser.add_argument("--largest", action="store_true", help=text)
-    text = "bound the least time along curves from below, and print the gap"
-    parser.add_argument("--certify", action="store_true", help=text)
-    _add_uniqueness_margin(parser)
-    add_cache(parser)
-    add_jobs(parser)
-    add_time_limit(parser)
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
-
-
-def add_jobs(parser: argparse.ArgumentParser) -> None:
-    """Add `--jobs` of a search for a goal."""
-    text = "processes that a search for a [goal] uses (2, or 1 where there is one core)"
-    parser.add_argument("--jobs", metavar="N", type=JOBS, help=text)
-
-
-def add_time_limit(parser: argparse.ArgumentParser) -> None:
-    """Add how long a search or planning may take."""
-    text = "longest time that this may take; a search then returns the best route so far (none)"
-    parser.add_argument("--time-limit", metavar="S", type=number(1e-3, 1e9), help=text)
-
-
-def add_cache(parser: argparse.ArgumentParser) -> None:
-    """Add where searches for a goal keep what they find."""
-    text = "folder to keep what is found out of the scene, for later searches for a goal (none); "
-    text += "nobody else may write there"
-    parser.add_argument("--cache", metavar="DIR", help=text)
-
-
-def add_verify(parser: argparse.ArgumentParser) -> None:
-    """Add what `verify` takes."""
-    parser.add_argument("problem", help="problem file (TOML)")
-    parser.add_argument("torques", help="trajectory file (.npz) or torques (.csv: t,tau1,tau2)")
-    parser.add_argument(
-        "--tolerance",
-        type=TOLERANCE,
-        default=1e-9,
-        help="of the simulator's steps, relative to the scene's scales (1e-9)",
-    )
-    text = (
-        "how far the replay may be from the plan, over the object's radius of gyration, and in rad"
-    )
-    parser.add_argument("--departure", type=DEPARTURE, help=f"{text} (1e-3)")
-    text = "speed that passes for rest, over the root of that radius times gravity"
-    parser.add_argument("--rest-speed", type=DEPARTURE, help=f"{text} (2e-2)")
-    _add_uniqueness_margin(parser)
-    text = "also list the paper's scalar equation of motion where a phase has four constraints"
-    parser.add_argument("--reduced", action="store_true", help=text)
-    text = "simulate without telling which contacts hold: whole, and a plan's phases one by one too"
-    parser.add_argument("--free", action="store_true", help=text)
-    text = "with --free: torques by this policy (.npz) instead of the plan's, from the start on"
-    parser.add_argument("--policy", metavar="FILE", help=text)
-    text = "with --policy: measured normal forces are handed to it, exact ones"
-    parser.add_argument("--sensor", action="store_true", help=text)
-    text = "Poisson's coefficient of impacts, 0 to 1, with --free (0: plastic)"
-    parser.add_argument("--restitution", type=number(0.0, 1.0), help=text)
-    text = "trajectory file to write (.npz) of the replayed motion, for plot"
-    parser.add_argument("-o", "--output", metavar="FILE", help=text)
-    parser.add_argument("--json", action="store_true", help="print the report as JSON")
-
-
-def _add_uniqueness_margin(parser: argparse.ArgumentParser) -> None:
-    text = "least uniqueness margin of contact forces: principal minors of the contact matrix "
-    text += "over those without friction, 1 without friction, 0 ambiguous (0.1)"
-    parser.add_argument("--uniqueness-margin", type=number(-1e3, 0.999), help=text)
-
-
-def add_plot(parser: argparse.ArgumentParser) -> None:
-    """Add what `plot` takes."""
-    text = "trajectory file (.npz), or torques to replay (.csv)"
-    parser.add_argument("trajectory", help=text)
-    parser.add_argument("--problem", metavar="FILE", help="problem file (TOML) for torques")
-    parser.add_argument("-o", "--output", required=True, help="figure to write (.png, .pdf, .svg)")
-    text = "overlay the simulated forces; free: simulated without telling which contacts hold"
-    parser.add_argument("--simulate", choices=SIMULATORS, metavar="[free]", help=text)
-    parser.add_argument("--width", type=number(3.0, 40.0), help="of the figure [in], 3 to 40 (10)")
-    text = "also draw the object's pose, and the joints' angles and speeds"
-    parser.add_argument("--motion", action="store_true", help=text)
-
-
-def add_predict(parser: argparse.ArgumentParser) -> None:
-    """Add what `predict` takes."""
-    parser.add_argument("problem", help="problem file (TOML)")
-    text = "figure to write (.png, .pdf, .svg) of the least normal force over speed"
-    parser.add_argument("-o", "--output", metavar="FILE", help=text)
-    text = "how hard quasistatic torques squeeze: 0 as little as needed, 1 as hard as helps (0.5)"
-    parser.add_argument("--squeeze", type=number(0.0, 1.0), default=0.5, help=text)
-    text = "write the quasistatic torques as CSV, which hand tuning starts from"
-    parser.add_argument("--torques", metavar="FILE", help=text)
-    text = "mean speed along the phases for these [m/s], over which they are spread in time (0.05)"
-    parser.add_argument("--speed", metavar="V", type=number(1e-9, 1e6), help=text)
-    parser.add_argument("--json", action="store_true", help="print everything as JSON")
-
-
-def add_tune(parser: argparse.ArgumentParser) -> None:
-    """Add what `tune` takes."""
-    parser.add_argument("problem", help="problem file (TOML)")
-    parser.add_argument("-o", "--output", metavar="FILE", help="torques to write (.csv)")
-    text = "let each phase have one more step of its torques, which stops it at its end"
-    parser.add_argument("--brake", action="store_true", help=text)
-    text = "with --brake: let a phase that fails stop up to N times on its way, 0 to 7 (0)"
-    parser.add_argument("--stops", metavar="N", type=number(0, 7), default=0, help=text)
-    text = "how hard quasistatic torques squeeze: 0 as little as needed, 1 as hard as helps (0.5)"
-    parser.add_argument("--squeeze", type=number(0.0, 1.0), default=0.5, help=text)
-    text = "raises beyond the first that reaches the end: 0 none, 1 all that keep contacts (1)"
-    parser.add_argument("--share", type=number(0.0, 1.0), default=1.0, help=text)
-    parser.add_argument("--json", action="store_true", help="print every trial as JSON")
-
-
-def add_compare(parser: argparse.ArgumentParser) -> None:
-    """Add what `compare` takes."""
-    parser.add_argument("problem", help="problem file (TOML)")
-    text = "trajectory files (.npz) or torques (.csv) for that problem"
-    parser.add_argument("files", nargs="+", metavar="FILE", help=text)
-    text = "figure to write (.png, .pdf, .svg) of the force margins of all"
-    parser.add_argument("-o", "--output", metavar="FILE", help=text)
-    parser.add_argument("--json", action="store_true", help="print everything as JSON")
-
-
-def add_map(parser: argparse.ArgumentParser) -> None:
-    """Add what `map` takes."""
-    parser.add_argument("problem", help="problem file (TOML)")
-    parser.add_argument(
-        "-o", "--output", help="figure to write (.png, .pdf, .svg; default: map_NAME.png)"
-    )
-    parser.add_argument("--plan", metavar="FILE", help="trajectory file (.npz) to draw over it")
-    parser.add_argument(
-        "--phi", metavar="LOW,HIGH", help="range of phi [deg] (default: the plan's)"
-    )
-    text = "print the formations along a route of two or more poses [m, deg] as [[phases]]"
-    parser.add_argument("--list", metavar="X,PHI", nargs="+", help=text)
-    _add_uniqueness_margin(parser)

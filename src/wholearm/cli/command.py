@@ -16,34 +16,14 @@ from typing import TYPE_CHECKING
 
 from ..common.errors import InputError, WholearmError, name_source
 from ..common.interrupts import guard
-from .arguments import (
-    Parser,
-    add_compare,
-    add_map,
-    add_plot,
-    add_predict,
-    add_solve,
-    add_tune,
-    add_verify,
-    name_simulator,
-)
+from .arguments import COMMANDS, Parser, name_simulator
 from .bench import add_bench
-from .compare import compare
-from .completion import add_completion
-from .engines import add_export, add_replay
-from .help import add_help
-from .map import draw, protect
-from .new import add_new, add_schema
+from .map import protect
 from .origin import tell_origin
 from .output import name_files, print_result
 from .overlay import overlay
-from .policy import add_policy
-from .predict import predict
 from .progress import announce, clear_progress, progress_log, show_progress
-from .robustness import add_robustness
-from .route import add_route, find, route
-from .tune import tune
-from .viewer import add_animate, add_gallery, add_report
+from .route import find
 
 if TYPE_CHECKING:
     from ..planning.result import Plan
@@ -103,43 +83,16 @@ def build_parser() -> argparse.ArgumentParser:
     parser = Parser(prog="wholearm", description="Plan and verify whole-arm manipulation.")
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    for name, add, run, text in (
-        ("new", add_new, None, "write a problem file to begin with"),
-        ("schema", add_schema, None, "print the JSON Schema of problem files, for editors"),
-        ("solve", add_solve, _solve, "plan joint torques for a problem file"),
-        ("verify", add_verify, _verify, "replay torques open loop and check the motion"),
-        ("plot", add_plot, _plot, "draw force margins, torques and snapshots"),
-        ("predict", add_predict, predict, "see up to which speed slow motions keep every contact"),
-        ("tune", add_tune, tune, "tune torques from quasistatic ones by steps of 10 percent"),
-        ("compare", add_compare, compare, "put plans and torques for a problem side by side"),
-        ("route", add_route, route, "find the contact formations that lead to a goal, and plan"),
-        ("map", add_map, draw, "draw the contact formations over (x, phi)"),
-        ("export", add_export, None, "write scene and plan for a physics engine"),
-        (
-            "replay",
-            add_replay,
-            None,
-            "replay a plan in MuJoCo or Drake and compare it with the plan",
-        ),
-        ("policy", add_policy, None, "make torques a function of the joints, by feedback"),
-        ("robustness", add_robustness, None, "see how much error a plan bears"),
-        ("animate", add_animate, None, "make a movie of a plan, or a page that plays it"),
-        ("report", add_report, None, "put a problem and its plans into one page to open anywhere"),
-        ("gallery", add_gallery, None, "plan problems and show them all on one page"),
-        ("help", add_help, None, "print a page of the documentation, or list its topics"),
-        ("completion", add_completion, None, "print what makes a shell complete all this"),
-        (
-            "bench",
-            add_bench,
-            None,
-            "run studies: measure, compare with stored answers, look for what must not be",
-        ),
-    ):
-        own = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
-        if run is not None:
-            own.set_defaults(run=run)
-        add(own)
+    for name, own in COMMANDS.items():
+        own.add(commands.add_parser(name, help=own.text, description=_to_sentence(own.text)))
+    text = "run studies: measure, compare with stored answers, look for what must not be"
+    add_bench(commands.add_parser("bench", help=text, description=_to_sentence(text)))
     return parser
+
+
+def _to_sentence(text: str) -> str:
+    """With a capital first, and a full stop."""
+    return f"{text[0].upper()}{text[1:]}."
 
 
 class _Version(argparse.Action):
@@ -150,9 +103,9 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-def _solve(options: argparse.Namespace) -> int:
-    from dataclasses import fields
-
+def solve(options: argparse.Namespace) -> int:
+    """Plan, and write the plan."""
+    from ..common.fields import keys_of
     from ..common.files import require_ending, require_writable, together
     from ..geometry.path_guess import load
     from ..planning.options import PlanOptions
@@ -161,12 +114,8 @@ def _solve(options: argparse.Namespace) -> int:
     from ..scene.ranges import find_unit_hint
 
     output = options.output or _stem(options.problem) + ".npz"
-    given = {
-        key: getattr(options, key)
-        for key in (field.name for field in fields(PlanOptions))
-        if getattr(options, key, None) is not None
-    }
-    plan_options = PlanOptions(**given)
+    given = {key: getattr(options, key) for key in keys_of(PlanOptions)}
+    plan_options = PlanOptions(**{key: own for key, own in given.items() if own is not None})
     for path, ending in ((output, ".npz"), (options.torques, ".csv")):
         if path is not None:
             require_writable(path)
@@ -238,11 +187,12 @@ def _stem(path: str) -> str:
     return os.path.splitext(os.path.basename(path))[0]
 
 
-def _verify(options: argparse.Namespace) -> int:
+def verify(options: argparse.Namespace) -> int:
+    """Replay torques, and print the verdict."""
     from ..common.files import require_ending, require_writable
     from ..problem.read import adopt_phases, read_problem
     from ..results.trajectory import Trajectory
-    from ..verification.verify import verify
+    from ..verification.verify import verify as run
 
     if options.output is not None:
         require_writable(options.output)
@@ -273,7 +223,7 @@ def _verify(options: argparse.Namespace) -> int:
         report: Report | FreeReport = _simulate_free(problem, torques, policy, given)
     else:
         announce(f"replaying {len(problem.phases)} phases")
-        report = verify(problem, torques, reduced=options.reduced, **given)
+        report = run(problem, torques, reduced=options.reduced, **given)
     if options.output is not None:
         report.trajectory.save(options.output)
     status = print_result(options, report, notes)
@@ -333,7 +283,8 @@ def _read_torques(path: str) -> Trajectory | TorqueProfile:
     return read_torque_csv(path) if csv else load_trajectory(path)
 
 
-def _plot(options: argparse.Namespace) -> int:
+def plot(options: argparse.Namespace) -> int:
+    """Draw a plan, or the replay of torques."""
     from ..common.files import require_writable
     from ..figures import plots
     from ..results.trajectory import Trajectory

@@ -9,13 +9,8 @@ from ..common.errors import InputError
 SHELLS = ("bash", "zsh", "tcsh")
 
 
-def add_completion(parser: argparse.ArgumentParser) -> None:
-    """Add what `completion` takes."""
-    parser.add_argument("shell", help="bash, zsh or tcsh; needs the extra completion")
-    parser.set_defaults(run=_print)
-
-
-def _print(options: argparse.Namespace) -> int:
+def complete(options: argparse.Namespace) -> int:
+    """Print what a shell needs."""
     if options.shell not in SHELLS:
         raise InputError("", "shell", f"{options.shell!r} given; allowed are {', '.join(SHELLS)}")
     try:

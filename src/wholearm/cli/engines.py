@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from ..common.errors import InputError, name_source
-from .arguments import DEPARTURE, STEP, number
+from ..common.fields import Range
 from .origin import tell_origin
 from .output import name_files, print_result
 from .progress import show_progress
@@ -16,45 +16,12 @@ if TYPE_CHECKING:
     from ..problem.definition import Problem
     from ..results.trajectory import Trajectory
 
-STEPS = (1e-6, 1e-1)
-"""Shortest and longest time step that is allowed, over the scene's time."""
-MOST = 6
-"""Most halvings of steps and softness."""
+STEPS = Range(1e-6, 1e-1, lambda scene, _: scene.scales.time, "times the scene's time")
+"""Time steps with which engines get along."""
 
 
-def add_export(parser: argparse.ArgumentParser) -> None:
-    """Add what `export` takes."""
-    parser.add_argument("problem", help="problem file (TOML)")
-    parser.add_argument("plan", nargs="?", help="trajectory file (.npz) that the model plays")
-    text = "file to write (.xml): the scene in MuJoCo's format"
-    parser.add_argument("--mjcf", metavar="FILE", required=True, help=text)
-    parser.add_argument("--step", type=STEP, help="time step of the model [s] (from the scene)")
-    parser.set_defaults(run=_export)
-
-
-def add_replay(parser: argparse.ArgumentParser) -> None:
-    """Add what `replay` takes."""
-    parser.add_argument("problem", help="problem file (TOML)")
-    parser.add_argument("plan", help="trajectory file (.npz)")
-    text = "mujoco or drake, installed with the extra of that name"
-    parser.add_argument("--engine", required=True, help=text)
-    text = "from start to end, instead of phase by phase from each planned start"
-    parser.add_argument("--whole", action="store_true", help=text)
-    text = "torques by this policy (.npz), at its own period, instead of the plan's by the clock"
-    parser.add_argument("--policy", metavar="FILE", help=text)
-    parser.add_argument("--step", type=STEP, help="longest time step [s] (from the scene)")
-    text = "softness of contacts, over the default, which is in proportion to the step (1)"
-    parser.add_argument("--softness", type=number(1e-6, 1e6), help=text)
-    text = "how far a replay may be from the plan, over the object's radius of gyration, and in rad"
-    words = "3e-3 for mujoco, 1.5e-3 for drake; of a policy's end, 3e-2"
-    parser.add_argument("--departure", type=DEPARTURE, help=f"{text} ({words})")
-    text = "also replay with steps of a half, a quarter, ... to N halvings (0)"
-    parser.add_argument("--refine", type=number(0, MOST), metavar="N", default=0, help=text)
-    parser.add_argument("--json", action="store_true", help="print the report as JSON")
-    parser.set_defaults(run=_replay)
-
-
-def _export(options: argparse.Namespace) -> int:
+def export(options: argparse.Namespace) -> int:
+    """Write the scene, with a plan if one is given."""
     from ..common.files import require_ending, require_writable, write_text
     from ..engines.mjcf import write_mjcf
     from ..problem.read import read_problem
@@ -63,7 +30,7 @@ def _export(options: argparse.Namespace) -> int:
     require_ending(options.mjcf, ".xml")
     problem = read_problem(options.problem)
     if options.step is not None:
-        _read_step(options.step, problem.scene.scales.time)
+        STEPS.check("--step", options.step, "s", problem.scene)
     plan = None
     if options.plan is not None:
         problem, plan = _load_plan(options.plan, problem)
@@ -74,16 +41,18 @@ def _export(options: argparse.Namespace) -> int:
     return 0
 
 
-def _replay(options: argparse.Namespace) -> int:
+def replay(options: argparse.Namespace) -> int:
+    """Replay a plan, and print the report."""
     from ..engines.replay import ENGINES, replay_in, require_engine
     from ..problem.read import read_problem
 
     require_engine(options.engine)
     problem = read_problem(options.problem)
     problem, plan = _load_plan(options.plan, problem)
-    setting, time = ENGINES[options.engine].setting, problem.scene.scales.time
+    setting = ENGINES[options.engine].setting
     if options.step is not None:
-        setting = setting._replace(step=_read_step(options.step, time))
+        STEPS.check("--step", options.step, "s", problem.scene)
+        setting = setting._replace(step=options.step / problem.scene.scales.time)
     if options.softness is not None:
         setting = setting._replace(softness=options.softness)
     if options.policy is not None:
@@ -130,15 +99,6 @@ def _play_policy(
             progress=show_progress(),
         )
     return print_result(options, report, notes)
-
-
-def _read_step(step: float, time: float) -> float:
-    """A time step over the scene's time, if it is one that engines get along with."""
-    least, most = (share * time for share in STEPS)
-    if not least <= step <= most:
-        text = f"{step:g} s given; allowed are {least:.3g} to {most:.3g} s"
-        raise InputError("", "--step", text)
-    return step / time
 
 
 def _load_plan(path: str, problem: Problem) -> tuple[Problem, Trajectory]:

@@ -36,14 +36,8 @@ TOPICS = {
 """Folder of the page of each topic."""
 
 
-def add_help(parser: argparse.ArgumentParser) -> None:
-    """Add what `help` takes."""
-    text = "what the page is about (left out: list the topics)"
-    parser.add_argument("topic", nargs="?", choices=tuple(TOPICS), metavar="TOPIC", help=text)
-    parser.set_defaults(run=_show)
-
-
-def _show(options: argparse.Namespace) -> int:
+def show(options: argparse.Namespace) -> int:
+    """Print a page, or the topics."""
     if options.topic is not None:
         print(read_page(TOPICS[options.topic]), end="")
         return 0

@@ -6,33 +6,12 @@ import argparse
 import os
 from typing import TYPE_CHECKING
 
-from .arguments import number
-
 if TYPE_CHECKING:
     from ..common.arrays import Array
 
 
-def add_new(parser: argparse.ArgumentParser) -> None:
-    """Add what `new` takes."""
-    parser.add_argument("name", help="the problem's name; NAME.toml is written")
-    text = "corners of the regular polygon, 3 to 50 (7)"
-    parser.add_argument("--polygon", type=number(3, 50), default=7, metavar="CORNERS", help=text)
-    text = "from its centre to its corners [m] (0.05)"
-    parser.add_argument("--size", type=number(1e-6, 1e6), default=0.05, help=text)
-    text = "corners of the object instead, anticlockwise [m], as in '0,0 0.08,0 0.08,0.03 0,0.09'"
-    parser.add_argument("--vertices", metavar="'X,Y ...'", help=text)
-    text = "of the object [kg] (0.2 at a size of 0.05 m, growing with the area)"
-    parser.add_argument("--mass", type=number(1e-6, 1e6), help=text)
-    parser.set_defaults(run=_write)
-
-
-def add_schema(parser: argparse.ArgumentParser) -> None:
-    """Add what `schema` takes."""
-    parser.add_argument("-o", "--output", metavar="FILE", help="file to write, instead of printing")
-    parser.set_defaults(run=_show_schema)
-
-
-def _write(options: argparse.Namespace) -> int:
+def write(options: argparse.Namespace) -> int:
+    """Write a problem file."""
     from ..common.errors import InputError, name_source
     from ..common.files import require_writable, write_text
     from ..mapping.template import write_template
@@ -63,12 +42,14 @@ def _read_vertices(text: str) -> Array:
         raise InputError("", "--vertices", given) from None
 
 
-def _show_schema(options: argparse.Namespace) -> int:
-    from importlib import resources
+def show_schema(options: argparse.Namespace) -> int:
+    """Print or write the schema, or the tables of keys."""
+    import json
 
     from ..common.files import require_writable, write_text
+    from ..problem.keys import build_schema, write_page
 
-    text = resources.files("wholearm.problem").joinpath("schema.json").read_text(encoding="utf-8")
+    text = write_page() if options.table else json.dumps(build_schema(), indent=2) + "\n"
     if options.output is None:
         print(text, end="")
         return 0

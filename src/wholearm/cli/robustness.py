@@ -10,7 +10,6 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from ..common.errors import InputError
-from .arguments import JOBS, TOLERANCE, number
 from .origin import tell_origin
 from .output import name_files, print_result
 from .progress import show_progress
@@ -22,54 +21,8 @@ if TYPE_CHECKING:
     from ..robustness.uncertainty import Uncertainty
 
 
-def add_robustness(parser: argparse.ArgumentParser) -> None:
-    """Add what `robustness` takes."""
-    parser.add_argument("problem", help="problem file (TOML)")
-    parser.add_argument("plan", help="trajectory file (.npz)")
-    text = "samples to replay, a Latin hypercube of all ranges (1000)"
-    parser.add_argument("--samples", type=number(1, 10**6), default=1000, help=text)
-    parser.add_argument("--seed", type=number(0, 2**63), default=0, help="of the samples (0)")
-    text = "only this phase, from its planned start at rest (default: the whole plan)"
-    parser.add_argument("--phase", type=number(1, 1000), metavar="K", help=text)
-    text = "torques by this policy (.npz), at its own period, instead of the plan's by the clock"
-    parser.add_argument("--policy", metavar="FILE", help=text)
-    text = "with --policy: measured normal forces are handed to it, exact ones"
-    parser.add_argument("--sensor", action="store_true", help=text)
-    text = (
-        "half widths of ranges, instead of the problem's: mass, inertia (0.05), friction (0.1), "
-        "gain of the torques (0.01), "
-        "all relative; geometry, start_x [m] (6e-3 radii of gyration), "
-        "delay (1e-3 s); 0 leaves a number as it is"
-    )
-    parser.add_argument("--vary", metavar="NAME=WIDTH", nargs="+", default=[], help=text)
-    text = "of a sample-and-hold of the torques [Hz] (1000; 0: torques as planned)"
-    parser.add_argument(
-        "--sample-rate", type=number(0.0, 1e6), metavar="HZ", default=1000.0, help=text
-    )
-    text = "of the simulations, relative to the scene's scales (1e-6)"
-    parser.add_argument("--tolerance", type=TOLERANCE, default=1e-6, help=text)
-    text = "how far from the plan's end the goal counts as reached [m] (0.03 radii of gyration)"
-    parser.add_argument("--goal-distance", type=number(1e-9, 1e6), metavar="M", help=text)
-    text = "and how far from its angle [degrees] (1)"
-    parser.add_argument(
-        "--goal-angle", type=number(1e-9, 360.0), metavar="DEG", default=1.0, help=text
-    )
-    text = "file to write results to, one by one (default: NAME_robustness.jsonl, with phase and "
-    text += "policy in the name); a study that is there goes on where it was stopped"
-    parser.add_argument("-o", "--output", metavar="FILE", help=text)
-    parser.add_argument(
-        "--fresh", action="store_true", help="begin the file anew, whatever it holds"
-    )
-    text = "also draw the motion with its noisy copies (.png, .pdf, .svg)"
-    parser.add_argument("--figure", metavar="FILE", help=text)
-    parser.add_argument("--jobs", type=JOBS, help="worker processes (default: all cores)")
-    text = "run on the cluster of this Dask scheduler (extra: cluster)"
-    parser.add_argument("--scheduler", metavar="ADDRESS", help=text)
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
-    parser.set_defaults(run=_robustness)
-
-
-def _robustness(options: argparse.Namespace) -> int:
+def robustness(options: argparse.Namespace) -> int:
+    """Replay samples, and print what becomes of them."""
     from ..common.files import require_ending, require_writable
     from ..policy.policy import Policy
     from ..problem.read import adopt_phases, read_problem

@@ -9,7 +9,6 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .arguments import add_cache, add_jobs, add_time_limit, number
 from .progress import clear_progress, show_progress
 
 if TYPE_CHECKING:
@@ -19,21 +18,6 @@ if TYPE_CHECKING:
 
 MOST_JOBS = 2
 """Most processes of a search if nothing else is asked for: there is seldom more to share out."""
-
-
-def add_route(parser: argparse.ArgumentParser) -> None:
-    """Add what `route` takes."""
-    parser.add_argument("problem", help="problem file (TOML) with [goal] in place of [[phases]]")
-    text = "figure to write (.png, .pdf, .svg) of the route over the map"
-    parser.add_argument("-o", "--output", metavar="FILE", help=text)
-    text = "how many routes of other formations are listed beside the best one (0)"
-    parser.add_argument("--alternatives", metavar="N", type=number(0, 100), default=0, help=text)
-    text = "of the plans: time, effort or margin (time); routes are looked for by time"
-    parser.add_argument("--objective", default="time", help=text)
-    add_cache(parser)
-    add_jobs(parser)
-    add_time_limit(parser)
-    parser.add_argument("--json", action="store_true", help="print everything as JSON")
 
 
 def route(options: argparse.Namespace) -> int:

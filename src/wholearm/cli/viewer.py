@@ -5,43 +5,13 @@ from __future__ import annotations
 import argparse
 import os
 
-from .arguments import SIMULATORS, number
 from .output import name_files
 from .overlay import overlay
 from .progress import show_progress
 
 
-def add_animate(parser: argparse.ArgumentParser) -> None:
-    """Add what `animate` takes."""
-    parser.add_argument("trajectory", help="trajectory file (.npz)")
-    text = "what to write: .gif, .mp4 (needs ffmpeg), or .html, which plays in any browser"
-    parser.add_argument("-o", "--output", required=True, metavar="FILE", help=text)
-    text = "speed over real time (0.1: ten times slower)"
-    parser.add_argument("--speed", type=number(1e-6, 1e3), default=0.1, help=text)
-    text = "draw the simulated motion behind; free: simulated without telling which contacts hold"
-    parser.add_argument("--simulate", choices=SIMULATORS, metavar="[free]", help=text)
-    parser.set_defaults(run=_animate)
-
-
-def add_report(parser: argparse.ArgumentParser) -> None:
-    """Add what `report` takes."""
-    parser.add_argument("problem", help="problem file (TOML)")
-    text = "trajectory files (.npz) or torques (.csv); none: plan the least time"
-    parser.add_argument("files", nargs="*", metavar="PLAN", help=text)
-    text = "page to write (default: NAME.html)"
-    parser.add_argument("-o", "--output", metavar="FILE", help=text)
-    parser.set_defaults(run=_report)
-
-
-def add_gallery(parser: argparse.ArgumentParser) -> None:
-    """Add what `gallery` takes."""
-    parser.add_argument("files", nargs="+", metavar="PROBLEM", help="problem files (TOML)")
-    text = "page to write (.md); figures and movies go to a folder beside it (results/gallery.md)"
-    parser.add_argument("-o", "--output", metavar="FILE", default="results/gallery.md", help=text)
-    parser.set_defaults(run=_gallery)
-
-
-def _gallery(options: argparse.Namespace) -> int:
+def gallery(options: argparse.Namespace) -> int:
+    """Plan problems, and write their page."""
     from ..common.files import require_ending, require_writable
     from ..viewer.gallery import write_gallery
 
@@ -52,7 +22,8 @@ def _gallery(options: argparse.Namespace) -> int:
     return 0
 
 
-def _animate(options: argparse.Namespace) -> int:
+def animate(options: argparse.Namespace) -> int:
+    """Write a movie, or a page."""
     from ..common.errors import name_source
     from ..common.files import require_ending, require_writable, write_text
     from ..problem.read import read_own_problem
@@ -80,7 +51,8 @@ def _animate(options: argparse.Namespace) -> int:
     return 0
 
 
-def _report(options: argparse.Namespace) -> int:
+def report(options: argparse.Namespace) -> int:
+    """Write the page of a problem and its plans."""
     import tempfile
     from pathlib import Path
 

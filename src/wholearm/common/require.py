@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from numbers import Real
+from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import ArrayLike
-
-from .arrays import Array
 from .errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from .arrays import Array
 
 
 def require_number(
@@ -16,7 +19,7 @@ def require_number(
 ) -> float:
     """Return `value` as a finite float, or raise `InputError` naming `key`."""
     allowed = "a positive number" if positive else "a number >= 0" if nonnegative else "a number"
-    real = isinstance(value, int | float | np.integer | np.floating)
+    real = isinstance(value, Real)
     try:
         result = float(value) if real and not isinstance(value, bool) else math.nan  # type: ignore[arg-type]
     except OverflowError:
@@ -42,6 +45,8 @@ def read_share(value: str, key: str) -> float:
 
 def require_vector(value: object, key: str, size: int) -> Array:
     """Return `value` as a read-only float array of `size` finite numbers, or raise `InputError`."""
+    import numpy as np
+
     if not isinstance(value, list | tuple | np.ndarray) or len(value) != size:
         raise InputError("", key, f"{value!r} is not a list of {size} numbers")
     return frozen([require_number(item, key) for item in value])
@@ -49,6 +54,8 @@ def require_vector(value: object, key: str, size: int) -> Array:
 
 def frozen(value: ArrayLike) -> Array:
     """Return a read-only float array."""
+    import numpy as np
+
     array = np.array(value, dtype=float)
     array.setflags(write=False)
     return array

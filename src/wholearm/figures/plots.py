@@ -96,9 +96,7 @@ def force_margins(
     _, trajectory = narrow(what)
     if trajectory is None:
         raise InputError("", "", "torques alone have no motion to draw; simulate them")
-    if not WIDTHS[0] <= require_number(width, "width") <= WIDTHS[1]:
-        allowed = f"{WIDTHS[0]:g} to {WIDTHS[1]:g} in"
-        raise InputError("", "width", f"{width:g} given; allowed are {allowed}")
+    width = WIDTHS.read(width, "width")
     meta = trajectory.meta
     problem = read_own_problem(meta)
     epsilon = require_number(meta.get("epsilon", problem.epsilon), "meta.epsilon")

@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ..common.fields import Range
+
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
 WIDTH = 10.0
 """Width of a figure, unless another one is asked for [in]."""
-WIDTHS = (3.0, 40.0)
+WIDTHS = Range(3.0, 40.0)
 """Least and largest width [in]."""
 # Okabe and Ito's colours without yellow and black, which here are Tol's wine and a grey.
 PALETTE = (

@@ -23,7 +23,8 @@ from ..contacts.closing import (
     evaluate_contacts,
 )
 from ..contacts.elemental import Contact
-from ..mechanics.uniqueness import UNIQUENESS_MARGIN, require_uniqueness_margin
+from ..mechanics.keys import UNIQUENESS
+from ..mechanics.uniqueness import UNIQUENESS_MARGIN
 from ..problem.definition import Problem
 from ..scene.model import Scene
 from .borders import NOWHERE, Piece, Window, label_cells, list_tracks, name_contacts
@@ -182,7 +183,7 @@ def build_map(
     """
     if resolution < 10:
         raise InputError("", "resolution", f"{resolution!r} given; allowed is 10 or more")
-    limit = require_uniqueness_margin(uniqueness_margin)
+    limit = UNIQUENESS.read(uniqueness_margin, UNIQUENESS.name)
     scene, report = problem.scene, progress or (lambda text: None)
     report("map: cells")
     window = window or choose_window(problem)

@@ -28,31 +28,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..common.arrays import Array
-from ..common.errors import InputError
-from ..common.require import require_number
 from ..contacts.formation import Formation, Kinematics
+from .keys import UNIQUENESS
 
-UNIQUENESS_MARGIN = 0.1
-"""Least uniqueness margin of a plan: coefficients of friction are not known to better than a
-tenth."""
+UNIQUENESS_MARGIN: float = UNIQUENESS.default
 _INDEPENDENT = 1e-12
 """Least Gram determinant of the rows of contacts, each of length one, at which they are
 independent."""
 _SLIDES, _STICKS, _SLIPS = " ", " sticking", (" slipping +", " slipping -")
-
-
-def require_uniqueness_margin(value: float) -> float:
-    """A least uniqueness margin that can be asked for: below 1, negative ones too.
-
-    Raises
-    ------
-    InputError
-        If it is not.
-    """
-    given = require_number(value, "uniqueness_margin")
-    if given >= 1:
-        raise InputError("", "uniqueness_margin", f"{given:g} given; allowed are numbers below 1")
-    return given
 
 
 def describe_uniqueness(ratio: float, contacts: str, place: str, least: float) -> str:

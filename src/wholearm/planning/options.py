@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import Any
 
-import numpy as np
-
-from ..common.bounds import PLANNER
 from ..common.errors import InputError
-from ..mechanics.uniqueness import UNIQUENESS_MARGIN, require_uniqueness_margin
-from ..problem.uncertainty import PARAMETERS, read_widths
+from ..common.fields import declare, read_keys
+from ..common.options import read_options
+from ..mechanics.keys import UNIQUENESS
 
 
 class Objective(Enum):
@@ -29,24 +28,43 @@ class Objective(Enum):
     """Least relaxation of one limit; used to say what would make a plan possible."""
 
 
-CHOICES = tuple(
-    choice.value for choice in Objective if choice not in (Objective.ELASTIC, Objective.RELAX)
-)
+CHOICES = ("time", "effort", "margin")
 """Objectives that a user can ask for."""
+PLANNER = """\
+--objective NAME    time, effort or margin = time among time|effort|margin
+--accuracy          relative error of the objective below which refining ends = 1e-4 in 1e-8..0.1
+--intervals         intervals of each phase along a curve (as many as the accuracy needs)
+    in 10..5000
+--duration          longest duration, for margin [s] (twice the least time) in 1e-9..1e9
+--time-weight       weight of time, for effort [(N m)^2] = 1 in 1e-30..1e30
+--samples           rows per phase of the trajectory file = 201 in 2..100000
+--transcription NAME  auto, or time for the time domain throughout = auto among auto|time
+--opening           least acceleration of contacts that are let go, over gravity = 0.01 in 0.0..100
+--clearance         least gap of contacts that were let go, over the radius of gyration
+    = 5e-4 in 0.0..1
+--time-intervals    intervals of a phase in the time domain (as many as the accuracy needs)
+    in 4..1000
+--degree            collocation points of an interval there = 3 in 2..6
+--scheme NAME       radau or legendre points = radau among radau|legendre
+--no-mode-search    keep the contact modes of the first plan that is found
+--no-replay         return the plan without replaying it
+--robust [FACTOR]   keep limits within the problem's ranges, [uncertainty], or FACTOR times these
+    = 0 in 0.0..1000
+--largest           also look for the largest factor with which there is a plan
+--certify           bound the least time along curves from below, and print the gap
+"""
+"""What takes more than these ranges takes memory or hours for nothing."""
+_FIELDS = [option.field for option in read_options(PLANNER)]
+_DEFAULTS: dict[str, Any] = {own.name: own.default for own in _FIELDS}
+DEFAULT_ACCURACY: float = _DEFAULTS["accuracy"]
+OPENING: float = _DEFAULTS["opening"]
+CLEARANCE: float = _DEFAULTS["clearance"]
 
-_LEFT_OUT = ("intervals", "time_intervals", "duration")
-"""Options that the planner chooses where they are not given."""
-DEFAULT_ACCURACY = 1e-4
-"""The error that is asked for by default."""
-OPENING = 0.01
-"""Least acceleration of a gap that opens, over gravity."""
-CLEARANCE = 5e-4
-"""Least gap of a contact that has been let go, over the radius of gyration."""
 
-
+@declare(*_FIELDS, UNIQUENESS)
 @dataclass(frozen=True)
 class PlanOptions:
-    """Options of the planner, each as `wholearm.solve` documents it.
+    """Options of the planner.
 
     `ranges` are the radii of a problem's ranges, by name, which `scale_ranges` fills in.
 
@@ -57,49 +75,28 @@ class PlanOptions:
     """
 
     objective: Objective | str = Objective.TIME
-    intervals: int | None = None
-    time_weight: float = 1.0
-    duration: float | None = None
-    samples: int = 201
-    transcription: str = "auto"
-    time_intervals: int | None = None
-    opening: float = OPENING
-    clearance: float = CLEARANCE
-    degree: int = 3
-    scheme: str = "radau"
-    replay: bool = True
-    mode_search: bool = True
-    certify: bool = False
-    accuracy: float = DEFAULT_ACCURACY
-    uniqueness_margin: float = UNIQUENESS_MARGIN
-    robust: float = 0.0
-    largest: bool = False
+    intervals: int | None = _DEFAULTS["intervals"]
+    time_weight: float = _DEFAULTS["time_weight"]
+    duration: float | None = _DEFAULTS["duration"]
+    samples: int = _DEFAULTS["samples"]
+    transcription: str = _DEFAULTS["transcription"]
+    time_intervals: int | None = _DEFAULTS["time_intervals"]
+    opening: float = _DEFAULTS["opening"]
+    clearance: float = _DEFAULTS["clearance"]
+    degree: int = _DEFAULTS["degree"]
+    scheme: str = _DEFAULTS["scheme"]
+    replay: bool = _DEFAULTS["replay"]
+    mode_search: bool = _DEFAULTS["mode_search"]
+    certify: bool = _DEFAULTS["certify"]
+    accuracy: float = _DEFAULTS["accuracy"]
+    uniqueness_margin: float = UNIQUENESS.default
+    robust: float = _DEFAULTS["robust"]
+    largest: bool = _DEFAULTS["largest"]
     ranges: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        given = self.objective
-        if given not in CHOICES and given not in [Objective(choice) for choice in CHOICES]:
-            raise InputError("", "objective", f"{given!r} given; allowed are {', '.join(CHOICES)}")
-        object.__setattr__(self, "objective", Objective(given))
-        for key, bounds in PLANNER.items():
-            value = getattr(self, key)
-            if value is not None or key not in _LEFT_OUT:
-                if isinstance(value, np.number):
-                    value = value.item()
-                bounds.check(key, value)
-                object.__setattr__(self, key, value if bounds.whole else float(value))
-        if self.scheme not in ("radau", "legendre"):
-            given = self.scheme
-            raise InputError("", "scheme", f"{given!r} given; allowed are radau and legendre")
-        if self.transcription not in ("auto", "time"):
-            given = self.transcription
-            raise InputError("", "transcription", f"{given!r} given; allowed are auto and time")
-        for key in ("replay", "mode_search", "certify", "largest"):
-            if not isinstance(value := getattr(self, key), bool):
-                raise InputError("", key, f"{value!r} given; allowed are true and false")
-        object.__setattr__(
-            self, "uniqueness_margin", require_uniqueness_margin(self.uniqueness_margin)
-        )
+        read_keys(self)
+        object.__setattr__(self, "objective", Objective(self.objective))
         if self.duration is not None and self.objective is not Objective.MARGIN:
             raise InputError("", "duration", "is for the objective margin only")
         if self.certify and self.objective in (Objective.EFFORT, Objective.MARGIN):
@@ -111,6 +108,8 @@ class PlanOptions:
 
     def scale_ranges(self, given: Mapping[str, float], factor: float | None = None) -> PlanOptions:
         """The same with ranges of so many times a problem's own, or as many as `robust` says."""
+        from ..problem.uncertainty import PARAMETERS, read_widths
+
         factor = self.robust if factor is None else factor
         ranges = (
             {key: factor * width for key, width in read_widths(given).items()} if factor else {}

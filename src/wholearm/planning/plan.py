@@ -59,40 +59,8 @@ def solve(
         Told in a few words what is being done.
     time_limit : float, optional, [s]
         Longest time that planning may take.
-    accuracy : float, default 1e-4
-        Relative error of the objective, from 1e-8 to 0.1, below whose estimate refining ends.
-    intervals : int, optional
-        Of the grid of each phase along a curve, at least 10; by default what the accuracy needs.
-    time_weight : float, default 1, [(N m)^2]
-        Weight of the duration against the effort, for `effort`.
-    duration : float, optional, [s]
-        What `margin` may take for all phases together; by default twice the least time.
-    samples : int, default 201
-        Rows per phase of the trajectory, at least 2.
-    transcription : {"auto", "time"}
-        Phases with one freedom along their curves and others in the time domain, or all there.
-    time_intervals : int, optional
-        Of each phase in the time domain, at least 4; by default 32 for a phase with one freedom
-        that is planned alone and 10 for others.
-    degree, scheme : int, default 3; {"radau", "legendre"}
-        Number of collocation points per interval in the time domain, from 2 to 6, and which.
-    opening, clearance : float, default 0.01, 5e-4
-        Least acceleration of the gap of a contact let go there, over gravity, and least gap over
-        the object's radius of gyration, from a third of the first stage on.
-    mode_search : bool, default True
-        Whether contact modes are changed, in the time domain, for as long as that betters a plan.
-    replay : bool, default True
-        Whether to replay the plan, to refine what does not hold and to return only what does.
-    robust : float, default 0
-        Factor on the problem's ranges (`uncertainty`), within which all limits of contact forces
-        hold at the planned places and speeds, under the planned torques; with 0 they do not count.
-    largest : bool, default False
-        Whether to look for the largest such factor with which there is a plan.
-    certify : bool, default False
-        Whether to bound the least time along curves from below, for `time`.
-    uniqueness_margin : float, default 0.1, below 1
-        Least uniqueness margin (`mechanics.uniqueness`): contact forces are the only ones where it
-        is positive, and at 0.1 still with a tenth more friction.
+    **options : Any
+        Fields of `PlanOptions`, which says what they are.
 
     Returns
     -------

@@ -11,20 +11,14 @@ from itertools import zip_longest
 import numpy as np
 
 from ..common.errors import InputError
+from ..common.fields import keys_of
 from ..common.require import require_number, require_vector
 from ..common.sharing import exclusive
 from ..contacts.formation import Formation, describe, find_touching
 from ..contacts.links import evaluate_finger_gap
 from ..contacts.reach import name_reach
 from ..scene.model import Scene
-from ..scene.ranges import (
-    TURN,
-    check_epsilon,
-    check_place,
-    check_ranges,
-    check_settle,
-    check_settle_gap,
-)
+from ..scene.ranges import TURN, check_place, check_ranges
 from .definition import ROWS, End, Phase, Problem
 from .goal import check_goal, name_goal
 from .uncertainty import spread_widths
@@ -39,22 +33,15 @@ def check_problem(problem: Problem) -> None:
     InputError
         For the first thing that is wrong.
     """
-    if not isinstance(problem.name, str):
-        raise InputError("", "name", f"{problem.name!r} is not a string")
-    epsilon = require_number(problem.epsilon, "epsilon", nonnegative=True)
     check_ranges(problem.scene)
-    check_epsilon(problem.scene, epsilon)
+    for attribute, own in keys_of(Problem).items():
+        value = own.read(getattr(problem, attribute), own.name)
+        own.check(value, own.name, problem.scene)
     spread_widths(problem.uncertainty or {}, "uncertainty.{}")
     check_place(problem.scene, "start.x", float(require_vector(problem.start, "start", 5)[0]))
-    if not problem.settle_share:
-        settle = require_number(problem.settle, "settle", nonnegative=True)
-        check_settle(problem.scene, "settle", settle)
     if problem.scene.actuator_lag.any() and problem.is_settled:
         text = "what holds an end may take all of a torque limit: with actuator_lag allowed is 0"
         raise InputError("", "settle", text)
-    if problem.settle_gap is not None:
-        gap = require_number(problem.settle_gap, "settle_gap", positive=True)
-        check_settle_gap(problem.scene, gap)
     for index, phase in enumerate(problem.phases):
         if phase.index != index:
             text = f"has the index {phase.index}; phases count up from 0, which makes it {index}"
@@ -132,9 +119,8 @@ def _check_until(scene: Scene, phase: Phase, key: str) -> None:
 
 def _check_settle(scene: Scene, phase: Phase, key: str) -> None:
     """Check for how long the end of a phase is held, if it says so itself."""
-    if phase.settle is None:
-        return
-    check_settle(scene, key, require_number(phase.settle, key, nonnegative=True))
+    own = keys_of(Phase)["settle"]
+    own.check(own.read(phase.settle, key), key, scene)
     if phase.settle and phase.end is End.SMOOTH:
         raise InputError("", key, f"{phase.settle:g} given, but the phase has end = 'smooth'")
 

@@ -10,10 +10,13 @@ from typing import Any
 
 from ..common.arrays import Array
 from ..common.errors import InputError, name_source
+from ..common.fields import NONNEGATIVE, POSITIVE, TEXT, Kind, choice, declare, key, leave
 from ..common.require import read_share
 from ..contacts.elemental import Contact
 from ..contacts.formation import Formation
 from ..scene.model import Scene
+from ..scene.ranges import EPSILON, SETTLE
+from ..scene.ranges import SETTLE_GAP as GAP_RANGE
 from .goal import Goal
 from .table import change_table, match_table, write_table
 from .uncertainty import read_widths
@@ -33,6 +36,20 @@ class End(Enum):
     """Position and velocity are continuous: a contact is gained softly or released."""
     IMPACT = "impact"
     """A contact is gained at speed: the velocity jumps onto the next phase's contacts."""
+
+
+def _name_contact(more: str = "") -> dict[str, str]:
+    """JSON Schema of the name of a contact, and of what may follow it."""
+    return {"type": "string", "pattern": f"^([ev][0-9]+-tip[12]|v[0-9]+-(palm|finger[12])){more}$"}
+
+
+CONTACT = _name_contact()
+"""JSON Schema of the name of a contact."""
+DWELL = Kind(
+    lambda given, key: (read_share if isinstance(given, str) else NONNEGATIVE.read)(given, key),
+    {"anyOf": [NONNEGATIVE.schema, {"type": "string", "pattern": "^[^%]+%\\s*$"}]},
+)
+"""A time, or a share of the motion's."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +107,29 @@ class Until:
         return ", ".join(parts)
 
 
+@declare(
+    key(
+        "contacts",
+        "Contacts that touch throughout, such as v1-palm, v3-finger1, e2-tip1; with ' rolling' "
+        "behind it one does not slide.",
+        leave({"type": "array", "minItems": 1, "items": _name_contact("( rolling)?")}),
+        attribute="formation",
+    ),
+    key(
+        "until",
+        "What ends the phase: a contact that is gained, or a coordinate; with two freedoms also "
+        "both, or both coordinates, the first of which ends it. Left out with end = 'smooth': "
+        "where the planner lets a contact go.",
+        leave({}),
+        default=None,
+    ),
+    key("end", "How the phase passes into the next one.", choice(*(end.value for end in End))),
+    key(
+        "settle",
+        "For how long its end is held, instead of the problem's [s].",
+        *(NONNEGATIVE, "time", SETTLE),
+    ),
+)
 @dataclass(frozen=True, eq=False)
 class Phase:
     """A stretch of the motion on one contact formation.
@@ -99,11 +139,7 @@ class Phase:
     index : int
         From 0; messages and files count from 1.
     formation : Formation
-    until : Until
-    end : End
-        How it passes into the next phase; the last one ends at rest.
-    settle : float or None, [s]
-        For how long its end is held, if it comes to rest there; the problem's if left out.
+        Of its contacts.
     """
 
     index: int
@@ -124,16 +160,24 @@ class Phase:
         return replace(self, formation=replace(self.formation, scene=scene))
 
 
+@declare(
+    key("name", "", TEXT, default="unnamed"),
+    key("epsilon", "Least normal force of every contact [N].", NONNEGATIVE, "force", EPSILON),
+    key(
+        "settle",
+        "For how long ends at rest are held, so that contacts close [s]; or a share of the "
+        'motion\'s time for all of them, such as "10 %".',
+        *(DWELL, "time", SETTLE),
+    ),
+    key("settle_gap", "From how far open they then close [m].", POSITIVE, "length", GAP_RANGE),
+)
 @dataclass(frozen=True, eq=False)
 class Problem:
     """A manipulation to plan.
 
     Attributes
     ----------
-    name : str
     scene : Scene
-    epsilon : float, [N]
-        Least normal force of every contact.
     start : ndarray, shape (5,)
         Configuration z at the start, with the fingers closed; see `place_start`.
     phases : tuple of Phase
@@ -146,12 +190,6 @@ class Problem:
     uncertainty : mapping or None
         Half widths of the ranges of what is not known exactly, by name; those that are left out
         have their defaults, see `problem.uncertainty`. None where the problem does not say.
-    settle : float, [s], or str
-        For how long phases that come to rest are held at their ends, so that contacts close that
-        are still open; a phase may have its own. Or a share of the motion's time, as in "10 %",
-        for all of them that have none: the planner shares it out.
-    settle_gap : float or None, [m]
-        By how much they may be open; `SETTLE_GAP` of the scene's length if left out.
     checked : bool
         Whether it is known to be like one from a file; otherwise it is checked when it is made.
     goals : tuple of Goal
@@ -207,12 +245,9 @@ class Problem:
             New values by dotted keys as messages write them, such as ``fingers.1.base`` or
             ``phases[2].until``, or by the short names of `named`.
         **named
-            `name`, `epsilon`, `gravity` and the other keys at the top of a problem file; `mass`,
-            `inertia`, `vertices` of the object; `friction` of all parts, or `friction_palm`,
-            `friction_finger1`, `friction_finger2`; `flush`, `x` of the start; `length`, `radius`,
-            `finger_inertia`, `viscous`, `dry`, `torque_limit`, `speed_limit`, `torque_rate_limit`,
-            `actuator_lag` of both fingers, or of one as in `torque_limit1`; `base1`, `base2`. None
-            leaves out what is optional.
+            Keys of a problem file: those at the top, of the object, of the start, of both fingers
+            or of one as in `torque_limit1`; `finger_inertia`; `friction` of all parts or of one as
+            in `friction_palm`. None leaves out what is optional.
 
         Raises
         ------
@@ -221,10 +256,11 @@ class Problem:
         """
         if not self.table:
             raise InputError(self.source, "", "the problem has no table that could be changed")
-        from .read import NAMES, build_problem
+        from .keys import name_keys
+        from .read import build_problem
 
         with name_source(self.source):
-            table = change_table(self.table, {**(changes or {}), **named}, NAMES)
+            table = change_table(self.table, {**(changes or {}), **named}, name_keys())
         return build_problem(table, self.source)
 
     @property

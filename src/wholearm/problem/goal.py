@@ -8,26 +8,29 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..common.errors import InputError
+from ..common.fields import NUMBER, declare, key, leave
 from ..common.require import require_number
 from ..scene.model import Scene
-from ..scene.ranges import TURN, check_place
+from ..scene.ranges import PLACE, TURN, check_place
 
+INDEX = leave({"type": "integer", "minimum": 0})
+"""Number of an edge."""
 _ALLOWED = "allowed is a table with flush or phi_deg, and x"
 
 
+@declare(
+    key("flush", "The edge that shall lie on the palm.", INDEX),
+    key(
+        "phi_deg",
+        "The angle that the object shall have instead [degrees].",
+        *(NUMBER, "", TURN),
+        attribute="phi",
+    ),
+    key("x", "Of the centroid [m]; anywhere if it is left out.", NUMBER, "length", PLACE),
+)
 @dataclass(frozen=True)
 class Goal:
-    """Where the object shall come to rest.
-
-    Attributes
-    ----------
-    flush : int or None
-        The edge that shall lie on the palm, in whichever turn.
-    phi : float or None, [rad]
-        The angle that the object shall have instead; one of the two is given.
-    x : float or None, [m]
-        Of its centroid; anywhere if it is None.
-    """
+    """Where the object shall come to rest: with an edge on the palm or at an angle, phi [rad]."""
 
     flush: int | None = None
     phi: float | None = None

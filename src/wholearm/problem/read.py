@@ -8,27 +8,26 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, fields, replace
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError, name_source
+from ..common.fields import collect_keys
 from ..common.require import require_number
 from ..common.sharing import exclusive
 from ..contacts.closing import close_finger, place_flush
 from ..contacts.elemental import Contact, parse_contact
 from ..contacts.formation import Formation
 from ..contacts.reach import name_reach
-from ..scene.model import HOLDS, Finger, Friction, Scene
+from ..scene.model import Finger, Friction, Scene
 from ..scene.polygon import Polygon
 from ..scene.ranges import TURN, check_place, check_ranges
+from . import keys
 from .definition import End, Phase, Problem, Until
 from .goal import read_goals
-from .table import name_keys
-from .uncertainty import GROUPS as PARAMETER_GROUPS
-from .uncertainty import NAMES as PARAMETER_NAMES
 
 _T = TypeVar("_T")
 
@@ -37,22 +36,6 @@ _THERE = 1e-3
 
 ROLLING = " rolling"
 """Follows the name of a contact that rolls in a phase's `contacts`."""
-
-_OPTIONAL = {
-    "name", "gravity", "fingers_collide", "phases", "goal", "settle", "settle_gap", "uncertainty",
-    "control_period", "control_hold",
-}  # fmt: skip
-_TOP = _OPTIONAL | {"epsilon", "object", "fingers", "friction", "start"}
-_OBJECT = {"vertices", "mass", "inertia"}
-_DEFAULTS = {"radius": 0.0, "viscous": 0.0, "dry": 0.0}
-_FINGER = {
-    own.name: own.default is MISSING and own.name not in _DEFAULTS
-    for own in fields(Finger)
-    if own.metadata
-}
-NAMES = name_keys(_TOP, _FINGER)
-"""Short names for `Problem.with_` and the keys that each stands for."""
-_ENDS = ", ".join(repr(end.value) for end in End)
 
 
 def read_problem(path: str) -> Problem:
@@ -94,28 +77,24 @@ def build_problem(table: Mapping[str, Any], source: str = "") -> Problem:
 
 
 def _build_problem(table: Mapping[str, Any], source: str) -> Problem:
-    _check_keys(table, "", _TOP, required=_TOP - _OPTIONAL)
+    check_keys(table, "", keys.TOP)
     scene = _read_scene(table)
     check_ranges(scene)
-    start = _read_start(scene, _table(table, "start"))
+    start = _read_start(scene, _table(table, "start", keys.START))
     given = table.get("phases", [])
     if not isinstance(given, list):
         raise InputError("", "phases", f"{given!r} is not a list of [[phases]]")
-    phases = tuple(_read_phase(scene, i, entry) for i, entry in enumerate(given))
-    ranges = _read_ranges(table) if "uncertainty" in table else None
-    name = table.get("name", "unnamed")
     return Problem(
-        name,
-        scene,
-        table["epsilon"],
-        start,
-        phases,
-        source,
-        table,
-        ranges,
-        settle=table.get("settle", 0.0),
-        settle_gap=table.get("settle_gap"),
+        scene=scene,
+        start=start,
+        phases=tuple(_read_phase(scene, i, entry) for i, entry in enumerate(given)),
+        source=source,
+        table=table,
+        uncertainty=_table(table, "uncertainty", keys.UNCERTAINTY)
+        if "uncertainty" in table
+        else None,
         goals=read_goals(table),
+        **collect_keys(Problem, table),
     )
 
 
@@ -167,40 +146,17 @@ def adopt_phases(problem: Problem, meta: Mapping[str, Any], q: Array, source: st
 
 
 def _read_scene(table: Mapping[str, Any]) -> Scene:
-    body = _table(table, "object")
-    _check_keys(body, "object", _OBJECT, required=_OBJECT - {"inertia"})
-    polygon = Polygon(body["vertices"], body["mass"], body.get("inertia"))
-    fingers = _table(table, "fingers")
-    _check_keys(fingers, "fingers", {"1", "2"}, required={"1", "2"})
-    friction = _table(table, "friction")
-    parts = {"palm", "finger1", "finger2"}
-    _check_keys(friction, "friction", parts, required=parts)
-    return Scene(
-        polygon,
-        (_read_finger(fingers, "1"), _read_finger(fingers, "2")),
-        Friction(friction["palm"], friction["finger1"], friction["finger2"]),
-        table.get("gravity", 9.81),
-        table.get("fingers_collide", True),
-        table.get("control_period", 0.0),
-        table.get("control_hold", HOLDS[0]),
+    polygon = Polygon(**collect_keys(Polygon, _table(table, "object", keys.OBJECT)))
+    fingers = _table(table, "fingers", keys.FINGERS)
+    friction = Friction(**collect_keys(Friction, _table(table, "friction", keys.FRICTION)))
+    right, left = (
+        Finger(**collect_keys(Finger, _table(fingers, key, keys.FINGER, name)), name=name)
+        for key, name in ((key, f"fingers.{key}") for key in keys.FINGERS)
     )
-
-
-def _read_ranges(table: Mapping[str, Any]) -> Mapping[str, float]:
-    given = _table(table, "uncertainty")
-    _check_keys(given, "uncertainty", {*PARAMETER_GROUPS, *PARAMETER_NAMES}, required=set())
-    return given
-
-
-def _read_finger(fingers: Mapping[str, Any], key: str) -> Finger:
-    name = f"fingers.{key}"
-    entry = _table(fingers, key, name)
-    _check_keys(entry, name, set(_FINGER), required={k for k, needed in _FINGER.items() if needed})
-    return Finger(**(_DEFAULTS | dict(entry)), name=name)
+    return Scene(polygon, (right, left), friction, **collect_keys(Scene, table))
 
 
 def _read_start(scene: Scene, start: Mapping[str, Any]) -> Array:
-    _check_keys(start, "start", {"flush", "x"}, required={"flush", "x"})
     edge, count = start["flush"], scene.polygon.n_vertices
     if not isinstance(edge, int) or isinstance(edge, bool) or not 0 <= edge < count:
         raise InputError(
@@ -241,15 +197,13 @@ def _read_phase(scene: Scene, index: int, entry: object) -> Phase:
     key = f"phases[{index + 1}]"
     if not isinstance(entry, dict):
         raise InputError("", key, f"{entry!r} is not a table")
-    _check_keys(entry, key, {"contacts", "until", "end", "settle"}, required={"contacts"})
+    check_keys(entry, key, keys.PHASE)
     names = entry["contacts"]
     if not isinstance(names, list) or not names:
         raise InputError("", f"{key}.contacts", f"{names!r} is not a list of contact names")
     formation = _at(f"{key}.contacts", lambda: read_formation(scene, names))
-    given = entry.get("end", End.REST.value)
-    if given not in [end.value for end in End]:
-        raise InputError("", f"{key}.end", f"{given!r} given; allowed are {_ENDS}")
-    until, end = Until(), End(given)
+    end = End(keys.PHASE["end"].kind.read(entry.get("end", "rest"), f"{key}.end"))
+    until = Until()
     if "until" in entry:
         until = _at(f"{key}.until", lambda: read_until(scene, entry["until"]))
     return Phase(index, formation, until, end, entry.get("settle"))
@@ -292,7 +246,7 @@ def read_until(scene: Scene, given: object) -> Until:
     if isinstance(given, str):
         return Until(contact=parse_contact(given, scene))
     allowed = "allowed are a contact name, or a table with contact, phi_deg or x, or several"
-    if not isinstance(given, dict) or not given or not set(given) <= {"contact", "phi_deg", "x"}:
+    if not isinstance(given, dict) or not given or not set(given) <= set(keys.UNTIL):
         raise InputError("", "", f"{given!r} does not end a phase; {allowed}")
     pins = tuple(_read_pin(key, value) for key, value in given.items() if key != "contact")
     if "contact" in given:
@@ -317,25 +271,28 @@ def _at(key: str, read: Callable[[], _T]) -> _T:
         raise InputError("", key, error.problem) from None
 
 
-def _table(parent: Mapping[str, Any], key: str, name: str = "") -> Mapping[str, Any]:
+def _table(
+    parent: Mapping[str, Any], key: str, known: keys.Table, name: str = ""
+) -> Mapping[str, Any]:
+    """The table at a key, with all the keys that it has to have and no others."""
     value = parent[key]
     if not isinstance(value, dict):
         raise InputError("", name or key, f"{value!r} is not a table")
+    check_keys(value, name or key, known)
     return value
 
 
-def _check_keys(
-    table: Mapping[str, Any], where: str, allowed: set[str], required: set[str]
-) -> None:
+def check_keys(table: Mapping[str, Any], where: str, known: keys.Table) -> None:
+    """Check that a table has what is required, and nothing unknown."""
     prefix = f"{where}." if where else ""
     for key in table:
-        if key not in allowed:
+        if key not in known:
             from difflib import get_close_matches
 
-            near = get_close_matches(key, allowed, 1, 0.5)
+            near = get_close_matches(key, known, 1, 0.5)
             hint = f"did you mean {near[0]!r}? " if near else ""
-            raise InputError(
-                "", f"{prefix}{key}", f"unknown key; {hint}allowed are {', '.join(sorted(allowed))}"
-            )
-    for key in sorted(required - set(table)):
-        raise InputError("", f"{prefix}{key}", "is missing")
+            allowed = ", ".join(sorted(known))
+            raise InputError("", f"{prefix}{key}", f"unknown key; {hint}allowed are {allowed}")
+    for key in sorted(name for name, own in known.items() if own.required):
+        if key not in table:
+            raise InputError("", f"{prefix}{key}", "is missing")

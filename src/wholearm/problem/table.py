@@ -5,14 +5,14 @@ from __future__ import annotations
 import copy
 import math
 import re
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..common.errors import InputError
+from ..common.fields import Field, keys_of
 from ..contacts.closing import close_finger, place_flush
 from ..scene.model import Scene
 from ..scene.polygon import Polygon
@@ -21,36 +21,7 @@ from .goal import match_goals
 if TYPE_CHECKING:
     from .definition import Phase, Problem, Until
 
-_OWN = {
-    "mass": ("object.mass",),
-    "vertices": ("object.vertices",),
-    "flush": ("start.flush",),
-    "x": ("start.x",),
-    "friction": ("friction.palm", "friction.finger1", "friction.finger2"),
-    "friction_palm": ("friction.palm",),
-    "friction_finger1": ("friction.finger1",),
-    "friction_finger2": ("friction.finger2",),
-}
-_OBJECT_INERTIA = {"inertia": ("object.inertia",)}
 _STEP = re.compile(r"([^.\[\]]+)|\[([1-9][0-9]*)\]")
-
-
-def name_keys(top: Collection[str], finger: Collection[str]) -> dict[str, tuple[str, ...]]:
-    """Short names for `Problem.with_` and the dotted keys that each stands for.
-
-    Parameters
-    ----------
-    top, finger : collection of str
-        Keys of a problem file, and of each finger in it.
-    """
-    names = {key: (key,) for key in top} | _OWN
-    for key in finger:
-        both = (f"fingers.1.{key}", f"fingers.2.{key}")
-        name = "finger_inertia" if key == "inertia" else key
-        names |= {f"{name}1": both[:1], f"{name}2": both[1:]}
-        if key != "base":
-            names[name] = both
-    return names | _OBJECT_INERTIA
 
 
 def change_table(
@@ -137,10 +108,10 @@ def match_table(problem: Problem) -> Mapping[str, Any]:
     table = problem.table
     if not table:
         return table
-    own = {key: getattr(problem, key) for key in ("name", "epsilon", "settle", "settle_gap")}
-    known = own | describe_scene(problem.scene)
-    known["uncertainty"] = _to_plain(problem.uncertainty)
-    differing = {key: value for key, value in known.items() if not _agrees(table, key, value)}
+    known = _list_values(("", problem), *_list_parts(problem.scene))
+    differing = {key: value for key, value, own in known if not _agrees(table, key, value, own)}
+    if problem.uncertainty != table.get("uncertainty"):
+        differing["uncertainty"] = _to_plain(problem.uncertainty)
     start = _match_start(table["start"], problem)
     if start is None:
         return {}
@@ -162,10 +133,11 @@ def write_table(problem: Problem) -> Mapping[str, Any]:
     if start is None:
         return {}
     table: dict[str, Any] = {
-        "name": problem.name,
-        "epsilon": problem.epsilon,
-        **({"settle": problem.settle} if problem.settle else {}),
-        **({} if problem.settle_gap is None else {"settle_gap": problem.settle_gap}),
+        **{
+            key: value
+            for key, value, own in _list_values(("", problem))
+            if own.required or value != own.shown_default
+        },
         "object": {},
         "fingers": {"1": {}, "2": {}},
         "friction": {},
@@ -183,39 +155,26 @@ def write_table(problem: Problem) -> Mapping[str, Any]:
 
 def describe_scene(scene: Scene) -> dict[str, Any]:
     """Values of a scene by the dotted keys of a problem file; None for what is left out there."""
-    body, friction = scene.polygon, scene.friction
-    points: Any = body.points
-    uniform = Polygon(points, body.mass).inertia == body.inertia
-    values: dict[str, Any] = {
-        "object.vertices": points.tolist(),
-        "object.mass": body.mass,
-        "object.inertia": None if uniform else body.inertia,
-        "friction.palm": friction.palm,
-        "friction.finger1": friction.finger1,
-        "friction.finger2": friction.finger2,
-    }
-    for number, link in enumerate(scene.fingers, 1):
-        for field in fields(link):
-            value = _to_plain(getattr(link, field.name))
-            if field.name != "name":
-                values[f"fingers.{number}.{field.name}"] = None if value == math.inf else value
-    for field in fields(scene):
-        if field.name not in ("polygon", "fingers", "friction"):
-            values[field.name] = getattr(scene, field.name)
-    return values
+    return {key: value for key, value, _ in _list_values(*_list_parts(scene))}
 
 
-_DEFAULTS = {
-    "name": "unnamed",
-    "settle": 0.0,
-    "radius": 0.0,
-    "viscous": 0.0,
-    "dry": 0.0,
-    "actuator_lag": 0.0,
-} | {field.name: field.default for field in fields(Scene)}
+def _list_parts(scene: Scene) -> list[tuple[str, object]]:
+    """Parts of a scene after the prefixes of their keys."""
+    fingers = [(f"{finger.name}.", finger) for finger in scene.fingers]
+    return [("object.", scene.polygon), ("friction.", scene.friction), *fingers, ("", scene)]
 
 
-def _agrees(table: Mapping[str, Any], key: str, value: object) -> bool:
+def _list_values(*parts: tuple[str, object]) -> Iterator[tuple[str, Any, Field]]:
+    """Dotted keys, values and declarations of parts of a problem."""
+    for prefix, part in parts:
+        for attribute, own in keys_of(part).items():
+            value = _to_plain(getattr(part, attribute))
+            if attribute == "inertia" and isinstance(part, Polygon):
+                value = None if value == part.uniform_inertia else value
+            yield f"{prefix}{own.name}", None if value == math.inf else value, own
+
+
+def _agrees(table: Mapping[str, Any], key: str, value: object, own: Field) -> bool:
     """Whether a table has a value, or leaves out a default."""
     *path, last = key.split(".")
     place: Any = table
@@ -224,7 +183,7 @@ def _agrees(table: Mapping[str, Any], key: str, value: object) -> bool:
     if key == "object.inertia" and value is None and last in place:
         uniform = Polygon(place["vertices"], place["mass"]).inertia
         return bool(place[last] == uniform)
-    return bool(place.get(last, _DEFAULTS.get(last)) == value)
+    return bool(place.get(last, own.shown_default) == value)
 
 
 def _match_start(start: Mapping[str, Any], problem: Problem) -> Mapping[str, Any] | None:

@@ -3,53 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from ..common.errors import InputError
+from ..common.fields import NONNEGATIVE, Field, leave
+from ..common.fields import key as declare_key
 from ..common.require import require_number
 from ..scene.model import Friction, Scene
 
-
-@dataclass(frozen=True)
-class Parameter:
-    """A number of a problem that may be off, or one of its torques.
-
-    Attributes
-    ----------
-    name : str
-    default : float
-        Half width of its range; of lengths over the scene's length.
-    unit : str
-        Of the half width; empty for a relative one.
-    """
-
-    name: str
-    default: float
-    unit: str = ""
-
-
 LENGTH = 1 / 30
 """Length of a scene, where none is known [m]: about that of the scenes in `problems/`."""
+_RELATIVE = leave({"type": "number", "minimum": 0, "exclusiveMaximum": 1})
+
+
+def _declare(names: str, default: float, unit: str = "") -> list[Field]:
+    """Half widths of the ranges of numbers, relative where there is no unit."""
+    text, kind = (f"Half width [{unit}].", NONNEGATIVE) if unit else (_TEXT, _RELATIVE)
+    return [declare_key(name, text, kind, default=default) for name in names.split()]
+
+
+_TEXT = "Half width, relative."
 PARAMETERS = (
-    Parameter("mass", 0.05),
-    Parameter("inertia", 0.05),
-    Parameter("friction_palm", 0.1),
-    Parameter("friction_finger1", 0.1),
-    Parameter("friction_finger2", 0.1),
-    Parameter("length1", 6e-3, "m"),
-    Parameter("length2", 6e-3, "m"),
-    Parameter("base1_x", 6e-3, "m"),
-    Parameter("base1_y", 6e-3, "m"),
-    Parameter("base2_x", 6e-3, "m"),
-    Parameter("base2_y", 6e-3, "m"),
-    Parameter("start_x", 6e-3, "m"),
-    Parameter("gain1", 0.01),
-    Parameter("gain2", 0.01),
-    Parameter("delay", 1e-3, "s"),
+    *_declare("mass inertia", 0.05),
+    *_declare("friction_palm friction_finger1 friction_finger2", 0.1),
+    *_declare("length1 length2 base1_x base1_y base2_x base2_y start_x", 6e-3, "m"),
+    *_declare("gain1 gain2", 0.01),
+    *_declare("delay", 1e-3, "s"),
 )
-"""All that can be varied. A delay is never negative: its range is [0, half width]."""
+"""All that can be varied; defaults of lengths are over the scene's length. A delay is never
+negative: its range is [0, half width]."""
 
 NAMES = tuple(parameter.name for parameter in PARAMETERS)
 GROUPS: Mapping[str, tuple[str, ...]] = {
@@ -95,20 +79,15 @@ def spread_widths(given: Mapping[str, object], label: str) -> dict[str, float]:
         for relative ones.
     """
     widths = dict[str, float]()
-    for key, value in sorted(given.items(), key=lambda item: item[0] not in GROUPS):
-        if key not in (*NAMES, *GROUPS):
-            allowed = ", ".join((*GROUPS, *NAMES))
-            raise InputError("", label.format(key), f"is unknown; allowed are {allowed}")
-        width, names = require_number(value, label.format(key), nonnegative=True), _list_names(key)
+    for name, value in sorted(given.items(), key=lambda item: item[0] not in GROUPS):
+        key = label.format(name)
+        if name not in (*NAMES, *GROUPS):
+            raise InputError("", key, f"is unknown; allowed are {', '.join((*GROUPS, *NAMES))}")
+        width, names = require_number(value, key, nonnegative=True), GROUPS.get(name, (name,))
         if width >= 1 and any(own.name in names and not own.unit for own in PARAMETERS):
-            text = f"{width:g} given; a relative range is below 1"
-            raise InputError("", label.format(key), text)
+            raise InputError("", key, f"{width:g} given; a relative range is below 1")
         widths |= dict.fromkeys(names, width)
     return widths
-
-
-def _list_names(key: str) -> tuple[str, ...]:
-    return GROUPS.get(key, (key,))
 
 
 def change_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:

@@ -8,7 +8,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.errors import InfeasibleError, InputError, name_source
+from ..common.errors import InfeasibleError, name_source
+from ..common.fields import SHARE
 from ..common.require import require_number
 from ..common.sharing import exclusive
 from ..geometry.path_guess import find_end
@@ -66,9 +67,7 @@ def predict(
         If the phases cannot be carried out geometrically, or a number is out of its range.
     """
     require_phases(problem)
-    share = require_number(squeeze, "squeeze")
-    if not 0 <= share <= 1:
-        raise InputError("", "squeeze", f"{squeeze!r} given; allowed are 0 to 1")
+    share = SHARE.read(squeeze, "squeeze")
     found: list[PhasePrediction] = []
     z, moving = problem.start, False
     with name_source(problem.source):

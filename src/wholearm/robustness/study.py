@@ -20,9 +20,9 @@ import numpy as np
 
 from .. import __version__
 from ..common.arrays import Array
-from ..common.bounds import Bounds
 from ..common.crowd import DiedError, run_all
 from ..common.document import Document, Result, Table
+from ..common.fields import Range
 from ..common.journal import Journal
 from ..common.workers import Spawning
 from ..policy.policy import Policy
@@ -35,7 +35,7 @@ from .uncertainty import Uncertainty
 
 Task = tuple[int, tuple[float, ...]]
 """Number and values of a sample."""
-SAMPLES = Bounds(1, 10**6)
+SAMPLES = Range(1, 10**6)
 """Samples of a study."""
 DRAWN = 200
 """Samples whose paths are kept, for figures."""
@@ -220,7 +220,7 @@ def assess_robustness(
         written by another run, or cannot be written.
     """
     problem, trajectory = adopt_motion(problem, plan)
-    SAMPLES.check("samples", samples)
+    SAMPLES.read(samples, "samples")
     require_same_phases(problem, trajectory)
     own = uncertainty or Uncertainty(problem.ranges)
     trial = make_trial(problem, trajectory, own, phase, policy)

@@ -9,9 +9,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..common.arrays import Array
+from ..common.fields import Field
 from ..common.require import require_number
 from ..problem.definition import Problem
-from ..problem.uncertainty import PARAMETERS, Parameter, change_scene, read_widths
+from ..problem.uncertainty import PARAMETERS, change_scene, read_widths
 from ..results.torque import TorqueProfile
 from ..scene.model import Scene
 
@@ -66,7 +67,7 @@ class Uncertainty:
         return REACHED * scene.scales.length if self.distance is None else self.distance
 
     @property
-    def varied(self) -> tuple[Parameter, ...]:
+    def varied(self) -> tuple[Field, ...]:
         """The parameters with a range."""
         return tuple(own for own in PARAMETERS if self.widths[own.name] > 0)
 

@@ -32,7 +32,7 @@ S. L. Yeap and J. C. Trinkle, "Dynamic Whole-Arm Dexterous Manipulation in the P
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -41,8 +41,34 @@ from numpy.typing import ArrayLike
 
 from ..common.arrays import Array
 from ..common.errors import InputError
-from ..common.require import require_number, require_vector
+from ..common.fields import (
+    BOOLEAN,
+    COEFFICIENT,
+    NONNEGATIVE,
+    POINT,
+    POSITIVE,
+    choice,
+    declare,
+    key,
+    read_keys,
+)
 from .polygon import Polygon
+from .ranges import (
+    CONTROL_PERIOD,
+    DRY,
+    FRICTION,
+    GRAVITY,
+    JOINT,
+    LAG,
+    LENGTH,
+    PLACE,
+    RADIUS,
+    SPEED,
+    STRENGTH,
+    TORQUE,
+    TORQUE_RATE,
+    VISCOUS,
+)
 
 LIGHT = 1e-4
 """Weight, over what the weaker finger can press with, that is next to nothing."""
@@ -52,63 +78,57 @@ TOUCHING = 3e-6
 """Gap below which features count as touching, in radii of gyration of the object."""
 
 
+@declare(
+    key("base", "The joint [m].", POINT, "length", PLACE),
+    key("length", "From the joint to the centre of the tip [m].", POSITIVE, "length", LENGTH),
+    key("radius", "Half thickness of the link [m].", NONNEGATIVE, "length", RADIUS, default=0.0),
+    key("inertia", "About the joint [kg m^2].", POSITIVE, "inertia", JOINT),
+    key(
+        "viscous",
+        "Viscous friction of the joint [N m s].",
+        NONNEGATIVE,
+        "drag",
+        VISCOUS,
+        default=0.0,
+    ),
+    key("dry", "Dry friction of the joint [N m].", NONNEGATIVE, "torque", DRY, default=0.0),
+    key("torque_limit", "[N m]", POSITIVE, "torque", TORQUE, STRENGTH),
+    key("speed_limit", "Of the joint [rad/s]; none by default.", POSITIVE, "rate", SPEED),
+    key(
+        "torque_rate_limit",
+        "How quickly the torque may change [N m/s]; none by default: it may step.",
+        *(POSITIVE, "torque_rate", TORQUE_RATE),
+    ),
+    key(
+        "actuator_lag",
+        "Time constant with which the torque follows its command [s].",
+        *(NONNEGATIVE, "time", LAG),
+    ),
+)
 @dataclass(frozen=True, eq=False)
 class Finger:
     """A single-link finger: a capsule on a motorised revolute joint.
 
-    Parameters
-    ----------
-    base : array_like, shape (2,), [m]
-        The joint.
-    length : float, [m]
-        From the joint to the centre of the tip.
-    radius : float, [m]
-        Half thickness of the link and radius of its tip; zero for a pointed line.
-    inertia : float, [kg m^2]
-        J_i about the joint.
-    viscous, dry : float, [N m s], [N m]
-        Viscous and dry friction of the joint, B_i and D_i.
-    torque_limit : float, [N m]
-    speed_limit : float, optional, [rad/s]
-        Infinite when left out.
-    torque_rate_limit : float, optional, [N m/s]
-        Largest rate at which the torque changes; infinite when left out, and then it may step.
-    actuator_lag : float, [s]
-        Time constant with which the torque follows its command.
-    name : str
-        Key of this finger in messages.
-
-    Notes
-    -----
-    The unit of a field is that of `Scales` with this name.
+    `name` is the key of the finger in messages.
     """
 
-    base: ArrayLike = field(metadata={"unit": "length"})
-    length: float = field(metadata={"unit": "length"})
-    radius: float = field(metadata={"unit": "length"})
-    inertia: float = field(metadata={"unit": "inertia"})
-    viscous: float = field(metadata={"unit": "drag"})
-    dry: float = field(metadata={"unit": "torque"})
-    torque_limit: float = field(metadata={"unit": "torque"})
-    speed_limit: float = field(default=math.inf, metadata={"unit": "rate"})
-    torque_rate_limit: float = field(default=math.inf, metadata={"unit": "torque_rate"})
-    actuator_lag: float = field(default=0.0, metadata={"unit": "time"})
+    base: ArrayLike
+    length: float
+    radius: float
+    inertia: float
+    viscous: float
+    dry: float
+    torque_limit: float
+    speed_limit: float = math.inf
+    torque_rate_limit: float = math.inf
+    actuator_lag: float = 0.0
     name: str = "fingers"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "base", require_vector(self.base, f"{self.name}.base", 2))
-        for key in ("length", "inertia", "torque_limit"):
-            value = require_number(getattr(self, key), f"{self.name}.{key}", positive=True)
-            object.__setattr__(self, key, value)
-        for key in ("radius", "viscous", "dry", "actuator_lag"):
-            value = require_number(getattr(self, key), f"{self.name}.{key}", nonnegative=True)
-            object.__setattr__(self, key, value)
-        for key in ("speed_limit", "torque_rate_limit"):
-            if getattr(self, key) != math.inf:
-                value = require_number(getattr(self, key), f"{self.name}.{key}", positive=True)
-                object.__setattr__(self, key, value)
+        read_keys(self, f"{self.name}.")
 
 
+@declare(*(key(part, "", COEFFICIENT, "", FRICTION) for part in ("palm", "finger1", "finger2")))
 @dataclass(frozen=True)
 class Friction:
     """Coulomb coefficients between the object and each part of the hand."""
@@ -118,9 +138,7 @@ class Friction:
     finger2: float
 
     def __post_init__(self) -> None:
-        for key in ("palm", "finger1", "finger2"):
-            value = require_number(getattr(self, key), f"friction.{key}", nonnegative=True)
-            object.__setattr__(self, key, value)
+        read_keys(self, "friction.")
 
     def of(self, finger: int | None) -> float:
         """Coefficient with finger 0 or 1, or with the palm when `finger` is None."""
@@ -186,23 +204,34 @@ class Scales(NamedTuple):
         return self.force / self.mass
 
 
+@declare(
+    key("gravity", "[m/s^2]", NONNEGATIVE, "acceleration", GRAVITY),
+    key(
+        "fingers_collide",
+        "Whether the links stop each other; false where they move in different planes.",
+        BOOLEAN,
+    ),
+    key(
+        "control_period",
+        "Period over which torques are held; with 0 they are free [s].",
+        *(NONNEGATIVE, "time", CONTROL_PERIOD),
+    ),
+    key(
+        "control_hold",
+        "Whether torques are constant over each period, or lines that go on from period to period.",
+        choice(*HOLDS),
+    ),
+)
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Everything that does not move by plan: object, both fingers, friction and gravity.
 
-    Parameters
+    Attributes
     ----------
     polygon : Polygon
     fingers : (Finger, Finger)
         The right one, then the left one.
     friction : Friction
-    gravity : float, [m/s^2]
-    control_period : float, [s]
-        Over which planned torques are held, from the start of each phase; 0 for free torques.
-    control_hold : {"constant", "linear"}
-        How they are held over it.
-    fingers_collide : bool
-        Whether the links are solid to each other; False for fingers in different planes.
 
     Raises
     ------
@@ -216,19 +245,10 @@ class Scene:
     gravity: float = 9.81
     fingers_collide: bool = True
     control_period: float = 0.0
-    control_hold: str = "constant"
+    control_hold: str = HOLDS[0]
 
     def __post_init__(self) -> None:
-        value = require_number(self.gravity, "gravity", nonnegative=True)
-        object.__setattr__(self, "gravity", value)
-        if not isinstance(self.fingers_collide, bool):
-            given = f"{self.fingers_collide!r} given; allowed are true and false"
-            raise InputError("", "fingers_collide", given)
-        period = require_number(self.control_period, "control_period", nonnegative=True)
-        object.__setattr__(self, "control_period", period)
-        if self.control_hold not in HOLDS:
-            given = f"{self.control_hold!r} given; allowed are {' and '.join(map(repr, HOLDS))}"
-            raise InputError("", "control_hold", given)
+        read_keys(self)
         # Messages name a finger by its place here, whatever it was made as.
         named = zip(self.fingers, ("fingers.1", "fingers.2"), strict=True)
         fingers = tuple(f if f.name == name else replace(f, name=name) for f, name in named)

@@ -10,7 +10,9 @@ from numpy.typing import ArrayLike
 
 from ..common.arrays import Array
 from ..common.errors import InputError
-from ..common.require import frozen, require_number, require_vector
+from ..common.fields import POINT, POSITIVE, Kind, declare, key, read_keys
+from ..common.require import frozen
+from .ranges import INERTIA, MASS
 
 SIZES = (1e-4, 1e3)
 """Least and largest distance between the two corners of a polygon that are farthest apart [m]."""
@@ -24,17 +26,38 @@ MOST_VERTICES = 500
 """Most corners of a polygon."""
 
 
+def _read_corners(given: object, key: str) -> Array:
+    if not isinstance(given, list | tuple | np.ndarray) or len(given) < 3:
+        raise InputError("", key, f"{given!r} is not a list of 3 or more points")
+    if len(given) > MOST_VERTICES:
+        allowed = f"allowed are 3 to {MOST_VERTICES}"
+        raise InputError("", key, f"{len(given)} corners given; {allowed}")
+    return frozen([POINT.read(point, f"{key}[{k}]") for k, point in enumerate(given)])
+
+
+CORNERS = Kind(
+    _read_corners,
+    {"type": "array", "minItems": 3, "maxItems": MOST_VERTICES, "items": POINT.schema},
+)
+
+
+@declare(
+    key(
+        "vertices",
+        "Corners of a convex polygon, anticlockwise, from any origin [m].",
+        *(CORNERS, "length"),
+        attribute="points",
+    ),
+    key("mass", "[kg]", POSITIVE, "mass", MASS),
+    key(
+        "inertia",
+        "About the centroid [kg m^2]; by default that of uniform density.",
+        *(POSITIVE, "inertia", INERTIA),
+    ),
+)
 @dataclass(frozen=True, eq=False)
 class Polygon:
     """The object: a rigid convex polygon.
-
-    Parameters
-    ----------
-    points : array_like, shape (n_v, 2), [m]
-        Corners, anticlockwise, in any frame.
-    mass : float, [kg]
-    inertia : float, optional, [kg m^2]
-        About the centroid; that of uniform density when left out.
 
     Attributes
     ----------
@@ -63,15 +86,8 @@ class Polygon:
     size: float = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        given = self.points
-        if not isinstance(given, list | tuple | np.ndarray) or len(given) < 3:
-            raise InputError("", "object.vertices", f"{given!r} is not a list of 3 or more points")
-        if len(given) > MOST_VERTICES:
-            allowed = f"allowed are 3 to {MOST_VERTICES}"
-            raise InputError("", "object.vertices", f"{len(given)} corners given; {allowed}")
-        corners = np.array(
-            [require_vector(p, f"object.vertices[{i}]", 2) for i, p in enumerate(given)]
-        )
+        read_keys(self, "object.")
+        corners = np.asarray(self.points)
         size = _check_size(corners)
         edges = np.roll(corners, -1, axis=0) - corners
         # About a corner: far from the origin, areas would lose their digits.
@@ -101,18 +117,12 @@ class Polygon:
         neighbours = local + np.roll(local, -1, axis=0)
         middle = (neighbours * cross[:, None]).sum(axis=0) / (6 * area)
         vertices = local - middle
-        mass = require_number(self.mass, "object.mass", positive=True)
         after = np.roll(vertices, -1, axis=0)
         squares = (vertices**2 + vertices * after + after**2).sum(axis=1)
-        uniform = mass * float(cross_product(vertices, after) @ squares) / (12 * float(area))
-        inertia = uniform
-        if self.inertia is not None:
-            inertia = require_number(self.inertia, "object.inertia", positive=True)
-        object.__setattr__(self, "points", frozen(corners))
+        uniform = self.mass * float(cross_product(vertices, after) @ squares) / (12 * float(area))
         object.__setattr__(self, "vertices", frozen(vertices))
         object.__setattr__(self, "centroid", frozen(corners[0] + middle))
-        object.__setattr__(self, "mass", mass)
-        object.__setattr__(self, "inertia", inertia)
+        object.__setattr__(self, "inertia", uniform if self.inertia is None else self.inertia)
         object.__setattr__(self, "uniform_inertia", uniform)
         object.__setattr__(self, "size", size)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..common.arrays import Array
 from ..common.errors import InputError, name_source
-from ..common.require import require_number
+from ..common.fields import SHARE
 from ..common.sharing import exclusive
 from ..problem.check import require_phases
 from ..problem.definition import End, Phase, Problem, Until
@@ -70,9 +70,7 @@ def tune(
         If the phases cannot be carried out geometrically, or a number is out of its range.
     """
     require_phases(problem)
-    for key, value, most in (("squeeze", squeeze, 1), ("share", share, 1)):
-        if not 0 <= require_number(value, key) <= most:
-            raise InputError("", key, f"{value!r} given; allowed are 0 to {most}")
+    squeeze, share = SHARE.read(squeeze, "squeeze"), SHARE.read(share, "share")
     _require_stops(stops, brake)
     found: list[PhaseTuning] = []
     steps: list[Step] = []

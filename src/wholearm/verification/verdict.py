@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..common.arrays import Array
-from ..common.require import require_number
+from ..common.fields import POSITIVE, declare, key, read_keys
 from ..contacts.links import FINGERS_TOUCH
 from ..geometry.curve import describe_pose
-from ..mechanics.uniqueness import UNIQUENESS_MARGIN, describe_uniqueness, require_uniqueness_margin
+from ..mechanics.keys import UNIQUENESS
+from ..mechanics.uniqueness import UNIQUENESS_MARGIN, describe_uniqueness
 from ..problem.definition import End, Problem
 from ..results.report import ContactMargin, Deviation, Failure, FingerGap, PhaseReport
 from ..scene.model import Scene
@@ -39,6 +40,12 @@ OVERLAP = 3e-5
 """Overlap of the links that passes for touching, relative to the scene's length."""
 
 
+@declare(
+    key("departure", kind=POSITIVE),
+    key("rest_speed", kind=POSITIVE),
+    key("stray", kind=POSITIVE),
+    UNIQUENESS,
+)
 @dataclass(frozen=True)
 class Allowance:
     """What a replay may differ by from what is asked and still hold.
@@ -67,12 +74,7 @@ class Allowance:
     uniqueness_margin: float = UNIQUENESS_MARGIN
 
     def __post_init__(self) -> None:
-        for key in ("departure", "rest_speed", "stray"):
-            value = require_number(getattr(self, key), key, positive=True)
-            object.__setattr__(self, key, value)
-        object.__setattr__(
-            self, "uniqueness_margin", require_uniqueness_margin(self.uniqueness_margin)
-        )
+        read_keys(self)
 
     def scale(self, share: float) -> Allowance:
         """A share of what is allowed from the plan; the speed that passes for rest stays."""

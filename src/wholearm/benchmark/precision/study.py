@@ -8,8 +8,8 @@ from itertools import product
 
 from matplotlib.figure import Figure
 
-from ...common.bounds import Bounds
 from ...common.errors import InputError
+from ...common.fields import Range
 from ..study import Case, Row, Study
 from .phases import find_files, list_instances
 from .planners import LEAST_TIME, NO_DRAG, PLANNERS, is_installed, run_planner
@@ -39,7 +39,7 @@ class Precision(Study):
         text = "measure these methods only, by the names that the table has"
         parser.add_argument("--peers", nargs="+", default=METHODS, metavar="NAME", help=text)
         text = "processor time that one setting of a method may take on one phase [s] (60)"
-        parser.add_argument("--limit", type=Bounds(1e-3, 1e6).read, default=60.0, help=text)
+        parser.add_argument("--limit", type=Range(1e-3, 1e6).parse, default=60.0, help=text)
 
     def list_cases(self, options: argparse.Namespace) -> Iterator[Case]:
         """Study, phase, method, setting, and the files that phases are from."""

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...common.bounds import Bounds
 from ...common.errors import InputError, SolverError, WholearmError
+from ...common.fields import Range
 from ...common.files import make_folder, write_text
 from ...geometry.path_guess import check_phases, load
 from ...planning.plan import solve
@@ -64,7 +64,7 @@ class Stress(Study):
 
     def add_options(self, parser: argparse.ArgumentParser) -> None:
         """How much of each."""
-        read, many = Bounds(0, 10**7).read, Bounds(0, 2**63).read
+        read, many = Range(0, 10**7).parse, Range(0, 2**63).parse
         parser.add_argument("--scenes", type=read, default=1000, help="generated scenes (1000)")
         parser.add_argument("--files", type=read, default=0, help="damaged files (0)")
         text = "problem files to plan with noise, and with other masses and forces"

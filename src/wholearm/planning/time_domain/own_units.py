@@ -7,16 +7,18 @@ weighed in the time domain counts in these.
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
 from ...common.arrays import Array
+from ...common.fields import keys_of
 from ...contacts.formation import Formation
 from ...problem.definition import Phase, Problem
 from ...problem.uncertainty import PARAMETERS
-from ...scene.model import Finger, Scales, Scene
+from ...scene.model import Scales, Scene
 from ...scene.polygon import Polygon
 from ..options import Objective, PlanOptions
 from .stage import Stage, StagePoints
@@ -45,18 +47,13 @@ def _scale_scene(scene: Scene, scales: Scales) -> Scene:
         body.vertices / scales.length, body.mass / scales.mass, body.inertia / scales.inertia
     )
 
-    def scale(finger: Finger) -> Finger:
-        measured = {own.name: own.metadata["unit"] for own in fields(finger) if own.metadata}
-        units = {name: getattr(scales, unit) for name, unit in measured.items()}
-        return replace(
-            finger, **{name: getattr(finger, name) / unit for name, unit in units.items()}
-        )
+    def scale(owner: Any) -> dict[str, Any]:
+        known = keys_of(owner).items()
+        units = {name: getattr(scales, own.scale) for name, own in known if own.scale}
+        return {name: getattr(owner, name) / unit for name, unit in units.items()}
 
-    right, left = scene.fingers
-    gravity = scene.gravity / scales.acceleration
-    period = scene.control_period / scales.time
-    fingers = scale(right), scale(left)
-    return replace(scene, polygon=polygon, fingers=fingers, gravity=gravity, control_period=period)
+    right, left = (replace(finger, **scale(finger)) for finger in scene.fingers)
+    return replace(scene, polygon=polygon, fingers=(right, left), **scale(scene))
 
 
 def _scale_phase(phase: Phase, scene: Scene, scales: Scales) -> Phase:

@@ -1,0 +1,310 @@
+"""Values that a user may give: name, unit, scale, range, default and text, declared once for each.
+
+A dataclass declares its keys by the decorator `declare`. From what `keys_of` lists follow the
+reader of problem files with its messages, ranges relative to the scene, the JSON Schema, the names
+of `Problem.with_`, the writer, options of the command line with their help, and tables of keys.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, replace
+from functools import partial
+from numbers import Real
+from typing import Any, TypeVar
+
+from .errors import InputError
+from .require import require_number, require_vector
+
+T = TypeVar("T")
+REQUIRED: Any = object()
+"""Default of what has to be given."""
+Schema = Mapping[str, Any]
+"""JSON Schema of a value."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a value may be: its reader, which takes value and key and raises, and its schema."""
+
+    read: Callable[[Any, str], Any]
+    schema: Schema
+
+
+@dataclass(frozen=True)
+class Range:
+    """Numbers from `low` to `high`, both included; whole ones only if `low` is an integer.
+
+    Attributes
+    ----------
+    low, high : float
+        As multiples of the scale, where there is one.
+    scale : callable, optional
+        Of the scene and of what has the number; None where the range does not count.
+    of : str
+        What messages call the scale; ``{time}`` stands for the scene's time.
+    """
+
+    low: float
+    high: float
+    scale: Callable[[Any, Any], float | None] | None = None
+    of: str = ""
+
+    @property
+    def whole(self) -> bool:
+        """Whether only whole numbers are allowed."""
+        return isinstance(self.low, int)
+
+    @property
+    def schema(self) -> Schema:
+        """JSON Schema of the range."""
+        kind = "integer" if self.whole else "number"
+        return {"type": kind, "minimum": self.low, "maximum": self.high}
+
+    def describe(self, time: str = "the scene's time") -> str:
+        """The range in words."""
+        low, high = (f"{end}" if self.whole else f"{end:g}" for end in (self.low, self.high))
+        text = f"{'whole numbers from ' if self.whole else ''}{low} to {high}"
+        return f"{text} {self.of.format(time=time)}".rstrip()
+
+    def find_fault(self, given: object) -> str:
+        """What is wrong with a value; empty if nothing is."""
+        kinds = (int,) if self.whole else (int, float)
+        known = isinstance(given, kinds) and not isinstance(given, bool)
+        if known and self.low <= given <= self.high:  # type: ignore[operator]
+            return ""
+        return f"{given!r} given; allowed are {self.describe()}"
+
+    def read(self, given: Any, key: str) -> Any:
+        """The value as int or float, or an `InputError` that names `key`."""
+        # Numbers of NumPy are no int.
+        value = given.item() if isinstance(given, Real) and hasattr(given, "item") else given
+        if text := self.find_fault(value):
+            raise InputError("", key, text)
+        return value if self.whole else float(value)
+
+    def parse(self, text: str) -> float:
+        """The value of a command-line option."""
+        value: float | str
+        try:
+            value = int(text) if self.whole else float(text)
+        except ValueError:
+            value = text
+        if wrong := self.find_fault(value):
+            from argparse import ArgumentTypeError
+
+            raise ArgumentTypeError(wrong)
+        return value  # type: ignore[return-value]
+
+    def check(
+        self, key: str, given: Any, unit: str = "", scene: Any = None, owner: Any = None
+    ) -> None:
+        """Raise an `InputError` that names `key` if a number, or one of several, is out of range.
+
+        What stands for none, 0 or infinity, is in every range: the kind says whether it is allowed.
+        """
+        scale = 1.0 if self.scale is None else self.scale(scene, owner)
+        if scale is None:
+            return
+        low, high = self.low * scale, self.high * scale
+        time = f"{scene.scales.time:.3g} s" if scene is not None else ""
+        several = hasattr(given, "__len__") and not isinstance(given, str)
+        for value in given if several else (given,):
+            counts = isinstance(value, Real) and value and math.isfinite(value)
+            if counts and not low <= value <= high:
+                what = f" ({self.describe(time)})" if self.of else ""
+                text = f"{low:.3g} to {high:.3g} {unit}".rstrip()
+                raise InputError("", key, f"{value:g} given; allowed are {text}{what}")
+
+
+def choice(*words: str) -> Kind:
+    """One of several words, or the member of an enumeration that has it."""
+
+    def read(given: Any, key: str) -> Any:
+        if getattr(given, "value", given) not in words:
+            allowed = " and ".join(map(repr, words)) if len(words) == 2 else str(words)[1:-1]
+            raise InputError("", key, f"{given!r} given; allowed are {allowed}")
+        return given
+
+    return Kind(read, {"enum": list(words)})
+
+
+def _read_boolean(given: Any, key: str) -> bool:
+    if not isinstance(given, bool):
+        raise InputError("", key, f"{given!r} given; allowed are true and false")
+    return given
+
+
+def _read_text(given: Any, key: str) -> str:
+    if not isinstance(given, str):
+        raise InputError("", key, f"{given!r} is not a string")
+    return given
+
+
+def refer(name: str) -> Schema:
+    """The schema that has a name."""
+    return {"$ref": f"#/definitions/{name}"}
+
+
+def leave(schema: Schema) -> Kind:
+    """What has a reader of its own."""
+    return Kind(lambda given, _: given, schema)
+
+
+SHARE = Range(0.0, 1.0)
+NUMBER = Kind(require_number, {"type": "number"})
+POSITIVE = Kind(partial(require_number, positive=True), {"type": "number", "exclusiveMinimum": 0})
+NONNEGATIVE = Kind(partial(require_number, nonnegative=True), {"type": "number", "minimum": 0})
+COEFFICIENT = Kind(NONNEGATIVE.read, refer("coefficient"))
+POINT = Kind(partial(require_vector, size=2), refer("point"))
+BOOLEAN = Kind(_read_boolean, {"type": "boolean"})
+TEXT = Kind(_read_text, {"type": "string"})
+
+
+@dataclass(frozen=True)
+class Field:
+    """A value that a user may give.
+
+    Attributes
+    ----------
+    name : str
+    text : str
+        What it is, with its unit in brackets.
+    kind : Kind or Range
+    scale : str
+        Unit of the scene, of `Scales`, that it counts in.
+    ranges : tuple of Range
+        Which it has to be in, relative to the scene.
+    default : object
+        REQUIRED where a value has to be given.
+    attribute : str
+        Of the dataclass that keeps it, if it is not the name.
+    """
+
+    name: str
+    text: str = ""
+    kind: Kind | Range = NUMBER
+    scale: str = ""
+    ranges: tuple[Range, ...] = ()
+    default: Any = REQUIRED
+    attribute: str = ""
+
+    @property
+    def required(self) -> bool:
+        """Whether a value has to be given."""
+        return self.default is REQUIRED
+
+    @property
+    def unit(self) -> str:
+        """The unit; empty where there is none."""
+        found = re.search(r"\[([^\]]*)\]", self.text)
+        return found[1] if found else ""
+
+    @property
+    def shown_default(self) -> Any:
+        """The default, if it is a value that could be given, or None."""
+        left_out = self.required or self.default == math.inf
+        return None if left_out else getattr(self.default, "value", self.default)
+
+    @property
+    def schema(self) -> dict[str, Any]:
+        """The value's JSON Schema."""
+        given = {"default": self.shown_default, "description": self.text}
+        return {**self.kind.schema} | {k: v for k, v in given.items() if v not in (None, "")}
+
+    def describe_default(self) -> str:
+        """The default as it is shown to a user; empty where there is none."""
+        value = self.shown_default
+        if isinstance(value, bool):
+            return str(value).lower()
+        if isinstance(value, float):
+            return re.sub(r"e([+-])0*", lambda found: f"e{found[1]}".replace("+", ""), f"{value:g}")
+        return "" if value is None else str(value)
+
+    def explain(self) -> str:
+        """The text, with range and default."""
+        allowed = [
+            field.describe() for field in (self.kind, *self.ranges) if isinstance(field, Range)
+        ]
+        default = f"default {self.describe_default()}" if self.describe_default() else ""
+        more = "; ".join(filter(None, (*allowed, default)))
+        return self.text + (more and f" ({more})")
+
+    def read(self, given: Any, key: str) -> Any:
+        """The value, if it is of its kind; raises an `InputError` that names `key`."""
+        if self.default is None and given is None:
+            return None
+        if self.default == math.inf and given == math.inf:
+            return math.inf
+        return self.kind.read(given, key)
+
+    def check(self, given: Any, key: str, scene: Any, owner: Any = None) -> None:
+        """Raise an `InputError` if a value is out of a range relative to the scene."""
+        for field in self.ranges:
+            field.check(key, given, self.unit, scene, owner)
+
+
+def key(
+    name: str,
+    text: str = "",
+    kind: Kind | Range = NUMBER,
+    scale: str = "",
+    *ranges: Range,
+    **more: Any,
+) -> Field:
+    """A `Field` with its ranges one after the other."""
+    return Field(name, text, kind, scale, ranges, **more)
+
+
+def name_fields(*fields: Field) -> dict[str, Field]:
+    """Fields by name."""
+    return {field.name: field for field in fields}
+
+
+def declare(*fields: Field) -> Callable[[type[T]], type[T]]:
+    """Say which fields of a dataclass are keys of a file or options, and what they are.
+
+    Their defaults are those of the dataclass, where it has any, and its docstring lists them.
+    """
+
+    def describe(owner: type[T]) -> type[T]:
+        known = {field.name: field.default for field in dataclasses.fields(owner)}  # type: ignore[arg-type]
+        found = {}
+        for field in fields:
+            attribute = field.attribute or field.name
+            default = known[attribute]
+            found[attribute] = field if default is MISSING else replace(field, default=default)
+        lines = [
+            f"    {name}\n        {field.explain()}" for name, field in found.items() if field.text
+        ]
+        owner.__doc__ = "\n".join([owner.__doc__ or "", "    Keys", "    ----", *lines, ""])
+        owner.__keys__ = found  # type: ignore[attr-defined]
+        return owner
+
+    return describe
+
+
+def keys_of(owner: Any) -> dict[str, Field]:
+    """The declared fields of a dataclass, or of an object of one, by attribute."""
+    found: dict[str, Field] = owner.__keys__
+    return found
+
+
+def read_keys(owner: Any, prefix: str = "") -> None:
+    """Check the declared fields of a frozen dataclass, and keep them as they are read."""
+    for attribute, field in keys_of(owner).items():
+        value = field.read(getattr(owner, attribute), f"{prefix}{field.name}")
+        object.__setattr__(owner, attribute, value)
+
+
+def collect_keys(owner: type, table: Mapping[str, Any]) -> dict[str, Any]:
+    """Values of a table, or their defaults, by attribute."""
+    known = keys_of(owner).items()
+    return {
+        name: table.get(field.name, field.default)
+        for name, field in known
+        if field.name in table or not field.required
+    }
