@@ -23,6 +23,7 @@ import numpy as np
 import wholearm
 from wholearm import Plan, Problem
 
+from ..search.route import forget_charts
 from .kernels import list_modes
 from .queries import draw_leg, draw_query
 from .stress.damage import BASE, to_toml
@@ -222,6 +223,8 @@ def _reach(folder: Path, number: int) -> Row:
         edge = polygon.flush_angle(flush)
         free = {"flush": flush} if number % 4 else {"phi_deg": np.degrees(edge) + 10.0}
         problem = problem.with_({"goal": free})
+    # What is known of a scene from other goals may lead to another route.
+    forget_charts()
     try:
         found = wholearm.find_route(problem)
     except wholearm.WholearmError as error:
